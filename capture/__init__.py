@@ -1,0 +1,1 @@
+"""Cameras to frames. NumPy, OpenCV and pyzmq; never torch."""

@@ -1,0 +1,1 @@
+"""One file a source, each with `Config`, `stream(config)` and, for devices, `find()`."""

@@ -1,0 +1,69 @@
+"""Frame and Intrinsics: the only image types in the project."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera's calibration, in pixels of an image `width` x `height`.
+
+    The centre of the top-left pixel is (0.5, 0.5), as in COLMAP. `distortion` are OpenCV's coefficients
+    (k1 k2 p1 p2 ...), empty for none. `source` tells where the numbers come from: "exif" (nominal, a few per cent),
+    "given" or "calibration" (trusted), "estimated" (by the reconstruction).
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    source: str
+    distortion: tuple[float, ...] = ()
+
+    @property
+    def K(self) -> npt.NDArray[np.float64]:  # (3, 3)
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    def resized(self, width: int, height: int) -> Intrinsics:
+        """The same camera for its image resized to `width` x `height`."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One image of a stream."""
+
+    frame_id: int  # position in its stream, from 0
+    name: str  # unique in its stream; for a file, its name
+    stamp_ns: int  # monotonic time of exposure
+    image: npt.NDArray[np.uint8]  # (H, W, 3) RGB
+    intrinsics: Intrinsics | None  # None: nothing is known about this camera
+
+    def __post_init__(self) -> None:
+        if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:
+            raise ValueError(f"image must be (H, W, 3) uint8, got {self.image.shape} {self.image.dtype}")
+
+    @property
+    def height(self) -> int:
+        return self.image.shape[0]
+
+    @property
+    def width(self) -> int:
+        return self.image.shape[1]
+
+
+@dataclass(frozen=True)
+class DroppedFrame:
+    """An image that was left out, and why: a result, not an exception."""
+
+    name: str
+    reason: str

@@ -1,0 +1,1 @@
+"""Frames to camera poses and a Gaussian scene."""

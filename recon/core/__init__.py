@@ -1,0 +1,76 @@
+"""The compiled core: one C ABI, built once per instruction set and chosen when it is first used.
+
+Everything in here is reached through the Python functions beside its use (`recon.rasterize.cpu`,
+`recon.priors.stereo`, ...), which check shapes and types; nothing else should call it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+from pathlib import Path
+
+from recon.core.compile import INSTRUCTION_SETS, library_path, machine
+
+# What /proc/cpuinfo must list before a library may be loaded.
+_REQUIRED_FLAGS = {
+    "avx512": {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "avx2", "fma", "bmi2"},
+    "avx2": {"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"},
+    "baseline": set(),
+}
+
+
+def instruction_sets() -> list[str]:
+    """The instruction sets that are compiled here and that this processor can run, best first.
+
+    `SPLATNODE_ISA` narrows the choice to one (for tests and benchmarks).
+    """
+    wanted = os.environ.get("SPLATNODE_ISA")
+    flags = _processor_flags()
+    return [
+        name
+        for name in INSTRUCTION_SETS.get(machine(), {"baseline": []})
+        if _REQUIRED_FLAGS[name] <= flags and library_path(name).exists() and wanted in (None, name)
+    ]
+
+
+@functools.cache
+def library(instruction_set: str | None = None) -> ctypes.CDLL:
+    """The core library for the best instruction set, or for the one named. Its threads are set from the affinity.
+
+    Raises RuntimeError when it has not been compiled.
+    """
+    usable = [instruction_set] if instruction_set else instruction_sets()
+    if not usable:
+        raise RuntimeError(
+            "the compiled core is missing, or $SPLATNODE_ISA names one that cannot run here. "
+            "Run: python recon/core/compile.py"
+        )
+    core = ctypes.CDLL(str(library_path(usable[0])))
+    core.core_set_threads(default_threads())
+    return core
+
+
+def default_threads() -> int:
+    """As many threads as this process may use processors (its affinity, not the machine's size)."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def set_threads(threads: int) -> None:
+    """Bounds the core's threads. Raises ValueError below 1."""
+    if threads < 1:
+        raise ValueError(f"threads must be at least 1, got {threads}")
+    library().core_set_threads(threads)
+
+
+def _processor_flags() -> set[str]:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("flags"):
+                return set(line.split(":", 1)[1].split())
+    except OSError:
+        pass
+    return set()

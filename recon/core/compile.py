@@ -1,0 +1,121 @@
+"""Compiles the C++ core into one shared library per instruction set: `python recon/core/compile.py`.
+
+The core is plain C++17 without dependencies, so any recent g++ or clang++ will do; where neither is installed the
+compiler that PyPI carries as `ziglang` is used. Nothing is compiled when the libraries are newer than their sources.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+
+# Reassociation lets sums use vector lanes. NaN and infinity keep their meaning (no -ffinite-math-only), because the
+# core checks its input for them, and the flags are never given to the linker: there they would change the rounding
+# mode of the whole process.
+FLAGS = [
+    "-O3", "-std=c++17", "-fPIC", "-pthread", "-fvisibility=hidden",
+    "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math", "-freciprocal-math",
+    "-ffp-contract=fast",
+]  # fmt: skip
+
+# Best first. The loader takes the first one that the processor can run.
+INSTRUCTION_SETS = {
+    "x86_64": {
+        "avx512": ["-march=x86-64-v4", "-mprefer-vector-width=512"],
+        "avx2": ["-march=x86-64-v3"],
+        "baseline": [],
+    },
+    "aarch64": {"baseline": []},
+}
+
+
+def machine() -> str:
+    """The processor family in the spelling of `INSTRUCTION_SETS`."""
+    name = platform.machine().lower()
+    return {"amd64": "x86_64", "arm64": "aarch64"}.get(name, name)
+
+
+def library_path(instruction_set: str) -> Path:
+    return HERE / f"_core_{machine()}_{instruction_set}.so"
+
+
+def find_compiler() -> list[str] | None:
+    """The command of a C++ compiler, or None: $CXX, g++, clang++, c++, then ziglang from PyPI."""
+    for name in (os.environ.get("CXX"), "g++", "clang++", "c++"):
+        if name and shutil.which(name.split()[0]):
+            return name.split()
+    if importlib.util.find_spec("ziglang"):
+        return [sys.executable, "-m", "ziglang", "c++"]
+    return None
+
+
+def compile_core(force: bool = False) -> list[Path]:
+    """Compiles what is out of date and returns the libraries' paths.
+
+    Raises RuntimeError when there is no compiler (naming the command that installs one) or when compilation fails.
+    """
+    compiler = find_compiler()
+    if compiler is None:
+        raise RuntimeError(
+            "no C++ compiler found (looked for $CXX, g++, clang++, c++ and the Python package ziglang). "
+            "Run: pip install ziglang"
+        )
+    sources = sorted(HERE.glob("*.cpp"))
+    digest = hashlib.sha256(" ".join(compiler + FLAGS).encode())
+    for path in sources + sorted(HERE.glob("*.h")):
+        digest.update(path.read_bytes())
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        built = [
+            pool.submit(_compile_one, compiler, sources, name, flags, digest.hexdigest(), force)
+            for name, flags in INSTRUCTION_SETS.get(machine(), {"baseline": []}).items()
+        ]
+    return [job.result() for job in built]
+
+
+def _compile_one(
+    compiler: list[str], sources: list[Path], name: str, flags: list[str], digest: str, force: bool
+) -> Path:
+    library = library_path(name)
+    stamp = library.with_suffix(".stamp")
+    if not force and library.exists() and stamp.exists() and stamp.read_text() == digest:
+        return library
+    unfinished = library.with_suffix(f".{os.getpid()}.so")
+    objects = [unfinished.with_suffix(f".{source.stem}.o") for source in sources]
+    try:
+        for source, output in zip(sources, objects, strict=True):
+            _run([*compiler, *FLAGS, *_portable(compiler, flags), "-c", str(source), "-o", str(output)])
+        _run([*compiler, "-shared", "-pthread", *map(str, objects), "-o", str(unfinished)])
+        os.replace(unfinished, library)
+    finally:
+        for path in [*objects, unfinished]:
+            path.unlink(missing_ok=True)
+    stamp.write_text(digest)
+    return library
+
+
+def _portable(compiler: list[str], flags: list[str]) -> list[str]:
+    """Zig takes processor names in its own spelling and refuses -march without one."""
+    if "ziglang" not in compiler:
+        return flags
+    target = [] if flags else ["-mcpu=baseline"]
+    return target + [flag.replace("-march=x86-64-v", "-mcpu=x86_64_v") for flag in flags]
+
+
+def _run(command: list[str]) -> None:
+    result = subprocess.run(command, capture_output=True, text=True)
+    if result.returncode != 0:
+        raise RuntimeError(f"the C++ core did not compile: {' '.join(command)}\n{result.stderr[-4000:]}")
+
+
+if __name__ == "__main__":
+    for built_library in compile_core(force="--force" in sys.argv):
+        print(built_library.name)

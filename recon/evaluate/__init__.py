@@ -1,0 +1,1 @@
+"""Held-out evaluation: protocol, metrics, methods, charts."""

@@ -1,0 +1,44 @@
+"""Keyframe: an accepted frame with its features and its image at modelled size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from capture.frame import Frame
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Local features of a frame at full size."""
+
+    points: npt.NDArray[np.float64]  # (M, 2) pixels of the full-size image, top-left pixel centre at (0.5, 0.5)
+    descriptors: npt.NDArray[np.float32]  # (M, 128) unit length
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    frame: Frame
+    image: npt.NDArray[np.uint8]  # (h, w, 3) RGB at modelled size
+    features: Features
+
+    @property
+    def name(self) -> str:
+        return self.frame.name
+
+
+def modelled_size(width: int, height: int, longer_side: int) -> tuple[int, int]:
+    """(width, height) with the longer side at most `longer_side`; images are never enlarged."""
+    scale = min(1.0, longer_side / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def modelled_image(image: npt.NDArray[np.uint8], longer_side: int) -> npt.NDArray[np.uint8]:
+    """`image` (H, W, 3) area-resampled to its modelled size."""
+    width, height = modelled_size(image.shape[1], image.shape[0], longer_side)
+    if (width, height) == (image.shape[1], image.shape[0]):
+        return image
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)

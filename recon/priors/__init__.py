@@ -1,0 +1,1 @@
+"""One file a prior; each turns keyframes into cameras and point maps."""

@@ -1,0 +1,30 @@
+"""Pointmap: what every prior gives for a keyframe, in one world frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+
+@dataclass(frozen=True, eq=False)
+class Pointmap:
+    """A 3D point and a confidence for every pixel of a keyframe at modelled size, with the camera that saw them."""
+
+    name: str
+    frame_id: int
+    depth: npt.NDArray[np.float32]  # (h, w) z in the camera frame, 0 where unknown
+    confidence: npt.NDArray[np.float32]  # (h, w) in [0, 1], 0 where unknown
+    normal: npt.NDArray[np.float32]  # (h, w, 3) camera frame, unit length, facing the camera, 0 where unknown
+    T_world_camera: npt.NDArray[np.float64]  # (4, 4)
+    K: npt.NDArray[np.float64]  # (3, 3) at modelled size
+
+    @property
+    def points(self) -> npt.NDArray[np.float32]:
+        """(h, w, 3) world points; the camera's centre where the depth is unknown."""
+        height, width = self.depth.shape
+        u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        rays = np.stack([(u - self.K[0, 2]) / self.K[0, 0], (v - self.K[1, 2]) / self.K[1, 1], np.ones_like(u)], -1)
+        camera_points = rays * self.depth[..., None]
+        return (camera_points @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]).astype(np.float32)

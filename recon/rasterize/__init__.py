@@ -1,0 +1,1 @@
+"""Differentiable rasterisers behind one interface; `reference.py` is the definition."""

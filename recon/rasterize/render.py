@@ -1,0 +1,17 @@
+"""Render: what every rasteriser returns."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Render:
+    """An image of the Gaussians. A channel that was not asked for is None."""
+
+    rgb: Tensor | None  # (H, W, 3) on black: sum of w_k c_k (equation 2)
+    depth: Tensor | None  # (H, W) expected z in the camera frame: sum of w_k z_k / sum of w_k, 0 where alpha is 0
+    normal: Tensor | None  # (H, W, 3) sum of w_k n_k in the camera frame, facing the camera (equation 4)
+    alpha: Tensor | None  # (H, W) sum of w_k

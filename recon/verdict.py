@@ -1,0 +1,40 @@
+"""Verdicts: a set of frames that cannot be reconstructed is a result with a code, one sentence, and what to do."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+
+class Code(enum.Enum):
+    OK = "OK"
+    OK_PARTIAL = "OK_PARTIAL"
+    TOO_FEW_VIEWS = "TOO_FEW_VIEWS"
+    NO_OVERLAP = "NO_OVERLAP"
+    LOW_TEXTURE = "LOW_TEXTURE"
+    NO_PARALLAX = "NO_PARALLAX"
+    PLANAR_ONLY = "PLANAR_ONLY"
+    BASELINE_TOO_SMALL = "BASELINE_TOO_SMALL"
+    OUTLIER_VIEW = "OUTLIER_VIEW"
+    AMBIGUOUS = "AMBIGUOUS"
+    BLUR = "BLUR"
+    EXPOSURE_SHIFT = "EXPOSURE_SHIFT"
+    MOVING_SCENE = "MOVING_SCENE"
+    STATIC_CAMERA = "STATIC_CAMERA"
+    FOCAL_SUSPECT = "FOCAL_SUSPECT"
+    MIXED_CAMERAS = "MIXED_CAMERAS"
+    SPLIT = "SPLIT"
+    OVERFIT = "OVERFIT"
+    DIVERGED = "DIVERGED"
+    BUDGET_HIT = "BUDGET_HIT"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """`publishable` says whether a scene may be shown as a result; `frames` are the names that the code is about."""
+
+    code: Code
+    message: str  # one sentence
+    advice: str  # what to do about it; empty when there is nothing to do
+    frames: tuple[str, ...] = ()
+    publishable: bool = False
