@@ -1,0 +1,87 @@
+"""A folder of photographs as a camera."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from capture.frame import DroppedFrame, Frame, Intrinsics
+from capture.image_file import UnusableImage, decode_image
+
+DECODED_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
+# Photographs that cannot be decoded here: they are named, so that nobody wonders where they went.
+FOREIGN_SUFFIXES = {".heic", ".heif", ".avif", ".jxl", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf"}
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    folder: Path
+    names: tuple[str, ...] = ()  # the files to take, with or without suffix; none: all
+    intrinsics: Intrinsics | None = None  # of all images of its aspect ratio, instead of what their EXIF tells
+    max_pixels: int = 100_000_000  # larger images are left out
+    frames_per_second: float = 10.0  # of the stamps only; reading is as fast as the consumer
+
+
+def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
+    """The photographs in natural order (img2 before img10); what cannot be used is named and left out.
+
+    Of a capture's other files, none is read: cameras that happen to lie beside the images stay unknown.
+    Raises FileNotFoundError or ValueError, with what to do, where there is nothing to stream.
+    """
+    paths = chosen_images(config.folder, config.names)  # before the first frame, so that mistakes show at once
+    return _frames(paths, config)
+
+
+def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]:
+    frame_id = 0
+    for path in paths:
+        if path.suffix.lower() in FOREIGN_SUFFIXES:
+            yield DroppedFrame(path.name, f"{path.suffix.lower()} files cannot be read; convert it to JPEG or PNG")
+            continue
+        try:
+            image, intrinsics = decode_image(path.read_bytes(), config.max_pixels)
+        except UnusableImage as error:
+            yield DroppedFrame(path.name, str(error))
+        except OSError as error:
+            yield DroppedFrame(path.name, f"cannot be read: {error.strerror}")
+        else:
+            height, width = image.shape[:2]
+            if config.intrinsics is not None and _same_aspect(config.intrinsics, width, height):
+                intrinsics = config.intrinsics.resized(width, height)
+            yield Frame(frame_id, path.name, round(frame_id / config.frames_per_second * 1e9), image, intrinsics)
+            frame_id += 1
+
+
+def image_paths(folder: Path) -> list[Path]:
+    """The photographs that lie in `folder` itself, by their suffix, in natural order; hidden files are not for us."""
+    if not folder.is_dir():
+        raise FileNotFoundError(f"no folder {str(folder)!r}; give a folder that holds JPEG or PNG photographs")
+    suffixes = DECODED_SUFFIXES | FOREIGN_SUFFIXES
+    visible = [path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir()]
+    return sorted((path for path in visible if path.suffix.lower() in suffixes), key=natural_order)
+
+
+def chosen_images(folder: Path, names: tuple[str, ...] = ()) -> list[Path]:
+    """The photographs of `folder` called `names` (with or without suffix), or all. Raises where one is missing."""
+    paths = image_paths(folder)
+    if not paths:
+        inside = sorted(child.name for child in folder.iterdir() if child.is_dir() and image_paths(child))
+        advice = f"give one of its folders: {', '.join(inside)}" if inside else "give a folder of JPEGs or PNGs"
+        raise ValueError(f"no photographs in {str(folder)!r}; {advice}")
+    missing = [name for name in names if not any(name in (path.name, path.stem) for path in paths)]
+    if missing:
+        present = ", ".join(path.name for path in paths[:5]) + (", ..." if len(paths) > 5 else "")
+        raise ValueError(f"no photograph named {', '.join(missing)} in {str(folder)!r}; it holds {present}")
+    return [path for path in paths if not names or path.name in names or path.stem in names]
+
+
+def natural_order(path: Path) -> tuple:
+    """Sort key by which numbers count as numbers: img2 before img10. Ties (img2, img02) fall back to the name."""
+    parts = re.split(r"([0-9]+)", path.name.lower())
+    return tuple((int(part), "") if part.isdecimal() else (-1, part) for part in parts if part), path.name
+
+
+def _same_aspect(intrinsics: Intrinsics, width: int, height: int) -> bool:
+    return abs(intrinsics.width * height - intrinsics.height * width) <= max(width, height)

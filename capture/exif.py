@@ -1,0 +1,94 @@
+"""The few EXIF tags that tell about the camera, read from the TIFF structure that holds them (EXIF 2.32, 4.6)."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping
+
+from capture.frame import Intrinsics
+
+IMAGE_WIDTH, IMAGE_LENGTH = 0x0100, 0x0101
+EXIF_IFD = 0x8769
+FOCAL_LENGTH = 0x920A  # mm
+PIXEL_X_DIMENSION, PIXEL_Y_DIMENSION = 0xA002, 0xA003
+FOCAL_PLANE_X_RESOLUTION, FOCAL_PLANE_RESOLUTION_UNIT = 0xA20E, 0xA210
+FOCAL_LENGTH_35MM = 0xA405
+
+Tags = Mapping[int, tuple[float, ...]]
+
+_FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+_FORMATS = {1: "B", 3: "H", 4: "I", 5: "II", 8: "h", 9: "i", 10: "ii"}  # TIFF type -> struct codes of one value
+# From a fisheye to a long telephoto lens; what lies outside is a wrong tag.
+_PLAUSIBLE_FOCAL = (0.2, 12.0)  # in longer image sides
+
+
+def read_tags(tiff: bytes) -> Tags:
+    """Numeric tags of the first image and its EXIF part, from bytes that begin with a TIFF header.
+
+    What cannot be parsed is left out: EXIF is a hint that an image may lack, and many programs damage it.
+    """
+    order = {b"II*\0": "<", b"MM\0*": ">"}.get(tiff[:4])
+    if order is None:
+        return {}
+    try:
+        tags = _read_directory(tiff, struct.unpack_from(order + "I", tiff, 4)[0], order)
+        if EXIF_IFD in tags:
+            tags |= _read_directory(tiff, int(tags[EXIF_IFD][0]), order)
+    except struct.error:  # an offset points outside
+        return {}
+    return tags
+
+
+def _read_directory(tiff: bytes, offset: int, order: str) -> dict[int, tuple[float, ...]]:
+    tags: dict[int, tuple[float, ...]] = {}
+    (entries,) = struct.unpack_from(order + "H", tiff, offset)
+    for entry in range(offset + 2, offset + 2 + 12 * entries, 12):
+        tag, kind, count = struct.unpack_from(order + "HHI", tiff, entry)
+        if kind not in _FORMATS or not 1 <= count <= 16:  # texts, thumbnails, maker notes
+            continue
+        layout = struct.Struct(order + _FORMATS[kind] * count)
+        start = entry + 8 if layout.size <= 4 else struct.unpack_from(order + "I", tiff, entry + 8)[0]
+        values = layout.unpack_from(tiff, start)
+        if len(_FORMATS[kind]) == 2:
+            values = tuple(p / q if q else math.nan for p, q in zip(values[::2], values[1::2], strict=True))
+        tags[tag] = values
+    return tags
+
+
+def exif_intrinsics(tags: Tags, width: int, height: int) -> Intrinsics | None:
+    """The nominal camera of an image of `width` x `height` pixels; None where the tags do not tell it.
+
+    The principal point is taken to be the centre. Tags are not believed where the image was cropped after it was
+    taken or the focal length is not that of a real lens.
+    """
+    taken = sorted((_first(tags, PIXEL_X_DIMENSION) or width, _first(tags, PIXEL_Y_DIMENSION) or height))
+    shorter, longer = sorted((width, height))  # sorted: programs that turn an image do not always turn its tags
+    if abs(taken[0] * longer / (taken[1] * shorter) - 1) > 0.02:
+        return None
+    focal = _focal_from_35mm(tags, width, height) or _focal_from_sensor(tags, longer / taken[1])
+    if focal is None or not _PLAUSIBLE_FOCAL[0] <= focal / longer <= _PLAUSIBLE_FOCAL[1]:
+        return None
+    return Intrinsics(width, height, fx=focal, fy=focal, cx=width / 2, cy=height / 2, source="exif")
+
+
+def _focal_from_35mm(tags: Tags, width: int, height: int) -> float | None:
+    """Pixels. The equivalent focal length compares diagonals (CIPA DCG-001), so that it holds for 4:3 sensors too."""
+    focal_mm = _first(tags, FOCAL_LENGTH_35MM)
+    return focal_mm * math.hypot(width, height) / _FILM_DIAGONAL_MM if focal_mm else None
+
+
+def _focal_from_sensor(tags: Tags, resized: float) -> float | None:
+    """Pixels, from the lens and the sensor's pixels per unit of length, for an image `resized` times its taken size."""
+    focal_mm, per_unit = _first(tags, FOCAL_LENGTH), _first(tags, FOCAL_PLANE_X_RESOLUTION)
+    mm_per_unit = _MM_PER_UNIT.get(int(_first(tags, FOCAL_PLANE_RESOLUTION_UNIT) or 2))
+    if not focal_mm or not per_unit or not mm_per_unit:
+        return None
+    return focal_mm / mm_per_unit * per_unit * resized
+
+
+def _first(tags: Tags, tag: int) -> float | None:
+    """The tag's first value; None where it is absent or says "unknown" (zero, negative, 0/0)."""
+    value = tags.get(tag, (0.0,))[0]
+    return float(value) if value > 0 and math.isfinite(value) else None
