@@ -1,0 +1,1 @@
+"""Unposed, uncalibrated frames to camera poses: features, matches, two-view geometry, mapping, bundle adjustment."""

@@ -1,0 +1,158 @@
+"""Registration: keyframes in, cameras and sparse points with the evidence for them out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from capture.frame import Frame
+from recon.keyframe import Keyframe
+from recon.registration import bundle, features, focal, mapper, matching, two_view
+from recon.registration.two_view import TwoView
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Config:
+    features: features.Config = field(default_factory=features.Config)
+    matching: matching.Config = field(default_factory=matching.Config)
+    two_view: two_view.Config = field(default_factory=two_view.Config)
+    mapper: mapper.Config = field(default_factory=mapper.Config)
+    exif_sigma: float = 0.05  # of log focal: nominal focal lengths are rounded, and focusing changes them
+    voted_sigma: float = 0.3  # of log focal when frames voted for it
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredCamera:
+    """An estimated camera of the frame at full size."""
+
+    index: int  # position among the keyframes
+    T_world_camera: Array  # (4, 4)
+    focal: float  # pixels of the full-size image
+    radial: float  # first radial distortion coefficient
+    rotation_sigma_deg: float
+    centre_sigma_rel: float  # relative to the spread of the centres
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """What is known about the cameras. The world is the first camera's frame; the median depth of the points is 1."""
+
+    cameras: tuple[RegisteredCamera, ...]  # in the order of the keyframes
+    points: Array  # (P, 3) world
+    observed_by: npt.NDArray[np.int64]  # (O,) keyframe index
+    observed_point: npt.NDArray[np.int64]  # (O,)
+    observed_pixels: Array  # (O, 2) full-size pixels
+    agreement: dict[tuple[int, int], float]  # share of each pair's matches that the cameras explain
+    median_angle_deg: float
+    rms_px: float
+
+
+Pairs = dict[tuple[int, int], TwoView]
+
+
+def compare(keyframe1: Keyframe, keyframe2: Keyframe, config: Config) -> TwoView | None:
+    """Matches and verifies one pair of keyframes."""
+    matches = matching.match(keyframe1.features, keyframe2.features, config.matching)
+    points1 = keyframe1.features.points[matches[:, 0]] - principal_point(keyframe1.frame)
+    points2 = keyframe2.features.points[matches[:, 1]] - principal_point(keyframe2.frame)
+    size = (keyframe2.frame.width, keyframe2.frame.height)
+    return two_view.verify(points1, points2, matches, size, config.two_view)
+
+
+def register(keyframes: Sequence[Keyframe], pairs: Mapping[tuple[int, int], TwoView], config: Config) -> Registration | None:  # fmt: skip
+    """Cameras of as many keyframes as hang together, or None when no two do.
+
+    `pairs` holds the verified pairs by position (i < j).
+    """
+    groups, lenses = _lenses(keyframes, pairs, config)
+    views = [
+        mapper.View(
+            points=keyframe.features.points - principal_point(keyframe.frame),
+            lens=groups[i],
+            longer_side=max(keyframe.frame.width, keyframe.frame.height),
+        )
+        for i, keyframe in enumerate(keyframes)
+    ]
+    built = mapper.build_map(views, lenses, pairs, config.mapper)
+    return _in_first_camera(built, keyframes) if built else None
+
+
+def principal_point(frame: Frame) -> Array:
+    """(2,) pixels: as given, else the middle of the image."""
+    if frame.intrinsics is not None:
+        return np.array([frame.intrinsics.cx, frame.intrinsics.cy])
+    return np.array([frame.width / 2.0, frame.height / 2.0])
+
+
+def _lenses(
+    keyframes: Sequence[Keyframe], pairs: Mapping[tuple[int, int], TwoView], config: Config
+) -> tuple[list[int], list[mapper.Lens]]:
+    """Frames of one size (turned or not) and one nominal focal length share a lens."""
+    keys, groups = [], []
+    for keyframe in keyframes:
+        frame, given = keyframe.frame, keyframe.frame.intrinsics
+        nominal = None if given is None else (given.source, round(float(np.log(given.fx)) / 0.01))
+        key = (max(frame.width, frame.height), min(frame.width, frame.height), nominal)
+        if key not in keys:
+            keys.append(key)
+        groups.append(keys.index(key))
+    lenses = []
+    for group, (longer_side, _, _) in enumerate(keys):
+        members = [i for i, member in enumerate(groups) if member == group]
+        given = keyframes[members[0]].frame.intrinsics
+        if given is not None:
+            known = given.source in ("given", "calibration")
+            lenses.append(mapper.Lens((given.fx,), 0.0 if known else config.exif_sigma))
+            continue
+        inside = [pair for key, pair in pairs.items() if key[0] in members and key[1] in members]
+        ratios = focal.vote(inside, num_candidates=3)
+        lenses.append(mapper.Lens(tuple(ratio * longer_side for ratio in ratios), config.voted_sigma))
+    return groups, lenses
+
+
+def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe]) -> Registration:
+    """The map with the first registered keyframe as the world's frame and a median point depth of 1."""
+    state = built.problem
+    order = sorted(built.views)
+    covariances = bundle.covariance(state, built.prior, bundle.Config(), built.views[0])
+    _, depths = bundle.project(state)
+    scale = 1.0 / max(float(np.median(depths)), 1e-9)
+    rotation0, translation0 = state.rotations[order[0]], state.translations[order[0]]
+    points = scale * (state.points @ rotation0.T + translation0)
+    centres = {i: -state.rotations[i].T @ state.translations[i] for i in order}
+    spread = np.sqrt(np.mean(np.sum((np.stack(list(centres.values())) - np.mean(list(centres.values()), 0)) ** 2, 1)))
+    cameras = []
+    for i in order:
+        T_world_camera = np.eye(4)
+        T_world_camera[:3, :3] = rotation0 @ state.rotations[i].T
+        T_world_camera[:3, 3] = scale * (rotation0 @ centres[i] + translation0)
+        lens = state.lens_of_camera[i]
+        # The centre is -R^T t: its covariance follows from that of rotation and translation.
+        jacobian = np.hstack([-state.rotations[i].T @ bundle.cross_matrix(state.translations[i][None])[0], -state.rotations[i].T])  # fmt: skip
+        centre_covariance = jacobian @ covariances[i] @ jacobian.T
+        cameras.append(
+            RegisteredCamera(
+                index=i,
+                T_world_camera=T_world_camera,
+                focal=float(np.exp(state.log_focals[lens])),
+                radial=float(state.radials[lens]),
+                rotation_sigma_deg=float(np.degrees(np.sqrt(np.trace(covariances[i][:3, :3])))),
+                centre_sigma_rel=float(np.sqrt(max(np.trace(centre_covariance), 0.0)) / max(spread, 1e-12)),
+            )
+        )
+    principal = np.stack([principal_point(keyframe.frame) for keyframe in keyframes])
+    return Registration(
+        cameras=tuple(cameras),
+        points=points,
+        observed_by=state.camera_of,
+        observed_point=state.point_of,
+        observed_pixels=state.pixels + principal[state.camera_of],
+        agreement=built.agreement,
+        median_angle_deg=built.median_angle_deg,
+        rms_px=built.rms_px,
+    )
