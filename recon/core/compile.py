@@ -1,7 +1,8 @@
 """Compiles the C++ core into one shared library per instruction set: `python recon/core/compile.py`.
 
 The core is plain C++17 without dependencies, so any recent g++ or clang++ will do; where neither is installed the
-compiler that PyPI carries as `ziglang` is used. Nothing is compiled when the libraries are newer than their sources.
+compiler that PyPI carries as `ziglang` is used. Nothing is compiled when sources, flags and compiler are those of the
+last time.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import platform
 import shutil
 import subprocess
 import sys
+import sysconfig
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -26,6 +28,9 @@ FLAGS = [
     "-fno-math-errno", "-fno-trapping-math", "-fno-signed-zeros", "-fassociative-math", "-freciprocal-math",
     "-ffp-contract=fast",
 ]  # fmt: skip
+LINK_FLAGS = ["-shared", "-pthread", "-s"]
+
+OLDEST_GLIBC = "2.17"  # what Zig compiles against: that of manylinux2014
 
 # Best first. The loader takes the first one that the processor can run.
 INSTRUCTION_SETS = {
@@ -58,6 +63,18 @@ def find_compiler() -> list[str] | None:
     return None
 
 
+def platform_tag() -> str:
+    """The platform of a wheel that carries the libraries, for example linux_x86_64.
+
+    Zig compiles against an old glibc of choice and links its own C++ library, so its libraries run on any Linux of
+    the last ten years; those of another compiler are promised only to machines like this one.
+    """
+    platform_name = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    if platform_name.startswith("linux") and _is_zig(find_compiler() or []):
+        return f"manylinux_{OLDEST_GLIBC.replace('.', '_')}_{machine()}"
+    return platform_name
+
+
 def compile_core(force: bool = False) -> list[Path]:
     """Compiles what is out of date and returns the libraries' paths.
 
@@ -70,15 +87,22 @@ def compile_core(force: bool = False) -> list[Path]:
             "Run: pip install ziglang"
         )
     sources = sorted(HERE.glob("*.cpp"))
-    digest = hashlib.sha256(" ".join(compiler + FLAGS).encode())
-    for path in sources + sorted(HERE.glob("*.h")):
-        digest.update(path.read_bytes())
+    digest = _digest(compiler, sources + sorted(HERE.glob("*.h")))
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         built = [
-            pool.submit(_compile_one, compiler, sources, name, flags, digest.hexdigest(), force)
+            pool.submit(_compile_one, compiler, sources, name, flags, digest, force)
             for name, flags in INSTRUCTION_SETS.get(machine(), {"baseline": []}).items()
         ]
     return [job.result() for job in built]
+
+
+def _digest(compiler: list[str], files: list[Path]) -> str:
+    """Changes when a library would. Zig is the same wherever it is installed (a build environment, a virtual one)."""
+    command = ["ziglang"] if _is_zig(compiler) else compiler
+    digest = hashlib.sha256(repr((command, FLAGS, LINK_FLAGS, INSTRUCTION_SETS, OLDEST_GLIBC)).encode())
+    for path in files:
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def _compile_one(
@@ -88,12 +112,15 @@ def _compile_one(
     stamp = library.with_suffix(".stamp")
     if not force and library.exists() and stamp.exists() and stamp.read_text() == digest:
         return library
-    unfinished = library.with_suffix(f".{os.getpid()}.so")
+    if _is_zig(compiler):
+        flags = _zig_flags(flags)
+    unfinished = library.with_suffix(f".{os.getpid()}.unfinished")
     objects = [unfinished.with_suffix(f".{source.stem}.o") for source in sources]
     try:
         for source, output in zip(sources, objects, strict=True):
-            _run([*compiler, *FLAGS, *_portable(compiler, flags), "-c", str(source), "-o", str(output)])
-        _run([*compiler, "-shared", "-pthread", *map(str, objects), "-o", str(unfinished)])
+            _run([*compiler, *FLAGS, *flags, "-c", str(source), "-o", str(output)])
+        target = [flag for flag in flags if flag.startswith("--target=")]
+        _run([*compiler, *LINK_FLAGS, *target, *map(str, objects), "-o", str(unfinished)])
         os.replace(unfinished, library)
     finally:
         for path in [*objects, unfinished]:
@@ -102,12 +129,15 @@ def _compile_one(
     return library
 
 
-def _portable(compiler: list[str], flags: list[str]) -> list[str]:
-    """Zig takes processor names in its own spelling and refuses -march without one."""
-    if "ziglang" not in compiler:
-        return flags
-    target = [] if flags else ["-mcpu=baseline"]
-    return target + [flag.replace("-march=x86-64-v", "-mcpu=x86_64_v") for flag in flags]
+def _is_zig(compiler: list[str]) -> bool:
+    return "ziglang" in compiler
+
+
+def _zig_flags(flags: list[str]) -> list[str]:
+    """Zig spells processors its own way and, without one, compiles for the processor that it runs on."""
+    target = [f"--target={machine()}-linux-gnu.{OLDEST_GLIBC}"] if sys.platform == "linux" else []
+    processor = [] if any(flag.startswith("-march=") for flag in flags) else ["-mcpu=baseline"]
+    return target + processor + [flag.replace("-march=x86-64-v", "-mcpu=x86_64_v") for flag in flags]
 
 
 def _run(command: list[str]) -> None:
@@ -117,5 +147,7 @@ def _run(command: list[str]) -> None:
 
 
 if __name__ == "__main__":
+    if "--find-compiler" in sys.argv:
+        sys.exit(find_compiler() is None)
     for built_library in compile_core(force="--force" in sys.argv):
         print(built_library.name)

@@ -1,0 +1,1 @@
+"""Snapshots to the screen. Never torch, never the optimiser."""
