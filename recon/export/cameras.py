@@ -1,0 +1,143 @@
+"""Cameras as text: cameras.json (ours), COLMAP's text model, nerfstudio's transforms.json, a TUM trajectory.
+
+All are for the images at modelled size, with the centre of the top-left pixel at (0.5, 0.5) (COLMAP's and nerfstudio's
+convention too). The world has no metric scale, and every file says so.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from recon.export.error import SceneFileError
+from recon.export.prepare import base_rgb
+from recon.export.quaternions import quats_from_matrices
+from recon.export.staged import json_bytes
+from recon.snapshot import CameraEstimate, GaussianArrays
+
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes right, up, back
+
+
+def camera_record(camera: CameraEstimate) -> dict[str, object]:
+    """A camera as cameras.json and report.json hold it."""
+    return {
+        "name": camera.name,
+        "frame_id": camera.frame_id,
+        "T_world_camera": camera.T_world_camera.tolist(),
+        "K": camera.K.tolist(),
+        "width": camera.width,
+        "height": camera.height,
+        "uncertainty": {"rotation_deg": camera.rotation_sigma_deg, "centre_rel": camera.centre_sigma_rel},
+    }
+
+
+def encode_cameras(cameras: Sequence[CameraEstimate]) -> bytes:
+    """cameras.json."""
+    return json_bytes(
+        {
+            "scale": "relative",
+            "axes": "OpenCV: x right, y down, z forward",
+            "T_world_camera": "p_world = T_world_camera @ p_camera",
+            "pixel_origin": "the centre of the top-left pixel is (0.5, 0.5)",
+            "cameras": [camera_record(camera) for camera in cameras],
+        }
+    )
+
+
+def decode_cameras(data: bytes, name: str = "cameras.json") -> tuple[CameraEstimate, ...]:
+    """Reads cameras.json. Raises SceneFileError, which names the file as `name`, where it is something else."""
+    try:
+        return tuple(_camera_from_record(record) for record in json.loads(data)["cameras"])
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise SceneFileError(f"{name} is not a cameras.json of splatnode, or is damaged: {error!r}") from error
+
+
+def _camera_from_record(record: Mapping) -> CameraEstimate:
+    T_world_camera = np.array(record["T_world_camera"], np.float64)
+    K = np.array(record["K"], np.float64)
+    if T_world_camera.shape != (4, 4) or K.shape != (3, 3):
+        raise ValueError(f"T_world_camera must be 4x4 and K 3x3, got {T_world_camera.shape} and {K.shape}")
+    if not np.isfinite(T_world_camera).all() or not np.isfinite(K).all():
+        raise ValueError("T_world_camera and K must be finite")
+    uncertainty = record.get("uncertainty") or {}
+    return CameraEstimate(
+        name=str(record["name"]),
+        frame_id=int(record["frame_id"]),
+        T_world_camera=T_world_camera,
+        K=K,
+        width=int(record["width"]),
+        height=int(record["height"]),
+        rotation_sigma_deg=uncertainty.get("rotation_deg"),
+        centre_sigma_rel=uncertainty.get("centre_rel"),
+    )
+
+
+def encode_colmap(cameras: Sequence[CameraEstimate], gaussians: GaussianArrays) -> dict[str, bytes]:
+    """COLMAP's text model: cameras.txt, images.txt and points3D.txt (the Gaussians' centres, without tracks).
+
+    Images with the same calibration share a camera; the number of an image is its place in `cameras`, from 1.
+    """
+    calibrations = [(c.width, c.height, c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2]) for c in cameras]
+    camera_ids = {calibration: i + 1 for i, calibration in enumerate(dict.fromkeys(calibrations))}
+    camera_lines = [f"{i} PINHOLE {_row(calibration)}" for calibration, i in camera_ids.items()]
+    image_lines = []
+    for number, (camera, calibration) in enumerate(zip(cameras, calibrations, strict=True), 1):
+        T_camera_world = np.linalg.inv(camera.T_world_camera)
+        numbers = _row([*quats_from_matrices(T_camera_world[:3, :3]), *T_camera_world[:3, 3]])
+        image_lines += [f"{number} {numbers} {camera_ids[calibration]} {camera.name}", ""]
+    colours = base_rgb(gaussians)
+    point_lines = [
+        f"{i} {x:.6g} {y:.6g} {z:.6g} {r} {g} {b} 0"
+        for i, ((x, y, z), (r, g, b)) in enumerate(zip(gaussians.means.tolist(), colours.tolist(), strict=True), 1)
+    ]
+    return {
+        "cameras.txt": _text(["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"], camera_lines),
+        "images.txt": _text(["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"], image_lines),
+        "points3D.txt": _text(["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"], point_lines),
+    }
+
+
+def encode_nerfstudio(cameras: Sequence[CameraEstimate]) -> bytes:
+    """transforms.json for nerfstudio and instant-ngp: OpenGL camera axes, images expected in images/."""
+    frames = [
+        {
+            "file_path": f"images/{camera.name}",
+            "fl_x": camera.K[0, 0],
+            "fl_y": camera.K[1, 1],
+            "cx": camera.K[0, 2],
+            "cy": camera.K[1, 2],
+            "w": camera.width,
+            "h": camera.height,
+            "transform_matrix": (camera.T_world_camera @ _OPENGL).tolist(),
+        }
+        for camera in cameras
+    ]
+    return json_bytes({"camera_model": "OPENCV", "scale": "relative", "frames": frames})
+
+
+def encode_tum(cameras: Sequence[CameraEstimate], stamps_ns: Mapping[str, int] | None = None) -> bytes:
+    """trajectory.tum: `time x y z qx qy qz qw` a line, camera to world.
+
+    The time is the exposure's, in seconds, where `stamps_ns` (by camera name) is given, and the frame's id otherwise.
+    """
+    lines = []
+    for camera in sorted(cameras, key=lambda camera: camera.frame_id):
+        w, x, y, z = quats_from_matrices(camera.T_world_camera[:3, :3])
+        time = _seconds(stamps_ns[camera.name]) if stamps_ns else str(camera.frame_id)
+        lines.append(f"{time} {_row([*camera.T_world_camera[:3, 3], x, y, z, w])}")
+    meaning = "seconds" if stamps_ns else "frame id"
+    return _text([f"# time ({meaning}), x y z, qx qy qz qw of T_world_camera"], lines)
+
+
+def _seconds(stamp_ns: int) -> str:
+    return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
+
+
+def _row(values: Sequence[float]) -> str:
+    return " ".join(str(int(value)) if float(value).is_integer() else repr(float(value)) for value in values)
+
+
+def _text(head: Sequence[str], lines: Sequence[str]) -> bytes:
+    return ("\n".join([*head, "# scale: relative (no metric unit)", *lines]) + "\n").encode()

@@ -1,0 +1,179 @@
+""".spz: Niantic's compact scene format (version 3), about a tenth of the PLY file.
+
+A gzip stream of a 16-byte header and one array an attribute: centres (24-bit fixed point), opacities, colours, log
+scales (8 bits each), rotations (the three smallest quaternion components in 10 bits each), spherical harmonics (8 bits,
+quantised to 5 and 4 so that they compress). Axes in the file are right, up, back; ours are right, down, forward.
+Written from the description in the README of github.com/nianticlabs/spz.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.export.error import SceneFileError
+from recon.export.prepare import unknown_source
+from recon.snapshot import GaussianArrays
+
+_MAGIC, _VERSION = 0x5053474E, 3
+_HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
+_FLAG_EXTENSIONS = 0x2  # records follow that a reader may ignore
+_MOST_GAUSSIANS = 10_000_000  # bounds what a hostile header can make us allocate
+_COLOUR_SCALE = 0.15  # smaller than the basis function's 0.28: colours may leave [0, 1] before SH brings them back
+_NUM_BASES = {0: 1, 1: 4, 2: 9, 3: 16}
+
+# Signs under (x, y, z) -> (x, -y, -z) of the bases in order: each is odd or even in y and in z.
+_SH_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
+_AXES = np.array([1, -1, -1], np.float32)
+
+
+def encode_spz(gaussians: GaussianArrays) -> bytes:
+    """The file's bytes. Scales and opacities must be positive and finite (see `viewer_safe`).
+
+    Rounding errors: log scales 1/32, opacities 1/510, f_dc 1/76, rotations 0.3 degrees, and centres 2^-23 of the
+    largest coordinate (at least 2^-24).
+    """
+    num_gaussians, num_bases = gaussians.sh.shape[:2]
+    degree = {bases: degree for degree, bases in _NUM_BASES.items()}[num_bases]
+    bits = _fractional_bits(gaussians.means)
+    fixed = np.rint(gaussians.means.astype(np.float64) * _AXES * 2.0**bits).astype("<i4")
+    parts = [
+        _HEADER.pack(_MAGIC, _VERSION, num_gaussians, degree, bits, 0, 0),
+        np.ascontiguousarray(fixed.view(np.uint8).reshape(-1, 4)[:, :3]).tobytes(),
+        _to_bytes(gaussians.opacities * 255.0),
+        _to_bytes(gaussians.sh[:, 0] * (_COLOUR_SCALE * 255.0) + 127.5),
+        _to_bytes((np.log(gaussians.scales) + 10.0) * 16.0),
+        _pack_quats(gaussians.quats).astype("<u4").tobytes(),
+        _pack_sh(gaussians.sh[:, 1:] * _SH_SIGNS[1:num_bases, None]),
+    ]
+    compressor = zlib.compressobj(9, zlib.DEFLATED, 16 + zlib.MAX_WBITS)  # 16: a gzip wrapper, without a time stamp
+    return compressor.compress(b"".join(parts)) + compressor.flush()
+
+
+def decode_spz(data: bytes, name: str = "scene.spz") -> GaussianArrays:
+    """Reads versions 2 and 3. Raises SceneFileError, which names the file as `name`, for anything else."""
+    stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
+    version, num_gaussians, degree, bits, flags = _parse_header(_inflate(stream, data, _HEADER.size, name), name)
+    num_bases = _NUM_BASES[degree]
+    widths = (9, 1, 3, 3, 4 if version == 3 else 3, 3 * (num_bases - 1))
+    size = num_gaussians * sum(widths)
+    body = _inflate(stream, stream.unconsumed_tail, size, name)
+    if len(body) < size:
+        raise SceneFileError(
+            f"{name} is truncated: its header promises {size} bytes for {num_gaussians} Gaussians, {len(body)} are "
+            "there. Copy or export it again"
+        )
+    if not flags & _FLAG_EXTENSIONS and _inflate(stream, stream.unconsumed_tail, 1, name):
+        raise SceneFileError(f"{name} holds more than the {num_gaussians} Gaussians that its header promises")
+    ends = np.cumsum([num_gaussians * width for width in widths])[:-1]
+    columns = np.split(np.frombuffer(body, np.uint8), ends)
+    centre, alpha, colour, scale, quat, sh = (
+        column.reshape(num_gaussians, width) for column, width in zip(columns, widths, strict=True)
+    )
+    rest = (sh.reshape(num_gaussians, num_bases - 1, 3).astype(np.float32) - 128.0) / 128.0
+    return GaussianArrays(
+        means=_unpack_fixed(centre) * np.float32(2.0**-bits) * _AXES,
+        quats=_unpack_quats(quat.copy().view("<u4")[:, 0]) if version == 3 else _unpack_first_three(quat),
+        scales=np.exp(scale.astype(np.float32) / 16.0 - 10.0),
+        opacities=alpha[:, 0].astype(np.float32) / 255.0,
+        sh=np.concatenate(
+            [
+                ((colour.astype(np.float32) / 255.0 - 0.5) / _COLOUR_SCALE)[:, None],
+                rest * _SH_SIGNS[1:num_bases, None],
+            ],
+            axis=1,
+        ),
+        source_frame=unknown_source(num_gaussians),
+    )
+
+
+def _parse_header(header: bytes, name: str) -> tuple[int, int, int, int, int]:
+    """(version, count, SH degree, fractional bits, flags), all within bounds."""
+    if len(header) < _HEADER.size:
+        raise SceneFileError(f"{name} is truncated: it ends within its header")
+    magic, version, count, degree, bits, flags, _ = _HEADER.unpack(header)
+    if magic != _MAGIC:
+        raise SceneFileError(f"{name} is compressed but not a .spz file: its signature is {header[:4]!r}, not b'NGSP'")
+    if version not in (2, 3):
+        raise SceneFileError(f"{name} is .spz version {version}; versions 2 and 3 can be read. Save it as version 3")
+    if degree not in _NUM_BASES:
+        raise SceneFileError(f"{name} has spherical harmonics of degree {degree}; 0 to 3 can be read")
+    if bits > 23 or count > _MOST_GAUSSIANS:
+        raise SceneFileError(f"{name} has an impossible header: {count} Gaussians, {bits} fractional bits")
+    return version, count, degree, bits, flags
+
+
+def _inflate(stream, data: bytes, size: int, name: str) -> bytes:
+    """At most `size` further bytes of the stream, so that a small file cannot fill the memory."""
+    if size == 0:
+        return b""
+    try:
+        return stream.decompress(data, size)
+    except zlib.error as error:
+        raise SceneFileError(f"{name} is not a .spz file or is damaged: {error}") from error
+
+
+def _to_bytes(values: npt.NDArray) -> bytes:
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8).tobytes()
+
+
+def _fractional_bits(means: npt.NDArray[np.float32]) -> int:
+    """As many as let the largest coordinate fit in 24 bits: the scale of our scenes is arbitrary."""
+    largest = float(np.abs(means).max(initial=0.0))
+    bits = int(np.floor(np.log2((2**23 - 1) / max(largest, 1.0))))
+    if bits < 0:
+        raise ValueError(f"centres must be within 2^23 of the origin for .spz, the farthest is at {largest:g}")
+    return bits
+
+
+def _unpack_fixed(centre: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    """(N, 9) bytes as (N, 3) integers: shifted into the top 24 of 32 bits, so that the sign extends by itself."""
+    wide = np.zeros((len(centre), 3, 4), np.uint8)
+    wide[..., 1:] = centre.reshape(-1, 3, 3)
+    return (wide.view("<i4")[..., 0] >> 8).astype(np.float32)
+
+
+def _pack_quats(quats: npt.NDArray[np.float32]) -> npt.NDArray[np.uint32]:
+    """(N, 4) wxyz as 2 bits for the largest component's index in xyzw, then sign and 9 bits for each of the others."""
+    xyzw = quats[:, [1, 2, 3, 0]].astype(np.float64)
+    xyzw[:, :3] *= _AXES
+    xyzw /= np.linalg.norm(xyzw, axis=1, keepdims=True)
+    largest = np.abs(xyzw).argmax(axis=1)
+    xyzw *= np.where(xyzw[np.arange(len(xyzw)), largest] < 0, -1.0, 1.0)[:, None]
+    packed = largest.astype(np.uint32)
+    for i in range(4):
+        magnitude = np.minimum(np.rint(np.abs(xyzw[:, i]) * np.sqrt(2.0) * 511.0), 511).astype(np.uint32)
+        field = (xyzw[:, i] < 0).astype(np.uint32) << np.uint32(9) | magnitude
+        packed = np.where(largest == i, packed, packed << np.uint32(10) | field)
+    return packed
+
+
+def _unpack_quats(packed: npt.NDArray[np.uint32]) -> npt.NDArray[np.float32]:
+    largest = (packed >> 30).astype(np.intp)
+    xyzw = np.zeros((len(packed), 4))
+    for i in (3, 2, 1, 0):
+        value = (packed & 511) / 511.0 * np.sqrt(0.5) * np.where(packed >> 9 & 1, -1.0, 1.0)
+        xyzw[:, i] = np.where(largest == i, 0.0, value)
+        packed = np.where(largest == i, packed, packed >> 10)
+    xyzw[np.arange(len(packed)), largest] = np.sqrt(np.maximum(1.0 - (xyzw**2).sum(1), 0.0))
+    return _our_axes(xyzw)
+
+
+def _unpack_first_three(quat: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    """Version 2: x, y and z in 8 bits; w is what they leave."""
+    xyz = quat / 127.5 - 1.0
+    return _our_axes(np.concatenate([xyz, np.sqrt(np.maximum(1.0 - (xyz**2).sum(1, keepdims=True), 0.0))], 1))
+
+
+def _our_axes(xyzw: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+    wxyz = xyzw[:, [3, 0, 1, 2]] * np.array([1, *_AXES])
+    return (wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)).astype(np.float32)
+
+
+def _pack_sh(rest: npt.NDArray[np.float32]) -> bytes:
+    """Coefficients in [-1, 1], rounded to 5 bits (degree 1) and 4 bits (above) so that 0 stays 0."""
+    step = np.where(np.arange(rest.shape[1]) < 3, 8, 16)[:, None]
+    return _to_bytes(np.rint(rest * 128.0 / step) * step + 128.0)
