@@ -1,4 +1,4 @@
-"""The build backend: setuptools, with the C++ core compiled before a wheel or an editable install is made (PEP 517, 660).
+"""The build backend (PEP 517, 660): setuptools, with the C++ core compiled before a wheel or an editable install.
 
 Where no compiler is installed, the build asks for the one that PyPI carries as `ziglang`. The core is loaded with
 ctypes, so a wheel is tied to a platform but to no version of Python.

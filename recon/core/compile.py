@@ -15,6 +15,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -88,12 +89,21 @@ def compile_core(force: bool = False) -> list[Path]:
         )
     sources = sorted(HERE.glob("*.cpp"))
     digest = _digest(compiler, sources + sorted(HERE.glob("*.h")))
-    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+    instruction_sets = INSTRUCTION_SETS.get(machine(), {"baseline": []})
+    stale = [name for name in instruction_sets if force or not _is_current(library_path(name), digest)]
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as compilers, ThreadPoolExecutor() as linkers:
         built = [
-            pool.submit(_compile_one, compiler, sources, name, flags, digest, force)
-            for name, flags in INSTRUCTION_SETS.get(machine(), {"baseline": []}).items()
+            linkers.submit(_build, compilers, compiler, sources, library_path(name), instruction_sets[name], digest)
+            for name in stale
         ]
-    return [job.result() for job in built]
+        for job in built:
+            job.result()
+    return [library_path(name) for name in instruction_sets]
+
+
+def _is_current(library: Path, digest: str) -> bool:
+    stamp = library.with_suffix(".stamp")
+    return library.exists() and stamp.exists() and stamp.read_text() == digest
 
 
 def _digest(compiler: list[str], files: list[Path]) -> str:
@@ -105,28 +115,30 @@ def _digest(compiler: list[str], files: list[Path]) -> str:
     return digest.hexdigest()
 
 
-def _compile_one(
-    compiler: list[str], sources: list[Path], name: str, flags: list[str], digest: str, force: bool
-) -> Path:
-    library = library_path(name)
-    stamp = library.with_suffix(".stamp")
-    if not force and library.exists() and stamp.exists() and stamp.read_text() == digest:
-        return library
+def _build(
+    compilers: ThreadPoolExecutor,
+    compiler: list[str],
+    sources: list[Path],
+    library: Path,
+    flags: list[str],
+    digest: str,
+) -> None:
+    """One library, which replaces the one that is there when it is whole. Sources are compiled by `compilers`."""
     if _is_zig(compiler):
         flags = _zig_flags(flags)
-    unfinished = library.with_suffix(f".{os.getpid()}.unfinished")
-    objects = [unfinished.with_suffix(f".{source.stem}.o") for source in sources]
-    try:
-        for source, output in zip(sources, objects, strict=True):
-            _run([*compiler, *FLAGS, *flags, "-c", str(source), "-o", str(output)])
+    with tempfile.TemporaryDirectory(prefix=".build-", dir=HERE) as folder:
+        objects = [Path(folder) / f"{source.stem}.o" for source in sources]
+        jobs = [
+            compilers.submit(_run, [*compiler, *FLAGS, *flags, "-c", str(source), "-o", str(output)])
+            for source, output in zip(sources, objects, strict=True)
+        ]
+        for job in jobs:
+            job.result()
+        unfinished = Path(folder) / library.name
         target = [flag for flag in flags if flag.startswith("--target=")]
         _run([*compiler, *LINK_FLAGS, *target, *map(str, objects), "-o", str(unfinished)])
         os.replace(unfinished, library)
-    finally:
-        for path in [*objects, unfinished]:
-            path.unlink(missing_ok=True)
-    stamp.write_text(digest)
-    return library
+    library.with_suffix(".stamp").write_text(digest)
 
 
 def _is_zig(compiler: list[str]) -> bool:
@@ -149,5 +161,8 @@ def _run(command: list[str]) -> None:
 if __name__ == "__main__":
     if "--find-compiler" in sys.argv:
         sys.exit(find_compiler() is None)
-    for built_library in compile_core(force="--force" in sys.argv):
-        print(built_library.name)
+    try:
+        for built_library in compile_core(force="--force" in sys.argv):
+            print(built_library.name)
+    except RuntimeError as error:
+        sys.exit(str(error))

@@ -1,0 +1,232 @@
+"""The command line: one line a verb in `VERBS`, each of which imports its room only when it runs.
+
+Exit codes: 0 good; 2 usage or configuration; 65 the frames cannot be reconstructed (the verdict says why);
+69 camera unavailable; 70 internal; 73, 74 cannot write; 75 try again; 77 not allowed; 130 interrupted.
+SIGTERM is a clean stop with 0.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import importlib
+import logging
+import math
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+# libgomp's threads spin while they wait. On a robot's busy processor that doubles the time of torch's operations.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+Command = Callable[[argparse.Namespace], int]  # returns the exit code
+
+EXPORT_FILES = {
+    "ply": "scene.ply",
+    "spz": "scene.spz",
+    "splat": "scene.splat",
+    "colmap": "colmap",
+    "nerfstudio": "transforms.json",
+    "tum": "trajectory.tum",
+}
+
+
+@dataclass(frozen=True)
+class Verb:
+    name: str
+    summary: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Command
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the verb that `argv` names and returns the exit code. Raises SystemExit for usage errors and SIGTERM."""
+    parser = build_parser()
+    args = parser.parse_args(argv)
+    if args.verb is None:
+        parser.print_help(sys.stderr)
+        return 2
+    logging.basicConfig(format="%(message)s", stream=sys.stderr)
+    for room in ("capture", "recon", "viewer"):
+        logging.getLogger(room).setLevel(logging.INFO)
+    signal.signal(signal.SIGTERM, _stop)
+    try:
+        code = args.run(args)
+        sys.stdout.flush()
+        return code
+    except (Exception, KeyboardInterrupt) as error:
+        if args.debug:
+            traceback.print_exc()
+        code = exit_code(error)
+        print(f"splatnode: {explain(error, code)}", file=sys.stderr)
+        return code
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="splatnode",
+        description="Photographs in, camera poses and a 3D Gaussian scene out, on a CPU.",
+        allow_abbrev=False,
+    )
+    parser.set_defaults(verb=None)
+    verbs = parser.add_subparsers(metavar="VERB")
+    for verb in VERBS:
+        subparser = verbs.add_parser(verb.name, help=verb.summary, description=verb.summary, allow_abbrev=False)
+        verb.add_arguments(subparser)
+        subparser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        subparser.set_defaults(verb=verb.name, run=verb.run)
+    return parser
+
+
+def exit_code(error: BaseException) -> int:
+    """What an exception that ended a verb tells the shell. Rooms raise ValueError for what the user can put right."""
+    if isinstance(error, KeyboardInterrupt):
+        return 130
+    if isinstance(error, OSError):
+        return _os_exit_code(error)
+    return 2 if isinstance(error, ValueError) else 70
+
+
+def explain(error: BaseException, code: int) -> str:
+    """One line, or the error's own text where that has more."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.strerror}: {error.filename}" if error.filename is not None else error.strerror
+    if code == 70:
+        return f"internal error: {type(error).__name__}: {error} (--debug shows where; splatnode doctor may tell why)"
+    return str(error)
+
+
+def _os_exit_code(error: OSError) -> int:
+    if _is_write_error(error):
+        no_room = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE}
+        return 74 if error.errno in no_room else 73
+    if isinstance(error, (FileNotFoundError, NotADirectoryError, IsADirectoryError)):
+        return 2
+    return 77 if isinstance(error, PermissionError) else 74
+
+
+def _is_write_error(error: OSError) -> bool:
+    """ResultWriteError can only have been raised by a room that has been imported."""
+    staged = sys.modules.get("recon.export.staged")
+    return staged is not None and isinstance(error, staged.ResultWriteError)
+
+
+def _stop(_signal: int, _frame: object) -> None:
+    sys.exit(0)
+
+
+def _lazily(module: str, function: str) -> Command:
+    def run(args: argparse.Namespace) -> int:
+        return getattr(importlib.import_module(module), function)(args)
+
+    return run
+
+
+# A flag that is not given is None, so that a configuration file, then the default, decides.
+
+
+def _demo_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: out/demo")
+    parser.add_argument("--seed", type=_natural, metavar="N")
+    _json_argument(parser)
+
+
+def _replay_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="photographs of one place, in any order")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with what differs from the defaults")
+    parser.add_argument("--preset", metavar="P", help="a named set of parameters")
+    parser.add_argument("--prior", metavar="K", help="what gives poses and first points (default: classical)")
+    parser.add_argument("--size", type=_positive, metavar="PIXELS", help="longer side as modelled (default: 512)")
+    parser.add_argument("--budget-s", type=_seconds, metavar="S", help="stop refining after this many seconds")
+    parser.add_argument("--max-gaussians", type=_positive, metavar="N")
+    parser.add_argument("--seed", type=_natural, metavar="N")
+    chosen = parser.add_mutually_exclusive_group()
+    chosen.add_argument("--views", type=_positive, metavar="N", help="use N frames, evenly spread")
+    chosen.add_argument("--frames", type=_names, metavar="A,B,C", help="use these frames, by name")
+    _json_argument(parser)
+
+
+def _export_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="a result's folder, or a .ply, .spz or .splat file")
+    parser.add_argument("--to", required=True, choices=EXPORT_FILES, help="the format")
+    parser.add_argument("--out", type=Path, metavar="PATH", help="default: beside the scene")
+
+
+def _bench_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help="folders with images and true cameras")
+    parser.add_argument("--views", type=_counts, metavar="3,6,12", help="numbers of training views")
+    parser.add_argument("--methods", type=_names, metavar="A,B,C", help="presets and baselines")
+    parser.add_argument("--seeds", type=_positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--weights-dir", type=Path, metavar="DIR", help="LPIPS networks (default: $SPLATNODE_WEIGHTS)")
+
+
+def _doctor_arguments(parser: argparse.ArgumentParser) -> None:
+    _json_argument(parser)
+
+
+def _json_argument(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print one JSON object for programs")
+
+
+def _export(args: argparse.Namespace) -> int:
+    from recon.export import export_scene
+
+    beside = args.scene if args.scene.is_dir() else args.scene.parent
+    destination = args.out or beside / EXPORT_FILES[args.to]
+    if args.out is None and destination.exists():
+        raise ValueError(f"{destination} is there already: give another place with --out PATH")
+    print(export_scene(args.scene, args.to, destination))
+    return 0
+
+
+def _whole_number(least: int) -> Callable[[str], int]:
+    def convert(text: str) -> int:
+        if not text.strip().isdecimal() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"must be a whole number, {least} or more; got {text!r}")
+        return int(text)
+
+    return convert
+
+
+_positive, _natural = _whole_number(1), _whole_number(0)
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = math.nan
+    if not 0 < seconds < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a number of seconds above 0; got {text!r}")
+    return seconds
+
+
+def _names(text: str) -> tuple[str, ...]:
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise argparse.ArgumentTypeError(f"must be values with commas between them; got {text!r}")
+    return names
+
+
+def _counts(text: str) -> tuple[int, ...]:
+    return tuple(_positive(name) for name in _names(text))
+
+
+VERBS = (
+    Verb("demo", "reconstruct the built-in capture", _demo_arguments, _lazily("recon.cli", "demo")),
+    Verb("replay", "reconstruct a folder of photographs", _replay_arguments, _lazily("recon.cli", "replay")),
+    Verb("export", "write a scene in another format", _export_arguments, _export),
+    Verb("bench", "measure held-out quality, poses and seconds", _bench_arguments, _lazily("recon.cli", "bench")),
+    Verb("doctor", "tell what is installed and what is missing", _doctor_arguments, _lazily("recon.doctor", "doctor")),
+)
+
+if __name__ == "__main__":
+    sys.exit(main())
