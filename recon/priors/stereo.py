@@ -1,0 +1,221 @@
+"""Dense multi-view stereo: a depth, a normal and a confidence for every pixel of views with known cameras.
+
+`depth_maps` does it for a set of views. For a single new keyframe, `choose_sources` names the views to compare it with,
+`estimate` matches it alone and `cross_check` compares it with the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from recon.priors import fusion
+from recon.priors.fusion import DepthMap
+from recon.priors.patchmatch import Level, Matching, Planes, Search, improve, make_level, resized
+
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One call of PatchMatch for every view."""
+
+    level: int  # at 1 / 2**level of the resolution
+    search: Search
+    geometric: bool = True  # whether the depth of the other views, from the stage before, is part of the cost
+
+
+DEFAULT_STAGES = (
+    Stage(2, Search(iterations=4, perturbation=4.0, random_starts=16), geometric=False),
+    Stage(2, Search(iterations=2, perturbation=1.0)),
+    Stage(1, Search(iterations=2, perturbation=1.0)),
+    Stage(0, Search(iterations=2, perturbation=1.0)),
+)
+
+
+@dataclass(frozen=True)
+class Config:
+    num_sources: int = 4  # views that each view is compared with, at most
+    best_angle_deg: float = 12.0  # triangulation angle that matches best
+    stages: tuple[Stage, ...] = DEFAULT_STAGES
+    matching: Matching = field(default_factory=Matching)
+    fusion: fusion.Config = field(default_factory=fusion.Config)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """An image with its camera. The centre of the top-left pixel is (0.5, 0.5)."""
+
+    image: npt.NDArray[np.uint8]  # (h, w, 3) RGB
+    K: Float64  # (3, 3)
+    T_world_camera: Float64  # (4, 4)
+    depth_range: tuple[float, float]  # nearest and farthest z that is searched
+
+    def __post_init__(self) -> None:
+        if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:
+            raise ValueError(f"image must be (h, w, 3) uint8, got {self.image.shape} {self.image.dtype}")
+        if self.K.shape != (3, 3) or self.T_world_camera.shape != (4, 4):
+            raise ValueError(
+                f"K must be (3, 3) and T_world_camera (4, 4), got {self.K.shape} and {self.T_world_camera.shape}"
+            )
+        near, far = self.depth_range
+        if not 0 < near < far < np.inf:
+            raise ValueError(f"depth_range must be 0 < near < far, got {self.depth_range}; see stereo.depth_range")
+
+
+@dataclass(frozen=True, eq=False)
+class Sparse:
+    """Known points of a view, as structure from motion gives them, to start the search from."""
+
+    points: Float64  # (M, 2) pixels
+    depths: Float64  # (M,) z in the camera frame
+
+
+def depth_maps(
+    views: Sequence[View], config: Config, *, seed: int = 0, sparse: Sequence[Sparse | None] | None = None
+) -> list[DepthMap]:
+    """A depth map for every view, in order. A view that overlaps with no other comes back without any depth.
+
+    The result depends on the arguments only, not on the number of threads.
+    """
+    known_points = list(sparse) if sparse is not None else [None] * len(views)
+    if len(known_points) != len(views):
+        raise ValueError(f"sparse must have one entry a view, got {len(known_points)} for {len(views)} views")
+    sources = [choose_sources(views, index, config, known_points[index]) for index in range(len(views))]
+    levels: dict[int, list[Level]] = {}
+    planes: list[Planes] = []
+    for stream, stage in enumerate(config.stages):
+        if stage.level not in levels:
+            levels[stage.level] = [_level(view, stage.level) for view in views]
+        at_level = levels[stage.level]
+        if not planes:
+            planes = [_start(*start) for start in zip(views, at_level, known_points, strict=True)]
+        planes = [resized(p, level) for p, level in zip(planes, at_level, strict=True)]
+        planes = [
+            improve(
+                at_level[i], [at_level[j] for j in sources[i]], planes[i], stage.search, config.matching,
+                known={n: planes[j].inverse_depth for n, j in enumerate(sources[i])} if stage.geometric else {},
+                seed=seed, stream=stream,
+            )
+            if sources[i]
+            else planes[i]
+            for i in range(len(views))
+        ]  # fmt: skip
+    return fusion.cross_check(levels[config.stages[-1].level], planes, config.fusion)
+
+
+def estimate(
+    view: View,
+    sources: Sequence[View],
+    config: Config,
+    *,
+    seed: int = 0,
+    sparse: Sparse | None = None,
+    known: Mapping[int, Float32] | None = None,
+) -> Planes:
+    """The planes of `view` alone, matched against `sources`, not yet checked against other maps.
+
+    `known` gives the depth maps (h, w), 0 where unknown, of the sources with these positions that have one already.
+    """
+    known_planes = {
+        n: Planes(np.stack([_inverse(depth), np.zeros_like(depth), np.zeros_like(depth)], -1), np.zeros_like(depth))
+        for n, depth in (known or {}).items()
+    }
+    planes: Planes | None = None
+    for stream, stage in enumerate(config.stages):
+        level, source_levels = _level(view, stage.level), [_level(source, stage.level) for source in sources]
+        planes = resized(planes, level) if planes else _start(view, level, sparse)
+        planes = improve(
+            level, source_levels, planes, stage.search, config.matching,
+            known={n: resized(p, source_levels[n]).inverse_depth for n, p in known_planes.items()},
+            seed=seed, stream=stream,
+        )  # fmt: skip
+    if planes is None:
+        raise ValueError("config.stages is empty: at least one stage is needed")
+    return planes
+
+
+def choose_sources(views: Sequence[View], index: int, config: Config, sparse: Sparse | None = None) -> list[int]:
+    """The views that view `index` should be compared with, best first: at most `config.num_sources`, maybe none.
+
+    A candidate scores for every probe point of the view that falls into its image, by the triangulation angle: too
+    small tells nothing, too large does not match. The probes are the sparse points, or a grid over the depth range.
+    """
+    view = views[index]
+    pixels, depths = (sparse.points, sparse.depths) if sparse is not None else _probes(view)
+    rays = np.c_[pixels, np.ones(len(pixels))] @ np.linalg.inv(view.K).T
+    world = (rays * depths[:, None]) @ view.T_world_camera[:3, :3].T + view.T_world_camera[:3, 3]
+    scores = {
+        other: float((_inside(candidate, world) * _angle_score(view, candidate, world, config.best_angle_deg)).mean())
+        for other, candidate in enumerate(views)
+        if other != index
+    }
+    useful = [other for other, score in scores.items() if score > 0.01]
+    return sorted(useful, key=lambda other: -scores[other])[: config.num_sources]
+
+
+def depth_range(depths: Float64, margin: float = 1.5) -> tuple[float, float]:
+    """(near, far) to search, from the depths of sparse points of a view: robust extremes, widened by `margin`.
+
+    Raises ValueError below three positive depths.
+    """
+    depths = depths[np.isfinite(depths) & (depths > 0)]
+    if len(depths) < 3:
+        raise ValueError(f"at least 3 sparse points are needed to know a depth range, got {len(depths)}")
+    near, far = np.percentile(depths, [1.0, 99.0])
+    return float(near / margin), float(far * margin)
+
+
+def _level(view: View, level: int) -> Level:
+    return make_level(view.image, view.K, view.T_world_camera, view.depth_range, level)
+
+
+def _start(view: View, level: Level, sparse: Sparse | None) -> Planes:
+    """The depth of the nearest sparse point, facing the camera; all unknown where there are no sparse points."""
+    values = np.zeros((*level.shape, 3), np.float32)
+    if sparse is not None and len(sparse.points):
+        height, width = level.shape
+        scale = np.array([width / view.image.shape[1], height / view.image.shape[0]])
+        x, y = np.clip((sparse.points * scale).astype(int), 0, [width - 1, height - 1]).T
+        elsewhere = np.ones(level.shape, np.uint8)
+        elsewhere[y, x] = 0
+        _, labels = cv2.distanceTransformWithLabels(elsewhere, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+        inverse_depths = np.zeros(labels.max() + 1, np.float32)
+        inverse_depths[labels[y, x]] = 1 / sparse.depths
+        values[..., 0] = inverse_depths[labels]
+    return Planes(values, np.zeros(level.shape, np.float32))
+
+
+def _probes(view: View) -> tuple[Float64, Float64]:
+    """(M, 2) pixels and (M,) depths of a grid in the view's frustum, even in inverse depth."""
+    height, width = view.image.shape[:2]
+    near, far = view.depth_range
+    inverse_depths = np.linspace(1 / far, 1 / near, 7)[1:-1]
+    u, v, w = np.meshgrid((np.arange(8) + 0.5) * width / 8, (np.arange(6) + 0.5) * height / 6, inverse_depths)
+    return np.stack([u.ravel(), v.ravel()], 1), 1 / w.ravel()
+
+
+def _inside(view: View, world: Float64) -> npt.NDArray[np.bool_]:
+    """Which of the points (M, 3) fall into the view's image."""
+    T_camera_world = np.linalg.inv(view.T_world_camera)
+    x, y, z = view.K @ (T_camera_world[:3, :3] @ world.T + T_camera_world[:3, 3:])
+    height, width = view.image.shape[:2]
+    return (z > 0) & (x >= 0) & (y >= 0) & (x < width * z) & (y < height * z)
+
+
+def _angle_score(view: View, other: View, world: Float64, best_angle_deg: float) -> Float64:
+    """(M,) in [0, 1]: how well the angle at each point between the rays of two views suits matching."""
+    here, there = (camera.T_world_camera[:3, 3] - world for camera in (view, other))
+    lengths = np.linalg.norm(here, axis=1) * np.linalg.norm(there, axis=1)
+    angle = np.degrees(np.arccos(np.clip((here * there).sum(1) / np.maximum(lengths, 1e-12), -1, 1)))
+    spread = np.where(angle < best_angle_deg, best_angle_deg / 2, 2 * best_angle_deg)
+    return np.exp(-0.5 * ((angle - best_angle_deg) / spread) ** 2)
+
+
+def _inverse(depth: Float32) -> Float32:
+    return np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
