@@ -1,0 +1,188 @@
+"""The command line: what it loads, how it ends, what it says."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+import splatnode
+from recon.export import FORMATS, ResultWriteError
+from recon.snapshot import GaussianArrays
+from tests.conftest import ROOT
+
+
+def run_verb(monkeypatch, command, *arguments):
+    verb = splatnode.Verb("act", "for the test", lambda parser: None, command)
+    monkeypatch.setattr(splatnode, "VERBS", (verb,))
+    return splatnode.main(["act", *arguments])
+
+
+def raising(error):
+    def command(args):
+        raise error
+
+    return command
+
+
+def test_help_loads_no_room():
+    code = (
+        "import sys, splatnode\n"
+        "splatnode.build_parser().format_help()\n"
+        "print(sorted({'capture', 'recon', 'viewer', 'numpy', 'torch', 'cv2'} & set(sys.modules)))"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).strip() == "[]"
+
+
+def test_openmp_threads_sleep_while_they_wait():
+    code = "import splatnode, os; print(os.environ['OMP_WAIT_POLICY'])"
+    assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).strip() == "passive"
+
+
+@pytest.mark.parametrize(
+    "error, code",
+    [
+        (ValueError("size must be 1 or more, got 0"), 2),
+        (FileNotFoundError(errno.ENOENT, "No such file or directory", "photos"), 2),
+        (NotADirectoryError(errno.ENOTDIR, "Not a directory", "photos"), 2),
+        (PermissionError(errno.EACCES, "Permission denied", "photos"), 77),
+        (ResultWriteError(errno.EACCES, "cannot write 3 files to out. Choose another folder"), 73),
+        (ResultWriteError(errno.ENOTDIR, "cannot write 3 files to out. Choose another folder"), 73),
+        (ResultWriteError(errno.ENOSPC, "cannot write 3 files to out. Free some space"), 74),
+        (OSError(errno.EIO, "Input/output error"), 74),
+        (RuntimeError("a bug"), 70),
+        (ZeroDivisionError("a bug"), 70),
+        (KeyboardInterrupt(), 130),
+    ],
+)
+def test_an_error_is_one_line_and_a_code(monkeypatch, capsys, error, code):
+    assert run_verb(monkeypatch, raising(error)) == code
+    said = capsys.readouterr().err
+    assert said.startswith("splatnode: ") and said.count("\n") == 1
+    if not isinstance(error, KeyboardInterrupt):
+        assert (getattr(error, "strerror", None) or str(error)) in said
+
+
+def test_debug_shows_the_traceback(monkeypatch, capsys):
+    assert run_verb(monkeypatch, raising(RuntimeError("a bug")), "--debug") == 70
+    assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("code", [0, 65])
+def test_the_verb_decides_the_exit_code(monkeypatch, code):
+    assert run_verb(monkeypatch, lambda args: code) == code
+
+
+@pytest.mark.parametrize("number, code", [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
+def test_signals_end_a_verb_cleanly(number, code):
+    program = (
+        "import sys, time, splatnode\n"
+        "def wait(args):\n"
+        "    try:\n"
+        "        print('ready', flush=True)\n"
+        "        time.sleep(60)\n"
+        "    finally:\n"
+        "        print('tidied', flush=True)\n"
+        "splatnode.VERBS = (splatnode.Verb('wait', '', lambda parser: None, wait),)\n"
+        "sys.exit(splatnode.main(['wait']))"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program], cwd=ROOT, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    time.sleep(0.05)
+    process.send_signal(number)
+    out, err = process.communicate(timeout=30)
+    assert (process.returncode, out) == (code, "tidied\n")
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    "argv, said",
+    [
+        (["replay", "photos"], "--out"),
+        (["replay", "photos", "--out", "o", "--views", "0"], "must be a whole number, 1 or more"),
+        (["replay", "photos", "--out", "o", "--size", "big"], "must be a whole number, 1 or more"),
+        (["replay", "photos", "--out", "o", "--budget-s", "nan"], "must be a number of seconds above 0"),
+        (["replay", "photos", "--out", "o", "--views", "3", "--frames", "a,b,c"], "not allowed with"),
+        (["replay", "photos", "--out", "o", "--frames", "a,,c"], "commas between them"),
+        (["export", "scene.ply", "--to", "docx"], "choose from"),
+        (["fly"], "choose from"),
+    ],
+)
+def test_usage_errors_end_with_2(capsys, argv, said):
+    with pytest.raises(SystemExit) as end:
+        splatnode.main(argv)
+    assert end.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+def test_no_verb_shows_the_help(capsys):
+    assert splatnode.main([]) == 2
+    assert "replay" in capsys.readouterr().err
+
+
+def test_replay_flags_arrive_and_unset_ones_are_none():
+    parser = splatnode.build_parser()
+    args = parser.parse_args(["replay", "photos", "--out", "o", "--frames", "a.jpg, b.jpg", "--budget-s", "2.5"])
+    assert args.frames == ("a.jpg", "b.jpg")
+    assert args.budget_s == 2.5
+    for unset in ("config", "preset", "prior", "size", "max_gaussians", "seed", "views"):
+        assert getattr(args, unset) is None
+    assert not args.json
+
+
+def test_bench_lists_are_parsed():
+    args = splatnode.build_parser().parse_args(
+        ["bench", "a", "b", "--views", "3,6,12", "--methods", "fast,best", "--out", "o"]
+    )
+    assert (args.views, args.methods, args.seeds) == ((3, 6, 12), ("fast", "best"), 1)
+    assert [scene.name for scene in args.scenes] == ["a", "b"]
+
+
+def test_export_offers_the_formats_that_there_are():
+    assert set(splatnode.EXPORT_FILES) == set(FORMATS)
+
+
+def test_export_writes_beside_the_scene_but_never_over_a_file(tmp_path, capsys):
+    from recon.export import read_gaussians, write_file
+    from recon.export.ply import encode_ply
+
+    one = GaussianArrays(
+        means=np.zeros((1, 3), np.float32),
+        quats=np.array([[1, 0, 0, 0]], np.float32),
+        scales=np.full((1, 3), 0.1, np.float32),
+        opacities=np.full(1, 0.5, np.float32),
+        sh=np.zeros((1, 1, 3), np.float32),
+        source_frame=np.zeros(1, np.int32),
+    )
+    write_file(tmp_path / "scene.ply", encode_ply(one))
+    assert splatnode.main(["export", str(tmp_path), "--to", "splat"]) == 0
+    assert capsys.readouterr().out.strip() == str(tmp_path / "scene.splat")
+    assert len(read_gaussians(tmp_path / "scene.splat")) == 1
+    assert splatnode.main(["export", str(tmp_path), "--to", "splat"]) == 2
+    assert "--out" in capsys.readouterr().err
+
+
+def test_doctor_finds_the_core_and_what_it_needs(capsys):
+    assert splatnode.main(["doctor", "--json"]) == 0
+    states = {finding["name"]: finding["state"] for finding in json.loads(capsys.readouterr().out)}
+    assert states["core"] == states["torch"] == states["numpy"] == "ok"
+
+
+def test_doctor_fails_when_the_core_is_missing(monkeypatch, capsys):
+    from recon import core, doctor
+
+    def missing():
+        raise RuntimeError("the compiled core is missing. Run: python recon/core/compile.py")
+
+    monkeypatch.setattr(core, "library", missing)
+    assert doctor.doctor(argparse.Namespace(json=False)) == 2
+    assert "Run: python recon/core/compile.py" in capsys.readouterr().out
