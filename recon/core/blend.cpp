@@ -1,0 +1,80 @@
+// Stage 3: every block of pixels blends the splats that touch it, nearest first.
+#include "threads.h"
+#include "tile.h"
+
+namespace core {
+namespace {
+
+template <int Channels>
+void store_images(const Vec* features, Vec transmittance, const Camera& camera, const BlockPosition& at,
+                  const RasterImages& images) {
+    using F = Features<Channels>;
+    const int width = camera.width;
+    const size_t plane = size_t(width) * camera.height;
+    const Vec alpha = 1.0f - transmittance;
+    store_block(images.alpha, width, at, alpha);
+    for (int c = 0; c < F::kColours; ++c) store_block(images.rgb + c * plane, width, at, features[c]);
+    if (F::kDepths) {
+        const Mask seen = less(Vec{}, alpha);
+        store_block(images.depth, width, at, keep(seen, features[F::kColours] / select(seen, alpha, splat(1.0f))));
+    }
+    for (int c = 0; c < F::kNormals; ++c)
+        store_block(images.normal + c * plane, width, at, features[F::kColours + F::kDepths + c]);
+}
+
+// Blends one block. `words` says which splats to try; afterwards, which of them changed a pixel.
+template <int Channels>
+void blend_block(const Raster& raster, TileOrigin origin, int block, const TileSplat* splats, uint64_t* words,
+                 uint32_t num_words, const RasterImages& images) {
+    using F = Features<Channels>;
+    const BlockPosition at = block_position(raster.camera, origin, block);
+    if (at.outside()) return;
+    const Vec x = block_x(block), y = block_y(block);
+    const Vec initial = at.whole() ? splat(1.0f) : initial_transmittance(raster.camera, origin, block);
+    Vec transmittance = initial;
+    Vec features[F::kCount + 1] = {};
+
+    uint32_t word = 0;
+    for (bool open = true; word < num_words && open; ++word) {
+        uint64_t blended = 0;
+        for (uint64_t rest = words[word]; rest && open; rest &= rest - 1) {
+            const TileSplat& splat = splats[word * 64 + __builtin_ctzll(rest)];
+            const Contribution c = blend_splat(splat, x, y, transmittance);
+            for (int i = 0; i < F::kCount; ++i) features[i] += c.weight * splat.features[F::place(i)];
+            blended |= any(c.on) ? rest & -rest : 0;
+            open = any(at_least(transmittance, core::splat(kTransmittanceMin)));
+        }
+        words[word] = blended;
+    }
+    for (; word < num_words; ++word) words[word] = 0;
+    store_images<Channels>(features, 1.0f - (initial - transmittance), raster.camera, at, images);
+}
+
+struct BlendTiles {
+    Raster& raster;
+    const RasterImages& images;
+
+    template <int Channels>
+    void run() {
+        run_parallel(raster.num_tiles(), [&](int tile, int) {
+            thread_local Buffer<TileSplat> splats;
+            splats.resize(raster.num_entries(tile) + 1);
+            sort_entries(raster, tile);
+            load_splats(raster, tile, splats.data());
+            find_blocks(raster, tile);
+            const uint32_t words = raster.num_words(tile);
+            uint64_t* bits = raster.block_bits.data() + raster.first_words[tile];
+            for (int block = 0; block < kBlocks; ++block)
+                blend_block<Channels>(raster, tile_origin(raster, tile), block, splats.data(), bits + block * words,
+                                      words, images);
+        });
+    }
+};
+
+}  // namespace
+
+void blend(Raster& raster, int channels, const RasterImages& images) {
+    with_channels(channels, BlendTiles{raster, images});
+}
+
+}  // namespace core

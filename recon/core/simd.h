@@ -1,0 +1,173 @@
+// One register of floats, as wide as the instruction set that this file is compiled for.
+//
+// GCC's and Clang's vector extensions give arithmetic; the few operations that they express badly are intrinsics
+// behind guards. Wider vectors than the processor has are split into scalars by the compilers (measured: ten times
+// slower), hence the width at compile time.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#if defined(__x86_64__)
+#include <immintrin.h>
+#elif defined(__aarch64__)
+#include <arm_neon.h>
+#endif
+
+#if defined(__AVX512F__)
+#define CORE_LANES 16
+#elif defined(__AVX2__)
+#define CORE_LANES 8
+#else
+#define CORE_LANES 4
+#endif
+
+namespace core {
+
+constexpr int kLanes = CORE_LANES;
+
+typedef float Vec __attribute__((vector_size(4 * CORE_LANES)));
+typedef int32_t IntVec __attribute__((vector_size(4 * CORE_LANES)));
+typedef uint32_t BitVec __attribute__((vector_size(4 * CORE_LANES)));
+typedef int64_t PairVec __attribute__((vector_size(4 * CORE_LANES)));  // pairs of floats moved as one
+
+inline Vec splat(float value) { return Vec{} + value; }
+
+// For addresses that are multiples of the register's size.
+inline Vec load(const float* from) { return *reinterpret_cast<const Vec*>(from); }
+inline void store(float* to, Vec value) { *reinterpret_cast<Vec*>(to) = value; }
+
+// ---- Masks: one truth value a lane -------------------------------------------------------------------------------
+#if CORE_LANES == 16
+typedef __mmask16 Mask;
+inline Mask at_least(Vec a, Vec b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_GE_OQ); }
+inline Mask less(Vec a, Vec b) { return _mm512_cmp_ps_mask((__m512)a, (__m512)b, _CMP_LT_OQ); }
+inline Vec select(Mask mask, Vec yes, Vec no) { return (Vec)_mm512_mask_blend_ps(mask, (__m512)no, (__m512)yes); }
+inline Vec keep(Mask mask, Vec value) { return (Vec)_mm512_maskz_mov_ps(mask, (__m512)value); }
+inline unsigned bits(Mask mask) { return mask; }
+inline bool any(Mask mask) { return mask != 0; }
+#else
+typedef IntVec Mask;
+inline Mask at_least(Vec a, Vec b) { return a >= b; }
+inline Mask less(Vec a, Vec b) { return a < b; }
+inline Vec select(Mask mask, Vec yes, Vec no) { return (Vec)(((IntVec)yes & mask) | ((IntVec)no & ~mask)); }
+inline Vec keep(Mask mask, Vec value) { return (Vec)((IntVec)value & mask); }
+#if CORE_LANES == 8
+inline unsigned bits(Mask mask) { return unsigned(_mm256_movemask_ps((__m256)mask)); }
+#elif defined(__x86_64__)
+inline unsigned bits(Mask mask) { return unsigned(_mm_movemask_ps((__m128)mask)); }
+#elif defined(__aarch64__)
+inline unsigned bits(Mask mask) {
+    const uint32x4_t place = {1, 2, 4, 8};
+    return vaddvq_u32(vandq_u32((uint32x4_t)mask, place));
+}
+#else
+inline unsigned bits(Mask mask) { return (mask[0] & 1) | (mask[1] & 2) | (mask[2] & 4) | (mask[3] & 8); }
+#endif
+inline bool any(Mask mask) { return bits(mask) != 0; }
+#endif
+
+// ---- Functions ---------------------------------------------------------------------------------------------------
+inline Vec minimum(Vec a, Vec b) {
+#if CORE_LANES == 16
+    return (Vec)_mm512_min_ps((__m512)a, (__m512)b);
+#elif CORE_LANES == 8
+    return (Vec)_mm256_min_ps((__m256)a, (__m256)b);
+#elif defined(__x86_64__)
+    return (Vec)_mm_min_ps((__m128)a, (__m128)b);
+#else
+    return select(less(a, b), a, b);
+#endif
+}
+
+inline Vec maximum(Vec a, Vec b) { return -minimum(-a, -b); }
+inline Vec clamp(Vec value, Vec low, Vec high) { return minimum(maximum(value, low), high); }
+inline Vec absolute(Vec value) { return (Vec)((BitVec)value & 0x7fffffffu); }
+
+inline Vec square_root(Vec value) {
+#if CORE_LANES == 16
+    return (Vec)_mm512_sqrt_ps((__m512)value);
+#elif CORE_LANES == 8
+    return (Vec)_mm256_sqrt_ps((__m256)value);
+#elif defined(__x86_64__)
+    return (Vec)_mm_sqrt_ps((__m128)value);
+#elif defined(__aarch64__)
+    return (Vec)vsqrtq_f32((float32x4_t)value);
+#else
+    for (int lane = 0; lane < kLanes; ++lane) value[lane] = std::sqrt(value[lane]);
+    return value;
+#endif
+}
+
+// 2^x to 2e-7 relative for x in [-126, 0]. Smaller x give 0 or rubbish, never a trap: mask them.
+inline Vec exp2_nonpositive(Vec x) {
+#if CORE_LANES == 16
+    const Vec fraction = (Vec)_mm512_reduce_ps((__m512)x, 0x08);  // x - round(x)
+#else
+    // Adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits. The compiler must not see through it.
+    const Vec magic = splat(12582912.0f);
+    Vec shifted = x + magic;
+#if defined(__x86_64__)
+    __asm__("" : "+x"(shifted));
+#elif defined(__aarch64__)
+    __asm__("" : "+w"(shifted));
+#endif
+    const Vec fraction = x - (shifted - magic);
+#endif
+    Vec power = fraction * 1.326472721e-3f + 9.671512813e-3f;
+    power = power * fraction + 5.550733745e-2f;
+    power = power * fraction + 2.402224208e-1f;
+    power = power * fraction + 6.931469776e-1f;
+    power = power * fraction + 1.0f;
+#if CORE_LANES == 16
+    return (Vec)_mm512_scalef_ps((__m512)power, _mm512_sub_ps((__m512)x, (__m512)fraction));
+#else
+    return (Vec)(((BitVec)shifted << 23) + (BitVec)power);
+#endif
+}
+
+// log2(x) to 1e-7 absolute for normal positive x.
+inline Vec log2_positive(Vec x) {
+    // x = 2^exponent * mantissa with the mantissa in [sqrt(1/2), sqrt(2)).
+    const BitVec offset = (BitVec)x - 0x3f3504f3u;
+    const IntVec exponent = (IntVec)offset >> 23;
+    const Vec mantissa = (Vec)((offset & 0x007fffffu) + 0x3f3504f3u);
+    const Vec s = (mantissa - 1.0f) / (mantissa + 1.0f), ss = s * s;
+    const Vec series = (((ss * (1 / 9.0f) + 1 / 7.0f) * ss + 1 / 5.0f) * ss + 1 / 3.0f) * ss + 1.0f;
+    return __builtin_convertvector(exponent, Vec) + series * s * 2.88539008177793f;
+}
+
+// ---- Pairs: lane l of two registers side by side, so that one 64-bit load broadcasts both --------------------------
+#if defined(__clang__)
+#define CORE_SHUFFLE(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+#define CORE_SHUFFLE(a, b, ...) __builtin_shuffle(a, b, IntVec{__VA_ARGS__})
+#endif
+
+// Stores 2 * kLanes floats: the pairs (a[l], b[l]) in the order of `pair_lane`, which is the cheap one to make.
+inline void store_pairs(float* to, Vec a, Vec b) {
+#if CORE_LANES == 16
+    store(to, CORE_SHUFFLE(a, b, 0, 16, 1, 17, 4, 20, 5, 21, 8, 24, 9, 25, 12, 28, 13, 29));
+    store(to + 16, CORE_SHUFFLE(a, b, 2, 18, 3, 19, 6, 22, 7, 23, 10, 26, 11, 27, 14, 30, 15, 31));
+#elif CORE_LANES == 8
+    store(to, CORE_SHUFFLE(a, b, 0, 8, 1, 9, 4, 12, 5, 13));
+    store(to + 8, CORE_SHUFFLE(a, b, 2, 10, 3, 11, 6, 14, 7, 15));
+#else
+    store(to, CORE_SHUFFLE(a, b, 0, 4, 1, 5));
+    store(to + 4, CORE_SHUFFLE(a, b, 2, 6, 3, 7));
+#endif
+}
+
+// The lane whose pair `store_pairs` writes at this place.
+constexpr int pair_lane(int place) {
+    return place % (kLanes / 2) / 2 * 4 + place % 2 + place / (kLanes / 2) * 2;
+}
+
+// The two floats at `pair` in every two lanes: (a, b, a, b, ...).
+inline Vec broadcast_pair(const float* pair) {
+    int64_t both;
+    __builtin_memcpy(&both, pair, sizeof both);
+    return (Vec)(PairVec{} + both);
+}
+
+}  // namespace core

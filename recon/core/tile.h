@@ -1,0 +1,145 @@
+// A tile's splats, as its blocks see them.
+#pragma once
+
+#include "rasterize.h"
+
+namespace core {
+
+// A splat in the pixel coordinates of a tile, measured from the tile's centre:
+//   u = k0 * x + k1 * y + u0,  w = k2 * y + w0.
+struct alignas(64) TileSplat {
+    float k0, k1, u0, k2, w0, log2_opacity;
+    float unused[2];
+    float features[kFeatures];
+    float unused2;
+};
+
+struct TileOrigin {
+    int x, y;  // the top left pixel
+    float centre_x() const { return float(x + kTile / 2); }
+    float centre_y() const { return float(y + kTile / 2); }
+};
+
+inline TileOrigin tile_origin(const Raster& raster, int tile) {
+    return {tile % raster.tiles_x * kTile, tile / raster.tiles_x * kTile};
+}
+
+// Pixel centres of a block relative to the tile's centre.
+inline Vec block_x(int block) {
+    Vec x;
+    for (int lane = 0; lane < kLanes; ++lane) x[lane] = float(lane % kBlockWidth) + 0.5f - kTile / 2;
+    return x + float(block % kBlocksAcross * kBlockWidth);
+}
+inline Vec block_y(int block) {
+    Vec y;
+    for (int lane = 0; lane < kLanes; ++lane) y[lane] = float(lane / kBlockWidth) + 0.5f - kTile / 2;
+    return y + float(block / kBlocksAcross * kBlockHeight);
+}
+
+// Sorts the tile's entries by depth, of equal ones by Gaussian.
+void sort_entries(Raster& raster, int tile);
+
+// The tile's splats in the order of its entries, and one more that nothing sees.
+void load_splats(const Raster& raster, int tile, TileSplat* splats);
+
+// For each block the tile's splats whose ellipse alpha = 1/255 reaches a pixel centre of it, as bits.
+void find_blocks(Raster& raster, int tile);
+
+// What a pixel block takes of one splat.
+struct Contribution {
+    Mask on;  // lanes that take anything
+    Vec alpha, weight;
+};
+
+// Blends `splat` into the lanes at (x, y) that still let light through; `transmittance` becomes what is left.
+inline Contribution blend_splat(const TileSplat& splat_, Vec x, Vec y, Vec& transmittance) {
+    const Vec u = splat_.k0 * x + (splat_.k1 * y + splat_.u0);
+    const Vec w = splat_.k2 * y + splat_.w0;
+    const Vec log2_alpha = splat_.log2_opacity - u * u - w * w;
+    Contribution c;
+    c.on = at_least(log2_alpha, splat(kLog2AlphaMin)) & at_least(transmittance, splat(kTransmittanceMin));
+    c.alpha = keep(c.on, minimum(exp2_nonpositive(log2_alpha), splat(kAlphaMax)));
+    c.weight = c.alpha * transmittance;
+    transmittance -= c.weight;
+    return c;
+}
+
+// Lanes of a block whose pixel is inside the image let all light through, the others none.
+inline Vec initial_transmittance(const Camera& camera, TileOrigin origin, int block) {
+    const Vec x = block_x(block) + origin.centre_x(), y = block_y(block) + origin.centre_y();
+    const Vec inside_x = keep(less(x, splat(float(camera.width))), splat(1.0f));
+    return keep(less(y, splat(float(camera.height))), inside_x);
+}
+
+// The pixel of an image at which a block starts.
+struct BlockPosition {
+    int x, y, columns, rows;  // columns and rows that are inside the image; 0 if none is
+    bool whole() const { return columns == kBlockWidth && rows == kBlockHeight; }
+    bool outside() const { return columns <= 0 || rows <= 0; }
+};
+
+inline BlockPosition block_position(const Camera& camera, TileOrigin origin, int block) {
+    const int x = origin.x + block % kBlocksAcross * kBlockWidth, y = origin.y + block / kBlocksAcross * kBlockHeight;
+    const int columns = camera.width - x, rows = camera.height - y;
+    return {x, y, columns < kBlockWidth ? columns : kBlockWidth, rows < kBlockHeight ? rows : kBlockHeight};
+}
+
+// A block of an image plane; 0 outside the image.
+inline Vec load_block(const float* plane, int width, const BlockPosition& at) {
+    alignas(64) float pixels[kLanes] = {};
+    const float* from = plane + size_t(at.y) * width + at.x;
+    if (at.whole()) {
+        for (int row = 0; row < kBlockHeight; ++row)
+            __builtin_memcpy(pixels + row * kBlockWidth, from + size_t(row) * width, sizeof(float) * kBlockWidth);
+    } else {
+        for (int row = 0; row < at.rows; ++row)
+            for (int column = 0; column < at.columns; ++column)
+                pixels[row * kBlockWidth + column] = from[size_t(row) * width + column];
+    }
+    return load(pixels);
+}
+
+inline void store_block(float* plane, int width, const BlockPosition& at, Vec value) {
+    alignas(64) float pixels[kLanes];
+    store(pixels, value);
+    float* to = plane + size_t(at.y) * width + at.x;
+    if (at.whole()) {
+        for (int row = 0; row < kBlockHeight; ++row)
+            __builtin_memcpy(to + size_t(row) * width, pixels + row * kBlockWidth, sizeof(float) * kBlockWidth);
+    } else {
+        for (int row = 0; row < at.rows; ++row)
+            for (int column = 0; column < at.columns; ++column)
+                to[size_t(row) * width + column] = pixels[row * kBlockWidth + column];
+    }
+}
+
+// Which features the channels blend: known at compile time, so that what is not asked for costs nothing.
+template <int Channels>
+struct Features {
+    static constexpr int kColours = Channels & kRgb ? 3 : 0;
+    static constexpr int kDepths = Channels & kDepth ? 1 : 0;
+    static constexpr int kNormals = Channels & kNormal ? 3 : 0;
+    static constexpr int kCount = kColours + kDepths + kNormals;
+
+    // The place in Splat::features of the i-th blended feature.
+    static constexpr int place(int i) {
+        return i < kColours ? i : i < kColours + kDepths ? 3 : 4 + i - kColours - kDepths;
+    }
+};
+
+// Calls function.run<Channels>() for the channels that are blended.
+template <class Function>
+void with_channels(int channels, Function&& function) {
+    switch (channels & (kRgb | kDepth | kNormal)) {
+        case 0: return function.template run<0>();
+        case 1: return function.template run<1>();
+        case 2: return function.template run<2>();
+        case 3: return function.template run<3>();
+        case 4: return function.template run<4>();
+        case 5: return function.template run<5>();
+        case 6: return function.template run<6>();
+        default: return function.template run<7>();
+    }
+}
+
+}  // namespace core
