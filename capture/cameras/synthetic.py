@@ -1,0 +1,119 @@
+"""A camera that needs no camera: hand-held photographs of a procedural place, with everything known about them.
+
+The frames carry no intrinsics, as those of an unknown camera do. What is known is for tests and benchmarks:
+scene_cameras, held_out_cameras and depth. The place is made by capture.diorama; this file photographs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from capture.diorama.cast import Camera, Matrix, cast
+from capture.diorama.layout import place
+from capture.diorama.solids import Solid
+from capture.frame import Frame
+
+TARGET = np.array([1.05, 1.05, 0.82])  # what the photographer looks at: the table in the corner, metres
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    views: int = 8
+    width: int = 640
+    height: int = 480
+    seed: int = 0  # of the place and of the photographer's path
+    noise: float = 1.0  # standard deviation of the sensor noise, grey levels
+    samples: int = 2  # rays a pixel in each direction
+    frames_per_second: float = 2.0
+
+    def __post_init__(self) -> None:
+        if min(self.views, self.width, self.height, self.samples) < 1:
+            raise ValueError(f"views, width, height and samples must be at least 1, got {self}")
+
+
+def stream(config: Config) -> Iterator[Frame]:
+    """The photographs in the order of the path."""
+    for index, camera in enumerate(scene_cameras(config)):
+        stamp_ns = round(index / config.frames_per_second * 1e9)
+        yield Frame(index, frame_name(index), stamp_ns, photograph(config, camera, index), intrinsics=None)
+
+
+def frame_name(index: int) -> str:
+    return f"view_{index:03d}.png"
+
+
+def scene_cameras(config: Config) -> list[Camera]:
+    """The cameras of the stream, in its order; world axes as in capture.diorama.layout."""
+    return [_camera_on_path(config, float(index)) for index in range(config.views)]
+
+
+def held_out_cameras(config: Config) -> list[Camera]:
+    """Cameras for testing: midway between each two neighbours of the stream."""
+    return [_camera_on_path(config, index + 0.5) for index in range(config.views - 1)]
+
+
+def photograph(config: Config, camera: Camera, noise_seed: int = 0) -> npt.NDArray[np.uint8]:
+    """(H, W, 3) RGB as `camera` sees the place of `config`: antialiased, with sensor noise."""
+    T_world_camera, K = camera
+    dense = T_world_camera, np.diag([config.samples, config.samples, 1.0]) @ K
+    colours, _ = cast(_solids(config), dense, config.width * config.samples, config.height * config.samples)
+    image = cv2.resize(colours, (config.width, config.height), interpolation=cv2.INTER_AREA)
+    grain = np.random.default_rng([config.seed, noise_seed]).normal(scale=config.noise, size=image.shape)
+    return np.clip(np.rint(image + grain), 0, 255).astype(np.uint8)
+
+
+def depth(config: Config, index: int) -> npt.NDArray[np.float32]:
+    """(H, W) true z in the frame of the stream's camera `index`, metres, at pixel centres; inf where nothing is."""
+    return depth_map(config, scene_cameras(config)[index])
+
+
+def depth_map(config: Config, camera: Camera) -> npt.NDArray[np.float32]:
+    """(H, W) true z in the frame of `camera`, metres, at pixel centres; inf where nothing is."""
+    return cast(_solids(config), camera, config.width, config.height)[1]
+
+
+def _solids(config: Config) -> tuple[Solid, ...]:
+    """The place, its skins as dense as the picture's samples are on average."""
+    return place(
+        config.seed, density=float(np.clip(0.25 * max(config.width, config.height) * config.samples, 64, 1024))
+    )
+
+
+def _camera_on_path(config: Config, position: float) -> Camera:
+    """The photographer walks on an arc of at most 66 degrees around the corner, 11 a step, and holds the camera freely.
+
+    Height, distance, aim and roll are smooth functions of the way, so that there is a camera at any `position`.
+    """
+    rng = np.random.default_rng([config.seed, 1])
+    phases = rng.uniform(0, 2 * np.pi, 6)
+    focal = rng.uniform(0.82, 0.95) * max(config.width, config.height)
+    span = min(66.0, 11.0 * (config.views - 1))
+    share = position / max(config.views - 1, 1)
+    sway = np.sin(phases + 2.4 * position)  # quick against the arc: neighbours differ in height as well
+    azimuth = np.radians(45 + span * (share - 0.5) + 0.8 * sway[0])
+    distance = 3.35 + 0.20 * sway[1]
+    height = 1.55 + 0.22 * sway[2]
+    centre = np.array([TARGET[0] + distance * np.cos(azimuth), TARGET[1] + distance * np.sin(azimuth), height])
+    target = TARGET + 0.07 * sway[3:6]
+    return look_at(centre, target, roll_deg=2.5 * sway[4]), intrinsic_matrix(config, focal)
+
+
+def look_at(centre: Matrix, target: Matrix, roll_deg: float = 0.0) -> Matrix:
+    """T_world_camera (4, 4) at `centre`, its z axis towards `target`, upright in a world whose z is up, then rolled."""
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    cosine, sine = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = np.stack([cosine * right + sine * down, cosine * down - sine * right, forward], 1)
+    T_world_camera[:3, 3] = centre
+    return T_world_camera
+
+
+def intrinsic_matrix(config: Config, focal: float) -> Matrix:
+    return np.array([[focal, 0.0, config.width / 2], [0.0, focal, config.height / 2], [0.0, 0.0, 1.0]])

@@ -1,0 +1,1 @@
+"""The place that the synthetic camera photographs: solids, their textures, their light and how they stand together."""

@@ -1,0 +1,114 @@
+"""Light baked into the skins: a low sun with soft shadows, and the sky as far as other solids leave it open.
+
+All surfaces are Lambertian, so that a point has one colour from everywhere and the skin can hold it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from capture.diorama.solids import Array, Solid, face_points, face_size, ray_interval
+
+
+@dataclass(frozen=True)
+class Light:
+    towards_sun: tuple[float, float, float]
+    sun: tuple[float, float, float] = (1.75, 1.6, 1.36)  # linear RGB irradiance
+    sky: tuple[float, float, float] = (0.60, 0.63, 0.70)
+    bounced: tuple[float, float, float] = (0.21, 0.18, 0.15)  # what arrives from other surfaces
+    sun_radius: float = 0.035  # radians: how soft the shadows are
+    texels_per_metre: float = 22.0
+    sun_samples: int = 8
+    sky_samples: int = 36
+
+
+def lit(solids: Sequence[Solid], light: Light, rng: np.random.Generator) -> list[Solid]:
+    """The solids with the light of their place multiplied into their skins."""
+    return [replace(solid, skins=_lit_skins(solid, solids, light, rng)) for solid in solids]
+
+
+def _lit_skins(solid: Solid, solids: Sequence[Solid], light: Light, rng: np.random.Generator):
+    others = [other for other in solids if other is not solid]
+    skins = []
+    for face, skin in enumerate(solid.skins):
+        if skin.shape[:2] == (1, 1):
+            skins.append(skin)
+            continue
+        irradiance = _irradiance(solid, face, others, light, rng)
+        smooth = cv2.resize(irradiance, (skin.shape[1], skin.shape[0]), interpolation=cv2.INTER_LINEAR)
+        skins.append(to_srgb(from_srgb(skin) * smooth))
+    return tuple(skins)
+
+
+def _irradiance(solid: Solid, face: int, others: Sequence[Solid], light: Light, rng: np.random.Generator) -> Array:
+    """(h, w, 3) linear RGB on a coarse grid of the face."""
+    columns, rows = (
+        int(np.clip(np.ceil(side * light.texels_per_metre), 3, 130))
+        for side in face_size(solid.shape, solid.axes, face)
+    )
+    u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
+    points, normals = (part.reshape(-1, 3) for part in face_points(solid.shape, face, u, v))
+    normals = normals @ solid.inverse  # a normal maps with the inverse transpose
+    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    points = points @ solid.axes.T + solid.centre + 1e-3 * normals
+    in_front = [other for other in others if ((other.corners @ normals.T) > (points * normals).sum(1)).any()]
+
+    towards_sun = np.array(light.towards_sun) / np.linalg.norm(light.towards_sun)
+    cosine = np.maximum(normals @ towards_sun, 0)
+    sun_directions = towards_sun + light.sun_radius * rng.normal(size=(len(points), light.sun_samples, 3)) / 1.7
+    sunlit = cosine * _openness(points, sun_directions, in_front) if cosine.any() else cosine
+    open_sky = _openness(points, _cosine_directions(normals, light.sky_samples, rng), in_front)[:, None]
+    irradiance = sunlit[:, None] * light.sun + open_sky * light.sky + (1 - open_sky) * light.bounced
+    return cv2.GaussianBlur(irradiance.reshape(rows, columns, 3).astype(np.float32), (0, 0), 0.7)
+
+
+def _cosine_directions(normals: Array, samples: int, rng: np.random.Generator) -> Array:
+    """(P, samples, 3) directions, cosine-weighted about normals (P, 3): stratified rings, turned at random by point."""
+    index = np.arange(samples) + 0.5
+    radius = np.sqrt(index / samples)
+    angle = index * np.pi * (3 - np.sqrt(5)) + rng.uniform(0, 2 * np.pi, (len(normals), 1))
+    helper = np.where(np.abs(normals[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    tangent = np.cross(normals, helper)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    basis = np.stack([tangent, np.cross(normals, tangent), normals], 1)  # (P, 3, 3) rows
+    height = np.broadcast_to(np.sqrt(1 - radius**2), angle.shape)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1) @ basis
+
+
+def _openness(points: Array, directions: Array, occluders: Sequence[Solid]) -> Array:
+    """(P,) share of the directions (P, S, 3) from points (P, 3) that meet no solid."""
+    blocked = np.zeros(directions.shape[:2], bool)
+    directions = directions.astype(np.float32)
+    for solid in occluders:
+        origin = solid.to_local(points).astype(np.float32)[:, None]
+        local = directions @ solid.inverse.T.astype(np.float32)
+        near, far = ray_interval(solid.shape, tuple(np.moveaxis(origin, -1, 0)), tuple(np.moveaxis(local, -1, 0)))
+        blocked |= (near <= far) & (far > 0)
+    return 1 - blocked.mean(1)
+
+
+def from_srgb(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    """8-bit sRGB -> linear [0, 1]."""
+    return _LINEAR[image]
+
+
+def to_srgb(linear: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    """Linear light -> 8-bit sRGB; highlights roll off towards white instead of clipping."""
+    return _SRGB[np.minimum(linear * _STEPS_PER_UNIT, len(_SRGB) - 1).astype(np.int32)]
+
+
+def _encoding_table(linear: npt.NDArray[np.float64]) -> npt.NDArray[np.uint8]:
+    rolled = np.where(linear > 0.6, 0.6 + 0.4 * np.tanh((linear - 0.6) / 0.4), linear)
+    encoded = np.where(rolled <= 0.0031308, 12.92 * rolled, 1.055 * rolled ** (1 / 2.4) - 0.055)
+    return np.rint(encoded * 255).astype(np.uint8)
+
+
+_STEPS_PER_UNIT = 8192
+_SRGB = _encoding_table(np.arange(3 * _STEPS_PER_UNIT) / _STEPS_PER_UNIT)
+_CODES = np.arange(256) / 255
+_LINEAR = np.where(_CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** 2.4).astype(np.float32)
