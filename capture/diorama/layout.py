@@ -104,7 +104,8 @@ def place(seed: int, density: float) -> tuple[Solid, ...]:
     _cartons(builder, palette, *sides[1])
     _on_the_rug(builder, palette)
     height = rng.uniform(1.0, 1.3)
-    light = Light(towards_sun=(rng.uniform(0.55, 0.8), rng.uniform(0.35, 0.6), height))
+    towards_sun = rng.uniform(0.55, 0.8), rng.uniform(0.35, 0.6), height
+    light = Light(towards_sun, texels_per_metre=density / 14)
     return tuple(lit(builder.solids, light, rng))
 
 

@@ -18,11 +18,11 @@ from capture.diorama.solids import Array, Solid, face_points, face_size, ray_int
 @dataclass(frozen=True)
 class Light:
     towards_sun: tuple[float, float, float]
+    texels_per_metre: float  # of the coarse grids on which the light is gathered
     sun: tuple[float, float, float] = (1.75, 1.6, 1.36)  # linear RGB irradiance
     sky: tuple[float, float, float] = (0.60, 0.63, 0.70)
     bounced: tuple[float, float, float] = (0.21, 0.18, 0.15)  # what arrives from other surfaces
     sun_radius: float = 0.035  # radians: how soft the shadows are
-    texels_per_metre: float = 22.0
     sun_samples: int = 8
     sky_samples: int = 36
 

@@ -38,6 +38,10 @@ def to_image(colours: Field) -> Image:
     return np.clip(np.rint(colours), 0, 255).astype(np.uint8)
 
 
+def _f32(colour: Colour) -> npt.NDArray[np.float32]:
+    return np.array(colour, np.float32)
+
+
 def unseen(rng: np.random.Generator, width_m: float, height_m: float, density: float) -> Image:
     """For a face that no camera can see: it is neither painted nor lit."""
     return np.zeros((1, 1, 3), np.uint8)
@@ -49,7 +53,7 @@ def plain(colour: Colour, contrast: float = 0.03, cell_m: float = 0.12) -> Paint
     def paint(rng: np.random.Generator, width_m: float, height_m: float, density: float) -> Image:
         shape = texels(width_m, height_m, density)
         shade = 1 + contrast * noise(rng, shape, cell_m * density)
-        return to_image(shade[..., None] * np.array(colour))
+        return to_image(shade[..., None] * _f32(colour))
 
     return paint
 
@@ -61,7 +65,7 @@ def plaster(colour: Colour) -> Painter:
         shape = texels(width_m, height_m, density)
         shade = 1 + 0.030 * noise(rng, shape, 0.9 * density, 3) + 0.022 * noise(rng, shape, 0.05 * density, 5, 2.2)
         specks = noise(rng, shape, 0.022 * density, 2) > 3.0
-        return to_image((shade - 0.10 * cv2.blur(specks.astype(np.float32), (3, 3)))[..., None] * np.array(colour))
+        return to_image((shade - 0.10 * cv2.blur(specks.astype(np.float32), (3, 3)))[..., None] * _f32(colour))
 
     return paint
 
@@ -73,16 +77,16 @@ def bricks(colour: Colour, mortar: Colour) -> Painter:
         x += 0.004 * noise(rng, shape, 0.07 * density, 3)
         y += 0.003 * noise(rng, shape, 0.07 * density, 3)
         row = np.floor(y / 0.086).astype(int)
-        offset = 0.5 * (row % 2) + rng.uniform(-0.04, 0.04, row.max() + 2)[row]
+        offset = (0.5 * (row % 2) + rng.uniform(-0.04, 0.04, row.max() + 2)[row]).astype(np.float32)
         across = x / 0.25 + offset
         column = np.floor(across).astype(int)
         edge = np.minimum.reduce(
             [(across - column) * 0.25, (column + 1 - across) * 0.25, y - row * 0.086, (row + 1) * 0.086 - y]
         )
-        tint = rng.normal(size=(row.max() + 2, column.max() + 3, 3))[row, column + 1]
+        tint = rng.normal(size=(row.max() + 2, column.max() + 3, 3)).astype(np.float32)[row, column + 1]
         shade = 1 + 0.08 * noise(rng, shape, 0.10 * density, 5) + 0.06 * noise(rng, shape, 0.012 * density, 2)
-        face = (np.array(colour) * (1 + 0.12 * tint[..., :1]) + 4 * tint) * shade[..., None]
-        joint = np.array(mortar) * (1 + 0.10 * noise(rng, shape, 0.03 * density, 4))[..., None]
+        face = (_f32(colour) * (1 + 0.12 * tint[..., :1]) + 4 * tint) * shade[..., None]
+        joint = _f32(mortar) * (1 + 0.10 * noise(rng, shape, 0.03 * density, 4))[..., None]
         filled = np.clip((edge - 0.0055) / 0.004, 0, 1)[..., None]
         bevel = 1 - 0.25 * np.exp(-(((edge - 0.008) / 0.004) ** 2))[..., None]
         return to_image((joint * 0.86 * (1 - filled) + face * filled) * bevel)
@@ -97,9 +101,9 @@ def planks(colour: Colour, width: float = 0.14, length: float = 1.3) -> Painter:
         shape = texels(width_m, height_m, density)
         y, x = np.mgrid[: shape[0], : shape[1]].astype(np.float32) / density
         row = np.floor(y / width).astype(int)
-        along = x / length + rng.uniform(0, 1, row.max() + 1)[row]
+        along = x / length + rng.uniform(0, 1, row.max() + 1).astype(np.float32)[row]
         column = np.floor(along).astype(int)
-        board = rng.normal(size=(row.max() + 1, column.max() + 1, 3))[row, column]
+        board = rng.normal(size=(row.max() + 1, column.max() + 1, 3)).astype(np.float32)[row, column]
         wave = noise(rng, shape, 0.10 * density, 4, 7)
         rings = np.sin(2 * np.pi * (y / 0.021 + 0.9 * wave + 3 * board[..., 2]))
         grain = 0.055 * rings + 0.075 * wave + 0.07 * noise(rng, shape, 0.016 * density, 3, 12)
@@ -107,7 +111,7 @@ def planks(colour: Colour, width: float = 0.14, length: float = 1.3) -> Painter:
         shade = 1 + 0.12 * board[..., 0] + grain - 0.55 * knots
         gap = np.minimum((y - row * width), (along - column) * length)
         shade *= 1 - 0.62 * np.exp(-((gap / 0.0035) ** 2))
-        return to_image(shade[..., None] * (np.array(colour) + 5 * board[..., 1:2] * [1.0, 0.2, -1.0]))
+        return to_image(shade[..., None] * (_f32(colour) + board[..., 1:2] * _f32((5.0, 1.0, -5.0))))
 
     return paint
 
@@ -122,7 +126,7 @@ def wood(colour: Colour) -> Painter:
         wave = noise(rng, shape, 0.12 * density, 4, 6)
         y = np.arange(shape[0], dtype=np.float32)[:, None] / density
         grain = 0.06 * np.sin(2 * np.pi * (y / 0.03 + 1.2 * wave)) + 0.07 * noise(rng, shape, 0.012 * density, 3, 10)
-        return to_image((1 + grain + 0.06 * wave)[..., None] * np.array(colour))
+        return to_image((1 + grain + 0.06 * wave)[..., None] * _f32(colour))
 
     return paint
 
@@ -212,7 +216,7 @@ def carton(colour: Colour, ink: Colour) -> Painter:
     def paint(rng: np.random.Generator, width_m: float, height_m: float, density: float) -> Image:
         height, width = shape = texels(width_m, height_m, density)
         ribs = 0.02 * np.sin(2 * np.pi * np.arange(width) / (0.008 * density))
-        image = to_image((1 + ribs + 0.05 * noise(rng, shape, 0.09 * density, 5))[..., None] * np.array(colour))
+        image = to_image((1 + ribs + 0.05 * noise(rng, shape, 0.09 * density, 5))[..., None] * _f32(colour))
         tape = slice(round(0.45 * width), round(0.55 * width))
         image[: round(0.22 * height), tape] = to_image(image[: round(0.22 * height), tape] * 0.80 + 26.0)
         write(image, words(rng, 1).upper(), 0.08 * width, 0.50 * height, 0.52 * width, ink, 3)
@@ -240,7 +244,7 @@ def book(colour: Colour, ink: Colour) -> Painter:
         if height_m > 2 * width_m:
             return np.ascontiguousarray(np.rot90(paint(rng, height_m, width_m, density), -1))
         height, width = shape = texels(width_m, height_m, density)
-        image = to_image((1 + 0.06 * noise(rng, shape, 0.03 * density, 4))[..., None] * np.array(colour))
+        image = to_image((1 + 0.06 * noise(rng, shape, 0.03 * density, 4))[..., None] * _f32(colour))
         for edge in (0.05, 0.93):
             image[:, round(edge * width) : round((edge + 0.02) * width) + 1] = np.array(ink, np.uint8)
         write(image, words(rng, 2).upper(), 0.14 * width, 0.62 * height, 0.7 * width, ink, 2)
@@ -301,7 +305,7 @@ def glazed(colour: Colour, band: Colour) -> Painter:
         height, width = shape = texels(width_m, height_m, density)
         field = noise(rng, shape, 0.06 * density, 5)
         shade = 1 + 0.07 * field - 0.18 * np.exp(-((noise(rng, shape, 0.03 * density, 3) / 0.05) ** 2))
-        image = to_image(shade[..., None] * np.array(colour))
+        image = to_image(shade[..., None] * _f32(colour))
         for _ in range(round(6 + 40 * width_m)):
             x, y = rng.uniform(0, width), rng.uniform(0.25, 0.6) * height
             dx, dy = rng.uniform(-0.03, 0.03) * width, rng.uniform(0.03, 0.2) * height
@@ -316,7 +320,7 @@ def marble(colour: Colour, vein: Colour) -> Painter:
         shape = texels(width_m, height_m, density)
         veins = np.exp(-((noise(rng, shape, 0.22 * density, 6) / 0.16) ** 2)) * 0.6
         veins += np.exp(-((noise(rng, shape, 0.10 * density, 5) / 0.07) ** 2)) * 0.35
-        mixed = np.array(colour) + (np.array(vein) - np.array(colour)) * np.clip(veins, 0, 1)[..., None]
+        mixed = _f32(colour) + (_f32(vein) - _f32(colour)) * np.clip(veins, 0, 1)[..., None]
         return to_image(mixed * (1 + 0.025 * noise(rng, shape, 0.03 * density))[..., None])
 
     return paint
@@ -327,7 +331,7 @@ def leaf(colour: Colour) -> Painter:
         shape = texels(width_m, height_m, density)
         across = np.linspace(0, 14 * np.pi, shape[1])[None] + np.abs(np.linspace(-4, 4, shape[0]))[:, None]
         shade = 1 + 0.10 * np.sin(across) + 0.12 * noise(rng, shape, 0.03 * density, 4)
-        return to_image(shade[..., None] * np.array(colour))
+        return to_image(shade[..., None] * _f32(colour))
 
     return paint
 
