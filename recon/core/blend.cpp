@@ -6,12 +6,11 @@ namespace core {
 namespace {
 
 template <int Channels>
-void store_images(const Vec* features, Vec transmittance, const Camera& camera, const BlockPosition& at,
+void store_images(const Vec* features, Vec alpha, const Camera& camera, const BlockPosition& at,
                   const RasterImages& images) {
     using F = Features<Channels>;
     const int width = camera.width;
     const size_t plane = size_t(width) * camera.height;
-    const Vec alpha = 1.0f - transmittance;
     store_block(images.alpha, width, at, alpha);
     for (int c = 0; c < F::kColours; ++c) store_block(images.rgb + c * plane, width, at, features[c]);
     if (F::kDepths) {
@@ -30,9 +29,9 @@ void blend_block(const Raster& raster, TileOrigin origin, int block, const TileS
     const BlockPosition at = block_position(raster.camera, origin, block);
     if (at.outside()) return;
     const Vec x = block_x(block), y = block_y(block);
-    const Vec initial = at.whole() ? splat(1.0f) : initial_transmittance(raster.camera, origin, block);
-    Vec transmittance = initial;
-    Vec features[F::kCount + 1] = {};
+    Vec transmittance = at.whole() ? splat(1.0f) : initial_transmittance(raster.camera, origin, block);
+    // Where little is seen, 1 - transmittance has lost the digits that the expected depth needs of the sum of weights.
+    Vec alpha{}, features[F::kCount + 1] = {};
 
     uint32_t word = 0;
     for (bool open = true; word < num_words && open; ++word) {
@@ -40,6 +39,7 @@ void blend_block(const Raster& raster, TileOrigin origin, int block, const TileS
         for (uint64_t rest = words[word]; rest && open; rest &= rest - 1) {
             const TileSplat& splat = splats[word * 64 + __builtin_ctzll(rest)];
             const Contribution c = blend_splat(splat, x, y, transmittance);
+            alpha += c.weight;
             for (int i = 0; i < F::kCount; ++i) features[i] += c.weight * splat.features[F::place(i)];
             blended |= any(c.on) ? rest & -rest : 0;
             open = any(at_least(transmittance, core::splat(kTransmittanceMin)));
@@ -47,7 +47,7 @@ void blend_block(const Raster& raster, TileOrigin origin, int block, const TileS
         words[word] = blended;
     }
     for (; word < num_words; ++word) words[word] = 0;
-    store_images<Channels>(features, 1.0f - (initial - transmittance), raster.camera, at, images);
+    store_images<Channels>(features, alpha, raster.camera, at, images);
 }
 
 struct BlendTiles {
