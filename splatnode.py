@@ -128,7 +128,7 @@ def _lazily(module: str, function: str) -> Command:
     return run
 
 
-# A flag that is not given is None, so that a configuration file, then the default, decides.
+# A flag of the reconstruction that is not given is None, so that the configuration file, then the preset, decides.
 
 
 def _demo_arguments(parser: argparse.ArgumentParser) -> None:
@@ -141,7 +141,7 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="photographs of one place, in any order")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with what differs from the defaults")
-    parser.add_argument("--preset", metavar="P", help="a named set of parameters")
+    parser.add_argument("--preset", metavar="P", help="a named set of parameters (default: balanced)")
     parser.add_argument("--prior", metavar="K", help="what gives poses and first points (default: classical)")
     parser.add_argument("--size", type=_positive, metavar="PIXELS", help="longer side as modelled (default: 512)")
     parser.add_argument("--budget-s", type=_seconds, metavar="S", help="stop refining after this many seconds")
@@ -161,8 +161,13 @@ def _export_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _bench_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help="folders with images and true cameras")
-    parser.add_argument("--views", type=_counts, metavar="3,6,12", help="numbers of training views")
-    parser.add_argument("--methods", type=_names, metavar="A,B,C", help="presets and baselines")
+    parser.add_argument(
+        "--views", type=_counts, default=(3, 6, 12), metavar="N,N,N", help="training views (default: 3,6,12)"
+    )
+    parser.add_argument(
+        "--methods", type=_names, default=("balanced",), metavar="A,B,C", help="presets (default: balanced)"
+    )
+    parser.add_argument("--checkpoints", type=_counts, default=(), metavar="N,N", help="iterations scored on the way")
     parser.add_argument("--seeds", type=_positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--weights-dir", type=Path, metavar="DIR", help="LPIPS networks (default: $SPLATNODE_WEIGHTS)")

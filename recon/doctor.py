@@ -5,12 +5,10 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import os
 import platform
 import sys
 from dataclasses import asdict, dataclass
 from importlib import metadata
-from pathlib import Path
 
 from recon import core
 from recon.core.compile import find_compiler
@@ -63,7 +61,7 @@ def findings() -> list[Finding]:
         _core(),
         *(_required(module, distribution) for module, distribution in REQUIRED.items()),
         *(_optional(module, *about) for module, about in OPTIONAL.items()),
-        _weights(),
+        *(_lpips(network) for network in ("alex", "vgg")),
     ]
 
 
@@ -109,11 +107,15 @@ def _version(distribution: str) -> str:
         return f"installed, though not from {distribution}"
 
 
-def _weights() -> Finding:
-    folder = os.environ.get("SPLATNODE_WEIGHTS")
-    if not folder:
-        return Finding("weights", "optional", "$SPLATNODE_WEIGHTS is not set; the default prior needs none")
-    if not Path(folder).is_dir():
-        return Finding("weights", "optional", f"$SPLATNODE_WEIGHTS is {folder}, which is no folder")
-    names = sorted(path.name for path in Path(folder).iterdir() if path.is_dir())
-    return Finding("weights", "ok", f"{folder}: {', '.join(names) or 'empty'}")
+def _lpips(network: str) -> Finding:
+    """Loads the network, because a file of that name may hold something else."""
+    name = f"lpips-{network}"
+    try:
+        from recon.evaluate.lpips import load_lpips
+
+        loaded = load_lpips(network)
+    except (ImportError, OSError, ValueError) as error:
+        return Finding(name, "optional", f"not measured: {error}")
+    if loaded is None:
+        return Finding(name, "optional", "no weights (looked in $SPLATNODE_WEIGHTS); splatnode bench leaves it out")
+    return Finding(name, "ok", "weights found and loaded")

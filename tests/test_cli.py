@@ -141,9 +141,10 @@ def test_replay_flags_arrive_and_unset_ones_are_none():
 
 def test_bench_lists_are_parsed():
     args = splatnode.build_parser().parse_args(
-        ["bench", "a", "b", "--views", "3,6,12", "--methods", "fast,best", "--out", "o"]
+        ["bench", "a", "b", "--views", "3,6,12", "--methods", "fast,best", "--checkpoints", "100,400", "--out", "o"]
     )
     assert (args.views, args.methods, args.seeds) == ((3, 6, 12), ("fast", "best"), 1)
+    assert args.checkpoints == (100, 400)
     assert [scene.name for scene in args.scenes] == ["a", "b"]
 
 
