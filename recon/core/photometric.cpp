@@ -1,0 +1,294 @@
+// L1 + D-SSIM between an image and a fixed target, with its gradient, in one sweep over the rows.
+//
+// SSIM ("Image quality assessment", Wang et al. 2004) compares moments under an 11 x 11 Gaussian window of sigma 1.5;
+// beyond the border the images count as 0, as in 3DGS. With the blur B, which is its own transpose,
+//   dSSIM/dx = B[dS/dm] + 2 x B[dS/d(xx)] + y B[dS/d(xy)],   m = B[x], xx = B[x^2], xy = B[x y].
+// A row is blurred along x, waits in a ring until its neighbours are there to blur along y, gives the derivatives,
+// which are blurred the same way five rows later. The rings stay in the cache; nothing of image size is stored.
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+
+#include "buffer.h"
+#include "simd.h"
+#include "threads.h"
+
+namespace core {
+namespace {
+
+constexpr int kRadius = 5;
+constexpr int kWindow = 2 * kRadius + 1;
+constexpr int kMargin = 16;     // zeros on both sides of a row, at least kRadius and aligned
+constexpr int kBandRows = 96;   // rows of a task: fixed, so that the sums do not depend on the threads
+constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
+
+struct Kernel {
+    float half[kRadius + 1];  // from the rim to the middle
+    Kernel() {
+        double sum = 0, values[kRadius + 1];
+        for (int i = 0; i <= kRadius; ++i) {
+            values[i] = std::exp(-(i - kRadius) * (i - kRadius) / (2 * 1.5 * 1.5));
+            sum += i < kRadius ? 2 * values[i] : values[i];
+        }
+        for (int i = 0; i <= kRadius; ++i) half[i] = float(values[i] / sum);
+    }
+};
+const Kernel kKernel;
+
+inline Vec load_unaligned(const float* from) {
+    Vec value;
+    __builtin_memcpy(&value, from, sizeof value);
+    return value;
+}
+inline void store_unaligned(float* to, Vec value) { __builtin_memcpy(to, &value, sizeof value); }
+
+int padded(int width) { return (width + 15) / 16 * 16; }
+int stride(int width) { return padded(width) + 2 * kMargin; }
+
+// out[x] = blur along x of `row`, which has kMargin zeros on both sides.
+void blur_along_x(const float* row, float* out, int width) {
+    for (int x = 0; x < width; x += kLanes) {
+        Vec sum = kKernel.half[kRadius] * load(row + x);
+        for (int i = 0; i < kRadius; ++i)
+            sum += kKernel.half[i] * (load_unaligned(row + x + i - kRadius) + load_unaligned(row + x + kRadius - i));
+        store(out + x, sum);
+    }
+}
+
+// The last kWindow rows of several maps.
+struct Ring {
+    Buffer<float> memory;
+    int maps, row_stride;
+
+    void reset(int map_count, int width) {
+        maps = map_count, row_stride = padded(width);
+        memory.resize(size_t(kWindow) * maps * row_stride);
+    }
+    float* row(int y, int map) { return &memory[size_t((y + 2 * kWindow) % kWindow * maps + map) * row_stride]; }
+    void clear(int y) { std::memset(row(y, 0), 0, sizeof(float) * maps * row_stride); }
+};
+
+// Blur along y at row y, where rows y - 5 to y + 5 of a map are in the ring.
+struct ColumnBlur {
+    const float* rows[kWindow];
+    ColumnBlur(Ring& ring, int y, int map) {
+        for (int i = 0; i < kWindow; ++i) rows[i] = ring.row(y + i - kRadius, map);
+    }
+    Vec at(int x) const {
+        Vec sum = kKernel.half[kRadius] * load(rows[kRadius] + x);
+        for (int i = 0; i < kRadius; ++i) sum += kKernel.half[i] * (load(rows[i] + x) + load(rows[kWindow - 1 - i] + x));
+        return sum;
+    }
+};
+
+struct Plane {
+    const float* image;
+    const float* target;
+    const float* target_mean;      // blurred target
+    const float* target_variance;  // blurred square minus squared mean
+    const float* weights;          // null: all 1
+    float* gradient;               // null: not wanted
+    int width, height;
+};
+
+struct Sums {
+    double absolute = 0, dissimilarity = 0;
+};
+
+// Rows of the image with zeros around them. Where the weight is 0 the image is taken to equal the target, so that
+// such a pixel has no influence through its neighbours' windows either.
+struct Rows {
+    Buffer<float> memory;
+    int row_stride;
+
+    void reset(int rows, int width) {
+        row_stride = stride(width);
+        std::memset(memory.resize(size_t(rows) * row_stride), 0, sizeof(float) * rows * row_stride);
+    }
+    float* row(int index) { return &memory[size_t(index) * row_stride + kMargin]; }
+};
+
+void read_image_row(const Plane& plane, int y, float* row) {
+    const size_t at = size_t(y) * plane.width;
+    std::memcpy(row, plane.image + at, sizeof(float) * plane.width);
+    if (!plane.weights) return;
+    for (int x = 0; x < plane.width; ++x)
+        if (plane.weights[at + x] == 0) row[x] = plane.target[at + x];
+}
+
+struct Scratch {
+    Rows rows;        // image, target, squares, products, and the three derivatives
+    Ring moments;     // blurred along x: image, its square, its product with the target
+    Ring derivatives;  // blurred along x
+};
+
+// Weighted 1 - SSIM of row y summed; its derivatives into three rows (zero beyond the image).
+double similarity_row(const Plane& plane, int y, Ring& moments, float* (&derivatives)[3], float* ones) {
+    const ColumnBlur mean(moments, y, 0), square(moments, y, 1), product(moments, y, 2);
+    const size_t at = size_t(y) * plane.width;
+    const float* weights = plane.weights ? plane.weights + at : ones;
+    double sum = 0;
+    for (int x = 0; x < plane.width; x += kLanes) {
+        const int valid = std::min(kLanes, plane.width - x);
+        alignas(64) float cached[3][kLanes] = {};
+        const float* from[3] = {plane.target_mean + at + x, plane.target_variance + at + x, weights + (plane.weights ? x : 0)};
+        for (int i = 0; i < 3; ++i) {
+            if (valid == kLanes) std::memcpy(cached[i], from[i], sizeof(float) * kLanes);
+            else std::memcpy(cached[i], from[i], sizeof(float) * valid);
+        }
+        const Vec m1 = mean.at(x), m2 = load(cached[0]), weight = load(cached[2]);
+        const Vec a1 = 2.0f * m1 * m2 + kC1, a2 = 2.0f * (product.at(x) - m1 * m2) + kC2;
+        const Vec b1 = m1 * m1 + m2 * m2 + kC1, b2 = square.at(x) - m1 * m1 + load(cached[1]) + kC2;
+        const Vec inverse = 1.0f / (b1 * b2), similarity = a1 * a2 * inverse;
+        store(derivatives[0] + x, weight * inverse * 2.0f * (m2 * (a2 - a1) - m1 * similarity * (b2 - b1)));
+        store(derivatives[1] + x, -weight * similarity * b1 * inverse);
+        store(derivatives[2] + x, weight * 2.0f * a1 * inverse);
+        const Vec lost = weight * (1.0f - similarity);
+        float row_sum = 0;
+        for (int lane = 0; lane < kLanes; ++lane) row_sum += lost[lane];
+        sum += row_sum;
+    }
+    return sum;
+}
+
+// Gradient of row y, and the sum of its weighted absolute differences.
+double gradient_row(const Plane& plane, int y, Ring& derivatives, float l1_factor, float ssim_factor) {
+    const ColumnBlur mean(derivatives, y, 0), square(derivatives, y, 1), product(derivatives, y, 2);
+    const size_t at = size_t(y) * plane.width;
+    double sum = 0;
+    for (int x = 0; x < plane.width; x += kLanes) {
+        const size_t bytes = sizeof(float) * std::min(kLanes, plane.width - x);
+        alignas(64) float image_row[kLanes] = {}, target_row[kLanes] = {}, weight_row[kLanes] = {};
+        std::memcpy(image_row, plane.image + at + x, bytes);
+        std::memcpy(target_row, plane.target + at + x, bytes);
+        const Vec image = load(image_row), target = load(target_row), difference = image - target;
+        Vec weight = splat(1.0f);
+        if (plane.weights) std::memcpy(weight_row, plane.weights + at + x, bytes), weight = load(weight_row);
+        const Vec lost = weight * absolute(difference);
+        float row_sum = 0;
+        for (int lane = 0; lane < kLanes; ++lane) row_sum += lost[lane];
+        sum += row_sum;
+        if (!plane.gradient) continue;
+        const Vec one = splat(1.0f), sign = keep(less(Vec{}, difference), one) - keep(less(difference, Vec{}), one);
+        const Vec structure = mean.at(x) + 2.0f * image * square.at(x) + target * product.at(x);
+        const Vec gradient = keep(less(Vec{}, weight), l1_factor * weight * sign - ssim_factor * structure);
+        alignas(64) float out[kLanes];
+        store(out, gradient);
+        std::memcpy(plane.gradient + at + x, out, bytes);
+    }
+    return sum;
+}
+
+Sums sweep(const Plane& plane, int begin, int end, float l1_factor, float ssim_factor, Scratch& scratch) {
+    const int width = plane.width, height = plane.height;
+    scratch.rows.reset(7, width);
+    scratch.moments.reset(3, width);
+    scratch.derivatives.reset(3, width);
+    float *image = scratch.rows.row(0), *target = scratch.rows.row(1);
+    float *square = scratch.rows.row(2), *product = scratch.rows.row(3);
+    float* derivatives[3] = {scratch.rows.row(4), scratch.rows.row(5), scratch.rows.row(6)};
+    alignas(64) float ones[kLanes];
+    store(ones, splat(1.0f));
+
+    Sums sums;
+    // `y` is the row that comes in; its moments are whole 5 rows later, its derivatives after 10.
+    for (int y = begin - 2 * kRadius; y < end + 2 * kRadius; ++y) {
+        if (y >= 0 && y < height) {
+            read_image_row(plane, y, image);
+            std::memcpy(target, plane.target + size_t(y) * width, sizeof(float) * width);
+            for (int x = 0; x < width; x += kLanes) {
+                const Vec value = load(image + x);
+                store(square + x, value * value);
+                store(product + x, value * load(target + x));
+            }
+            const float* maps[3] = {image, square, product};
+            for (int map = 0; map < 3; ++map) blur_along_x(maps[map], scratch.moments.row(y, map), width);
+        } else {
+            scratch.moments.clear(y);
+        }
+
+        const int middle = y - kRadius;
+        if (middle < begin - kRadius) continue;
+        if (middle >= 0 && middle < height) {
+            const double lost = similarity_row(plane, middle, scratch.moments, derivatives, ones);
+            if (middle >= begin && middle < end) sums.dissimilarity += lost;
+            for (int map = 0; map < 3 && plane.gradient; ++map) {
+                std::fill(derivatives[map] + width, derivatives[map] + padded(width), 0.0f);
+                blur_along_x(derivatives[map], scratch.derivatives.row(middle, map), width);
+            }
+        } else {
+            scratch.derivatives.clear(middle);
+        }
+
+        const int out = middle - kRadius;
+        if (out >= begin) sums.absolute += gradient_row(plane, out, scratch.derivatives, l1_factor, ssim_factor);
+    }
+    return sums;
+}
+
+// Blurred target and its variance of one plane.
+void target_moments(const float* target, int width, int height, float* mean_out, float* variance_out) {
+    Rows rows;
+    Ring ring;
+    rows.reset(2, width);
+    ring.reset(2, width);
+    for (int y = -kRadius; y < height + kRadius; ++y) {
+        if (y >= 0 && y < height) {
+            std::memcpy(rows.row(0), target + size_t(y) * width, sizeof(float) * width);
+            for (int x = 0; x < width; ++x) rows.row(1)[x] = rows.row(0)[x] * rows.row(0)[x];
+            for (int map = 0; map < 2; ++map) blur_along_x(rows.row(map), ring.row(y, map), width);
+        } else {
+            ring.clear(y);
+        }
+        const int out = y - kRadius;
+        if (out < 0) continue;
+        const ColumnBlur mean(ring, out, 0), square(ring, out, 1);
+        for (int x = 0; x < width; x += kLanes) {
+            alignas(64) float values[2][kLanes];
+            const Vec m = mean.at(x);
+            store(values[0], m);
+            store(values[1], square.at(x) - m * m);
+            const size_t bytes = sizeof(float) * std::min(kLanes, width - x);
+            std::memcpy(mean_out + size_t(out) * width + x, values[0], bytes);
+            std::memcpy(variance_out + size_t(out) * width + x, values[1], bytes);
+        }
+    }
+}
+
+}  // namespace
+}  // namespace core
+
+using namespace core;
+
+// Planar images (3, H, W). The moments that `core_photometric` needs of a target.
+CORE_API void core_photometric_moments(const float* target, int width, int height, float* mean, float* variance) {
+    const size_t plane = size_t(width) * height;
+    run_parallel(3, [&](int channel, int) {
+        const size_t at = channel * plane;
+        target_moments(target + at, width, height, mean + at, variance + at);
+    });
+}
+
+// (1 - ssim_weight) * mean |image - target| + ssim_weight * mean (1 - SSIM), the means weighted by `weights` (H, W), of
+// which `total_weight` is the sum. Planar images (3, H, W); `gradient` as the image, or null.
+CORE_API double core_photometric(const float* image, const float* target, const float* target_mean,
+                                 const float* target_variance, const float* weights, double total_weight,
+                                 double ssim_weight, int width, int height, float* gradient) {
+    const size_t plane_size = size_t(width) * height;
+    const int bands = (height + kBandRows - 1) / kBandRows;
+    const double unit = total_weight > 0 ? 1 / (3 * total_weight) : 0;
+    Buffer<Sums> sums;
+    sums.resize(size_t(3) * bands);
+    run_parallel(3 * bands, [&](int task, int) {
+        thread_local Scratch scratch;
+        const size_t at = task / bands * plane_size;
+        const Plane plane = {image + at, target + at, target_mean + at, target_variance + at, weights,
+                             gradient ? gradient + at : nullptr, width, height};
+        const int begin = task % bands * kBandRows, end = std::min(height, begin + kBandRows);
+        sums[task] = sweep(plane, begin, end, float(unit * (1 - ssim_weight)), float(unit * ssim_weight), scratch);
+    });
+    double loss = 0;
+    for (int task = 0; task < 3 * bands; ++task)
+        loss += (1 - ssim_weight) * sums[task].absolute + ssim_weight * sums[task].dissimilarity;
+    return unit * loss;
+}
