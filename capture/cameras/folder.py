@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 
@@ -21,7 +22,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     names: tuple[str, ...] = ()  # the files to take, with or without suffix; none: all
     intrinsics: Intrinsics | None = None  # of all images of its aspect ratio, instead of what their EXIF tells
     max_pixels: int = 100_000_000  # larger images are left out
-    frames_per_second: float = 10.0  # of the stamps only; reading is as fast as the consumer
+    frames_per_second: Annotated[float, msgspec.Meta(gt=0)] = (
+        10.0  # of the stamps only; reading is as fast as the consumer
+    )
 
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:

@@ -7,6 +7,7 @@ scene_cameras, held_out_cameras and depth. The place is made by capture.diorama;
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Annotated
 
 import cv2
 import msgspec
@@ -21,18 +22,17 @@ from capture.frame import Frame
 TARGET = np.array([1.05, 1.05, 0.82])  # what the photographer looks at: the table in the corner, metres
 
 
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    views: int = 8
-    width: int = 640
-    height: int = 480
+    views: Count = 8
+    width: Count = 640
+    height: Count = 480
     seed: int = 0  # of the place and of the photographer's path
     noise: float = 1.0  # standard deviation of the sensor noise, grey levels
-    samples: int = 2  # rays a pixel in each direction
-    frames_per_second: float = 2.0
-
-    def __post_init__(self) -> None:
-        if min(self.views, self.width, self.height, self.samples) < 1:
-            raise ValueError(f"views, width, height and samples must be at least 1, got {self}")
+    samples: Count = 2  # rays a pixel in each direction
+    frames_per_second: Annotated[float, msgspec.Meta(gt=0)] = 2.0
 
 
 def stream(config: Config) -> Iterator[Frame]:
