@@ -11,7 +11,7 @@ from recon.export.ply import ply_bytes
 from recon.export.prepare import viewer_safe
 from recon.snapshot import Snapshot
 
-_PACKAGES = {"splatnode": "splatnode", "numpy": "numpy", "torch": "torch", "opencv": "opencv-python-headless"}
+_PACKAGES = ("splatnode", "numpy", "torch", "opencv-contrib-python-headless", "pycolmap", "poselib")
 
 
 def build_report(
@@ -55,7 +55,7 @@ def versions() -> dict[str, str | None]:
     return {
         "python": platform.python_version(),
         "platform": platform.platform(),
-        **{name: _version(package) for name, package in _PACKAGES.items()},
+        **{package: _version(package) for package in _PACKAGES},
     }
 
 

@@ -1,0 +1,233 @@
+"""Estimated cameras against true ones, and the search for a test image's camera in a finished scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from recon.geometry import Similarity, align_cameras, exp_se3, twist_gradient
+from recon.rasterize.render import Render
+from recon.snapshot import GaussianArrays
+
+Array = npt.NDArray[np.float64]
+Rasterize = Callable[..., Render]
+
+_BETA1, _BETA2 = 0.9, 0.999  # of Adam (Kingma and Ba 2015)
+
+
+def umeyama(source: Array, target: Array) -> Similarity:
+    """The similarity that carries points `source` (M, 3) onto `target` with the least squared error (Umeyama 1991)."""
+    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3 or len(source) < 2:
+        raise ValueError(f"points must both be (M, 3) with M >= 2, got {source.shape} and {target.shape}")
+    source_centred, target_centred = source - source.mean(0), target - target.mean(0)
+    u, singular, vt = np.linalg.svd(target_centred.T @ source_centred)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ np.diag(signs) @ vt
+    spread = float((source_centred**2).sum())
+    scale = float((singular * signs).sum() / spread) if spread > 0 else 1.0
+    return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
+
+
+@dataclass(frozen=True)
+class CameraErrors:
+    """Errors of C estimated cameras. None where C, or the true motion, is too small to tell.
+
+    `rotation_deg` is the largest angle of any camera once both sets share the best common rotation;
+    `rotation_pair_deg` the largest error of any relative rotation, which needs no alignment. `centre_pct` is the RMS
+    distance of the centres after Umeyama's similarity, in percent of the true centres' RMS distance from their mean.
+    With C = 3 that similarity has 7 degrees of freedom against 9 numbers: read it with the rotations. `focal_pct` is
+    the mean absolute relative error of the focal length.
+    """
+
+    rotation_deg: float | None
+    rotation_pair_deg: float | None
+    centre_pct: float | None
+    focal_pct: float | None
+    ate_instantsplat: float | None
+
+
+def camera_errors(Ts_estimated: Array, Ts_true: Array, Ks_estimated: Array, Ks_true: Array) -> CameraErrors:
+    """Compares (C, 4, 4) T_world_camera and (C, 3, 3) K, in the same order and for the same image sizes."""
+    if Ts_estimated.shape != Ts_true.shape or Ks_estimated.shape != Ks_true.shape:
+        raise ValueError(
+            f"cameras must come in pairs, got {Ts_estimated.shape} and {Ts_true.shape}, "
+            f"{Ks_estimated.shape} and {Ks_true.shape}"
+        )
+    if len(Ts_true) == 0:
+        return CameraErrors(None, None, None, None, None)
+    focal = 100.0 * float(np.abs(_focal(Ks_estimated) / _focal(Ks_true) - 1.0).mean())
+    if len(Ts_true) < 2:
+        return CameraErrors(None, None, None, focal, None)
+    rotations_estimated, rotations_true = Ts_estimated[:, :3, :3], Ts_true[:, :3, :3]
+    common = align_cameras(Ts_estimated, Ts_true).rotation
+    first, second = np.triu_indices(len(Ts_true), 1)
+    return CameraErrors(
+        rotation_deg=float(angles_deg(common @ rotations_estimated, rotations_true).max()),
+        rotation_pair_deg=float(
+            angles_deg(
+                rotations_estimated[first].transpose(0, 2, 1) @ rotations_estimated[second],
+                rotations_true[first].transpose(0, 2, 1) @ rotations_true[second],
+            ).max()
+        ),
+        centre_pct=centre_error_pct(Ts_estimated[:, :3, 3], Ts_true[:, :3, 3]),
+        focal_pct=focal,
+        ate_instantsplat=ate_instantsplat(Ts_estimated, Ts_true),
+    )
+
+
+def angles_deg(rotations: Array, others: Array) -> Array:
+    """(...,) angles between rotations (..., 3, 3), accurate also where they are tiny."""
+    chord = np.linalg.norm(rotations - others, axis=(-2, -1)) / math.sqrt(8.0)
+    return np.rad2deg(2.0 * np.arcsin(np.minimum(chord, 1.0)))
+
+
+def centre_error_pct(estimated: Array, true: Array) -> float | None:
+    """RMS distance of centres (C, 3) after Umeyama's similarity, in percent of the true ones' RMS spread.
+
+    None where the true camera does not move.
+    """
+    spread = math.sqrt(float(((true - true.mean(0)) ** 2).sum(1).mean()))
+    if spread <= 1e-9 * (1.0 + float(np.abs(true).max())):
+        return None
+    return 100.0 * _rms_after_umeyama(estimated, true) / spread
+
+
+def ate_instantsplat(Ts_estimated: Array, Ts_true: Array) -> float | None:
+    """The "ATE" of InstantSplat's released evaluation, only for comparison with published figures.
+
+    It aligns the translation columns t = -R C of the world-to-camera matrices, each set centred and divided by its
+    Frobenius norm. They do not transform by a similarity when the world moves, so a perfect reconstruction does not
+    score 0 (0.008 to 0.02 on typical arcs), and the norm makes the figure shrink with the number of cameras. None where
+    either set does not move.
+    """
+    columns = []
+    for Ts in (Ts_estimated, Ts_true):
+        t = np.linalg.inv(Ts)[:, :3, 3]
+        centred = t - t.mean(0)
+        norm = float(np.linalg.norm(centred))
+        if norm <= 1e-9 * (1.0 + float(np.abs(t).max())):
+            return None
+        columns.append(centred / norm)
+    return _rms_after_umeyama(*columns)
+
+
+def _rms_after_umeyama(source: Array, target: Array) -> float:
+    similarity = umeyama(source, target)
+    moved = similarity.scale * source @ similarity.rotation.T + similarity.translation
+    return math.sqrt(float(((moved - target) ** 2).sum(1).mean()))
+
+
+def _focal(Ks: Array) -> Array:
+    return np.sqrt(Ks[:, 0, 0] * Ks[:, 1, 1])
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedPose:
+    T_world_camera: Array  # (4, 4)
+    loss: float  # mean absolute difference to the image
+
+
+def align_test_pose(
+    gaussians: GaussianArrays,
+    image: Tensor,  # (H, W, 3) in [0, 1]
+    T_world_camera: Array,  # (4, 4) where the search starts
+    K: Array,  # (3, 3) of `image`
+    rasterize: Rasterize,
+    *,
+    steps: int = 500,
+    levels: int = 1,
+    learning_rate: float = 0.003,
+) -> AlignedPose:
+    """Equation 18: the pose from which the frozen Gaussians look most like the image, in mean absolute difference.
+
+    Adam moves a twist at the current pose, with a learning rate that falls to 0 along a cosine; the best pose seen is
+    returned, never one worse than the start. `learning_rate` is in radians, and for the translation in parts of the
+    scene's depth, so that both move the image by similar amounts in a world without scale. With `levels` > 1 the steps
+    are shared between resolutions that double up to the image's own, which widens the basin and saves time.
+    """
+    if steps < 1 or levels < 1:
+        raise ValueError(f"steps and levels must be at least 1, got {steps} and {levels}")
+    tensors = [torch.from_numpy(array).to(image) for array in _parameters(gaussians)]
+    start = torch.from_numpy(np.ascontiguousarray(T_world_camera, np.float64))
+    units = torch.ones(6, dtype=torch.float64)
+    units[:3] = _depth(gaussians, T_world_camera)
+    first, second = torch.zeros(6, dtype=torch.float64), torch.zeros(6, dtype=torch.float64)  # Adam's moments
+
+    T, best_T, best_loss = start, start, math.inf
+    for step in range(steps):
+        level = step * levels // steps
+        reduced, reduced_K = _reduced(image, K, 2 ** (levels - 1 - level))
+        loss, gradient = _loss_and_gradient(tensors, reduced, T, reduced_K, rasterize)
+        if level == levels - 1 and loss < best_loss:
+            best_T, best_loss = T, loss
+        slope = twist_gradient(T, gradient) * units
+        first = _BETA1 * first + (1 - _BETA1) * slope
+        second = _BETA2 * second + (1 - _BETA2) * slope**2
+        unbiased = first / (1 - _BETA1 ** (step + 1)), second / (1 - _BETA2 ** (step + 1))
+        rate = learning_rate * 0.5 * (1.0 + math.cos(math.pi * step / steps))
+        # The moments live in the camera's own frame, which turns with it: each step is a twist at the current pose.
+        T = T @ exp_se3(-rate * unbiased[0] / (unbiased[1].sqrt() + 1e-12) * units)
+    for candidate in (T, start):
+        loss, _ = _loss_and_gradient(tensors, image, candidate, torch.from_numpy(K), rasterize)
+        if loss < best_loss:
+            best_T, best_loss = candidate, loss
+    return AlignedPose(best_T.numpy(), best_loss)
+
+
+@torch.no_grad()
+def render_rgb(
+    gaussians: GaussianArrays, T_world_camera: Array, K: Array, width: int, height: int, rasterize: Rasterize
+) -> Tensor:
+    """(H, W, 3) the Gaussians' image on black, in [0, 1]."""
+    tensors = [torch.from_numpy(array) for array in _parameters(gaussians)]
+    pose, intrinsics = (torch.from_numpy(matrix).float() for matrix in (T_world_camera, K))
+    return _rasterize_rgb(tensors, pose, intrinsics, width, height, rasterize).clamp(0.0, 1.0)
+
+
+def _loss_and_gradient(
+    tensors: list[Tensor], image: Tensor, T_world_camera: Tensor, K: Tensor, rasterize: Rasterize
+) -> tuple[float, Tensor]:
+    """The mean absolute difference, and its gradient (4, 4) with respect to the pose alone."""
+    T = T_world_camera.to(image).requires_grad_()
+    height, width = image.shape[:2]
+    rgb = _rasterize_rgb(tensors, T, K.to(image), width, height, rasterize)
+    loss = (rgb - image).abs().mean()
+    (gradient,) = torch.autograd.grad(loss, T)
+    return float(loss.detach()), gradient.double()
+
+
+def _rasterize_rgb(
+    tensors: list[Tensor], T_world_camera: Tensor, K: Tensor, width: int, height: int, rasterize: Rasterize
+) -> Tensor:
+    rgb = rasterize(*tensors, T_world_camera, K, width, height, channels=("rgb",)).rgb
+    if rgb is None:
+        raise ValueError("the rasteriser was asked for the channel rgb and gave none")
+    return rgb
+
+
+def _reduced(image: Tensor, K: Array, factor: int) -> tuple[Tensor, Tensor]:
+    """The image area-resampled by 1 / `factor`, and its K."""
+    height, width = image.shape[:2]
+    size = max(1, round(height / factor)), max(1, round(width / factor))
+    ratios = torch.tensor([size[1] / width, size[0] / height, 1.0], dtype=torch.float64)
+    if size != (height, width):
+        image = functional.interpolate(image.permute(2, 0, 1)[None], size=size, mode="area")[0].permute(1, 2, 0)
+    return image, torch.from_numpy(K) * ratios[:, None]
+
+
+def _depth(gaussians: GaussianArrays, T_world_camera: Array) -> float:
+    """The median depth of the Gaussians in front of the camera; 1 where there are none."""
+    z = (gaussians.means - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
+    ahead = z[z > 0]
+    return float(np.median(ahead)) if len(ahead) else 1.0
+
+
+def _parameters(gaussians: GaussianArrays) -> tuple[npt.NDArray[np.float32], ...]:
+    return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh

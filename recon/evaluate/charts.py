@@ -1,0 +1,197 @@
+"""Charts of a benchmark, drawn from bench.json alone: `python -m recon.evaluate.charts bench.json --out DIR`.
+
+Needs matplotlib (pip install 'splatnode[bench]'). Only numbers are drawn, never an image of a scene.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from recon.evaluate.summary import Point, points
+from recon.export.staged import write_files
+
+# Okabe and Ito's colours, which people with any colour vision tell apart, and a marker each for print without colour.
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#7F7F7F")
+_MARKERS = "osD^vP*X"
+_INK, _MUTED, _GRID = "#222222", "#6B6B6B", "#E4E4E4"
+_SMALLEST, _LARGEST = 20.0, 320.0  # bubble areas, in points^2
+
+
+@dataclass(frozen=True)
+class Quality:
+    """A measure of held-out views. Axes are turned so that better is up."""
+
+    label: str
+    value: Callable[[Point], float | None]
+    higher_is_better: bool
+
+
+_PSNR = Quality("PSNR (dB)", lambda point: point.psnr, True)
+_SSIM = Quality("SSIM", lambda point: point.ssim, True)
+_LPIPS_VGG = Quality("LPIPS VGG", lambda point: point.lpips_vgg, False)
+_LPIPS_ALEX = Quality("LPIPS Alex", lambda point: point.lpips_alex, False)
+
+
+def draw(bench_json: Path, out_dir: Path) -> list[Path]:
+    """Writes speed_accuracy.png and parsimony.png to `out_dir` and returns their paths.
+
+    Raises ValueError where bench.json has no row with a scored scene: there is nothing to draw.
+    """
+    measured = [p for p in points(json.loads(bench_json.read_text())["rows"]) if p.psnr is not None]
+    if not measured:
+        raise ValueError(f"{bench_json} must have a row with a scored scene to draw, it has none")
+    files = {"speed_accuracy.png": _png(speed_accuracy(measured)), "parsimony.png": _png(parsimony(measured))}
+    write_files(out_dir, files)
+    return [out_dir / name for name in files]
+
+
+def speed_accuracy(measured: Sequence[Point]) -> Figure:
+    """Seconds against quality: a curve a method through its checkpoints, a bubble's area is the number of Gaussians."""
+    largest = max((p.num_gaussians or 0.0 for p in measured), default=0.0)
+
+    def area(point: Point) -> float:
+        share = (point.num_gaussians or 0.0) / largest if largest else 0.0
+        return _SMALLEST + (_LARGEST - _SMALLEST) * share
+
+    figure = _grid(measured, "seconds (log scale)", lambda p: p.seconds, area)
+    _head(figure, "Quality of held-out views against time", f"Area: number of Gaussians, at most {largest:,.0f}. ")
+    return figure
+
+
+def parsimony(measured: Sequence[Point]) -> Figure:
+    """Number of Gaussians against quality: what a method buys with its scene's size."""
+    figure = _grid(measured, "Gaussians (log scale)", lambda p: p.num_gaussians, lambda p: 45.0)
+    _head(figure, "Quality of held-out views against the number of Gaussians")
+    return figure
+
+
+def pareto_front(pairs: Sequence[tuple[float, float]], higher_is_better: bool) -> list[tuple[float, float]]:
+    """The (cost, quality) pairs that no other beats in both, by rising cost."""
+    front: list[tuple[float, float]] = []
+    sign = 1.0 if higher_is_better else -1.0
+    for cost, quality in sorted(pairs, key=lambda pair: (pair[0], -sign * pair[1])):
+        if not front or sign * quality > sign * front[-1][1]:
+            front.append((cost, quality))
+    return front
+
+
+def _grid(
+    measured: Sequence[Point], x_label: str, x: Callable[[Point], float | None], area: Callable[[Point], float]
+) -> Figure:
+    """A row of charts a number of views, a column a measure."""
+    views = sorted({p.views for p in measured})
+    qualities = _qualities(measured)
+    methods = list(dict.fromkeys(p.method for p in measured))
+    figure = Figure(figsize=(4.3 * len(qualities), 3.3 * len(views) + 1.5), dpi=150, layout="constrained")
+    axes = figure.subplots(len(views), len(qualities), squeeze=False, sharex=True)
+    for row, count in enumerate(views):
+        here = [p for p in measured if p.views == count]
+        for column, quality in enumerate(qualities):
+            chart = axes[row][column]
+            _chart(chart, here, methods, quality, x, area)
+            chart.set_title(f"{count} views" if column == 0 else "", loc="left", color=_INK, fontsize=11, weight="bold")
+            if row == len(views) - 1:
+                chart.set_xlabel(x_label, color=_MUTED)
+    handles = [
+        Line2D([], [], color=_style(i)[0], marker=_style(i)[1], label=method, linewidth=1.8)
+        for i, method in enumerate(methods)
+    ]
+    handles.append(Line2D([], [], color=_MUTED, linestyle=(0, (4, 3)), linewidth=1.2, label="Pareto front"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=min(6, len(handles)), frameon=False, fontsize=9)
+    return figure
+
+
+def _chart(
+    chart: Axes,
+    here: Sequence[Point],
+    methods: Sequence[str],
+    quality: Quality,
+    x: Callable[[Point], float | None],
+    area: Callable[[Point], float],
+) -> None:
+    drawn = [(p, cost, value) for p in here if (cost := x(p)) and (value := quality.value(p)) is not None]
+    front = pareto_front([(cost, value) for _, cost, value in drawn], quality.higher_is_better)
+    if front:
+        chart.step(
+            *zip(*front, strict=True), where="post", color=_MUTED, linestyle=(0, (4, 3)), linewidth=1.2, zorder=1
+        )
+    for i, method in enumerate(methods):
+        curve = [entry for entry in drawn if entry[0].method == method]
+        colour, marker = _style(i)
+        costs, values = [cost for _, cost, _ in curve], [value for _, _, value in curve]
+        chart.plot(costs, values, color=colour, linewidth=1.8, zorder=2)
+        chart.scatter(
+            costs,
+            values,
+            s=[area(p) for p, _, _ in curve],
+            c=colour,
+            marker=marker,
+            alpha=0.8,
+            edgecolors="white",
+            zorder=3,
+        )
+    chart.set_xscale("log")
+    chart.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    chart.xaxis.set_major_formatter(FuncFormatter(_short))
+    chart.xaxis.set_minor_formatter(NullFormatter())
+    chart.tick_params(labelbottom=True)
+    chart.margins(0.12, 0.15)
+    if not quality.higher_is_better:
+        chart.invert_yaxis()
+    chart.set_ylabel(quality.label if quality.higher_is_better else f"{quality.label} (axis turned)", color=_MUTED)
+    chart.grid(color=_GRID, linewidth=0.7)
+    chart.set_axisbelow(True)
+    chart.spines[["top", "right"]].set_visible(False)
+    chart.spines[["left", "bottom"]].set_color(_MUTED)
+    chart.tick_params(colors=_MUTED, labelsize=8)
+
+
+def _qualities(measured: Sequence[Point]) -> list[Quality]:
+    """PSNR, SSIM and whichever LPIPS was measured, VGG's before AlexNet's."""
+    lpips = [q for q in (_LPIPS_VGG, _LPIPS_ALEX) if any(q.value(p) is not None for p in measured)]
+    return [_PSNR, _SSIM, *lpips[:1]]
+
+
+def _style(index: int) -> tuple[str, str]:
+    return _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
+
+
+def _short(value: float, _position: int) -> str:
+    """1500 as 1.5k: ticks must fit beside each other."""
+    if value >= 1e6:
+        return f"{value / 1e6:g}M"
+    return f"{value / 1e3:g}k" if value >= 1e3 else f"{value:g}"
+
+
+def _head(figure: Figure, title: str, remark: str = "") -> None:
+    remark += "Means over the runs that published a scene; up and left is better."
+    figure.suptitle(f"{title}\n{remark}", x=0.01, ha="left", color=_INK, fontsize=11)
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", facecolor="white")
+    return buffer.getvalue()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Draws the charts of a benchmark from its bench.json.")
+    parser.add_argument("bench_json", type=Path)
+    parser.add_argument("--out", type=Path, required=True, help="the folder for the charts")
+    arguments = parser.parse_args()
+    for path in draw(arguments.bench_json, arguments.out):
+        print(path)
+
+
+if __name__ == "__main__":
+    main()

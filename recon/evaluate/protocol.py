@@ -1,0 +1,215 @@
+"""The protocol: what a reconstruction scores on the views that it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from recon.evaluate.alignment import CameraErrors, Rasterize, align_test_pose, camera_errors, render_rgb
+from recon.evaluate.lpips import Lpips, load_lpips
+from recon.evaluate.metrics import psnr, ssim
+from recon.evaluate.splits import Split
+from recon.evaluate.truth import EvaluationScene
+from recon.export import viewer_safe
+from recon.export.ply import ply_bytes
+from recon.geometry import align_cameras
+from recon.keyframe import modelled_image
+from recon.snapshot import CameraEstimate, Snapshot
+
+STAGES = ("poses", "points", "optimise")
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How held-out views are scored; part of every benchmark's record."""
+
+    longer_side: int = 512  # pixels
+    alignment_steps: int = 500
+    alignment_levels: int = 3
+
+
+@dataclass(frozen=True)
+class Run:
+    """Which reconstruction a row is about, and what it cost. `seconds` has STAGES and "total"; None: not measured."""
+
+    method: str
+    seed: int
+    checkpoint: int | None  # the iterations at which this row was asked for; None: the end of the run
+    seconds: Mapping[str, float | None]
+    peak_rss_mb: float | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One line of bench.json. What was not measured is None."""
+
+    scene: str
+    views: int
+    method: str
+    seed: int
+    checkpoint: int | None  # the iterations at which this row was asked for; None: the end of the run
+    final: bool
+    iterations: int | None = None
+    psnr: float | None = None  # dB, mean over the test views, as are the next three
+    ssim: float | None = None
+    lpips_alex: float | None = None
+    lpips_vgg: float | None = None
+    rotation_error_deg: float | None = None
+    rotation_pair_error_deg: float | None = None
+    centre_error_pct: float | None = None
+    focal_error_pct: float | None = None
+    ate_instantsplat: float | None = None
+    seconds: Mapping[str, float | None]
+    peak_rss_mb: float | None
+    num_gaussians: int | None = None
+    num_cameras: int | None = None  # of the training views, those with an estimated pose
+    scene_bytes: int | None = None
+    verdict: str  # a verdict's code; "FAILED" where the run ended without a result
+    error: str | None = None  # why it did
+
+
+@dataclass(frozen=True, eq=False)
+class Networks:
+    """The perceptual metrics for which there are weights."""
+
+    alex: Lpips | None
+    vgg: Lpips | None
+
+
+def load_networks(weights_dir: Path | None = None) -> Networks:
+    return Networks(load_lpips("alex", weights_dir), load_lpips("vgg", weights_dir))
+
+
+def evaluate(
+    snapshot: Snapshot,
+    scene: EvaluationScene,
+    split: Split,
+    run: Run,
+    *,
+    rasterize: Rasterize,
+    networks: Networks,
+    settings: Settings,
+) -> Row:
+    """Scores a snapshot on the scene's test views. The truth is used here and nowhere earlier.
+
+    A snapshot whose verdict forbids publishing it has no scene and is scored on nothing; its cameras are compared all
+    the same, which tells whether the refusal was needed.
+    """
+    estimated = [camera for camera in snapshot.cameras if camera.name in scene.cameras]
+    errors = _camera_errors(estimated, scene)
+    gaussians = viewer_safe(snapshot.gaussians)
+    publishable = snapshot.verdict.publishable and len(gaussians) > 0
+    views = _score_test_views(snapshot, estimated, scene, split, rasterize, networks, settings) if publishable else []
+    return Row(
+        scene=scene.name,
+        views=len(split.train),
+        method=run.method,
+        seed=run.seed,
+        checkpoint=run.checkpoint,
+        final=run.checkpoint is None,
+        iterations=snapshot.iterations,
+        psnr=_mean([view.psnr for view in views]),
+        ssim=_mean([view.ssim for view in views]),
+        lpips_alex=_mean([view.lpips_alex for view in views]),
+        lpips_vgg=_mean([view.lpips_vgg for view in views]),
+        rotation_error_deg=errors.rotation_deg,
+        rotation_pair_error_deg=errors.rotation_pair_deg,
+        centre_error_pct=errors.centre_pct,
+        focal_error_pct=errors.focal_pct,
+        ate_instantsplat=errors.ate_instantsplat,
+        seconds=run.seconds,
+        peak_rss_mb=run.peak_rss_mb,
+        num_gaussians=len(gaussians),
+        num_cameras=len(snapshot.cameras),
+        scene_bytes=ply_bytes(len(gaussians), gaussians.sh.shape[1]) if publishable else 0,
+        verdict=snapshot.verdict.code.value,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _ViewScore:
+    psnr: float
+    ssim: float
+    lpips_alex: float | None
+    lpips_vgg: float | None
+
+
+def _score_test_views(
+    snapshot: Snapshot,
+    estimated: Sequence[CameraEstimate],
+    scene: EvaluationScene,
+    split: Split,
+    rasterize: Rasterize,
+    networks: Networks,
+    settings: Settings,
+) -> list[_ViewScore]:
+    """Renders each test view from the pose that equation 18 finds, with the intrinsics of the training cameras.
+
+    The search starts from the true pose, carried into the estimated world by the similarity that aligns the training
+    cameras. No view can be scored with fewer than two of them.
+    """
+    if len(estimated) < 2:
+        return []
+    true_to_estimated = align_cameras(
+        np.stack([scene.cameras[camera.name].T_world_camera for camera in estimated]),
+        np.stack([camera.T_world_camera for camera in estimated]),
+    )
+    gaussians = viewer_safe(snapshot.gaussians)
+    scores = []
+    for name in split.test:
+        if name not in scene.cameras:
+            continue
+        truth = torch.from_numpy(modelled_image(scene.image(name), settings.longer_side)).float() / 255.0
+        height, width = truth.shape[:2]
+        K = mean_intrinsics(snapshot.cameras, width, height)
+        aligned = align_test_pose(
+            gaussians,
+            truth,
+            true_to_estimated.camera(scene.cameras[name].T_world_camera),
+            K,
+            rasterize,
+            steps=settings.alignment_steps,
+            levels=settings.alignment_levels,
+        )
+        image = render_rgb(gaussians, aligned.T_world_camera, K, width, height, rasterize)
+        scores.append(
+            _ViewScore(
+                psnr=psnr(image, truth),
+                ssim=ssim(image, truth),
+                lpips_alex=networks.alex(image, truth) if networks.alex else None,
+                lpips_vgg=networks.vgg(image, truth) if networks.vgg else None,
+            )
+        )
+    return scores
+
+
+def mean_intrinsics(cameras: Sequence[CameraEstimate], width: int, height: int) -> npt.NDArray[np.float64]:
+    """(3, 3) K for an image `width` x `height`: mean focal lengths and principal point, relative to the image sizes."""
+    longer = np.array([max(camera.width, camera.height) for camera in cameras])
+    Ks = np.stack([camera.K for camera in cameras])
+    fx, fy = (float((Ks[:, i, i] / longer).mean()) * max(width, height) for i in (0, 1))
+    cx = float((Ks[:, 0, 2] / [camera.width for camera in cameras]).mean()) * width
+    cy = float((Ks[:, 1, 2] / [camera.height for camera in cameras]).mean()) * height
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+
+
+def _camera_errors(estimated: Sequence[CameraEstimate], scene: EvaluationScene) -> CameraErrors:
+    true = [scene.cameras[camera.name] for camera in estimated]
+    return camera_errors(
+        np.array([camera.T_world_camera for camera in estimated]).reshape(-1, 4, 4),
+        np.array([camera.T_world_camera for camera in true]).reshape(-1, 4, 4),
+        np.array([camera.K for camera in estimated]).reshape(-1, 3, 3),
+        np.array([t.K_for(camera.width, camera.height) for t, camera in zip(true, estimated, strict=True)]).reshape(
+            -1, 3, 3
+        ),
+    )
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    measured = [value for value in values if value is not None]
+    return float(np.mean(measured)) if measured else None

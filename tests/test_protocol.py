@@ -1,0 +1,334 @@
+"""Scenes, splits and scores: a perfect reconstruction scores perfectly, a worse one by what is wrong with it."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from capture.frame import Frame
+from recon.evaluate.alignment import render_rgb
+from recon.evaluate.bench import Plan, run_alone, run_bench
+from recon.evaluate.protocol import Networks, Run, Settings, evaluate, mean_intrinsics
+from recon.evaluate.splits import Split, load_split, paper_split
+from recon.evaluate.truth import load_scene
+from recon.export import write_result
+from recon.export.cameras import encode_cameras, encode_colmap, encode_nerfstudio
+from recon.export.ply import encode_ply
+from recon.geometry import Similarity, exp_se3
+from recon.rasterize.cpu import rasterize
+from recon.report import build_report
+from recon.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from recon.verdict import Code, Verdict
+
+WIDTH, HEIGHT = 96, 72
+K = np.array([[90.0, 0, 48], [0, 90.0, 36], [0, 0, 1]])
+NAMES = [f"{i:02d}.png" for i in range(8)]
+SPLIT = Split(("00.png", "04.png", "07.png"), ("01.png", "03.png"))
+NO_NETWORKS = Networks(None, None)
+QUICK = Settings(alignment_steps=20, alignment_levels=1)
+RUN = Run("exact", 0, None, {"poses": 1.0, "points": None, "optimise": 2.0, "total": 3.5}, 123.0)
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Tiny images: threads would only wait for each other, for long where the machine has other work."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+def true_pose(i: int) -> np.ndarray:
+    return exp_se3(
+        torch.tensor([0.25 * (i - 4), 0.05 * (i % 3), 0, 0, -0.05 * (i - 4), 0], dtype=torch.float64)
+    ).numpy()
+
+
+def make_gaussians() -> GaussianArrays:
+    rng = np.random.default_rng(0)
+    count = 500
+    return GaussianArrays(
+        means=rng.uniform([-4, -3, 3], [4, 3, 6], (count, 3)).astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
+        scales=np.full((count, 3), 0.15, np.float32),
+        opacities=np.full(count, 0.8, np.float32),
+        sh=rng.uniform(-1.5, 1.5, (count, 1, 3)).astype(np.float32),
+        source_frame=np.zeros(count, np.int32),
+    )
+
+
+def estimate(name: str, T_world_camera: np.ndarray) -> CameraEstimate:
+    return CameraEstimate(name, int(name[:2]), T_world_camera, K, WIDTH, HEIGHT, None, None)
+
+
+def perfect_snapshot() -> Snapshot:
+    """The true scene, in a world of another scale, orientation and origin."""
+    world = exp_se3(torch.tensor([1.0, -2, 0.5, 0.3, 0.9, -0.4], dtype=torch.float64)).numpy()
+    similarity = Similarity(0.4, world[:3, :3], world[:3, 3])
+    gaussians = make_gaussians()
+    return Snapshot(
+        sequence=0,
+        verdict=Verdict(Code.OK, "Good.", "", publishable=True),
+        cameras=tuple(estimate(name, similarity.camera(true_pose(int(name[:2])))) for name in SPLIT.train),
+        gaussians=replace(
+            gaussians,
+            means=(0.4 * gaussians.means @ world[:3, :3].T + world[:3, 3]).astype(np.float32),
+            scales=gaussians.scales * np.float32(0.4),
+        ),
+        images={},
+        dropped=(),
+        iterations=100,
+        seconds={"poses": 1.0, "optimise": 2.0},
+        final=True,
+    )
+
+
+def write_images(folder: Path) -> None:
+    (folder / "images").mkdir(parents=True)
+    for name in NAMES:
+        image = render_rgb(make_gaussians(), true_pose(int(name[:2])), K, WIDTH, HEIGHT, rasterize)
+        pixels = np.rint(image.numpy() * 255).astype(np.uint8)
+        cv2.imwrite(str(folder / "images" / name), pixels[..., ::-1])
+
+
+@pytest.fixture(scope="session")
+def scene_folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes") / "blobs"
+    write_images(folder)
+    entries = []
+    for name in NAMES:
+        T_camera_world = np.linalg.inv(true_pose(int(name[:2])))
+        pose = {"R": T_camera_world[:3, :3].tolist(), "t": T_camera_world[:3, 3].tolist()}
+        entries.append({"name": name, "width": WIDTH, "height": HEIGHT, "K": K.tolist(), **pose})
+    (folder / "cameras.json").write_text(json.dumps({"images": entries}))
+    splits = {"blobs": {"train3": SPLIT.train, "test": SPLIT.test}}
+    (folder.parent / "splits.json").write_text(json.dumps(splits))
+    return folder
+
+
+def score(snapshot: Snapshot, folder: Path, **settings):
+    return evaluate(
+        snapshot,
+        load_scene(folder),
+        SPLIT,
+        RUN,
+        rasterize=rasterize,
+        networks=NO_NETWORKS,
+        settings=replace(QUICK, **settings),
+    )
+
+
+# --- splits
+
+
+def test_paper_split_of_24_frames():
+    names = [str(i) for i in range(24)]
+    assert paper_split(names, 3).train == ("0", "11", "23")
+    assert paper_split(names, 6).train == ("0", "5", "9", "13", "17", "23")
+    assert paper_split(names, 12).train == ("0", "3", "5", "7", "9", "11", "13", "15", "17", "19", "21", "23")
+    assert paper_split(names, 3).test == ("1", "2", "4", "6", "8", "10", "12", "14", "16", "18", "20", "22")
+
+
+@pytest.mark.parametrize("count", [6, 11, 23, 30, 100])
+def test_no_image_both_trains_and_tests(count):
+    names = [f"{i:03d}" for i in range(count)]
+    split = paper_split(names, 3)
+    assert len(set(split.train)) == 3 and not set(split.train) & set(split.test)
+    assert len(split.test) == min(12, count // 2)
+    assert split.train[0] == names[0] and split.train[-1] == names[-1]
+
+
+def test_more_views_than_there_are_is_a_clear_error():
+    with pytest.raises(ValueError, match="views must be 1 to 5 for 10 images, got 6"):
+        paper_split([str(i) for i in range(10)], 6)
+
+
+def test_listed_split_wins_over_the_paper_s(scene_folder, tmp_path):
+    assert load_split(scene_folder, NAMES, 3) == SPLIT
+    with pytest.raises(ValueError, match="must list train6 for blobs"):
+        load_split(scene_folder, NAMES, 6)
+    assert load_split(tmp_path / "elsewhere", NAMES, 2) == paper_split(NAMES, 2)
+
+
+def test_recorded_scenes_are_complete(shared):
+    splits = json.loads((shared / "scenes" / "splits.json").read_text())
+    for name in splits:
+        folder = shared / "scenes" / name
+        scene = load_scene(folder)
+        split = load_split(folder, list(scene.paths), 3)
+        assert len(split.train) == 3 and not set(split.train) & set(split.test)
+        assert set(split.train + split.test) <= set(scene.cameras), f"{name} must know its cameras"
+
+
+# --- scenes
+
+
+def test_every_layout_gives_the_same_cameras(scene_folder, tmp_path):
+    pytest.importorskip("pycolmap")
+    expected = load_scene(scene_folder)
+    cameras = [estimate(name, true_pose(int(name[:2]))) for name in NAMES]
+    files = {
+        "ours/cameras.json": encode_cameras(cameras),
+        "nerfstudio/transforms.json": encode_nerfstudio(cameras),
+        **{f"colmap/sparse/0/{name}": data for name, data in encode_colmap(cameras, make_gaussians()).items()},
+    }
+    for name, data in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(data)
+    for layout in ("ours", "nerfstudio", "colmap"):
+        os.symlink(scene_folder / "images", tmp_path / layout / "images")
+        scene = load_scene(tmp_path / layout)
+        assert list(scene.cameras) == NAMES
+        for name in NAMES:
+            found, true = scene.cameras[name], expected.cameras[name]
+            assert np.allclose(found.T_world_camera, true.T_world_camera, atol=1e-12)
+            assert np.allclose(found.K, K) and (found.width, found.height) == (WIDTH, HEIGHT)
+
+
+def test_incomplete_scenes_are_clear_errors(scene_folder, tmp_path):
+    with pytest.raises(FileNotFoundError, match="must hold the scene's images"):
+        load_scene(tmp_path)
+    os.symlink(scene_folder / "images", tmp_path / "images")
+    with pytest.raises(FileNotFoundError, match="must hold the true cameras"):
+        load_scene(tmp_path)
+    (tmp_path / "transforms.json").write_text('{"frames": [{"file_path": "00.png"}]}')
+    with pytest.raises(ValueError, match="must give w, h, fl_x, transform_matrix"):
+        load_scene(tmp_path)
+    frame = {"file_path": "00.png", "w": 1, "h": 1, "fl_x": 1, "k1": 0.1, "transform_matrix": np.eye(4).tolist()}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    with pytest.raises(ValueError, match="undistorted"):
+        load_scene(tmp_path)
+
+
+def test_frames_tell_a_reconstruction_nothing_but_pixels(scene_folder):
+    frames = load_scene(scene_folder).frames(SPLIT.train)
+    assert [frame.name for frame in frames] == list(SPLIT.train)
+    assert [frame.frame_id for frame in frames] == [0, 1, 2]
+    assert all(frame.intrinsics is None for frame in frames)
+    assert frames[0].image.shape == (HEIGHT, WIDTH, 3)
+
+
+# --- scores
+
+
+def test_perfect_reconstruction_scores_perfectly(scene_folder):
+    row = score(perfect_snapshot(), scene_folder)
+    assert row.psnr is not None and row.psnr > 50  # 8-bit images allow 59 dB
+    assert row.ssim is not None and row.ssim > 0.999
+    assert row.rotation_error_deg == pytest.approx(0, abs=1e-6)
+    assert row.centre_error_pct == pytest.approx(0, abs=1e-6)
+    assert row.focal_error_pct == pytest.approx(0, abs=1e-6)
+    assert row.lpips_alex is None and row.lpips_vgg is None
+    assert (row.scene, row.views, row.method, row.iterations, row.final) == ("blobs", 3, "exact", 100, True)
+    assert (row.num_gaussians, row.num_cameras, row.verdict) == (500, 3, "OK")
+    assert row.scene_bytes == len(encode_ply(make_gaussians()))
+    assert row.seconds["total"] == 3.5 and row.peak_rss_mb == 123.0
+
+
+def test_worse_scene_scores_worse_by_what_is_wrong(scene_folder):
+    perfect = perfect_snapshot()
+    faded = replace(perfect, gaussians=replace(perfect.gaussians, opacities=np.full(500, 0.3, np.float32)))
+    good, bad = score(perfect, scene_folder), score(faded, scene_folder)
+    assert good.psnr is not None and bad.psnr is not None and bad.psnr < good.psnr - 15
+    zoomed = replace(perfect, cameras=tuple(replace(c, K=c.K * [[1.04], [1.04], [1]]) for c in perfect.cameras))
+    assert score(zoomed, scene_folder).focal_error_pct == pytest.approx(4.0)
+
+
+def test_refused_scene_is_not_scored_but_its_cameras_are(scene_folder):
+    refused = replace(perfect_snapshot(), verdict=Verdict(Code.NO_PARALLAX, "No.", "Move."))
+    row = score(refused, scene_folder)
+    assert (row.verdict, row.psnr, row.ssim, row.scene_bytes) == ("NO_PARALLAX", None, None, 0)
+    assert row.rotation_error_deg == pytest.approx(0, abs=1e-6)
+
+
+def test_one_camera_cannot_be_aligned(scene_folder):
+    row = score(replace(perfect_snapshot(), cameras=perfect_snapshot().cameras[:1]), scene_folder)
+    assert (row.psnr, row.rotation_error_deg, row.centre_error_pct, row.num_cameras) == (None, None, None, 1)
+    assert row.focal_error_pct == pytest.approx(0, abs=1e-6)
+
+
+def test_intrinsics_are_carried_to_an_image_of_another_size():
+    first = CameraEstimate("a", 0, np.eye(4), np.array([[100.0, 0, 50], [0, 100, 30], [0, 0, 1]]), 100, 60, None, None)
+    second = replace(first, K=np.array([[110.0, 0, 52], [0, 110, 30], [0, 0, 1]]))
+    found = mean_intrinsics([first, second], 200, 120)
+    assert np.allclose(found, [[210, 0, 102], [0, 210, 60], [0, 0, 1]])
+
+
+# --- the benchmark
+
+
+def reconstruct(frames: Sequence[Frame], method: str, seed: int) -> Iterator[Snapshot]:
+    """Stands in for the pipeline, in the benchmark's own processes."""
+    assert all(frame.intrinsics is None for frame in frames)
+    if method == "broken":
+        raise RuntimeError("this method is broken")
+    if method == "killed":
+        os._exit(7)
+    for iterations in (0, 100, 200, 300):
+        final = iterations == 300
+        yield replace(perfect_snapshot(), iterations=iterations, final=final, sequence=seed)
+
+
+def test_bench_writes_a_row_a_checkpoint_and_keeps_what_was_measured(scene_folder, tmp_path):
+    plan = Plan((scene_folder,), views=(3,), methods=("exact", "broken"), checkpoints=(50, 150, 100000))
+    rows = run_bench(
+        plan, reconstruct, tmp_path, rasterize=rasterize, networks=NO_NETWORKS, settings=QUICK, command="bench"
+    )
+    assert [(row.method, row.checkpoint, row.iterations, row.final) for row in rows] == [
+        ("exact", 50, 100, False),
+        ("exact", 150, 200, False),
+        ("exact", None, 300, True),
+        ("broken", None, None, True),
+    ]
+    content = json.loads((tmp_path / "bench.json").read_text())
+    assert content["command"] == "bench" and content["machine"]["threads"] >= 1
+    assert content["settings"] == {"longer_side": 512, "alignment_steps": 20, "alignment_levels": 1}
+    exact, broken = content["rows"][2], content["rows"][3]
+    assert exact["psnr"] > 50 and exact["seconds"]["total"] > 0 and exact["peak_rss_mb"] > 10
+    assert exact["seconds"]["poses"] == 1.0 and exact["seconds"]["points"] is None
+    assert broken["verdict"] == "FAILED" and broken["psnr"] is None and broken["num_gaussians"] is None
+    assert "this method is broken" in broken["error"]
+    table = list(csv.DictReader((tmp_path / "bench.csv").read_text().splitlines()))
+    assert len(table) == 4 and table[3]["psnr"] == "" and float(table[2]["seconds_total"]) > 0
+    report = (tmp_path / "report.md").read_text()
+    assert "## 3 views" in report and "| exact | 1/1 |" in report and "| broken | 0/1 |" in report
+
+
+def test_process_that_dies_or_takes_too_long_is_told(scene_folder):
+    frames = load_scene(scene_folder).frames(SPLIT.train)
+    dead = run_alone(reconstruct, frames, "killed", 0, (), timeout_s=60)
+    assert dead.moments == () and dead.error is not None and "code 7" in dead.error
+    late = run_alone(reconstruct, frames, "exact", 0, (), timeout_s=0.05)
+    assert late.error == "stopped after 0.05 s"
+
+
+def test_scene_that_is_not_there_stops_the_bench_before_it_starts(tmp_path):
+    with pytest.raises(FileNotFoundError, match="must hold the scene's images"):
+        run_bench(
+            Plan((tmp_path / "absent",), (3,), ("exact",)),
+            reconstruct,
+            tmp_path / "out",
+            rasterize=rasterize,
+            networks=NO_NETWORKS,
+            settings=QUICK,
+            command="",
+        )
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_result_is_itself_a_scene_with_known_cameras(scene_folder, tmp_path):
+    """So that two reconstructions can be compared with each other."""
+    snapshot = perfect_snapshot()
+    write_result(snapshot, tmp_path, build_report(snapshot, seed=0, preset="p", peak_rss_mb=None))
+    os.symlink(scene_folder / "images", tmp_path / "images")
+    row = score(snapshot, tmp_path)
+    assert row.rotation_error_deg == pytest.approx(0, abs=1e-6)
