@@ -42,7 +42,9 @@ class PhotometricLoss:
         """
         _, height, width = self.target.shape
         if tuple(rgb.shape) != (height, width, 3) or not rgb.is_floating_point():
-            raise ValueError(f"rgb must be ({height}, {width}, 3) floats as the target, got {tuple(rgb.shape)} {rgb.dtype}")
+            raise ValueError(
+                f"rgb must be ({height}, {width}, 3) floats as the target, got {tuple(rgb.shape)} {rgb.dtype}"
+            )
         if weights is not None and tuple(weights.shape) != (height, width):
             raise ValueError(f"weights must be ({height}, {width}), got {tuple(weights.shape)}")
         return _Photometric.apply(rgb, self, weights)

@@ -49,7 +49,7 @@ def check_input(
         ("K", K, (3, 3)),
     ):
         if tuple(tensor.shape) != shape:
-            wanted = f"(N, {shape[1]})" if name in ("means", "quats", "scales") else shape
+            wanted = f"(N, {shape[-1]})" if name in ("means", "quats", "scales") else shape
             hint = f" (N = {count} from means)" if name != "means" and name in gaussians else ""
             raise ValueError(f"{name} must be {wanted}{hint}, got {tuple(tensor.shape)}")
     if sh.dim() != 3 or sh.shape[0] != count or sh.shape[1] not in SH_BASES or sh.shape[2] != 3:
@@ -71,7 +71,9 @@ def _check_camera(T_world_camera: Tensor, K: Tensor) -> None:
         raise ValueError(f"T_world_camera must be finite, got {T.tolist()}")
     drift = abs(T[:3, :3] @ T[:3, :3].T - [[1, 0, 0], [0, 1, 0], [0, 0, 1]]).max()
     if drift > 1e-2 or abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise ValueError(f"T_world_camera must be a rigid transform (its rotation is off by {drift:.2g}), got {T.tolist()}")
+        raise ValueError(
+            f"T_world_camera must be a rigid transform (its rotation is off by {drift:.2g}), got {T.tolist()}"
+        )
     matrix = K.to("cpu", torch.float64).numpy()
     if not abs(matrix).max() < float("inf") or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
         raise ValueError(f"K must be finite with positive focal lengths, got {matrix.tolist()}")

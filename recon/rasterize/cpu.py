@@ -134,7 +134,9 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *image_gradients):  # pyright: ignore[reportIncompatibleMethodOverride]
         means, quats, scales, opacities, sh, depth, alpha = ctx.saved_tensors
         planar = [_planar(gradient) for gradient in image_gradients]
-        channels = sum(bit for bit, gradient in zip(_CHANNEL_BITS.values(), planar, strict=True) if gradient is not None)
+        channels = sum(
+            bit for bit, gradient in zip(_CHANNEL_BITS.values(), planar, strict=True) if gradient is not None
+        )
         if not channels:
             return (None,) * 8
         parameters = [torch.empty_like(tensor) for tensor in (means, quats, scales, opacities, sh)]
@@ -174,5 +176,5 @@ def _channels_last(planar: Tensor | None) -> Tensor | None:
 def _planar(image: Tensor | None) -> Tensor | None:
     if image is None:
         return None
-    image = image.to(torch.float32)
-    return (image.permute(2, 0, 1) if image.dim() == 3 else image).contiguous()
+    planar = image.permute(2, 0, 1) if image.dim() == 3 else image
+    return planar.to(torch.float32).contiguous()

@@ -95,7 +95,9 @@ def project(
     with torch.no_grad():
         x, y, z = means_camera.unbind(1)
         u, v = fx * x / z + cx, fy * y / z + cy
-        inside = (u >= -GUARD * width) & (u <= (1 + GUARD) * width) & (v >= -GUARD * height) & (v <= (1 + GUARD) * height)
+        inside = (
+            (u >= -GUARD * width) & (u <= (1 + GUARD) * width) & (v >= -GUARD * height) & (v <= (1 + GUARD) * height)
+        )
         seen = torch.nonzero((z >= near) & inside).squeeze(1)
         seen = seen[torch.argsort(z[seen], stable=True)]
 
