@@ -29,6 +29,11 @@ class Keyframe:
     def name(self) -> str:
         return self.frame.name
 
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Modelled size over full size, horizontally and vertically."""
+        return self.image.shape[1] / self.frame.width, self.image.shape[0] / self.frame.height
+
 
 def modelled_size(width: int, height: int, longer_side: int) -> tuple[int, int]:
     """(width, height) with the longer side at most `longer_side`; images are never enlarged."""

@@ -41,6 +41,15 @@ class GaussianArrays:
     def __len__(self) -> int:
         return self.means.shape[0]
 
+    @classmethod
+    def empty(cls) -> GaussianArrays:
+        """No Gaussians."""
+
+        def zeros(*shape: int) -> Array:
+            return np.zeros(shape, np.float32)
+
+        return cls(zeros(0, 3), zeros(0, 4), zeros(0, 3), zeros(0), zeros(0, 1, 3), np.zeros(0, np.int32))
+
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:

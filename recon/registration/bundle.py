@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -30,8 +31,7 @@ class Problem:
     pixels: Array  # (O, 2) relative to the principal point
 
 
-@dataclass(frozen=True)
-class Config:
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robust_px: float = 1.0  # scale of the Cauchy loss, pixels
     max_iterations: int = 40
     tolerance: float = 1e-5  # relative decrease of the cost at which it stops

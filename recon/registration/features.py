@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from recon.keyframe import Features
 
 
-@dataclass(frozen=True)
-class Config:
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     num_features: int = 8000
     contrast: float = 0.01  # SIFT's contrast threshold; low, because with few views every match counts
     longer_side: int = 1600  # pixels; larger images are shrunk before features are found

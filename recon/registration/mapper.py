@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import poselib
@@ -20,8 +21,7 @@ Array = npt.NDArray[np.float64]
 Pairs = Mapping[tuple[int, int], TwoView]
 
 
-@dataclass(frozen=True)
-class Config:
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_error_px: float = 2.5  # reprojection error of a kept observation, at 1024 px on the longer side
     min_angle_deg: float = 1.0  # between the rays of a kept point
     min_points: int = 15  # 2D-3D inliers that a new view needs

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -11,8 +10,7 @@ import torch
 from recon.keyframe import Features
 
 
-@dataclass(frozen=True)
-class Config:
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     ratio: float = 0.85  # nearest over second-nearest distance; looser than usual, geometry decides later
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -16,12 +17,11 @@ from recon.registration.two_view import TwoView
 Array = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Config:
-    features: features.Config = field(default_factory=features.Config)
-    matching: matching.Config = field(default_factory=matching.Config)
-    two_view: two_view.Config = field(default_factory=two_view.Config)
-    mapper: mapper.Config = field(default_factory=mapper.Config)
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    features: features.Config = features.Config()
+    matching: matching.Config = matching.Config()
+    two_view: two_view.Config = two_view.Config()
+    mapper: mapper.Config = mapper.Config()
     exif_sigma: float = 0.05  # of log focal: nominal focal lengths are rounded, and focusing changes them
     voted_sigma: float = 0.3  # of log focal when frames voted for it
 

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import poselib
@@ -13,8 +14,7 @@ import poselib
 Array = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Config:
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     epipolar_px: float = 1.5  # inlier threshold, pixels at 1024 on the longer side
     homography_px: float = 2.5
     max_log10_nfa: float = -12.0  # at most this chance (log10) that unrelated images agree as well

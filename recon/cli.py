@@ -1,0 +1,125 @@
+"""The verbs of the command line that reconstruct."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from capture.cameras import folder, synthetic
+from capture.frame import DroppedFrame, Frame
+from recon.config import Config, preset
+from recon.export import write_result
+from recon.pipeline import reconstruct
+from recon.preview import contact_sheet
+from recon.report import build_report, peak_rss_mb
+from recon.snapshot import Snapshot
+
+EXIT_GOOD, EXIT_REFUSED = 0, 65
+
+
+def replay(args: argparse.Namespace) -> int:
+    """Reconstructs a folder of photographs."""
+    frames = folder.stream(folder.Config(folder=args.folder, names=_chosen(args)))
+    snapshot = run(frames, _config(args))
+    report = finish(snapshot, args.out, seed=_config(args).seed, preset_name=args.preset or "balanced")
+    _tell(snapshot, args.out, report, as_json=args.json)
+    return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
+
+
+def run(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:
+    """The final snapshot; progress goes to the terminal, if there is one."""
+    snapshot = None
+    for snapshot in reconstruct(frames, config):
+        _progress(snapshot)
+    assert snapshot is not None
+    return snapshot
+
+
+def finish(snapshot: Snapshot, out: Path, *, seed: int, preset_name: str, **extra: object) -> dict[str, object]:
+    """Writes the result folder and returns its report."""
+    report = build_report(snapshot, seed=seed, preset=preset_name, peak_rss_mb=peak_rss_mb()) | extra
+    preview = contact_sheet(snapshot) if snapshot.verdict.publishable else None
+    write_result(snapshot, out, report, preview=preview)
+    return report
+
+
+def demo(args: argparse.Namespace) -> int:
+    """Reconstructs the built-in capture and measures the result on views that it has not seen."""
+    from recon.evaluate.demo import held_out_quality
+
+    config = msgspec.structs.replace(preset("balanced"), seed=args.seed or 0)
+    place = synthetic.Config(seed=args.seed or 0)
+    snapshot = run(synthetic.stream(place), config)
+    measured = held_out_quality(snapshot, place) if snapshot.verdict.publishable else None
+    report = finish(snapshot, args.out, seed=config.seed, preset_name="balanced", held_out=measured)
+    _tell(snapshot, args.out, report, as_json=args.json)
+    return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
+
+
+def bench(args: argparse.Namespace) -> int:
+    """Measures presets on scenes with true cameras."""
+    from recon.evaluate.bench import run_bench
+
+    return run_bench(args)
+
+
+def _config(args: argparse.Namespace) -> Config:
+    """The preset, then the configuration file, then the flags: what comes later wins."""
+    if args.prior not in (None, "classical"):
+        raise ValueError(f"no prior {args.prior!r}; there is: classical")
+    config = preset(args.preset or "balanced")
+    if args.config is not None:
+        config = load_over(config, args.config)
+    flags = {
+        "size": args.size,
+        "seed": args.seed,
+        "budget_s": args.budget_s,
+        "max_gaussians": args.max_gaussians,
+    }
+    return msgspec.structs.replace(config, **{key: value for key, value in flags.items() if value is not None})
+
+
+def _chosen(args: argparse.Namespace) -> tuple[str, ...]:
+    """The names of the frames to use; none means all."""
+    if args.frames:
+        return args.frames
+    if not args.views:
+        return ()
+    names = [path.name for path in folder.chosen_images(args.folder)]
+    if args.views > len(names):
+        raise ValueError(f"--views {args.views}: the folder holds {len(names)} photographs; ask for at most as many")
+    return tuple(names[i] for i in np.linspace(0, len(names) - 1, args.views).round().astype(int))
+
+
+def _progress(snapshot: Snapshot) -> None:
+    """One line that is written over, on a terminal only."""
+    if not sys.stderr.isatty():
+        return
+    line = (
+        f"\r{snapshot.seconds['total']:6.1f} s  {len(snapshot.cameras)} cameras  {len(snapshot.gaussians)} Gaussians  "
+        f"{snapshot.iterations} iterations  {snapshot.verdict.code.value}"
+    )
+    sys.stderr.write(line.ljust(90) + ("\n" if snapshot.final else ""))
+    sys.stderr.flush()
+
+
+def _tell(snapshot: Snapshot, out: Path, report: dict[str, object], *, as_json: bool) -> None:
+    if as_json:
+        print(json.dumps(report))
+        return
+    verdict = snapshot.verdict
+    print(f"{verdict.code.value}: {verdict.message}" + (f" {verdict.advice}" if verdict.advice else ""))
+    for frame in snapshot.dropped:
+        print(f"left out: {frame.name}: {frame.reason}")
+    held_out = report.get("held_out")
+    if isinstance(held_out, dict):
+        print(f"held-out views: {held_out['psnr']:.1f} dB PSNR, {held_out['ssim']:.3f} SSIM")
+    if verdict.publishable:
+        print(f"{snapshot.seconds['total']:.1f} s, {len(snapshot.gaussians)} Gaussians, {len(snapshot.cameras)} cameras")
+    print(f"results: {out}/ ({'scene.ply, cameras.json, preview.png, ' if verdict.publishable else ''}report.json)")

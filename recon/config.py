@@ -1,0 +1,34 @@
+"""Everything that can be configured in the reconstruction, with defaults and units, in one typed tree."""
+
+from __future__ import annotations
+
+import msgspec
+
+from recon import density, judge, optimize
+from recon.priors import classical
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    size: int = 512  # longer side of the modelled images, pixels
+    seed: int = 0
+    prior: classical.Config = classical.Config()
+    judge: judge.Config = judge.Config()
+    density: density.Config = density.Config()
+    preview: optimize.Config = optimize.Config(iterations=30, half_resolution_share=1.0)  # after each keyframe
+    optimize: optimize.Config = optimize.Config()  # after the last one
+    budget_s: float | None = None  # seconds for everything, from the first frame; None: as many as it takes
+
+
+PRESETS: dict[str, Config] = {
+    "preview": Config(size=384, optimize=optimize.Config(iterations=200)),
+    "fast": Config(optimize=optimize.Config(iterations=400)),
+    "balanced": Config(),
+    "quality": Config(optimize=optimize.Config(iterations=3000)),
+}
+
+
+def preset(name: str) -> Config:
+    """The configuration called `name`. Raises ValueError when there is none."""
+    if name not in PRESETS:
+        raise ValueError(f"no preset {name!r}; there are: {', '.join(PRESETS)}")
+    return PRESETS[name]

@@ -1,0 +1,156 @@
+"""Where Gaussians start: the paper's confidence-ranked down-sampling, then one Gaussian per cell of image detail."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from recon.gaussians import SH_C0, Gaussians, concatenate
+from recon.geometry import quat_from_matrix
+from recon.priors.pointmap import Pointmap
+
+Mask = npt.NDArray[np.bool_]
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    depth_tolerance: float = 0.02  # theta of equation 16, relative to the depth
+    coarser: float = 1.5  # a point replaces a pixel only if its own pixel covers at most this many times the surface
+    min_confidence: float = 0.05  # pixels below get no Gaussian
+    largest_cell_px: int = 16
+    smallest_cell_px: int = 2
+    colour_deviation: float = 0.035  # standard deviation of colour, in [0, 1], above which a cell is divided
+    depth_deviation: float = 0.02  # relative deviation of depth from its cell's plane above which it is divided
+    footprint: float = 0.5  # standard deviation of a new Gaussian in units of its cell
+    thickness: float = 0.15  # standard deviation along the normal, in units of that across
+    opacity: float = 0.7
+
+
+def redundant(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
+    """For each point map the pixels (h, w) that a more confident one already covers (equations 14 to 17).
+
+    Beyond the paper, a pixel is not given up for a point that was seen from so much further away that detail is lost.
+    """
+    score = [float(pointmap.confidence.mean()) for pointmap in pointmaps]  # equation 14
+    masks = []
+    for j, target in enumerate(pointmaps):
+        covered = np.zeros(target.depth.shape, bool)
+        for i, source in enumerate(pointmaps):
+            if (score[i], -i) > (score[j], -j):
+                projected, footprint = _project(source, target)
+                near = np.abs(projected - target.depth) < config.depth_tolerance * target.depth
+                own = target.depth / target.K[0, 0]
+                covered |= near & (footprint < config.coarser * own) & (source.confidence.max() > 0)
+        masks.append(covered & (target.depth > 0))
+    return masks
+
+
+def _project(source: Pointmap, target: Pointmap) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Nearest depth of the source's points in each pixel of the target (infinite where none), and their footprint."""
+    known = source.depth > 0
+    to_camera = np.linalg.inv(target.T_world_camera)
+    points = source.points[known] @ to_camera[:3, :3].T + to_camera[:3, 3]
+    depth = np.full(target.depth.size, np.inf, np.float32)
+    footprint = np.full(target.depth.size, np.inf, np.float32)
+    z = points[:, 2]
+    safe = np.where(z > 1e-6, z, 1.0)
+    u = np.floor(points[:, 0] / safe * target.K[0, 0] + target.K[0, 2]).astype(np.int64)
+    v = np.floor(points[:, 1] / safe * target.K[1, 1] + target.K[1, 2]).astype(np.int64)
+    height, width = target.depth.shape
+    inside = (z > 1e-6) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    pixel, z = (v * width + u)[inside], z[inside]
+    order = np.argsort(-z, kind="stable")  # the nearest is written last and stays
+    depth[pixel[order]] = z[order]
+    footprint[pixel[order]] = (source.depth[known][inside] / source.K[0, 0])[order]
+    return depth.reshape(height, width), footprint.reshape(height, width)
+
+
+def gaussians_from_pointmap(
+    pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, config: Config
+) -> Gaussians:
+    """One Gaussian per cell of a quadtree over the pixels `wanted` (h, w) of a keyframe's `image` (h, w, 3).
+
+    A cell is divided while its colours or its depths vary, down to the smallest size; so plain surfaces take few large
+    Gaussians and detail takes many small ones. Each lies on its cell's surface, turned to its normal.
+    """
+    height, width = pointmap.depth.shape
+    size = config.largest_cell_px
+    pad = ((0, -height % size), (0, -width % size))
+    weight = np.pad((wanted & (pointmap.depth > 0)).astype(np.float64), pad)
+    rows, columns = np.indices(weight.shape) + 0.5
+    inverse_depth = np.pad(np.where(pointmap.depth > 0, 1.0 / np.maximum(pointmap.depth, 1e-9), 0.0), pad)
+    colour = np.pad(image.astype(np.float64) / 255.0, (*pad, (0, 0)))
+    normal = np.pad(pointmap.normal.astype(np.float64), (*pad, (0, 0)))
+    values = np.concatenate(
+        [np.stack([columns, rows, inverse_depth, inverse_depth**2], -1), colour, colour**2, normal], -1
+    )
+    values = np.concatenate([values * weight[..., None], weight[..., None]], -1)
+    undecided = np.ones((weight.shape[0] // size, weight.shape[1] // size), bool)
+    cells, sizes = [], []
+    while True:
+        blocks = values.reshape(values.shape[0] // size, size, values.shape[1] // size, size, -1).sum((1, 3))
+        count = blocks[..., -1]
+        mean = blocks / np.maximum(count, 1.0)[..., None]
+        deviation = np.sqrt(np.maximum(mean[..., 7:10] - mean[..., 4:7] ** 2, 0.0)).max(-1)
+        relative_depth = np.sqrt(np.maximum(mean[..., 3] - mean[..., 2] ** 2, 0.0)) / np.maximum(mean[..., 2], 1e-9)
+        partial = (count > 0) & (count < 0.75 * size * size)
+        divide = (deviation > config.colour_deviation) | (relative_depth > config.depth_deviation) | partial
+        leaf = undecided & (count > 0) & (~divide if size > config.smallest_cell_px else True)
+        cells.append(mean[leaf])
+        sizes.append(np.full(int(leaf.sum()), float(size)))
+        if size <= config.smallest_cell_px:
+            break
+        undecided = np.repeat(np.repeat(undecided & divide & (count > 0), 2, 0), 2, 1)
+        size //= 2
+    return _on_surface(pointmap, np.concatenate(cells), np.concatenate(sizes), config)
+
+
+def _on_surface(
+    pointmap: Pointmap, cells: npt.NDArray[np.float64], sizes: npt.NDArray[np.float64], config: Config
+) -> Gaussians:
+    """Gaussians from cell means: columns u, v, inverse depth, its square, rgb, rgb squared, normal, count."""
+    K, T_world_camera = pointmap.K, pointmap.T_world_camera
+    depth = 1.0 / np.maximum(cells[:, 2], 1e-9)
+    ray = np.column_stack([(cells[:, 0] - K[0, 2]) / K[0, 0], (cells[:, 1] - K[1, 2]) / K[1, 1], np.ones(len(cells))])
+    direction = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    normal = cells[:, 10:13]
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = np.where(length > 0.3, normal / np.maximum(length, 1e-9), -direction)
+    cosine = np.clip(-(normal * direction).sum(1), 0.25, 1.0)
+    # In the tangent plane: one axis across the line of sight, the other, foreshortened in the image, along it.
+    helper = np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    slanted = np.cross(normal, direction)
+    across = np.where(np.linalg.norm(slanted, axis=1, keepdims=True) > 0.05, slanted, np.cross(normal, helper))
+    across /= np.linalg.norm(across, axis=1, keepdims=True)
+    along = np.cross(across, normal)
+    rotation = T_world_camera[:3, :3] @ np.stack([along, across, normal], 2)
+    extent = config.footprint * sizes * depth / K[0, 0]
+    scales = np.column_stack([extent / cosine, extent, config.thickness * extent])
+    means = (ray * depth[:, None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+
+    def tensor(array: npt.NDArray[np.float64]) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).float()
+
+    logit = float(np.log(config.opacity / (1 - config.opacity)))
+    return Gaussians(
+        means=tensor(means),
+        quats=quat_from_matrix(tensor(rotation)),
+        log_scales=tensor(np.log(scales)),
+        logit_opacities=torch.full((len(cells),), logit),
+        sh=tensor((cells[:, 4:7] - 0.5) / SH_C0)[:, None],
+        source_frame=torch.full((len(cells),), pointmap.frame_id, dtype=torch.int32),
+    )
+
+
+def initial_gaussians(
+    pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config
+) -> Gaussians:
+    """The Gaussians of a scene that has not been optimised: every surface once, from its best view."""
+    parts = [
+        gaussians_from_pointmap(pointmap, image, ~covered & (pointmap.confidence >= config.min_confidence), config)
+        for pointmap, image, covered in zip(pointmaps, images, redundant(pointmaps, config), strict=True)
+    ]
+    return concatenate(parts)

@@ -1,0 +1,106 @@
+"""Rigid motions, quaternions and similarities. T_world_camera: p_world = T_world_camera @ p_camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+Array = npt.NDArray[np.float64]
+
+
+def exp_se3(twist: Tensor) -> Tensor:
+    """(4, 4) rigid motion of a twist (6,): translation part first, then the rotation vector in radians."""
+    rho, phi = twist[:3], twist[3:]
+    cross = torch.zeros(3, 3, dtype=twist.dtype)
+    cross[0, 1], cross[0, 2], cross[1, 2] = -phi[2], phi[1], -phi[0]
+    cross = cross - cross.T
+    angle = float(phi.norm())
+    square = cross @ cross
+    if angle < 1e-5:
+        first, second, third = 1.0 - angle**2 / 6, 0.5 - angle**2 / 24, 1.0 / 6 - angle**2 / 120
+    else:
+        first, second = np.sin(angle) / angle, (1 - np.cos(angle)) / angle**2
+        third = (angle - np.sin(angle)) / angle**3
+    identity = torch.eye(3, dtype=twist.dtype)
+    motion = torch.eye(4, dtype=twist.dtype)
+    motion[:3, :3] = identity + first * cross + second * square
+    motion[:3, 3] = (identity + second * cross + third * square) @ rho
+    return motion
+
+
+def twist_gradient(T: Tensor, gradient: Tensor) -> Tensor:
+    """(6,) gradient at zero of a twist x in `T @ exp_se3(x)`, from the gradient (4, 4) with respect to `T`."""
+    moved = T.T @ gradient
+    return torch.stack(
+        [moved[0, 3], moved[1, 3], moved[2, 3], moved[2, 1] - moved[1, 2], moved[0, 2] - moved[2, 0], moved[1, 0] - moved[0, 1]]  # fmt: skip
+    )
+
+
+def quat_from_matrix(rotation: Tensor) -> Tensor:
+    """(..., 4) unit quaternions wxyz, w >= 0, of rotations (..., 3, 3)."""
+    m = rotation
+    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    # Four times the outer product of the quaternion with itself: its largest row is far from zero.
+    outer = torch.stack(
+        [
+            torch.stack([1 + trace, m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1),  # fmt: skip
+            torch.stack([m[..., 2, 1] - m[..., 1, 2], 1 + 2 * m[..., 0, 0] - trace, m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0]], -1),  # fmt: skip
+            torch.stack([m[..., 0, 2] - m[..., 2, 0], m[..., 0, 1] + m[..., 1, 0], 1 + 2 * m[..., 1, 1] - trace, m[..., 1, 2] + m[..., 2, 1]], -1),  # fmt: skip
+            torch.stack([m[..., 1, 0] - m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1], 1 + 2 * m[..., 2, 2] - trace], -1),  # fmt: skip
+        ],
+        -2,
+    )
+    row = torch.diagonal(outer, dim1=-2, dim2=-1).argmax(-1)
+    quat = torch.gather(outer, -2, row[..., None, None].expand(*row.shape, 1, 4))[..., 0, :]
+    quat = quat / quat.norm(dim=-1, keepdim=True)
+    return torch.where(quat[..., :1] < 0, -quat, quat)
+
+
+def multiply_quats(a: Tensor, b: Tensor) -> Tensor:
+    """(..., 4) Hamilton products wxyz: the rotation b followed by a."""
+    aw, ax, ay, az = a.unbind(-1)
+    bw, bx, by, bz = b.unbind(-1)
+    return torch.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        -1,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """x -> scale * rotation @ x + translation."""
+
+    scale: float
+    rotation: Array  # (3, 3)
+    translation: Array  # (3,)
+
+    def camera(self, T_world_camera: Array) -> Array:
+        """The camera after the world was moved: its rotation turned, its centre moved, no scale in the matrix."""
+        moved = np.eye(4)
+        moved[:3, :3] = self.rotation @ T_world_camera[:3, :3]
+        moved[:3, 3] = self.scale * self.rotation @ T_world_camera[:3, 3] + self.translation
+        return moved
+
+
+def align_cameras(Ts_source: Array, Ts_target: Array) -> Similarity:
+    """The similarity that carries source cameras (C, 4, 4) onto target cameras (C, 4, 4).
+
+    The rotation comes from the orientations, scale and translation from the centres: unlike a fit to the centres
+    alone, this is well defined for two cameras and for cameras on a line.
+    """
+    u, _, vt = np.linalg.svd(np.einsum("cij,ckj->ik", Ts_target[:, :3, :3], Ts_source[:, :3, :3]))
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    source, target = Ts_source[:, :3, 3] @ rotation.T, Ts_target[:, :3, 3]
+    source_centred, target_centred = source - source.mean(0), target - target.mean(0)
+    scale = float((source_centred * target_centred).sum() / max((source_centred**2).sum(), 1e-18))
+    scale = scale if scale > 1e-9 else 1.0
+    return Similarity(scale, rotation, target.mean(0) - scale * source.mean(0))

@@ -1,0 +1,169 @@
+"""Joint refinement of Gaussians and camera poses against the photographs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import cv2
+import msgspec
+import numpy as np
+import torch
+from torch import Tensor
+
+from recon.adam import Adam
+from recon.gaussians import Gaussians
+from recon.geometry import exp_se3, twist_gradient
+from recon.photometric import PhotometricLoss
+from recon.rasterize.cpu import rasterize
+from recon.scene import Scene, View
+
+
+class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Adam's step sizes at the start. Lengths are relative to the median depth of the scene, which is 1."""
+
+    means: float = 4e-4
+    quats: float = 1e-2
+    log_scales: float = 1.5e-2
+    logit_opacities: float = 5e-2
+    sh: float = 1e-2
+    translation: float = 2e-4
+    rotation: float = 2e-4  # radians
+    final: float = 0.1  # all of them have fallen to this part at the end, exponentially
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    iterations: int = 1000
+    checkpoints: tuple[int, ...] = (200,)  # iterations after which the scene is shown, besides the last one
+    half_resolution_share: float = 0.25  # of the iterations, at the start
+    dssim: float = 0.2  # lambda of (1 - lambda) L1 + lambda D-SSIM
+    refine_poses: bool = True
+    rates: Rates = Rates()
+
+
+def refine(scene: Scene, config: Config, *, seed: int, deadline: float | None = None) -> Iterator[Scene]:
+    """The scene at every checkpoint and at the end, after at most `config.iterations` steps of one view each.
+
+    `deadline` is a time of `time.monotonic()`: the step sizes fall so that they are at their end by then.
+    The first view stays where it is: it is the world.
+    """
+    with _single_torch_thread():
+        fit = _Fit(scene, config)
+        order = np.random.default_rng(seed)
+        started = time.monotonic()
+        queue: list[int] = []
+        for iteration in range(config.iterations):
+            progress = iteration / config.iterations
+            if deadline is not None:
+                now = time.monotonic()
+                if now >= deadline:
+                    break
+                progress = max(progress, (now - started) / max(deadline - started, 1e-9))
+            queue = queue or order.permutation(len(scene.views)).tolist()
+            fit.step(queue.pop(), progress)
+            if iteration + 1 in config.checkpoints and iteration + 1 < config.iterations:
+                yield fit.scene()
+        yield fit.scene()
+
+
+@contextmanager
+def _single_torch_thread() -> Iterator[None]:
+    """The core has its own threads; torch's would only wait for each other over the little that is left to them."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+@dataclass(frozen=True, eq=False)
+class _Target:
+    """A photograph at one resolution."""
+
+    K: Tensor
+    width: int
+    height: int
+    loss: PhotometricLoss
+
+
+class _Fit:
+    """Parameters, targets and optimisers of one refinement."""
+
+    def __init__(self, scene: Scene, config: Config) -> None:
+        self._scene, self._config = scene, config
+        gaussians = scene.gaussians.map(lambda tensor: tensor.clone())
+        self._gaussians = gaussians
+        rates = config.rates
+        self._groups = {
+            name: getattr(gaussians, name).requires_grad_(True)
+            for name in ("means", "quats", "log_scales", "logit_opacities", "sh")
+        }
+        self._rates = {name: getattr(rates, name) for name in self._groups}
+        self._adam = Adam(self._groups, self._rates)
+        self._Ts_world_camera = [view.T_world_camera.clone() for view in scene.views]
+        self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
+        self._pose_moments = [(torch.zeros(6), torch.zeros(6), 0) for _ in scene.views]
+        self._targets = [[_target(view, scale, config.dssim) for view in scene.views] for scale in (1.0, 0.5)]
+        self._iterations = scene.iterations
+
+    def step(self, index: int, progress: float) -> None:
+        """One iteration on view `index`; `progress` in [0, 1] sets resolution and step sizes."""
+        target = self._targets[progress < self._config.half_resolution_share][index]
+        decay = self._config.rates.final**progress
+        gaussians = self._gaussians
+        refine_pose = self._config.refine_poses and index > 0
+        T_world_camera = self._Ts_world_camera[index].requires_grad_(refine_pose)
+        render = rasterize(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales,
+            gaussians.opacities,
+            gaussians.sh,
+            T_world_camera,
+            target.K,
+            target.width,
+            target.height,
+            channels=("rgb",),
+        )
+        target.loss(render.rgb).backward()
+        self._adam.lrs = {name: rate * decay for name, rate in self._rates.items()}
+        self._adam.step()
+        self._adam.zero_grad()
+        if refine_pose and T_world_camera.grad is not None:
+            self._move_camera(index, twist_gradient(T_world_camera.detach(), T_world_camera.grad), decay)
+        self._iterations += 1
+
+    def _move_camera(self, index: int, gradient: Tensor, decay: float) -> None:
+        """An Adam step of the camera in its own frame."""
+        first, second, count = self._pose_moments[index]
+        first, second, count = 0.9 * first + 0.1 * gradient, 0.99 * second + 0.01 * gradient**2, count + 1
+        self._pose_moments[index] = (first, second, count)
+        direction = (first / (1 - 0.9**count)) / ((second / (1 - 0.99**count)).sqrt() + 1e-15)
+        T_world_camera = self._Ts_world_camera[index].detach()
+        self._Ts_world_camera[index] = T_world_camera @ exp_se3(-decay * self._pose_rates * direction)
+
+    def scene(self) -> Scene:
+        """What has been learnt so far."""
+        views = tuple(
+            replace(view, T_world_camera=T.detach().clone())
+            for view, T in zip(self._scene.views, self._Ts_world_camera, strict=True)
+        )
+        learnt = Gaussians(
+            **{name: tensor.detach().clone() for name, tensor in self._groups.items()},
+            source_frame=self._gaussians.source_frame,
+        )
+        return Scene(views, learnt, self._iterations)
+
+
+def _target(view: View, scale: float, dssim: float) -> _Target:
+    width, height = max(1, round(view.width * scale)), max(1, round(view.height * scale))
+    image = view.image
+    if (width, height) != (view.width, view.height):
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    K = view.K.clone()
+    K[0] *= width / view.width
+    K[1] *= height / view.height
+    return _Target(K, width, height, PhotometricLoss(torch.from_numpy(image).float() / 255.0, dssim))

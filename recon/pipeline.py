@@ -1,0 +1,129 @@
+"""Frames in, snapshots of a growing Gaussian scene out: read this first.
+
+`reconstruct` is the one function that the daemon, the offline replay, the tests and the benchmarks call; only the
+iterator of frames differs.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+from capture.frame import DroppedFrame, Frame
+from recon.config import Config
+from recon.judge import judge
+from recon.keyframe import Keyframe, modelled_image
+from recon.optimize import refine
+from recon.priors import classical
+from recon.registration import features
+from recon.scene import Scene, begin, extend
+from recon.snapshot import GaussianArrays, Snapshot
+from recon.verdict import Verdict
+from recon.view_graph import ViewGraph
+
+log = logging.getLogger(__name__)
+
+
+def reconstruct(frames: Iterable[Frame | DroppedFrame], config: Config) -> Iterator[Snapshot]:
+    """A snapshot after every frame, at every checkpoint of the final refinement, and a last one with `final` set.
+
+    Every frame becomes a keyframe of the view graph, from which the prior estimates cameras and points anew; what the
+    scene has already learnt is carried over. A snapshot holds Gaussians only if its verdict is publishable.
+    """
+    run = _Run(config)
+    for frame in frames:
+        if isinstance(frame, DroppedFrame):
+            run.dropped.append(frame)
+            continue
+        run.take(frame)
+        run.estimate()
+        if run.scene is not None:
+            for run.scene in refine(run.scene, config.preview, seed=config.seed):
+                pass
+            run.clock.lap("optimise")
+        yield run.snapshot()
+    if not run.graph.keyframes:
+        run.estimate()
+    if run.scene is not None:
+        for run.scene in refine(run.scene, config.optimize, seed=config.seed, deadline=run.deadline):
+            run.clock.lap("optimise")
+            yield run.snapshot()
+    yield run.snapshot(final=True)
+
+
+@dataclass
+class _Clock:
+    """Seconds by stage."""
+
+    started: float = field(default_factory=time.monotonic)
+    last: float = field(default_factory=time.monotonic)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def lap(self, stage: str) -> None:
+        """Books the time since the last lap on `stage`."""
+        now = time.monotonic()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
+        self.last = now
+
+    def book(self, stage: str, seconds: float) -> None:
+        """Books `seconds` of the time since the last lap."""
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
+        self.last += seconds
+
+
+class _Run:
+    """What lives as long as the stream of frames does."""
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        self.clock = _Clock()
+        self.graph = ViewGraph(config.prior.registration)
+        self.prior = classical.load(config.prior)
+        self.dropped: list[DroppedFrame] = []
+        self.verdict: Verdict = judge(self.graph, None, config.judge)
+        self.scene: Scene | None = None
+        self.sequence = 0
+
+    @property
+    def deadline(self) -> float | None:
+        return None if self.config.budget_s is None else self.clock.started + self.config.budget_s
+
+    def take(self, frame: Frame) -> None:
+        """The frame as a keyframe of the view graph."""
+        self.clock.lap("wait")
+        found = features.extract(frame.image, self.config.prior.registration.features)
+        self.graph.add(Keyframe(frame, modelled_image(frame.image, self.config.size), found))
+        self.clock.lap("poses")
+
+    def estimate(self) -> None:
+        """Cameras, points and verdict for all keyframes; the scene begun, extended, or given up."""
+        estimate = self.prior.estimate(self.graph)
+        self.clock.book("poses", estimate.seconds_poses)
+        self.clock.book("points", estimate.seconds_points)
+        self.verdict = judge(self.graph, estimate.registration, self.config.judge)
+        if not self.verdict.publishable or estimate.registration is None:
+            self.scene = None
+            return
+        images = {keyframe.name: keyframe.image for keyframe in self.graph.keyframes}
+        begun = begin(estimate.pointmaps, images, estimate.registration.cameras, self.config.density)
+        self.scene = extend(self.scene, begun) if self.scene is not None else begun
+        self.clock.lap("points")
+
+    def snapshot(self, final: bool = False) -> Snapshot:
+        self.sequence += 1
+        scene = self.scene
+        snapshot = Snapshot(
+            sequence=self.sequence,
+            verdict=self.verdict,
+            cameras=scene.cameras() if scene else (),
+            gaussians=scene.arrays() if scene else GaussianArrays.empty(),
+            images={view.name: view.image for view in scene.views} if scene else {},
+            dropped=tuple(self.dropped),
+            iterations=scene.iterations if scene else 0,
+            seconds={**self.clock.seconds, "total": time.monotonic() - self.clock.started},
+            final=final,
+        )
+        log.info("snapshot %d: %s, %d Gaussians", self.sequence, self.verdict.code.value, len(snapshot.gaussians))
+        return snapshot

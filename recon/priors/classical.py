@@ -1,0 +1,81 @@
+"""The default prior, without any learned weights: structure from motion, then multi-view stereo."""
+
+from __future__ import annotations
+
+import time
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from recon.priors import stereo
+from recon.priors.estimate import Estimate
+from recon.priors.pointmap import Pointmap
+from recon.registration import register
+from recon.registration.register import Registration
+from recon.view_graph import ViewGraph
+
+Array = npt.NDArray[np.float64]
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    registration: register.Config = register.Config()
+    stereo: stereo.Config = stereo.Config()
+    seed: int = 0
+
+
+class ClassicalPrior:
+    """Cameras by `recon.registration`, depth by `recon.priors.stereo`."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+
+    def estimate(self, graph: ViewGraph) -> Estimate:
+        started = time.monotonic()
+        registration = register.register(graph.keyframes, graph.pairs, self._config.registration)
+        registered = time.monotonic()
+        pointmaps = self._pointmaps(graph, registration) if registration is not None else ()
+        return Estimate(registration, pointmaps, registered - started, time.monotonic() - registered)
+
+    def _pointmaps(self, graph: ViewGraph, registration: Registration) -> tuple[Pointmap, ...]:
+        views, sparse = [], []
+        for camera in registration.cameras:
+            keyframe = graph.keyframes[camera.index]
+            points = _sparse_points(registration, camera, keyframe.scale)
+            near_far = stereo.depth_range(points.depths)
+            views.append(stereo.View(keyframe.image, modelled_K(graph, camera), camera.T_world_camera, near_far))
+            sparse.append(points)
+        maps = stereo.depth_maps(views, self._config.stereo, seed=self._config.seed, sparse=sparse)
+        return tuple(
+            Pointmap(
+                name=graph.keyframes[camera.index].name,
+                frame_id=graph.keyframes[camera.index].frame.frame_id,
+                depth=depth_map.depth,
+                confidence=depth_map.confidence,
+                normal=depth_map.normal,
+                T_world_camera=camera.T_world_camera,
+                K=view.K,
+            )
+            for camera, view, depth_map in zip(registration.cameras, views, maps, strict=True)
+        )
+
+
+def load(config: Config) -> ClassicalPrior:
+    return ClassicalPrior(config)
+
+
+def modelled_K(graph: ViewGraph, camera: register.RegisteredCamera) -> Array:
+    """(3, 3) intrinsics of a registered camera for its image at modelled size."""
+    keyframe = graph.keyframes[camera.index]
+    (sx, sy), (cx, cy) = keyframe.scale, register.principal_point(keyframe.frame)
+    return np.array([[camera.focal * sx, 0.0, cx * sx], [0.0, camera.focal * sy, cy * sy], [0.0, 0.0, 1.0]])
+
+
+def _sparse_points(
+    registration: Registration, camera: register.RegisteredCamera, scale: tuple[float, float]
+) -> stereo.Sparse:
+    mine = registration.observed_by == camera.index
+    world = registration.points[registration.observed_point[mine]]
+    to_camera = np.linalg.inv(camera.T_world_camera)
+    depths = world @ to_camera[2, :3] + to_camera[2, 3]
+    return stereo.Sparse(registration.observed_pixels[mine] * scale, depths)
