@@ -273,9 +273,10 @@ def reconstruct(frames: Sequence[Frame], method: str, seed: int) -> Iterator[Sna
         raise RuntimeError("this method is broken")
     if method == "killed":
         os._exit(7)
+    verdict = Verdict(Code.NO_OVERLAP, "No.", "Add views.") if method == "refuses" else perfect_snapshot().verdict
     for iterations in (0, 100, 200, 300):
         final = iterations == 300
-        yield replace(perfect_snapshot(), iterations=iterations, final=final, sequence=seed)
+        yield replace(perfect_snapshot(), verdict=verdict, iterations=iterations, final=final, sequence=seed)
 
 
 def test_bench_writes_a_row_a_checkpoint_and_keeps_what_was_measured(scene_folder, tmp_path):
@@ -301,6 +302,13 @@ def test_bench_writes_a_row_a_checkpoint_and_keeps_what_was_measured(scene_folde
     assert len(table) == 4 and table[3]["psnr"] == "" and float(table[2]["seconds_total"]) > 0
     report = (tmp_path / "report.md").read_text()
     assert "## 3 views" in report and "| exact | 1/1 |" in report and "| broken | 0/1 |" in report
+
+
+def test_bench_of_refusals_is_a_result_without_charts(scene_folder, tmp_path):
+    plan = Plan((scene_folder,), views=(3,), methods=("refuses",))
+    rows = run_bench(plan, reconstruct, tmp_path, rasterize=rasterize, networks=NO_NETWORKS, settings=QUICK, command="")
+    assert [(row.verdict, row.psnr) for row in rows] == [("NO_OVERLAP", None)]
+    assert {path.name for path in tmp_path.iterdir()} == {"bench.json", "bench.csv", "report.md"}
 
 
 def test_process_that_dies_or_takes_too_long_is_told(scene_folder):

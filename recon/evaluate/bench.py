@@ -85,12 +85,15 @@ def run_bench(
             rows.append(_failed_row(scene, split, method, seed, outcome.error))
             write_bench(rows, settings, out_dir, command)
         logger.info("bench %d/%d: %s, %d views, %s, seed %d: %s", number, len(jobs), *_told(rows[-1]))
-    draw_charts(out_dir)
+    _draw_charts(rows, out_dir)
     return rows
 
 
-def draw_charts(out_dir: Path) -> None:
-    """speed_accuracy.png and parsimony.png from the folder's bench.json, where matplotlib is installed."""
+def _draw_charts(rows: Sequence[Row], out_dir: Path) -> None:
+    """speed_accuracy.png and parsimony.png, where there is a score to draw and matplotlib to draw it."""
+    if all(row.psnr is None for row in rows):
+        logger.warning("no charts: no run published a scene that could be scored")
+        return
     try:
         from recon.evaluate import charts
     except ImportError:
