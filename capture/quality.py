@@ -18,14 +18,15 @@ Image = npt.NDArray[np.uint8]  # (H, W, 3) RGB
 MEASURED_SIDE = 640  # blur is measured with the longer side at most this
 THUMBNAIL_SIDE = 160
 BOX = 15  # texels of the box that blurs again; wider edges cannot be told apart
-EDGE_STEP = 4.0  # grey levels a pixel; weaker gradients may be noise
+EDGE_STEP = 6.0  # grey levels a pixel; weaker gradients may be noise
+LEAST_EDGES = 0.001  # share of the pixels
 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     blur_px: float = 8.0  # real sharp photographs reach 7, of smooth objects
     relative_blur: float = 3.0  # times the sharpest of the stream
     exposed: float = 0.03  # least share of pixels that are neither black nor white; dark backgrounds are common
-    contrast: float = 1.5  # grey levels
+    contrast: float = 3.0  # grey levels; noise leaves up to 2, real photographs have 20
     novelty: float = 0.05  # half a pixel of motion, at 640 pixels
 
 
@@ -66,7 +67,7 @@ def _edge_width(grey: npt.NDArray, step: tuple[int, int]) -> float | None:
     kernel[BOX // 2 + along * step[0], BOX // 2 + along * step[1]] = 1 / BOX
     slope = _slope(grey, step)
     strong = slope >= max(float(np.quantile(slope, 0.9)), EDGE_STEP)
-    if strong.sum() < 50:
+    if strong.mean() < LEAST_EDGES:
         return None
     lost = np.maximum(slope - _slope(cv2.filter2D(grey, cv2.CV_32F, kernel), step), 0)
     return float(BOX * (1 - lost[strong].sum() / slope[strong].sum()))

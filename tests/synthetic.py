@@ -61,7 +61,7 @@ def places(config: synthetic.Config = SMALL, seeds: tuple[int, ...] = (0, 1)) ->
 
 def planar(config: synthetic.Config = SMALL) -> list[Frame]:
     """Photographs of the brick wall alone, so close that it fills them."""
-    wall = place(config.seed, density=float(config.width))[BRICK_WALL]
+    wall = place(config.seed, density=0.5 * config.width)[BRICK_WALL]
     images = []
     for azimuth in np.radians(np.linspace(-25, 25, config.views)):
         centre = np.array([1.6 * np.cos(azimuth), 1.6 + 1.6 * np.sin(azimuth), 1.5 + 0.2 * np.sin(5 * azimuth)])

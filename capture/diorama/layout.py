@@ -90,7 +90,7 @@ class Builder:
         self.add(Shape.CYLINDER, centre, (diameter, diameter, height), painter, TOWARDS_CAMERAS)
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def place(seed: int, density: float) -> tuple[Solid, ...]:
     """The lit solids of a place; another seed is another place. `density`: texels per metre of the skins."""
     palette = PALETTES[seed % len(PALETTES)]

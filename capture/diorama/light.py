@@ -47,24 +47,29 @@ def _lit_skins(solid: Solid, solids: Sequence[Solid], light: Light, rng: np.rand
 
 def _irradiance(solid: Solid, face: int, others: Sequence[Solid], light: Light, rng: np.random.Generator) -> Array:
     """(h, w, 3) linear RGB on a coarse grid of the face."""
-    columns, rows = (
-        int(np.clip(np.ceil(side * light.texels_per_metre), 3, 130))
-        for side in face_size(solid.shape, solid.axes, face)
-    )
-    u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
-    points, normals = (part.reshape(-1, 3) for part in face_points(solid.shape, face, u, v))
-    normals = normals @ solid.inverse  # a normal maps with the inverse transpose
-    normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-    points = points @ solid.axes.T + solid.centre + 1e-3 * normals
+    points, normals = _grid(solid, face, light.texels_per_metre)
+    shape = points.shape
+    points, normals = points.reshape(-1, 3), normals.reshape(-1, 3)
     in_front = [other for other in others if ((other.corners @ normals.T) > (points * normals).sum(1)).any()]
-
     towards_sun = np.array(light.towards_sun) / np.linalg.norm(light.towards_sun)
-    cosine = np.maximum(normals @ towards_sun, 0)
-    sun_directions = towards_sun + light.sun_radius * rng.normal(size=(len(points), light.sun_samples, 3)) / 1.7
-    sunlit = cosine * _openness(points, sun_directions, in_front) if cosine.any() else cosine
-    open_sky = _openness(points, _cosine_directions(normals, light.sky_samples, rng), in_front)[:, None]
+    to_sun = towards_sun + light.sun_radius * rng.normal(size=(len(points), light.sun_samples, 3)) / 1.7
+    to_sky = _cosine_directions(normals, light.sky_samples, rng)
+    is_open = _unblocked(points, np.concatenate([to_sun, to_sky], axis=1), in_front)
+    sunlit = np.maximum(normals @ towards_sun, 0) * is_open[:, : light.sun_samples].mean(1)
+    open_sky = is_open[:, light.sun_samples :].mean(1)[:, None]
     irradiance = sunlit[:, None] * light.sun + open_sky * light.sky + (1 - open_sky) * light.bounced
-    return cv2.GaussianBlur(irradiance.reshape(rows, columns, 3).astype(np.float32), (0, 0), 0.7)
+    return cv2.GaussianBlur(irradiance.reshape(shape).astype(np.float32), (0, 0), 0.7)
+
+
+def _grid(solid: Solid, face: int, texels_per_metre: float) -> tuple[Array, Array]:
+    """Points (h, w, 3) just above a face, in the world, and their unit normals (h, w, 3)."""
+    sides = face_size(solid.shape, solid.axes, face)
+    columns, rows = (int(np.clip(np.ceil(side * texels_per_metre), 3, 130)) for side in sides)
+    u, v = np.meshgrid((np.arange(columns) + 0.5) / columns, (np.arange(rows) + 0.5) / rows)
+    points, normals = face_points(solid.shape, face, u, v)
+    normals = normals @ solid.inverse  # a normal maps with the inverse transpose
+    normals = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
+    return points @ solid.axes.T + solid.centre + 1e-3 * normals, normals
 
 
 def _cosine_directions(normals: Array, samples: int, rng: np.random.Generator) -> Array:
@@ -80,16 +85,17 @@ def _cosine_directions(normals: Array, samples: int, rng: np.random.Generator) -
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), height], -1) @ basis
 
 
-def _openness(points: Array, directions: Array, occluders: Sequence[Solid]) -> Array:
-    """(P,) share of the directions (P, S, 3) from points (P, 3) that meet no solid."""
-    blocked = np.zeros(directions.shape[:2], bool)
+def _unblocked(points: Array, directions: Array, occluders: Sequence[Solid]) -> npt.NDArray[np.bool_]:
+    """(P, S) whether a ray from points (P, 3) along directions (P, S, 3) meets no solid."""
+    unblocked = np.ones(directions.shape[:2], bool)
     directions = directions.astype(np.float32)
     for solid in occluders:
-        origin = solid.to_local(points).astype(np.float32)[:, None]
-        local = directions @ solid.inverse.T.astype(np.float32)
-        near, far = ray_interval(solid.shape, tuple(np.moveaxis(origin, -1, 0)), tuple(np.moveaxis(local, -1, 0)))
-        blocked |= (near <= far) & (far > 0)
-    return 1 - blocked.mean(1)
+        o = solid.to_local(points).astype(np.float32)[:, None]
+        d = directions @ solid.inverse.T.astype(np.float32)
+        origin, direction = (o[..., 0], o[..., 1], o[..., 2]), (d[..., 0], d[..., 1], d[..., 2])
+        near, far = ray_interval(solid.shape, origin, direction)
+        unblocked &= ~((near <= far) & (far > 0))
+    return unblocked
 
 
 def from_srgb(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:

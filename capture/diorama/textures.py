@@ -168,7 +168,7 @@ _VOCABULARY = (
 
 
 def words(rng: np.random.Generator, count: int) -> str:
-    return " ".join(str(word) for word in rng.choice(_VOCABULARY.split(), count))
+    return " ".join(str(word) for word in rng.choice(_VOCABULARY.split(), count, replace=False))
 
 
 def write(image: Image, text: str, left: float, baseline: float, width: float, colour: Colour, bold: float = 2) -> None:
