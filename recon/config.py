@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from recon import density, judge, optimize
+from recon import background, completion, density, judge, optimize
 from recon.priors import classical
 
 
@@ -13,7 +13,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: int = 0
     prior: classical.Config = classical.Config()
     judge: judge.Config = judge.Config()
+    completion: completion.Config = completion.Config()
     density: density.Config = density.Config()
+    background: background.Config = background.Config()
     preview: optimize.Config = optimize.Config(iterations=30, half_resolution_share=1.0)  # after each keyframe
     optimize: optimize.Config = optimize.Config()  # after the last one
     budget_s: float | None = None  # seconds for everything, from the first frame; None: as many as it takes

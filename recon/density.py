@@ -11,7 +11,7 @@ import torch
 
 from recon.gaussians import SH_C0, Gaussians, concatenate
 from recon.geometry import quat_from_matrix
-from recon.priors.pointmap import Pointmap
+from recon.priors.pointmap import Pointmap, project_points
 
 Mask = npt.NDArray[np.bool_]
 
@@ -24,9 +24,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     smallest_cell_px: int = 2
     colour_deviation: float = 0.035  # standard deviation of colour, in [0, 1], above which a cell is divided
     depth_deviation: float = 0.02  # relative deviation of depth from its cell's plane above which it is divided
-    footprint: float = 0.5  # standard deviation of a new Gaussian in units of its cell
+    footprint: float = 0.6  # standard deviation of a new Gaussian in units of its cell
     thickness: float = 0.15  # standard deviation along the normal, in units of that across
-    opacity: float = 0.7
+    opacity: float = 0.9
 
 
 def redundant(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
@@ -43,7 +43,7 @@ def redundant(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
                 projected, footprint = _project(source, target)
                 near = np.abs(projected - target.depth) < config.depth_tolerance * target.depth
                 own = target.depth / target.K[0, 0]
-                covered |= near & (footprint < config.coarser * own) & (source.confidence.max() > 0)
+                covered |= near & (footprint < config.coarser * own)
         masks.append(covered & (target.depth > 0))
     return masks
 
@@ -51,21 +51,15 @@ def redundant(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
 def _project(source: Pointmap, target: Pointmap) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     """Nearest depth of the source's points in each pixel of the target (infinite where none), and their footprint."""
     known = source.depth > 0
-    to_camera = np.linalg.inv(target.T_world_camera)
-    points = source.points[known] @ to_camera[:3, :3].T + to_camera[:3, 3]
+    pixel, z = project_points(source.points[known], target)
+    inside = pixel >= 0
+    pixel, z, own = pixel[inside], z[inside], source.depth[known][inside] / np.float32(source.K[0, 0])
+    order = np.argsort(-z)  # the nearest is written last and stays
     depth = np.full(target.depth.size, np.inf, np.float32)
     footprint = np.full(target.depth.size, np.inf, np.float32)
-    z = points[:, 2]
-    safe = np.where(z > 1e-6, z, 1.0)
-    u = np.floor(points[:, 0] / safe * target.K[0, 0] + target.K[0, 2]).astype(np.int64)
-    v = np.floor(points[:, 1] / safe * target.K[1, 1] + target.K[1, 2]).astype(np.int64)
-    height, width = target.depth.shape
-    inside = (z > 1e-6) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    pixel, z = (v * width + u)[inside], z[inside]
-    order = np.argsort(-z, kind="stable")  # the nearest is written last and stays
     depth[pixel[order]] = z[order]
-    footprint[pixel[order]] = (source.depth[known][inside] / source.K[0, 0])[order]
-    return depth.reshape(height, width), footprint.reshape(height, width)
+    footprint[pixel[order]] = own[order]
+    return depth.reshape(target.depth.shape), footprint.reshape(target.depth.shape)
 
 
 def gaussians_from_pointmap(
@@ -79,19 +73,23 @@ def gaussians_from_pointmap(
     height, width = pointmap.depth.shape
     size = config.largest_cell_px
     pad = ((0, -height % size), (0, -width % size))
-    weight = np.pad((wanted & (pointmap.depth > 0)).astype(np.float64), pad)
-    rows, columns = np.indices(weight.shape) + 0.5
-    inverse_depth = np.pad(np.where(pointmap.depth > 0, 1.0 / np.maximum(pointmap.depth, 1e-9), 0.0), pad)
-    colour = np.pad(image.astype(np.float64) / 255.0, (*pad, (0, 0)))
-    normal = np.pad(pointmap.normal.astype(np.float64), (*pad, (0, 0)))
+    weight = np.pad((wanted & (pointmap.depth > 0)).astype(np.float32), pad)
+    rows, columns = np.indices(weight.shape, np.float32) + np.float32(0.5)
+    inverse_depth = np.pad(np.where(pointmap.depth > 0, 1.0 / np.maximum(pointmap.depth, 1e-9), 0.0), pad).astype(np.float32)
+    colour = np.pad(image.astype(np.float32) / 255.0, (*pad, (0, 0)))
+    normal = np.pad(pointmap.normal.astype(np.float32), (*pad, (0, 0)))
     values = np.concatenate(
         [np.stack([columns, rows, inverse_depth, inverse_depth**2], -1), colour, colour**2, normal], -1
     )
     values = np.concatenate([values * weight[..., None], weight[..., None]], -1)
     undecided = np.ones((weight.shape[0] // size, weight.shape[1] // size), bool)
     cells, sizes = [], []
+    # Sums over the smallest cells; those over larger ones are sums of four.
+    pyramid = {config.smallest_cell_px: _block_sums(values.astype(np.float64), config.smallest_cell_px)}
+    for level in _sizes(config)[1:]:
+        pyramid[level] = _block_sums(pyramid[level // 2], 2)
     while True:
-        blocks = values.reshape(values.shape[0] // size, size, values.shape[1] // size, size, -1).sum((1, 3))
+        blocks = pyramid[size]
         count = blocks[..., -1]
         mean = blocks / np.maximum(count, 1.0)[..., None]
         deviation = np.sqrt(np.maximum(mean[..., 7:10] - mean[..., 4:7] ** 2, 0.0)).max(-1)
@@ -106,6 +104,19 @@ def gaussians_from_pointmap(
         undecided = np.repeat(np.repeat(undecided & divide & (count > 0), 2, 0), 2, 1)
         size //= 2
     return _on_surface(pointmap, np.concatenate(cells), np.concatenate(sizes), config)
+
+
+def _sizes(config: Config) -> list[int]:
+    sizes = [config.smallest_cell_px]
+    while sizes[-1] < config.largest_cell_px:
+        sizes.append(2 * sizes[-1])
+    return sizes
+
+
+def _block_sums(values: npt.NDArray[np.float64], size: int) -> npt.NDArray[np.float64]:
+    """Sums over blocks of size x size of values (h, w, n)."""
+    height, width, channels = values.shape
+    return values.reshape(height // size, size, width // size, size, channels).sum((1, 3))
 
 
 def _on_surface(

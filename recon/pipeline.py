@@ -107,7 +107,15 @@ class _Run:
             self.scene = None
             return
         images = {keyframe.name: keyframe.image for keyframe in self.graph.keyframes}
-        begun = begin(estimate.pointmaps, images, estimate.registration.cameras, self.config.density)
+        config = self.config
+        begun = begin(
+            estimate.pointmaps,
+            images,
+            estimate.registration.cameras,
+            config.completion,
+            config.density,
+            config.background,
+        )
         self.scene = extend(self.scene, begun) if self.scene is not None else begun
         self.clock.lap("points")
 

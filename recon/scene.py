@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recon import density
+from recon import background, completion, density
 from recon.gaussians import Gaussians, concatenate
 from recon.geometry import align_cameras
 from recon.priors.pointmap import Pointmap
@@ -79,9 +79,13 @@ def begin(
     pointmaps: tuple[Pointmap, ...],
     images: dict[str, npt.NDArray[np.uint8]],
     cameras: tuple[RegisteredCamera, ...],
-    config: density.Config,
+    completing: completion.Config,
+    sampling: density.Config,
+    shell: background.Config,
 ) -> Scene:
     """The scene that has not been optimised: cameras as registered, Gaussians from the point maps."""
+    pictures = [images[pointmap.name] for pointmap in pointmaps]
+    completed = completion.complete(pointmaps, pictures, completing)
     views = tuple(
         View(
             name=pointmap.name,
@@ -93,9 +97,10 @@ def begin(
             rotation_sigma_deg=camera.rotation_sigma_deg,
             centre_sigma_rel=camera.centre_sigma_rel,
         )
-        for pointmap, camera in zip(pointmaps, cameras, strict=True)
+        for pointmap, camera in zip(completed, cameras, strict=True)
     )
-    return Scene(views, density.initial_gaussians(pointmaps, [view.image for view in views], config))
+    surfaces = density.initial_gaussians(completed, pictures, sampling)
+    return Scene(views, concatenate([surfaces, background.background(pointmaps, pictures, shell)]))
 
 
 def extend(old: Scene, new: Scene, tolerance: float = 0.02) -> Scene:
@@ -119,6 +124,7 @@ def extend(old: Scene, new: Scene, tolerance: float = 0.02) -> Scene:
         similarity.scale, torch.from_numpy(similarity.rotation), torch.from_numpy(similarity.translation)
     )
     known_frames = torch.tensor([view.frame_id for view in old.views], dtype=torch.int32)
+    known_frames = torch.cat([known_frames, known_frames.new_tensor([background.SOURCE_FRAME])])
     fresh = new.gaussians.subset(~torch.isin(new.gaussians.source_frame, known_frames))
     poses = {view.name: torch.from_numpy(T).float() for view, T in zip(both, carried, strict=True)}
     views = tuple(replace(view, T_world_camera=poses.get(view.name, view.T_world_camera)) for view in new.views)

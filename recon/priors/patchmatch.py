@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -37,6 +37,7 @@ class Search:
 
     iterations: int  # each visits every pixel once
     perturbation: float  # size of random changes in the first iteration, pixels of parallax; halved in each
+    active_sources: int = 3  # of each pixel, those that explain its plane best: new planes are compared in these
     random_starts: int = 0  # planes tried per pixel over the whole depth range before the first iteration
 
 
@@ -90,7 +91,7 @@ class _Problem(ctypes.Structure):
         *((name, ctypes.c_int32) for name in ("width", "height")),
         *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "min_inverse_depth", "max_inverse_depth")),
         ("sources", ctypes.c_void_p),
-        *((name, ctypes.c_int32) for name in ("num_sources", "random_starts", "iterations")),
+        *((name, ctypes.c_int32) for name in ("num_sources", "active_sources", "random_starts", "iterations")),
         *((name, ctypes.c_uint32) for name in ("stream", "seed")),
         *((name, ctypes.c_float) for name in ("perturbation", *Matching.__dataclass_fields__)),
     )
@@ -137,24 +138,28 @@ def improve(
     if planes.values.shape != (*view.shape, 3):
         raise ValueError(f"planes must be {(*view.shape, 3)}, got {planes.values.shape}")
     values, costs = planes.values.copy(), planes.costs.copy()
-    depths = {i: np.ascontiguousarray(inverse_depth, np.float32) for i, inverse_depth in known.items()}
-    for i, inverse_depth in depths.items():
-        if inverse_depth.shape != sources[i].shape:
-            raise ValueError(f"known depth {i} must be {sources[i].shape}, got {inverse_depth.shape}")
+    depths = [
+        np.ascontiguousarray(known[i], np.float32) if i in known else np.zeros(source.shape, np.float32)
+        for i, source in enumerate(sources)
+    ]
+    if any(depth.shape != source.shape for depth, source in zip(depths, sources, strict=True)):
+        raise ValueError(f"known must be as large as the sources, got {[depth.shape for depth in depths]}")
+    matching = matching if known else replace(matching, geometric=0.0)
     array = (_Source * len(sources))(
         *(
             _Source(
-                pointer(source.packed), pointer(depths[i]) if i in depths else None, source.shape[1], source.shape[0],
+                pointer(source.packed), pointer(depth), source.shape[1], source.shape[0],
                 transfer(view, source), transfer(source, view),
             )
-            for i, source in enumerate(sources)
+            for source, depth in zip(sources, depths, strict=True)
         )
     )  # fmt: skip
     near, far = view.depth_range
     problem = _Problem(
         pointer(view.grey), pointer(values), pointer(costs), view.shape[1], view.shape[0],
         view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2], 1 / far, 1 / near,
-        ctypes.cast(array, ctypes.c_void_p), len(sources), search.random_starts, search.iterations,
+        ctypes.cast(array, ctypes.c_void_p), len(sources),
+        search.active_sources, search.random_starts, search.iterations,
         stream, seed & 0xFFFFFFFF, search.perturbation,
         *(getattr(matching, name) for name in Matching.__dataclass_fields__),
     )  # fmt: skip

@@ -1,0 +1,85 @@
+"""A far shell behind the scene, so that what no view has seen is not black but of the colour around it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from recon.gaussians import SH_C0, Gaussians
+from recon.geometry import quat_from_matrix
+from recon.priors.pointmap import Pointmap
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    spacing_deg: float = 5.0  # between neighbouring Gaussians of the shell; 0 leaves it out
+    margin: float = 0.5  # how far beyond the images' borders it reaches, in units of their size
+    distance: float = 4.0  # from the cameras, in units of the farthest known depth
+    opacity: float = 0.95
+
+
+SOURCE_FRAME = -1  # of Gaussians that no frame's pixels started
+
+
+def background(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config) -> Gaussians:
+    """Gaussians on a sphere around the cameras, in the directions that they look.
+
+    Each has the colour of the image, strongly blurred, of the view that it lies deepest in, at the nearest pixel of
+    that image.
+    """
+    centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps])
+    centre = centres.mean(0)
+    farthest = max((float(pointmap.depth.max()) for pointmap in pointmaps), default=1.0)
+    spread = float(np.linalg.norm(centres - centre, axis=1).max())
+    radius = config.distance * max(farthest, spread)
+    directions = _sphere(config.spacing_deg) if config.spacing_deg > 0 else np.zeros((0, 3))
+    outside = np.full(len(directions), np.inf)
+    colours = np.zeros((len(directions), 3))
+    for pointmap, image in zip(pointmaps, images, strict=True):
+        height, width = image.shape[:2]
+        in_camera = (centre + radius * directions - pointmap.T_world_camera[:3, 3]) @ pointmap.T_world_camera[:3, :3]
+        ahead = in_camera[:, 2] > 0.05 * radius
+        pixels = in_camera[:, :2] / np.where(ahead, in_camera[:, 2], 1.0)[:, None] * np.diag(pointmap.K)[:2]
+        pixels += pointmap.K[:2, 2]
+        relative = pixels / (width, height) - 0.5
+        distance = np.where(ahead, np.abs(relative).max(1) - 0.5, np.inf)
+        blurred = cv2.GaussianBlur(image, (0, 0), 0.04 * max(height, width)).astype(np.float64) / 255.0
+        column = np.clip(pixels[:, 0], 0, width - 1).astype(int)
+        row = np.clip(pixels[:, 1], 0, height - 1).astype(int)
+        nearer = distance < outside
+        colours[nearer] = blurred[row[nearer], column[nearer]]
+        outside = np.minimum(outside, distance)
+    kept = outside < config.margin
+    directions, colours = directions[kept], colours[kept]
+    count = len(directions)
+    extent = radius * np.radians(config.spacing_deg) * 0.7
+    return Gaussians(
+        means=torch.from_numpy(centre + radius * directions).float(),
+        quats=quat_from_matrix(torch.from_numpy(_frames(directions)).float()),
+        log_scales=torch.from_numpy(np.tile(np.log(extent * np.array([1.0, 1.0, 0.1])), (count, 1))).float(),
+        logit_opacities=torch.full((count,), float(np.log(config.opacity / (1 - config.opacity)))),
+        sh=torch.from_numpy((colours - 0.5) / SH_C0).float()[:, None],
+        source_frame=torch.full((count,), SOURCE_FRAME, dtype=torch.int32),
+    )
+
+
+def _sphere(spacing_deg: float) -> npt.NDArray[np.float64]:
+    """(M, 3) directions that cover the sphere evenly (Fibonacci lattice)."""
+    count = int(4 * np.pi / np.radians(spacing_deg) ** 2)
+    step = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * step / count
+    angle = np.pi * (1.0 + np.sqrt(5.0)) * step
+    across = np.sqrt(1.0 - z**2)
+    return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
+
+
+def _frames(directions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """(M, 3, 3) rotations whose third axis points along each direction."""
+    helper = np.where(np.abs(directions[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(helper, directions)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(directions, first), directions], 2)

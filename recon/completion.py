@@ -1,0 +1,126 @@
+"""What no two views confirm: filled from its surroundings where nothing speaks against it, else left empty.
+
+A plain wall or the sky gives stereo nothing to match. Left empty it would be black in every new view. So where no
+other view shows a known point, a pixel gets the first of three depths that does not hide a known surface from any other
+view: stereo's own doubtful one, the smoothest that agrees with the image's edges (the stated prior), a far background.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.linalg import spsolve
+
+from recon.priors.pointmap import Pointmap, project_points
+
+Float32 = npt.NDArray[np.float32]
+Mask = npt.NDArray[np.bool_]
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    min_confidence: float = 0.3  # depths below are doubtful
+    background: float = 1.5  # depth of the background in units of the farthest known depth of a view
+    confidence: float = 0.1  # of what is filled in
+    reduction: int = 4  # the smooth depth is found at this part of the resolution
+    edge: float = 0.06  # difference of colour, in [0, 1], that counts as an edge between surfaces
+    in_front: float = 0.03  # relative depth by which a filled point may lie before a known one
+
+
+def complete(
+    pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config
+) -> list[Pointmap]:
+    """The point maps with their unknown pixels filled or, where that would contradict another view, empty."""
+    known = [_only(pointmap, pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
+    completed = list(known)
+    for j in sorted(range(len(known)), key=lambda i: -float(known[i].confidence.mean())):
+        others = [completed[i] for i in range(len(known)) if i != j]
+        hole = (known[j].depth <= 0) & ~_covered(known[j], others)
+        if not hole.any() or not (known[j].depth > 0).any():
+            continue
+        facing = _facing(known[j])
+        far = np.full_like(known[j].depth, config.background * known[j].depth.max())
+        guesses = (
+            pointmaps[j],
+            replace(known[j], depth=smooth_depth(known[j], images[j], config), normal=facing),
+            replace(known[j], depth=far, normal=facing),
+        )
+        for guess in guesses:
+            guess = _only(guess, hole)
+            guess = _only(guess, ~_hides_known(guess, [known[i] for i in range(len(known)) if i != j], config.in_front))
+            completed[j] = replace(
+                completed[j],
+                depth=completed[j].depth + guess.depth,
+                normal=completed[j].normal + guess.normal,
+                confidence=completed[j].confidence + np.float32(config.confidence) * (guess.depth > 0),
+            )
+            hole &= guess.depth <= 0
+    return completed
+
+
+def smooth_depth(pointmap: Pointmap, image: npt.NDArray[np.uint8], config: Config) -> Float32:
+    """(h, w) the smoothest inverse depth through the known ones that may jump at the image's edges, as a depth."""
+    height, width = pointmap.depth.shape
+    size = (max(2, width // config.reduction), max(2, height // config.reduction))
+    weight = cv2.resize(pointmap.confidence, size, interpolation=cv2.INTER_AREA)
+    inverse = np.where(pointmap.depth > 0, 1.0 / np.maximum(pointmap.depth, 1e-9), 0.0) * pointmap.confidence
+    inverse = cv2.resize(inverse.astype(np.float32), size, interpolation=cv2.INTER_AREA) / np.maximum(weight, 1e-6)
+    colour = cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.float64) / 255.0
+    index = np.arange(size[0] * size[1]).reshape(size[1], size[0])
+    first = np.concatenate([index[:, :-1].ravel(), index[:-1].ravel()])
+    second = np.concatenate([index[:, 1:].ravel(), index[1:].ravel()])
+    flat = colour.reshape(-1, 3)
+    link = np.exp(-np.abs(flat[first] - flat[second]).max(1) / config.edge) + 1e-3
+    count = index.size
+    laplacian = coo_matrix((link, (first, second)), (count, count))
+    laplacian = laplacian + laplacian.T
+    laplacian = diags(np.asarray(laplacian.sum(1)).ravel()) - laplacian
+    data = 10.0 * weight.ravel().astype(np.float64)
+    solution = spsolve((laplacian + diags(data + 1e-9)).tocsc(), data * inverse.ravel())
+    smooth = cv2.resize(solution.reshape(size[1], size[0]), (width, height), interpolation=cv2.INTER_LINEAR)
+    known = pointmap.depth[pointmap.depth > 0]
+    return (1.0 / np.clip(smooth, 0.5 / known.max(), 2.0 / known.min())).astype(np.float32)
+
+
+def _only(pointmap: Pointmap, keep: Mask) -> Pointmap:
+    return replace(
+        pointmap,
+        depth=pointmap.depth * keep,
+        confidence=pointmap.confidence * keep,
+        normal=pointmap.normal * keep[..., None],
+    )
+
+
+def _covered(target: Pointmap, others: Sequence[Pointmap]) -> Mask:
+    """Pixels of the target onto which a point of another view falls, small gaps between them closed."""
+    covered = np.zeros(target.depth.shape, np.uint8)
+    for other in others:
+        pixel, _ = project_points(other.points[other.depth > 0], target)
+        covered.ravel()[pixel[pixel >= 0]] = 1
+    return cv2.morphologyEx(covered, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+
+
+def _hides_known(filled: Pointmap, others: Sequence[Pointmap], in_front: float) -> Mask:
+    """Filled pixels whose point lies clearly before a known surface of another view."""
+    wrong = np.zeros(filled.depth.shape, bool)
+    candidates = filled.depth > 0
+    points = filled.points[candidates]
+    for other in others:
+        pixel, depth = project_points(points, other)
+        known = np.where(pixel >= 0, other.depth.ravel()[np.maximum(pixel, 0)], 0)
+        wrong[candidates] |= (known > 0) & (depth < (1.0 - in_front) * known)
+    return wrong
+
+
+def _facing(pointmap: Pointmap) -> Float32:
+    """(h, w, 3) normals that look straight at the camera."""
+    height, width = pointmap.depth.shape
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    K = pointmap.K
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1)
+    return (-rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
