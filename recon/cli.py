@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
 from collections.abc import Iterable
 from pathlib import Path
@@ -12,11 +13,19 @@ import msgspec
 import numpy as np
 
 from capture.cameras import folder, synthetic
+from capture.config import merged, read_yaml, typed
 from capture.frame import DroppedFrame, Frame
 from recon.config import Config, preset
+from recon.evaluate.bench import Plan, run_bench
+from recon.evaluate.demo import write_capture
+from recon.evaluate.methods import by_preset
+from recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
+from recon.evaluate.splits import Split
+from recon.evaluate.truth import load_scene
 from recon.export import write_result
 from recon.pipeline import reconstruct
 from recon.preview import contact_sheet
+from recon.rasterize.cpu import rasterize
 from recon.report import build_report, peak_rss_mb
 from recon.snapshot import Snapshot
 
@@ -37,7 +46,8 @@ def run(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:
     snapshot = None
     for snapshot in reconstruct(frames, config):
         _progress(snapshot)
-    assert snapshot is not None
+    if snapshot is None:
+        raise AssertionError("reconstruct always yields a last snapshot")
     return snapshot
 
 
@@ -50,23 +60,52 @@ def finish(snapshot: Snapshot, out: Path, *, seed: int, preset_name: str, **extr
 
 
 def demo(args: argparse.Namespace) -> int:
-    """Reconstructs the built-in capture and measures the result on views that it has not seen."""
-    from recon.evaluate.demo import held_out_quality
-
-    config = msgspec.structs.replace(preset("balanced"), seed=args.seed or 0)
-    place = synthetic.Config(seed=args.seed or 0)
-    snapshot = run(synthetic.stream(place), config)
-    measured = held_out_quality(snapshot, place) if snapshot.verdict.publishable else None
-    report = finish(snapshot, args.out, seed=config.seed, preset_name="balanced", held_out=measured)
+    """Writes the built-in capture, reconstructs it, and measures the result on views that it has not seen."""
+    seed = args.seed or 0
+    capture = args.out / "capture"
+    split = write_capture(capture, synthetic.Config(seed=seed))
+    config = msgspec.structs.replace(preset("balanced"), seed=seed)
+    snapshot = run(folder.stream(folder.Config(folder=capture / "images", names=split.train)), config)
+    measured = held_out_quality(snapshot, capture, split) if snapshot.verdict.publishable else None
+    report = finish(snapshot, args.out, seed=seed, preset_name="balanced", held_out=measured)
     _tell(snapshot, args.out, report, as_json=args.json)
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
 
 
+def held_out_quality(snapshot: Snapshot, capture: Path, split: Split) -> dict[str, float | None]:
+    """Mean scores over the test views, and the errors of the estimated cameras."""
+    row = evaluate(
+        snapshot,
+        load_scene(capture),
+        split,
+        Run("balanced", 0, None, snapshot.seconds, None),
+        rasterize=rasterize,
+        networks=Networks(alex=None, vgg=None),
+        settings=Settings(alignment_steps=100),
+    )
+    wanted = ("psnr", "ssim", "rotation_error_deg", "centre_error_pct", "focal_error_pct")
+    return {name: getattr(row, name) for name in wanted}
+
+
 def bench(args: argparse.Namespace) -> int:
     """Measures presets on scenes with true cameras."""
-    from recon.evaluate.bench import run_bench
-
-    return run_bench(args)
+    plan = Plan(args.scenes, args.views, args.methods, tuple(range(args.seeds)), args.checkpoints)
+    for method in plan.methods:
+        preset(method)
+    rows = run_bench(
+        plan,
+        by_preset,
+        args.out,
+        rasterize=rasterize,
+        networks=load_networks(args.weights_dir),
+        settings=Settings(),
+        command=shlex.join(["splatnode", *sys.argv[1:]]),
+    )
+    for row in rows:
+        score = "not scored" if row.psnr is None else f"{row.psnr:.2f} dB, {row.ssim:.3f} SSIM"
+        print(f"{row.scene} {row.views} views, {row.method}, seed {row.seed}: {row.verdict}, {score}")
+    print(f"results: {args.out}/ (bench.json, bench.csv, report.md)")
+    return EXIT_GOOD
 
 
 def _config(args: argparse.Namespace) -> Config:
@@ -75,7 +114,7 @@ def _config(args: argparse.Namespace) -> Config:
         raise ValueError(f"no prior {args.prior!r}; there is: classical")
     config = preset(args.preset or "balanced")
     if args.config is not None:
-        config = load_over(config, args.config)
+        config = typed(merged(msgspec.to_builtins(config), read_yaml(args.config)), Config)
     flags = {
         "size": args.size,
         "seed": args.seed,

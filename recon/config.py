@@ -18,6 +18,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     background: background.Config = background.Config()
     preview: optimize.Config = optimize.Config(iterations=30, half_resolution_share=1.0)  # after each keyframe
     optimize: optimize.Config = optimize.Config()  # after the last one
+    max_gaussians: int | None = None  # None: as many as the scene calls for
     budget_s: float | None = None  # seconds for everything, from the first frame; None: as many as it takes
 
 

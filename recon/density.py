@@ -157,11 +157,38 @@ def _on_surface(
 
 
 def initial_gaussians(
-    pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config
+    pointmaps: Sequence[Pointmap],
+    images: Sequence[npt.NDArray[np.uint8]],
+    config: Config,
+    max_gaussians: int | None = None,
 ) -> Gaussians:
-    """The Gaussians of a scene that has not been optimised: every surface once, from its best view."""
-    parts = [
-        gaussians_from_pointmap(pointmap, image, ~covered & (pointmap.confidence >= config.min_confidence), config)
-        for pointmap, image, covered in zip(pointmaps, images, redundant(pointmaps, config), strict=True)
+    """The Gaussians of a scene that has not been optimised: every surface once, from its best view.
+
+    With `max_gaussians` cells are coarsened, everywhere alike, until there are at most that many.
+    """
+    wanted = [
+        ~covered & (pointmap.confidence >= config.min_confidence)
+        for pointmap, covered in zip(pointmaps, redundant(pointmaps, config), strict=True)
     ]
-    return concatenate(parts)
+    while True:
+        gaussians = concatenate(
+            [gaussians_from_pointmap(*view, config) for view in zip(pointmaps, images, wanted, strict=True)]
+        )
+        if max_gaussians is None or len(gaussians) <= max_gaussians:
+            return gaussians
+        if config.smallest_cell_px >= 64:
+            keep = torch.linspace(0, len(gaussians) - 1, max_gaussians).round().long()
+            return gaussians.subset(keep)
+        config = _coarser(config)
+
+
+def _coarser(config: Config) -> Config:
+    """More deviation allowed in a cell; once that is beyond all contrast, larger cells."""
+    if config.colour_deviation < 0.25:
+        return msgspec.structs.replace(
+            config, colour_deviation=1.4 * config.colour_deviation, depth_deviation=1.4 * config.depth_deviation
+        )
+    smallest = 2 * config.smallest_cell_px
+    return msgspec.structs.replace(
+        config, smallest_cell_px=smallest, largest_cell_px=max(smallest, config.largest_cell_px)
+    )

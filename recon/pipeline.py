@@ -115,8 +115,11 @@ class _Run:
             config.completion,
             config.density,
             config.background,
+            config.max_gaussians,
         )
-        self.scene = extend(self.scene, begun) if self.scene is not None else begun
+        grown = extend(self.scene, begun) if self.scene is not None else begun
+        fits = config.max_gaussians is None or len(grown.gaussians) <= config.max_gaussians
+        self.scene = grown if fits else begun
         self.clock.lap("points")
 
     def snapshot(self, final: bool = False) -> Snapshot:

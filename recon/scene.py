@@ -82,6 +82,7 @@ def begin(
     completing: completion.Config,
     sampling: density.Config,
     shell: background.Config,
+    max_gaussians: int | None = None,
 ) -> Scene:
     """The scene that has not been optimised: cameras as registered, Gaussians from the point maps."""
     pictures = [images[pointmap.name] for pointmap in pointmaps]
@@ -99,8 +100,12 @@ def begin(
         )
         for pointmap, camera in zip(completed, cameras, strict=True)
     )
-    surfaces = density.initial_gaussians(completed, pictures, sampling)
-    return Scene(views, concatenate([surfaces, background.background(pointmaps, pictures, shell)]))
+    behind = background.background(pointmaps, pictures, shell)
+    if max_gaussians is not None:
+        behind = behind.subset(torch.arange(min(len(behind), max_gaussians // 10)))
+        max_gaussians -= len(behind)
+    surfaces = density.initial_gaussians(completed, pictures, sampling, max_gaussians)
+    return Scene(views, concatenate([surfaces, behind]))
 
 
 def extend(old: Scene, new: Scene, tolerance: float = 0.02) -> Scene:

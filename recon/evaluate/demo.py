@@ -1,0 +1,31 @@
+"""The built-in capture on disk, in the layout of a scene with known cameras."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+
+from capture.cameras import synthetic
+from recon.evaluate.splits import Split
+from recon.export.cameras import encode_cameras
+from recon.export.staged import write_file, write_files
+from recon.snapshot import CameraEstimate
+
+
+def write_capture(folder: Path, place: synthetic.Config) -> Split:
+    """Writes the photographs, those held out for testing, and the true cameras of both; returns their names.
+
+    The cameras are for evaluation: reconstruction reads the photographs in `folder`/images and nothing else.
+    """
+    training = {synthetic.frame_name(i): camera for i, camera in enumerate(synthetic.scene_cameras(place))}
+    testing = {f"test_{i:03d}.png": camera for i, camera in enumerate(synthetic.held_out_cameras(place))}
+    files, cameras = {}, []
+    for number, (name, (T_world_camera, K)) in enumerate({**training, **testing}.items()):
+        image = synthetic.photograph(place, (T_world_camera, K), noise_seed=number)
+        _, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        files[name] = png.tobytes()
+        cameras.append(CameraEstimate(name, number, T_world_camera, K, place.width, place.height, None, None))
+    write_files(folder / "images", files)
+    write_file(folder / "cameras.json", encode_cameras(cameras))
+    return Split(tuple(training), tuple(testing))
