@@ -1,4 +1,6 @@
 // Stage 3: every block of pixels blends the splats that touch it, nearest first.
+#include <algorithm>
+
 #include "threads.h"
 #include "tile.h"
 
@@ -21,7 +23,7 @@ void store_images(const Vec* features, Vec alpha, const Camera& camera, const Bl
         store_block(images.normal + c * plane, width, at, features[F::kColours + F::kDepths + c]);
 }
 
-// Blends one block. `words` says which splats to try; afterwards, which of them changed a pixel.
+// Blends one block. `words` says which splats; those that no light comes through to are taken out, 64 at a time.
 template <int Channels>
 void blend_block(const Raster& raster, TileOrigin origin, int block, const TileSplat* splats, uint64_t* words,
                  uint32_t num_words, const RasterImages& images) {
@@ -31,23 +33,34 @@ void blend_block(const Raster& raster, TileOrigin origin, int block, const TileS
     const Vec x = block_x(block), y = block_y(block);
     Vec transmittance = at.whole() ? splat(1.0f) : initial_transmittance(raster.camera, origin, block);
     // Where little is seen, 1 - transmittance has lost the digits that the expected depth needs of the sum of weights.
-    Vec alpha{}, features[F::kCount + 1] = {};
+    Vec alpha{}, features[F::kCount + 1];
+    for (Vec& feature : features) feature = Vec{};
 
     uint32_t word = 0;
-    for (bool open = true; word < num_words && open; ++word) {
-        uint64_t blended = 0;
-        for (uint64_t rest = words[word]; rest && open; rest &= rest - 1) {
+    for (; word < num_words && any(at_least(transmittance, splat(kTransmittanceMin))); ++word) {
+        for (uint64_t rest = words[word]; rest; rest &= rest - 1) {
             const TileSplat& splat = splats[word * 64 + __builtin_ctzll(rest)];
             const Contribution c = blend_splat(splat, x, y, transmittance);
             alpha += c.weight;
             for (int i = 0; i < F::kCount; ++i) features[i] += c.weight * splat.features[F::place(i)];
-            blended |= any(c.on) ? rest & -rest : 0;
-            open = any(at_least(transmittance, core::splat(kTransmittanceMin)));
         }
-        words[word] = blended;
     }
-    for (; word < num_words; ++word) words[word] = 0;
+    std::fill(words + word, words + num_words, uint64_t(0));
     store_images<Channels>(features, alpha, raster.camera, at, images);
+}
+
+template <int Channels>
+void blend_tile(Raster& raster, int tile, const RasterImages& images) {
+    thread_local Buffer<TileSplat> splats;
+    splats.resize(raster.num_entries(tile) + kPadding);
+    sort_entries(raster, tile);
+    load_splats(raster, tile, splats.data());
+    find_blocks(raster, tile);
+    const TileOrigin origin = tile_origin(raster, tile);
+    const uint32_t num_words = raster.num_words(tile);
+    uint64_t* words = raster.block_bits.data() + raster.first_words[tile];
+    for (int block = 0; block < kBlocks; ++block)
+        blend_block<Channels>(raster, origin, block, splats.data(), words + block * num_words, num_words, images);
 }
 
 struct BlendTiles {
@@ -56,18 +69,7 @@ struct BlendTiles {
 
     template <int Channels>
     void run() {
-        run_parallel(raster.num_tiles(), [&](int tile, int) {
-            thread_local Buffer<TileSplat> splats;
-            splats.resize(raster.num_entries(tile) + 1);
-            sort_entries(raster, tile);
-            load_splats(raster, tile, splats.data());
-            find_blocks(raster, tile);
-            const uint32_t words = raster.num_words(tile);
-            uint64_t* bits = raster.block_bits.data() + raster.first_words[tile];
-            for (int block = 0; block < kBlocks; ++block)
-                blend_block<Channels>(raster, tile_origin(raster, tile), block, splats.data(), bits + block * words,
-                                      words, images);
-        });
+        run_parallel(raster.num_tiles(), [&](int tile, int) { blend_tile<Channels>(raster, tile, images); });
     }
 };
 

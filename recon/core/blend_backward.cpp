@@ -2,6 +2,7 @@
 //
 // Per block: (a) the blending is repeated and each splat's alpha and weight kept, front to back; (b) back to front, the
 // gradient v = dL/d(ln alpha) of each pixel; (c) the sums over the block's pixels, as a small matrix product.
+#include <algorithm>
 #include <cstring>
 
 #include "threads.h"
@@ -13,7 +14,7 @@ namespace {
 constexpr int kMoments = 6;
 constexpr int kColumns = 16;  // of a row of sums: moments in even places, features in odd ones
 constexpr int kPairFloats = 2 * kLanes;
-constexpr int kSumsTogether = 8;  // registers of sums in flight
+constexpr int kSumsInFlight = 8;  // registers
 
 // Sums over the pixels of a tile, of v times a monomial and of the weight times a feature's gradient.
 struct alignas(64) Sums {
@@ -22,8 +23,8 @@ struct alignas(64) Sums {
 
 struct Scratch {
     Buffer<TileSplat> splats;
-    Buffer<Sums> sums;          // one per splat, and one for padding
-    Buffer<uint32_t> blended;   // the splats of a block
+    Buffer<Sums> sums;          // one per splat, then padding, whose splats nothing sees
+    Buffer<uint32_t> places;     // of a block's splats
     Buffer<float> pairs;        // (splats of a block, 2, lanes)
 };
 
@@ -61,17 +62,17 @@ PixelGradients<Channels> load_gradients(const Camera& camera, const BlockPositio
     return g;
 }
 
-// (a) Repeats the forward pass over the splats in `words`; returns how many there are.
+// (a) Repeats the forward pass over the splats in `words`, keeps (alpha, weight), and returns how many there are.
 uint32_t repeat_blending(const TileSplat* splats, const uint64_t* words, uint32_t num_words, Vec x, Vec y,
-                         Vec transmittance, uint32_t* blended, float* pairs) {
+                         Vec transmittance, uint32_t* places, float* pairs) {
     uint32_t count = 0;
     for (uint32_t word = 0; word < num_words; ++word) {
         for (uint64_t rest = words[word]; rest; rest &= rest - 1) {
-            const uint32_t index = word * 64 + __builtin_ctzll(rest);
-            const Contribution c = blend_splat(splats[index], x, y, transmittance);
+            const uint32_t place = word * 64 + __builtin_ctzll(rest);
+            const Contribution c = blend_splat(splats[place], x, y, transmittance);
             store(pairs + count * kPairFloats, c.alpha);
             store(pairs + count * kPairFloats + kLanes, c.weight);
-            blended[count++] = index;
+            places[count++] = place;
         }
     }
     return count;
@@ -81,18 +82,18 @@ uint32_t repeat_blending(const TileSplat* splats, const uint64_t* words, uint32_
 // seen through nothing: dL/d(alpha) = transmittance * (g - behind). Replaces (alpha, weight) by the pairs (v, weight).
 // Neither a division by 1 - alpha nor a difference of sums: both would lose digits behind opaque splats.
 template <int Channels>
-void differentiate(const TileSplat* splats, const uint32_t* blended, uint32_t count,
+void differentiate(const TileSplat* splats, const uint32_t* places, uint32_t count,
                    const PixelGradients<Channels>& gradients, float* pairs) {
     using F = Features<Channels>;
     Vec behind{};
     for (uint32_t i = count; i-- > 0;) {
-        const TileSplat& splat = splats[blended[i]];
+        const TileSplat& splat = splats[places[i]];
         float* pair = pairs + i * kPairFloats;
         const Vec alpha = load(pair), weight = load(pair + kLanes);
         Vec value = gradients.alpha;
         for (int c = 0; c < F::kCount; ++c) value += gradients.features[c] * splat.features[F::place(c)];
         const Vec difference = value - behind;
-        behind += alpha * difference;
+        behind = behind * (1.0f - alpha) + value * alpha;
         const Vec v = keep(less(alpha, core::splat(kAlphaMax)), weight * difference);
         store_pairs(pair, v, weight);
     }
@@ -103,20 +104,23 @@ template <int Channels>
 void make_columns(Vec x, Vec y, const PixelGradients<Channels>& gradients, float (&columns)[kLanes][kColumns]) {
     using F = Features<Channels>;
     const Vec monomials[kMoments] = {splat(1.0f), x, y, x * x, x * y, y * y};
-    for (int place = 0; place < kLanes; ++place) {
-        const int lane = pair_lane(place);
-        for (int i = 0; i < kMoments; ++i) columns[place][2 * i] = monomials[i][lane];
-        for (int i = 0; i < F::kCount; ++i) columns[place][2 * i + 1] = gradients.features[i][lane];
+    Vec by_lane[kColumns];
+    for (int i = 0; i < kColumns / 2; ++i) {
+        by_lane[2 * i] = i < kMoments ? monomials[i] : Vec{};
+        by_lane[2 * i + 1] = i < F::kCount ? gradients.features[i] : Vec{};
     }
+    float* places[kLanes];
+    for (int place = 0; place < kLanes; ++place) places[pair_lane(place)] = columns[place];
+    store_transposed(by_lane, places);
 }
 
 // (c) sums[splat] += pairs * columns, for several splats at a time to hide the latency of the additions.
 template <int Channels>
-void add_sums(const uint32_t* blended, uint32_t count, const float* pairs, const float (&columns)[kLanes][kColumns],
+void add_sums(const uint32_t* places, uint32_t count, const float* pairs, const float (&columns)[kLanes][kColumns],
               Sums* sums) {
     constexpr int kUsed = 2 * (Features<Channels>::kCount > kMoments ? Features<Channels>::kCount : kMoments);
     constexpr int kParts = (kUsed + kLanes - 1) / kLanes;
-    constexpr int kTogether = kSumsTogether / kParts;
+    constexpr int kTogether = kSumsInFlight / kParts;
     for (uint32_t first = 0; first < count; first += kTogether) {
         Vec totals[kTogether][kParts] = {};
         for (int place = 0; place < kLanes; ++place)
@@ -126,7 +130,7 @@ void add_sums(const uint32_t* blended, uint32_t count, const float* pairs, const
                     totals[i][part] += pair * load(columns[place] + part * kLanes);
             }
         for (int i = 0; i < kTogether; ++i) {
-            float* to = sums[blended[first + i]].columns;
+            float* to = sums[places[first + i]].columns;
             for (int part = 0; part < kParts; ++part)
                 store(to + part * kLanes, load(to + part * kLanes) + totals[i][part]);
         }
@@ -142,40 +146,57 @@ void differentiate_block(const Raster& raster, int tile, int block, const Raster
     const auto gradients = load_gradients<Channels>(raster.camera, at, images, image_gradients);
     if (!gradients.any) return;
 
-    const uint32_t num_words = raster.num_words(tile), padding = raster.num_entries(tile);
+    const uint32_t num_words = raster.num_words(tile);
     const uint64_t* words = raster.block_bits.data() + raster.first_words[tile] + block * num_words;
     const Vec x = block_x(block), y = block_y(block);
     const Vec transmittance = initial_transmittance(raster.camera, origin, block);
-    uint32_t* blended = scratch.blended.data();
+    uint32_t* places = scratch.places.data();
     float* pairs = scratch.pairs.data();
-    const uint32_t count = repeat_blending(scratch.splats.data(), words, num_words, x, y, transmittance, blended, pairs);
+    const uint32_t count =
+        repeat_blending(scratch.splats.data(), words, num_words, x, y, transmittance, places, pairs);
     if (!count) return;
-    differentiate<Channels>(scratch.splats.data(), blended, count, gradients, pairs);
-    for (int i = 0; i < kSumsTogether; ++i) blended[count + i] = padding;
-    std::memset(pairs + count * kPairFloats, 0, sizeof(float) * kSumsTogether * kPairFloats);
-    alignas(64) float columns[kLanes][kColumns] = {};
+    differentiate<Channels>(scratch.splats.data(), places, count, gradients, pairs);
+    std::fill(places + count, places + count + kSumsInFlight, raster.num_entries(tile));
+    std::fill(pairs + count * kPairFloats, pairs + (count + kSumsInFlight) * kPairFloats, 0.0f);
+    alignas(64) float columns[kLanes][kColumns];
     make_columns<Channels>(x, y, gradients, columns);
-    add_sums<Channels>(blended, count, pairs, columns, scratch.sums.data());
+    add_sums<Channels>(places, count, pairs, columns, scratch.sums.data());
 }
 
-// From monomials in the tile's pixels to u and w, which are of order one wherever a splat is seen.
+// Where the splat of an entry in a tile keeps its gradient.
+SplatGradient* find_slot(Raster& raster, int tile, uint32_t gaussian) {
+    const TileRect rect = raster.rects[gaussian];
+    const int row = tile / raster.tiles_x - rect.y0, column = tile % raster.tiles_x - rect.x0;
+    return &raster.slots[raster.first_slots[gaussian] + row * (rect.x1 - rect.x0) + column];
+}
+
+// Sums become the gradients of kLanes splats: from monomials in the tile's pixels to
+// u and w, which are of order one wherever a splat is seen.
 template <int Channels>
-SplatGradient splat_gradient(const TileSplat& splat, const Sums& sums) {
+void store_gradients(const TileSplat* splats, const Sums* sums, SplatGradient* const (&slots)[kLanes]) {
     using F = Features<Channels>;
-    const float* m = sums.columns;
-    const float one = m[0], x = m[2], y = m[4], xx = m[6], xy = m[8], yy = m[10];
-    const float k0 = splat.k0, k1 = splat.k1, k2 = splat.k2, u0 = splat.u0, w0 = splat.w0;
-    const float x_u = k0 * xx + k1 * xy + u0 * x, y_u = k0 * xy + k1 * yy + u0 * y, u = k0 * x + k1 * y + u0 * one;
-    const float y_w = k2 * yy + w0 * y, w = k2 * y + w0 * one;
-    SplatGradient gradient = {};
-    gradient.moments[0] = one;
-    gradient.moments[1] = u;
-    gradient.moments[2] = w;
-    gradient.moments[3] = k0 * x_u + k1 * y_u + u0 * u;
-    gradient.moments[4] = k2 * y_u + w0 * u;
-    gradient.moments[5] = k2 * y_w + w0 * w;
-    for (int i = 0; i < F::kCount; ++i) gradient.features[F::place(i)] = m[2 * i + 1];
-    return gradient;
+    const float *splat_rows[kLanes], *sum_rows[kLanes];
+    float* slot_rows[kLanes];
+    for (int lane = 0; lane < kLanes; ++lane) {
+        splat_rows[lane] = &splats[lane].k0;
+        sum_rows[lane] = sums[lane].columns;
+        slot_rows[lane] = slots[lane]->moments;
+    }
+    Vec s[16], m[16], out[16] = {};
+    load_transposed(splat_rows, s);
+    load_transposed(sum_rows, m);
+    const Vec k0 = s[0], k1 = s[1], u0 = s[2], k2 = s[3], w0 = s[4];
+    const Vec one = m[0], x = m[2], y = m[4], xx = m[6], xy = m[8], yy = m[10];
+    const Vec x_u = k0 * xx + k1 * xy + u0 * x, y_u = k0 * xy + k1 * yy + u0 * y, u = k0 * x + k1 * y + u0 * one;
+    const Vec y_w = k2 * yy + w0 * y, w = k2 * y + w0 * one;
+    out[0] = one;
+    out[1] = u;
+    out[2] = w;
+    out[3] = k0 * x_u + k1 * y_u + u0 * u;
+    out[4] = k2 * y_u + w0 * u;
+    out[5] = k2 * y_w + w0 * w;
+    for (int i = 0; i < F::kCount; ++i) out[8 + F::place(i)] = m[2 * i + 1];
+    store_transposed(out, slot_rows);
 }
 
 template <int Channels>
@@ -183,23 +204,22 @@ void differentiate_tile(Raster& raster, int tile, const RasterImages& images, co
                         Scratch& scratch) {
     const uint32_t count = raster.num_entries(tile);
     if (!count) return;
-    scratch.splats.resize(count + 1);
-    scratch.sums.resize(count + 1);
-    scratch.blended.resize(count + kSumsTogether);
-    scratch.pairs.resize(size_t(count + kSumsTogether) * kPairFloats);
+    const uint32_t padded = count + kPadding;
+    scratch.splats.resize(padded);
+    scratch.sums.resize(padded);
+    scratch.places.resize(padded);
+    scratch.pairs.resize(size_t(padded) * kPairFloats);
     load_splats(raster, tile, scratch.splats.data());
-    std::memset(scratch.sums.data(), 0, sizeof(Sums) * (count + 1));
+    std::memset(scratch.sums.data(), 0, sizeof(Sums) * padded);
     for (int block = 0; block < kBlocks; ++block)
         differentiate_block<Channels>(raster, tile, block, images, gradients, scratch);
 
-    const int tile_x = tile % raster.tiles_x, tile_y = tile / raster.tiles_x;
     const uint64_t* entries = raster.entries.data() + raster.first_entries[tile];
-    for (uint32_t i = 0; i < count; ++i) {
-        const uint32_t gaussian = entry_gaussian(entries[i]);
-        const TileRect rect = raster.rects[gaussian];
-        const uint32_t slot =
-            raster.first_slots[gaussian] + (tile_y - rect.y0) * (rect.x1 - rect.x0) + (tile_x - rect.x0);
-        raster.slots[slot] = splat_gradient<Channels>(scratch.splats[i], scratch.sums[i]);
+    for (uint32_t first = 0; first < count; first += kLanes) {
+        SplatGradient unwanted, *slots[kLanes];
+        for (uint32_t lane = 0; lane < kLanes; ++lane)
+            slots[lane] = first + lane < count ? find_slot(raster, tile, entry_gaussian(entries[first + lane])) : &unwanted;
+        store_gradients<Channels>(&scratch.splats[first], &scratch.sums[first], slots);
     }
 }
 

@@ -9,9 +9,13 @@ namespace core {
 template <int Columns>
 inline void load_rows(const float* rows, int valid, Vec (&columns)[Columns]) {
     alignas(64) float transposed[Columns][kLanes];
-    for (int lane = 0; lane < kLanes; ++lane) {
-        const float* row = rows + (lane < valid ? lane : valid - 1) * Columns;
-        for (int column = 0; column < Columns; ++column) transposed[column][lane] = row[column];
+    if (valid == kLanes) {  // with a fixed stride the compiler loads registers and permutes them
+        for (int lane = 0; lane < kLanes; ++lane)
+            for (int column = 0; column < Columns; ++column) transposed[column][lane] = rows[lane * Columns + column];
+    } else {
+        for (int lane = 0; lane < kLanes; ++lane)
+            for (int column = 0; column < Columns; ++column)
+                transposed[column][lane] = rows[(lane < valid ? lane : valid - 1) * Columns + column];
     }
     for (int column = 0; column < Columns; ++column) columns[column] = load(transposed[column]);
 }
@@ -20,7 +24,8 @@ template <int Columns>
 inline void store_rows(float* rows, int valid, const Vec (&columns)[Columns]) {
     alignas(64) float transposed[Columns][kLanes];
     for (int column = 0; column < Columns; ++column) store(transposed[column], columns[column]);
-    for (int lane = 0; lane < valid; ++lane)
+    const int count = valid == kLanes ? kLanes : valid;
+    for (int lane = 0; lane < count; ++lane)
         for (int column = 0; column < Columns; ++column) rows[lane * Columns + column] = transposed[column][lane];
 }
 

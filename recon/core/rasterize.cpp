@@ -1,7 +1,7 @@
 // The C interface of the rasteriser. recon/rasterize/cpu.py checks shapes and types before it calls.
 #include "rasterize.h"
 
-#include <chrono>
+#include <ctime>
 #include <memory>
 #include <mutex>
 #include <vector>
@@ -39,17 +39,19 @@ RasterPool& raster_pool() {
     return pool;
 }
 
+double now(clockid_t clock) {
+    timespec time;
+    clock_gettime(clock, &time);
+    return double(time.tv_sec) + 1e-9 * double(time.tv_nsec);
+}
+
 template <class Function>
 auto timed(Raster& raster, Stage stage, Function&& function) {
-    struct Clock {
-        Raster& raster;
-        Stage stage;
-        std::chrono::steady_clock::time_point start = std::chrono::steady_clock::now();
-        ~Clock() {
-            raster.seconds[stage] = std::chrono::duration<double>(std::chrono::steady_clock::now() - start).count();
-        }
-    } clock{raster, stage};
-    return function();
+    const double wall = now(CLOCK_MONOTONIC), processor = now(CLOCK_PROCESS_CPUTIME_ID);
+    const auto result = function();
+    raster.seconds[stage] = now(CLOCK_MONOTONIC) - wall;
+    raster.processor_seconds[stage] = now(CLOCK_PROCESS_CPUTIME_ID) - processor;
+    return result;
 }
 
 }  // namespace
@@ -67,7 +69,7 @@ CORE_API int core_raster_forward(const RasterInput* input, const RasterImages* i
         raster_pool().give_back(raster);
         return errors;
     }
-    timed(*raster, kStageBlend, [&] { blend(*raster, input->channels, *images); });
+    timed(*raster, kStageBlend, [&] { return blend(*raster, input->channels, *images), 0; });
     *result = raster;
     return 0;
 }
@@ -75,13 +77,19 @@ CORE_API int core_raster_forward(const RasterInput* input, const RasterImages* i
 // `channels` are those whose gradient is not null. May be called more than once.
 CORE_API void core_raster_backward(const RasterInput* input, Raster* raster, int channels, const RasterImages* images,
                                    const RasterImages* image_gradients, RasterGradients* gradients) {
-    timed(*raster, kStageBlendBackward, [&] { blend_backward(*raster, channels, *images, *image_gradients); });
-    timed(*raster, kStageProjectBackward, [&] { project_backward(*input, *raster, *gradients); });
+    timed(*raster, kStageBlendBackward, [&] {
+        return blend_backward(*raster, channels, *images, *image_gradients), 0;
+    });
+    timed(*raster, kStageProjectBackward, [&] { return project_backward(*input, *raster, *gradients), 0; });
 }
 
 CORE_API void core_raster_release(Raster* raster) { raster_pool().give_back(raster); }
 
-// Seconds of the five stages, in the order of `Stage`, in the raster's last forward and backward.
+// Of the five stages, in the order of `Stage`, in the raster's last forward and backward: seconds on the clock, then
+// seconds of all processors together.
 CORE_API void core_raster_seconds(const Raster* raster, double* seconds) {
-    for (int stage = 0; stage < kStages; ++stage) seconds[stage] = raster->seconds[stage];
+    for (int stage = 0; stage < kStages; ++stage) {
+        seconds[stage] = raster->seconds[stage];
+        seconds[kStages + stage] = raster->processor_seconds[stage];
+    }
 }

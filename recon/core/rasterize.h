@@ -116,7 +116,7 @@ struct Raster {
     Buffer<uint64_t> block_bits;    // (tiles, blocks, words) which of the tile's splats a block blends
     Buffer<SplatGradient> slots;    // (E)
     Buffer<double> camera_sums;     // (chunks, 16)
-    double seconds[kStages];
+    double seconds[kStages], processor_seconds[kStages];  // spent in the last forward and backward
 
     int num_tiles() const { return tiles_x * tiles_y; }
     uint32_t num_entries(int tile) const { return first_entries[tile + 1] - first_entries[tile]; }

@@ -6,6 +6,7 @@
 #pragma once
 
 #include <cmath>
+#include <cstddef>
 #include <cstdint>
 
 #if defined(__x86_64__)
@@ -99,31 +100,25 @@ inline Vec square_root(Vec value) {
 #endif
 }
 
-// 2^x to 2e-7 relative for x in [-126, 0]. Smaller x give 0 or rubbish, never a trap: mask them.
+// 2^x to 2e-7 relative for x in [-126, 0]. Smaller x give rubbish, never a trap: mask them.
 inline Vec exp2_nonpositive(Vec x) {
-#if CORE_LANES == 16
-    const Vec fraction = (Vec)_mm512_reduce_ps((__m512)x, 0x08);  // x - round(x)
-#else
     // Adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits. The compiler must not see through it.
     const Vec magic = splat(12582912.0f);
     Vec shifted = x + magic;
-#if defined(__x86_64__)
+#if CORE_LANES == 16
+    __asm__("" : "+v"(shifted));
+#elif defined(__x86_64__)
     __asm__("" : "+x"(shifted));
 #elif defined(__aarch64__)
     __asm__("" : "+w"(shifted));
 #endif
     const Vec fraction = x - (shifted - magic);
-#endif
     Vec power = fraction * 1.326472721e-3f + 9.671512813e-3f;
     power = power * fraction + 5.550733745e-2f;
     power = power * fraction + 2.402224208e-1f;
     power = power * fraction + 6.931469776e-1f;
     power = power * fraction + 1.0f;
-#if CORE_LANES == 16
-    return (Vec)_mm512_scalef_ps((__m512)power, _mm512_sub_ps((__m512)x, (__m512)fraction));
-#else
     return (Vec)(((BitVec)shifted << 23) + (BitVec)power);
-#endif
 }
 
 // log2(x) to 1e-7 absolute for normal positive x.
@@ -137,12 +132,86 @@ inline Vec log2_positive(Vec x) {
     return __builtin_convertvector(exponent, Vec) + series * s * 2.88539008177793f;
 }
 
-// ---- Pairs: lane l of two registers side by side, so that one 64-bit load broadcasts both --------------------------
+// ---- Lanes from one register to another ---------------------------------------------------------------------------
 #if defined(__clang__)
 #define CORE_SHUFFLE(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
 #else
 #define CORE_SHUFFLE(a, b, ...) __builtin_shuffle(a, b, IntVec{__VA_ARGS__})
 #endif
+
+// The lanes of `a` and `b` in turn: those of the first halves, then those of the second.
+inline void zip(Vec a, Vec b, Vec& first, Vec& second) {
+#if CORE_LANES == 16
+    first = CORE_SHUFFLE(a, b, 0, 16, 1, 17, 2, 18, 3, 19, 4, 20, 5, 21, 6, 22, 7, 23);
+    second = CORE_SHUFFLE(a, b, 8, 24, 9, 25, 10, 26, 11, 27, 12, 28, 13, 29, 14, 30, 15, 31);
+#elif CORE_LANES == 8
+    first = CORE_SHUFFLE(a, b, 0, 8, 1, 9, 2, 10, 3, 11);
+    second = CORE_SHUFFLE(a, b, 4, 12, 5, 13, 6, 14, 7, 15);
+#else
+    first = CORE_SHUFFLE(a, b, 0, 4, 1, 5);
+    second = CORE_SHUFFLE(a, b, 2, 6, 3, 7);
+#endif
+}
+
+// Rows become columns. Zipping each row of the upper half with its partner of the lower half, log2(kLanes) times.
+inline void transpose(Vec (&rows)[kLanes]) {
+    for (int round = kLanes; round > 1; round /= 2) {
+        Vec zipped[kLanes];
+        for (int i = 0; i < kLanes / 2; ++i) zip(rows[i], rows[i + kLanes / 2], zipped[2 * i], zipped[2 * i + 1]);
+        for (int i = 0; i < kLanes; ++i) rows[i] = zipped[i];
+    }
+}
+
+// The same for kLanes rows of 16 floats, which are one register or several.
+inline void load_transposed(const float* const (&rows)[kLanes], Vec (&columns)[16]) {
+    for (int part = 0; part < 16; part += kLanes) {
+        Vec square[kLanes];
+        for (int i = 0; i < kLanes; ++i) square[i] = load(rows[i] + part);
+        transpose(square);
+        for (int i = 0; i < kLanes; ++i) columns[part + i] = square[i];
+    }
+}
+inline void store_transposed(const Vec (&columns)[16], float* const (&rows)[kLanes]) {
+    for (int part = 0; part < 16; part += kLanes) {
+        Vec square[kLanes];
+        for (int i = 0; i < kLanes; ++i) square[i] = columns[part + i];
+        transpose(square);
+        for (int i = 0; i < kLanes; ++i) store(rows[i] + part, square[i]);
+    }
+}
+
+// Four floats from each of kLanes / 4 places.
+inline Vec load_quads(const float* from, size_t step) {
+#if CORE_LANES == 16
+    const __m512 first = _mm512_castps128_ps512(_mm_loadu_ps(from));
+    const __m512 two = _mm512_insertf32x4(first, _mm_loadu_ps(from + step), 1);
+    const __m512 three = _mm512_insertf32x4(two, _mm_loadu_ps(from + 2 * step), 2);
+    return (Vec)_mm512_insertf32x4(three, _mm_loadu_ps(from + 3 * step), 3);
+#elif CORE_LANES == 8
+    return (Vec)_mm256_insertf128_ps(_mm256_castps128_ps256(_mm_loadu_ps(from)), _mm_loadu_ps(from + step), 1);
+#else
+    (void)step;
+    Vec value;
+    __builtin_memcpy(&value, from, sizeof value);
+    return value;
+#endif
+}
+inline void store_quads(float* to, size_t step, Vec value) {
+#if CORE_LANES == 16
+    _mm_storeu_ps(to, _mm512_castps512_ps128((__m512)value));
+    _mm_storeu_ps(to + step, _mm512_extractf32x4_ps((__m512)value, 1));
+    _mm_storeu_ps(to + 2 * step, _mm512_extractf32x4_ps((__m512)value, 2));
+    _mm_storeu_ps(to + 3 * step, _mm512_extractf32x4_ps((__m512)value, 3));
+#elif CORE_LANES == 8
+    _mm_storeu_ps(to, _mm256_castps256_ps128((__m256)value));
+    _mm_storeu_ps(to + step, _mm256_extractf128_ps((__m256)value, 1));
+#else
+    (void)step;
+    __builtin_memcpy(to, &value, sizeof value);
+#endif
+}
+
+// ---- Pairs: lane l of two registers side by side, so that one 64-bit load broadcasts both --------------------------
 
 // Stores 2 * kLanes floats: the pairs (a[l], b[l]) in the order of `pair_lane`, which is the cheap one to make.
 inline void store_pairs(float* to, Vec a, Vec b) {

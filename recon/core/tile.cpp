@@ -55,7 +55,9 @@ void load_splats(const Raster& raster, int tile, TileSplat* splats) {
         here.log2_opacity = splat.log2_opacity;
         std::memcpy(here.features, splat.features, sizeof here.features);
     }
-    splats[count] = TileSplat{};
+    TileSplat unseen = {};
+    unseen.log2_opacity = -126;
+    std::fill(splats + count, splats + count + kPadding, unseen);
 }
 
 void find_blocks(Raster& raster, int tile) {

@@ -14,6 +14,8 @@ struct alignas(64) TileSplat {
     float unused2;
 };
 
+constexpr int kPadding = 16;
+
 struct TileOrigin {
     int x, y;  // the top left pixel
     float centre_x() const { return float(x + kTile / 2); }
@@ -39,29 +41,29 @@ inline Vec block_y(int block) {
 // Sorts the tile's entries by depth, of equal ones by Gaussian.
 void sort_entries(Raster& raster, int tile);
 
-// The tile's splats in the order of its entries, and one more that nothing sees.
+// The tile's splats in the order of its entries, and kPadding more that nothing sees.
 void load_splats(const Raster& raster, int tile, TileSplat* splats);
 
 // For each block the tile's splats whose ellipse alpha = 1/255 reaches a pixel centre of it, as bits.
 void find_blocks(Raster& raster, int tile);
 
-// What a pixel block takes of one splat.
+// What the pixels of a block take of a splat.
 struct Contribution {
-    Mask on;  // lanes that take anything
     Vec alpha, weight;
 };
 
-// Blends `splat` into the lanes at (x, y) that still let light through; `transmittance` becomes what is left.
+// Blends `splat` into the lanes at (x, y) that still let light through. `transmittance` becomes what is left; where it
+// is already too small it goes on falling, so that a splat waits for little of what the one before it computes.
 inline Contribution blend_splat(const TileSplat& splat_, Vec x, Vec y, Vec& transmittance) {
     const Vec u = splat_.k0 * x + (splat_.k1 * y + splat_.u0);
     const Vec w = splat_.k2 * y + splat_.w0;
     const Vec log2_alpha = splat_.log2_opacity - u * u - w * w;
-    Contribution c;
-    c.on = at_least(log2_alpha, splat(kLog2AlphaMin)) & at_least(transmittance, splat(kTransmittanceMin));
-    c.alpha = keep(c.on, minimum(exp2_nonpositive(log2_alpha), splat(kAlphaMax)));
-    c.weight = c.alpha * transmittance;
-    transmittance -= c.weight;
-    return c;
+    const Mask visible = at_least(log2_alpha, splat(kLog2AlphaMin));
+    const Mask open = at_least(transmittance, splat(kTransmittanceMin));
+    const Vec alpha = keep(visible, minimum(exp2_nonpositive(log2_alpha), splat(kAlphaMax)));
+    const Vec weight = alpha * transmittance;
+    transmittance -= weight;
+    return {keep(open, alpha), keep(open, weight)};
 }
 
 // Lanes of a block whose pixel is inside the image let all light through, the others none.
@@ -86,31 +88,23 @@ inline BlockPosition block_position(const Camera& camera, TileOrigin origin, int
 
 // A block of an image plane; 0 outside the image.
 inline Vec load_block(const float* plane, int width, const BlockPosition& at) {
-    alignas(64) float pixels[kLanes] = {};
     const float* from = plane + size_t(at.y) * width + at.x;
-    if (at.whole()) {
-        for (int row = 0; row < kBlockHeight; ++row)
-            __builtin_memcpy(pixels + row * kBlockWidth, from + size_t(row) * width, sizeof(float) * kBlockWidth);
-    } else {
-        for (int row = 0; row < at.rows; ++row)
-            for (int column = 0; column < at.columns; ++column)
-                pixels[row * kBlockWidth + column] = from[size_t(row) * width + column];
-    }
+    if (at.whole()) return load_quads(from, width);
+    alignas(64) float pixels[kLanes] = {};
+    for (int row = 0; row < at.rows; ++row)
+        for (int column = 0; column < at.columns; ++column)
+            pixels[row * kBlockWidth + column] = from[size_t(row) * width + column];
     return load(pixels);
 }
 
 inline void store_block(float* plane, int width, const BlockPosition& at, Vec value) {
+    float* to = plane + size_t(at.y) * width + at.x;
+    if (at.whole()) return store_quads(to, width, value);
     alignas(64) float pixels[kLanes];
     store(pixels, value);
-    float* to = plane + size_t(at.y) * width + at.x;
-    if (at.whole()) {
-        for (int row = 0; row < kBlockHeight; ++row)
-            __builtin_memcpy(to + size_t(row) * width, pixels + row * kBlockWidth, sizeof(float) * kBlockWidth);
-    } else {
-        for (int row = 0; row < at.rows; ++row)
-            for (int column = 0; column < at.columns; ++column)
-                to[size_t(row) * width + column] = pixels[row * kBlockWidth + column];
-    }
+    for (int row = 0; row < at.rows; ++row)
+        for (int column = 0; column < at.columns; ++column)
+            to[size_t(row) * width + column] = pixels[row * kBlockWidth + column];
 }
 
 // Which features the channels blend: known at compile time, so that what is not asked for costs nothing.

@@ -98,10 +98,12 @@ class _Raster:
     def __del__(self):
         self.core.core_raster_release(self.handle)
 
-    def seconds(self) -> dict[str, float]:
-        values = (ctypes.c_double * len(STAGES))()
+    def seconds(self) -> tuple[dict[str, float], dict[str, float]]:
+        """By stage, of the last forward and backward: seconds on the clock, and of all processors together."""
+        values = (ctypes.c_double * (2 * len(STAGES)))()
         self.core.core_raster_seconds(self.handle, values)
-        return dict(zip(STAGES, values, strict=True))
+        clock, processors = values[: len(STAGES)], values[len(STAGES) :]
+        return dict(zip(STAGES, clock, strict=True)), dict(zip(STAGES, processors, strict=True))
 
 
 class _Rasterize(torch.autograd.Function):
