@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
+
+from recon.geometry import multiply_quats, quat_from_matrix
 
 SH_C0 = 0.28209479177387814  # the constant basis function of the real spherical harmonics
 
@@ -37,7 +41,7 @@ class Gaussians:
         """(N, 3) colour without its view-dependent part."""
         return self.sh[:, 0] * SH_C0 + 0.5
 
-    def map(self, function) -> Gaussians:
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
         """`function` applied to every tensor."""
         return Gaussians(*(function(getattr(self, field.name)) for field in fields(self)))
 
@@ -47,14 +51,12 @@ class Gaussians:
 
     def transformed(self, scale: float, rotation: Tensor, translation: Tensor) -> Gaussians:
         """After the similarity x -> scale * rotation @ x + translation. View-dependent colour is not rotated."""
-        from recon.geometry import multiply_quats, quat_from_matrix
-
         rotation = rotation.to(self.means)
         return replace(
             self,
             means=scale * self.means @ rotation.T + translation.to(self.means),
             quats=multiply_quats(quat_from_matrix(rotation), self.quats),
-            log_scales=self.log_scales + float(torch.log(torch.tensor(scale))),
+            log_scales=self.log_scales + math.log(scale),
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,20 +14,26 @@ Array = npt.NDArray[np.float64]
 
 
 def exp_se3(twist: Tensor) -> Tensor:
-    """(4, 4) rigid motion of a twist (6,): translation part first, then the rotation vector in radians."""
-    rho, phi = twist[:3], twist[3:]
-    cross = torch.zeros(3, 3, dtype=twist.dtype)
+    """(4, 4) rigid motion of a twist (6,): translation part first, then the rotation vector in radians.
+
+    It does not carry gradients; `twist_gradient` is there for them.
+    """
+    rho, phi = twist[:3].detach(), twist[3:].detach()
+    cross = twist.new_zeros(3, 3)
     cross[0, 1], cross[0, 2], cross[1, 2] = -phi[2], phi[1], -phi[0]
     cross = cross - cross.T
     angle = float(phi.norm())
     square = cross @ cross
-    if angle < 1e-5:
-        first, second, third = 1.0 - angle**2 / 6, 0.5 - angle**2 / 24, 1.0 / 6 - angle**2 / 120
+    # Taylor's series where the closed form would subtract nearly equal numbers; the first term left out is below 1e-16.
+    if angle < 1e-2:
+        first = 1.0 - angle**2 / 6 + angle**4 / 120 - angle**6 / 5040
+        second = 1.0 / 2 - angle**2 / 24 + angle**4 / 720
+        third = 1.0 / 6 - angle**2 / 120 + angle**4 / 5040
     else:
-        first, second = np.sin(angle) / angle, (1 - np.cos(angle)) / angle**2
-        third = (angle - np.sin(angle)) / angle**3
-    identity = torch.eye(3, dtype=twist.dtype)
-    motion = torch.eye(4, dtype=twist.dtype)
+        first, second = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
+        third = (angle - math.sin(angle)) / angle**3
+    identity = torch.eye(3, dtype=twist.dtype, device=twist.device)
+    motion = torch.eye(4, dtype=twist.dtype, device=twist.device)
     motion[:3, :3] = identity + first * cross + second * square
     motion[:3, 3] = (identity + second * cross + third * square) @ rho
     return motion
@@ -35,25 +42,21 @@ def exp_se3(twist: Tensor) -> Tensor:
 def twist_gradient(T: Tensor, gradient: Tensor) -> Tensor:
     """(6,) gradient at zero of a twist x in `T @ exp_se3(x)`, from the gradient (4, 4) with respect to `T`."""
     moved = T.T @ gradient
-    return torch.stack(
-        [moved[0, 3], moved[1, 3], moved[2, 3], moved[2, 1] - moved[1, 2], moved[0, 2] - moved[2, 0], moved[1, 0] - moved[0, 1]]  # fmt: skip
-    )
+    turn = [moved[2, 1] - moved[1, 2], moved[0, 2] - moved[2, 0], moved[1, 0] - moved[0, 1]]
+    return torch.stack([*moved[:3, 3], *turn])
 
 
 def quat_from_matrix(rotation: Tensor) -> Tensor:
     """(..., 4) unit quaternions wxyz, w >= 0, of rotations (..., 3, 3)."""
-    m = rotation
-    trace = m[..., 0, 0] + m[..., 1, 1] + m[..., 2, 2]
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in rotation.unbind(-2))
     # Four times the outer product of the quaternion with itself: its largest row is far from zero.
-    outer = torch.stack(
-        [
-            torch.stack([1 + trace, m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1),  # fmt: skip
-            torch.stack([m[..., 2, 1] - m[..., 1, 2], 1 + 2 * m[..., 0, 0] - trace, m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0]], -1),  # fmt: skip
-            torch.stack([m[..., 0, 2] - m[..., 2, 0], m[..., 0, 1] + m[..., 1, 0], 1 + 2 * m[..., 1, 1] - trace, m[..., 1, 2] + m[..., 2, 1]], -1),  # fmt: skip
-            torch.stack([m[..., 1, 0] - m[..., 0, 1], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1], 1 + 2 * m[..., 2, 2] - trace], -1),  # fmt: skip
-        ],
-        -2,
-    )
+    rows = [
+        [1 + xx + yy + zz, zy - yz, xz - zx, yx - xy],
+        [zy - yz, 1 + xx - yy - zz, xy + yx, xz + zx],
+        [xz - zx, xy + yx, 1 - xx + yy - zz, yz + zy],
+        [yx - xy, xz + zx, yz + zy, 1 - xx - yy + zz],
+    ]
+    outer = torch.stack([torch.stack(row, -1) for row in rows], -2)
     row = torch.diagonal(outer, dim1=-2, dim2=-1).argmax(-1)
     quat = torch.gather(outer, -2, row[..., None, None].expand(*row.shape, 1, 4))[..., 0, :]
     quat = quat / quat.norm(dim=-1, keepdim=True)

@@ -6,8 +6,18 @@ import os
 from pathlib import Path
 
 import pytest
+import torch
+from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def pytest_configure() -> None:
+    """Tests are small: threads would wait for each other longer than they work, above all on a busy machine."""
+    torch.set_num_threads(1)
+    # The same examples every time, however slow the machine: a test that fails by chance is no test.
+    settings.register_profile("splatnode", deadline=None, derandomize=True, database=None)
+    settings.load_profile("splatnode")
 
 
 @pytest.fixture(scope="session")
