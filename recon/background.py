@@ -33,10 +33,10 @@ def background(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.ui
     """
     centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps])
     centre = centres.mean(0)
-    farthest = max((float(pointmap.depth.max()) for pointmap in pointmaps), default=1.0)
+    farthest = max(float(pointmap.depth.max()) for pointmap in pointmaps)
     spread = float(np.linalg.norm(centres - centre, axis=1).max())
     radius = config.distance * max(farthest, spread)
-    directions = _sphere(config.spacing_deg) if config.spacing_deg > 0 else np.zeros((0, 3))
+    directions = _sphere(config.spacing_deg)
     outside = np.full(len(directions), np.inf)
     colours = np.zeros((len(directions), 3))
     for pointmap, image in zip(pointmaps, images, strict=True):
@@ -56,11 +56,12 @@ def background(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.ui
     kept = outside < config.margin
     directions, colours = directions[kept], colours[kept]
     count = len(directions)
-    extent = radius * np.radians(config.spacing_deg) * 0.7
+    extent = 0.7 * radius * np.radians(config.spacing_deg)
+    scales = np.tile(extent * np.array([1.0, 1.0, 0.1]), (count, 1))
     return Gaussians(
         means=torch.from_numpy(centre + radius * directions).float(),
         quats=quat_from_matrix(torch.from_numpy(_frames(directions)).float()),
-        log_scales=torch.from_numpy(np.tile(np.log(extent * np.array([1.0, 1.0, 0.1])), (count, 1))).float(),
+        log_scales=torch.from_numpy(np.log(scales)).float(),
         logit_opacities=torch.full((count,), float(np.log(config.opacity / (1 - config.opacity)))),
         sh=torch.from_numpy((colours - 0.5) / SH_C0).float()[:, None],
         source_frame=torch.full((count,), SOURCE_FRAME, dtype=torch.int32),
@@ -68,8 +69,8 @@ def background(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.ui
 
 
 def _sphere(spacing_deg: float) -> npt.NDArray[np.float64]:
-    """(M, 3) directions that cover the sphere evenly (Fibonacci lattice)."""
-    count = int(4 * np.pi / np.radians(spacing_deg) ** 2)
+    """(M, 3) directions that cover the sphere evenly (Fibonacci lattice); none for a spacing of 0."""
+    count = int(4 * np.pi / np.radians(spacing_deg) ** 2) if spacing_deg > 0 else 0
     step = np.arange(count) + 0.5
     z = 1.0 - 2.0 * step / count
     angle = np.pi * (1.0 + np.sqrt(5.0)) * step
@@ -80,6 +81,6 @@ def _sphere(spacing_deg: float) -> npt.NDArray[np.float64]:
 def _frames(directions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """(M, 3, 3) rotations whose third axis points along each direction."""
     helper = np.where(np.abs(directions[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(helper, directions)
+    first: npt.NDArray[np.float64] = np.cross(helper, directions)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(directions, first), directions], 2)

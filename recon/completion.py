@@ -32,9 +32,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     in_front: float = 0.03  # relative depth by which a filled point may lie before a known one
 
 
-def complete(
-    pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config
-) -> list[Pointmap]:
+def complete(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config) -> list[Pointmap]:
     """The point maps with their unknown pixels filled or, where that would contradict another view, empty."""
     known = [_only(pointmap, pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
     completed = list(known)
@@ -81,7 +79,7 @@ def smooth_depth(pointmap: Pointmap, image: npt.NDArray[np.uint8], config: Confi
     laplacian = laplacian + laplacian.T
     laplacian = diags(np.asarray(laplacian.sum(1)).ravel()) - laplacian
     data = 10.0 * weight.ravel().astype(np.float64)
-    solution = spsolve((laplacian + diags(data + 1e-9)).tocsc(), data * inverse.ravel())
+    solution = np.asarray(spsolve((laplacian + diags(data + 1e-9)).tocsc(), data * inverse.ravel()), np.float64)
     smooth = cv2.resize(solution.reshape(size[1], size[0]), (width, height), interpolation=cv2.INTER_LINEAR)
     known = pointmap.depth[pointmap.depth > 0]
     return (1.0 / np.clip(smooth, 0.5 / known.max(), 2.0 / known.min())).astype(np.float32)

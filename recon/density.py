@@ -23,10 +23,17 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     largest_cell_px: int = 16
     smallest_cell_px: int = 2
     colour_deviation: float = 0.035  # standard deviation of colour, in [0, 1], above which a cell is divided
-    depth_deviation: float = 0.02  # relative deviation of depth from its cell's plane above which it is divided
+    depth_deviation: float = 0.02  # standard deviation of depth, relative to it, above which a cell is divided
     footprint: float = 0.6  # standard deviation of a new Gaussian in units of its cell
     thickness: float = 0.15  # standard deviation along the normal, in units of that across
     opacity: float = 0.9
+
+    def __post_init__(self) -> None:
+        if self.smallest_cell_px < 1 or self.largest_cell_px not in _sizes(self):
+            raise ValueError(
+                "smallest_cell_px must be at least 1, and largest_cell_px that times a power of two, "
+                f"got {self.smallest_cell_px} and {self.largest_cell_px}"
+            )
 
 
 def redundant(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
@@ -75,7 +82,8 @@ def gaussians_from_pointmap(
     pad = ((0, -height % size), (0, -width % size))
     weight = np.pad((wanted & (pointmap.depth > 0)).astype(np.float32), pad)
     rows, columns = np.indices(weight.shape, np.float32) + np.float32(0.5)
-    inverse_depth = np.pad(np.where(pointmap.depth > 0, 1.0 / np.maximum(pointmap.depth, 1e-9), 0.0), pad).astype(np.float32)
+    inverse_depth = np.where(pointmap.depth > 0, 1.0 / np.maximum(pointmap.depth, 1e-9), 0.0)
+    inverse_depth = np.pad(inverse_depth.astype(np.float32), pad)
     colour = np.pad(image.astype(np.float32) / 255.0, (*pad, (0, 0)))
     normal = np.pad(pointmap.normal.astype(np.float32), (*pad, (0, 0)))
     values = np.concatenate(

@@ -128,6 +128,7 @@ class _Fit:
             target.height,
             channels=("rgb",),
         )
+        assert render.rgb is not None  # it was asked for
         target.loss(render.rgb).backward()
         self._adam.lrs = {name: rate * decay for name, rate in self._rates.items()}
         self._adam.step()

@@ -16,7 +16,11 @@ Image = npt.NDArray[np.uint8]
 def render_camera(gaussians: GaussianArrays, camera: CameraEstimate) -> Image:
     """(H, W, 3) RGB of the Gaussians from an estimated camera."""
     render = rasterize(
-        *(torch.from_numpy(a) for a in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)),  # fmt: skip
+        torch.from_numpy(gaussians.means),
+        torch.from_numpy(gaussians.quats),
+        torch.from_numpy(gaussians.scales),
+        torch.from_numpy(gaussians.opacities),
+        torch.from_numpy(gaussians.sh),
         torch.from_numpy(camera.T_world_camera).float(),
         torch.from_numpy(camera.K).float(),
         camera.width,
@@ -28,10 +32,11 @@ def render_camera(gaussians: GaussianArrays, camera: CameraEstimate) -> Image:
 
 
 def contact_sheet(snapshot: Snapshot, max_views: int = 4, height: int = 240) -> bytes:
-    """A PNG: photographs above, the Gaussians seen from the same cameras below."""
-    step = max(1, len(snapshot.cameras) // max_views)
+    """A PNG: photographs above, the Gaussians seen from the same cameras below; cameras from the first to the last."""
+    count = len(snapshot.cameras)
+    shown = np.linspace(0, count - 1, min(count, max_views)).round().astype(int)
     columns = []
-    for camera in snapshot.cameras[::step][:max_views]:
+    for camera in (snapshot.cameras[index] for index in shown):
         pair = [snapshot.images[camera.name], render_camera(snapshot.gaussians, camera)]
         size = (round(camera.width * height / camera.height), height)
         columns.append(np.vstack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in pair]))
