@@ -12,10 +12,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 from capture.frame import DroppedFrame, Frame
+from recon import optimize
 from recon.config import Config
 from recon.judge import judge
 from recon.keyframe import Keyframe, modelled_image
-from recon.optimize import refine
 from recon.priors import classical
 from recon.registration import features
 from recon.scene import Scene, begin, extend
@@ -27,10 +27,11 @@ log = logging.getLogger(__name__)
 
 
 def reconstruct(frames: Iterable[Frame | DroppedFrame], config: Config) -> Iterator[Snapshot]:
-    """A snapshot after every frame, at every checkpoint of the final refinement, and a last one with `final` set.
+    """A snapshot after every frame, at every checkpoint and at the end of the refinement, and one with `final` set.
 
     Every frame becomes a keyframe of the view graph, from which the prior estimates cameras and points anew; what the
-    scene has already learnt is carried over. A snapshot holds Gaussians only if its verdict is publishable.
+    scene has already learnt is carried over. A dropped frame is named in the snapshots that follow. A snapshot holds
+    Gaussians only if its verdict is publishable.
     """
     run = _Run(config)
     for frame in frames:
@@ -39,23 +40,17 @@ def reconstruct(frames: Iterable[Frame | DroppedFrame], config: Config) -> Itera
             continue
         run.take(frame)
         run.estimate()
-        if run.scene is not None:
-            for run.scene in refine(run.scene, config.preview, seed=config.seed):
-                pass
-            run.clock.lap("optimise")
+        for _ in run.refine(config.preview):
+            pass
         yield run.snapshot()
-    if not run.graph.keyframes:
-        run.estimate()
-    if run.scene is not None:
-        for run.scene in refine(run.scene, config.optimize, seed=config.seed, deadline=run.deadline):
-            run.clock.lap("optimise")
-            yield run.snapshot()
+    for _ in run.refine(config.optimize):
+        yield run.snapshot()
     yield run.snapshot(final=True)
 
 
 @dataclass
 class _Clock:
-    """Seconds by stage."""
+    """Seconds by stage; "wait" is for the next frame, and for whoever reads the snapshots."""
 
     started: float = field(default_factory=time.monotonic)
     last: float = field(default_factory=time.monotonic)
@@ -91,7 +86,9 @@ class _Run:
         return None if self.config.budget_s is None else self.clock.started + self.config.budget_s
 
     def take(self, frame: Frame) -> None:
-        """The frame as a keyframe of the view graph."""
+        """The frame as a keyframe of the view graph. Time counts from the first one."""
+        if not self.graph.keyframes:
+            self.clock = _Clock()
         self.clock.lap("wait")
         found = features.extract(frame.image, self.config.prior.registration.features)
         self.graph.add(Keyframe(frame, modelled_image(frame.image, self.config.size), found))
@@ -121,6 +118,17 @@ class _Run:
         fits = config.max_gaussians is None or len(grown.gaussians) <= config.max_gaussians
         self.scene = grown if fits else begun
         self.clock.lap("points")
+
+    def refine(self, config: optimize.Config) -> Iterator[None]:
+        """Refines the scene, if there is one; stops for a look at every checkpoint and at the end."""
+        if self.scene is None:
+            return
+        self.clock.lap("wait")
+        for scene in optimize.refine(self.scene, config, seed=self.config.seed, deadline=self.deadline):
+            self.scene = scene
+            self.clock.lap("optimise")
+            yield
+            self.clock.lap("wait")
 
     def snapshot(self, final: bool = False) -> Snapshot:
         self.sequence += 1
