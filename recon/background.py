@@ -25,8 +25,23 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 SOURCE_FRAME = -1  # of Gaussians that no frame's pixels started
 
 
-def background(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config) -> Gaussians:
-    """Gaussians on a sphere around the cameras, in the directions that they look.
+def background(
+    pointmaps: Sequence[Pointmap],
+    images: Sequence[npt.NDArray[np.uint8]],
+    config: Config,
+    max_gaussians: int | None = None,
+) -> Gaussians:
+    """Gaussians on a sphere around the cameras, in the directions that they look; wider apart to be `max_gaussians`."""
+    shell = _shell(pointmaps, images, config)
+    while max_gaussians is not None and len(shell) > max_gaussians:
+        wider = max(1.1, (len(shell) / max(max_gaussians, 1)) ** 0.5)
+        config = msgspec.structs.replace(config, spacing_deg=wider * config.spacing_deg)
+        shell = _shell(pointmaps, images, config)
+    return shell
+
+
+def _shell(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config) -> Gaussians:
+    """The Gaussians `config.spacing_deg` apart.
 
     Each has the colour of the image, strongly blurred, of the view that it lies deepest in, at the nearest pixel of
     that image.

@@ -100,11 +100,9 @@ def begin(
         )
         for pointmap, camera in zip(completed, cameras, strict=True)
     )
-    behind = background.background(pointmaps, pictures, shell)
-    if max_gaussians is not None:
-        behind = behind.subset(torch.arange(min(len(behind), max_gaussians // 10)))
-        max_gaussians -= len(behind)
-    surfaces = density.initial_gaussians(completed, pictures, sampling, max_gaussians)
+    behind = background.background(pointmaps, pictures, shell, None if max_gaussians is None else max_gaussians // 10)
+    left = None if max_gaussians is None else max_gaussians - len(behind)
+    surfaces = density.initial_gaussians(completed, pictures, sampling, left)
     return Scene(views, concatenate([surfaces, behind]))
 
 
@@ -112,8 +110,9 @@ def extend(old: Scene, new: Scene, tolerance: float = 0.02) -> Scene:
     """`new`, which has further views, with what was already learnt in `old`.
 
     The old scene is carried into the new world by the similarity of the cameras that both have. Its Gaussians replace
-    those that start from the same views. Where the new estimate moved a camera by more than `tolerance` of the scene's
-    depth, what was learnt no longer fits and the new scene starts afresh.
+    those that start from the same views; the far shell is the new one, which reaches as far as the new views. Where the
+    new estimate moved a camera by more than `tolerance` of the scene's depth, or changed a focal length by more than
+    that part of it, what was learnt no longer fits and the new scene starts afresh.
     """
     before = {view.name: view for view in old.views}
     both = [view for view in new.views if view.name in before]
@@ -123,14 +122,27 @@ def extend(old: Scene, new: Scene, tolerance: float = 0.02) -> Scene:
     Ts_old = np.stack([before[view.name].T_world_camera.double().numpy() for view in both])
     similarity = align_cameras(Ts_old, Ts_new)
     carried = np.stack([similarity.camera(T) for T in Ts_old])
-    if np.abs(carried[:, :3] - Ts_new[:, :3]).max() > tolerance:
+    zoomed = max(abs(float(view.K[0, 0] / before[view.name].K[0, 0]) - 1.0) for view in both)
+    if np.abs(carried[:, :3] - Ts_new[:, :3]).max() > tolerance or zoomed > tolerance:
         return new
-    learnt = old.gaussians.transformed(
+    learnt = old.gaussians.subset(old.gaussians.source_frame != background.SOURCE_FRAME).transformed(
         similarity.scale, torch.from_numpy(similarity.rotation), torch.from_numpy(similarity.translation)
     )
     known_frames = torch.tensor([view.frame_id for view in old.views], dtype=torch.int32)
-    known_frames = torch.cat([known_frames, known_frames.new_tensor([background.SOURCE_FRAME])])
     fresh = new.gaussians.subset(~torch.isin(new.gaussians.source_frame, known_frames))
     poses = {view.name: torch.from_numpy(T).float() for view, T in zip(both, carried, strict=True)}
     views = tuple(replace(view, T_world_camera=poses.get(view.name, view.T_world_camera)) for view in new.views)
-    return Scene(views, concatenate([learnt, fresh]), old.iterations)
+    return _in_first_camera(Scene(views, concatenate([learnt, fresh]), old.iterations))
+
+
+def _in_first_camera(scene: Scene) -> Scene:
+    """The same scene with its first camera's frame as the world, as snapshots promise."""
+    T_camera_world = torch.linalg.inv(scene.views[0].T_world_camera.double())
+    views = tuple(
+        replace(view, T_world_camera=(T_camera_world @ view.T_world_camera.double()).float()) for view in scene.views
+    )
+    return replace(
+        scene,
+        views=views,
+        gaussians=scene.gaussians.transformed(1.0, T_camera_world[:3, :3], T_camera_world[:3, 3]),
+    )

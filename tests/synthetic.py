@@ -17,6 +17,7 @@ from capture.diorama.cast import Camera, cast
 from capture.diorama.layout import BRICK_WALL, place
 from capture.frame import Frame
 from recon.gaussians import Gaussians
+from recon.priors.pointmap import Pointmap
 
 SMALL = synthetic.Config(views=6, width=320, height=240)
 
@@ -148,4 +149,41 @@ def tiny_scene(
         K.expand(num_cameras, 3, 3).clone(),
         width,
         height,
+    )
+
+
+def plane_pointmap(
+    T_world_camera: np.ndarray,
+    normal: tuple[float, float, float] = (0.0, 0.0, -1.0),
+    point: tuple[float, float, float] = (0.0, 0.0, 2.0),
+    width: int = 32,
+    height: int = 24,
+    confidence: float = 0.8,
+    frame_id: int = 0,
+) -> Pointmap:
+    """What a perfect prior says of an endless plane through `point`, whose unit `normal` faces the camera (world)."""
+    K = np.array([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1]])
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1)
+    facing = np.array(normal) @ T_world_camera[:3, :3]
+    depth = float(np.dot(normal, np.array(point) - T_world_camera[:3, 3])) / (rays @ facing)
+    return Pointmap(
+        name=f"{frame_id:02d}.png",
+        frame_id=frame_id,
+        depth=depth.astype(np.float32),
+        confidence=np.full(depth.shape, confidence, np.float32),
+        normal=np.broadcast_to(facing, rays.shape).astype(np.float32),
+        T_world_camera=T_world_camera,
+        K=K,
+    )
+
+
+def without(pointmap: Pointmap, hole: np.ndarray) -> Pointmap:
+    """The point map with nothing known in `hole` (h, w)."""
+    keep = ~hole
+    return replace(
+        pointmap,
+        depth=pointmap.depth * keep,
+        confidence=pointmap.confidence * keep,
+        normal=pointmap.normal * keep[..., None],
     )
