@@ -22,6 +22,9 @@ constexpr int kMargin = 16;     // zeros on both sides of a row, at least kRadiu
 constexpr int kBandRows = 96;   // rows of a task: fixed, so that the sums do not depend on the threads
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 
+// The weights of an image without weights.
+constexpr float kOnes[16] = {1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1, 1};
+
 struct Kernel {
     float half[kRadius + 1];  // from the rim to the middle
     Kernel() {
@@ -40,7 +43,29 @@ inline Vec load_unaligned(const float* from) {
     __builtin_memcpy(&value, from, sizeof value);
     return value;
 }
-inline void store_unaligned(float* to, Vec value) { __builtin_memcpy(to, &value, sizeof value); }
+
+// The first `valid` of kLanes floats, and zeros.
+inline Vec load_part(const float* from, int valid) {
+    if (valid >= kLanes) return load_unaligned(from);
+    alignas(64) float values[kLanes] = {};
+    std::copy(from, from + valid, values);
+    return load(values);
+}
+inline void store_part(float* to, Vec value, int valid) {
+    if (valid >= kLanes) {
+        __builtin_memcpy(to, &value, sizeof value);
+        return;
+    }
+    alignas(64) float values[kLanes];
+    store(values, value);
+    std::copy(values, values + valid, to);
+}
+
+inline float sum_lanes(Vec value) {
+    float sum = 0;
+    for (int lane = 0; lane < kLanes; ++lane) sum += value[lane];
+    return sum;
+}
 
 int padded(int width) { return (width + 15) / 16 * 16; }
 int stride(int width) { return padded(width) + 2 * kMargin; }
@@ -122,61 +147,46 @@ struct Scratch {
     Ring derivatives;  // blurred along x
 };
 
-// Weighted 1 - SSIM of row y summed; its derivatives into three rows (zero beyond the image).
-double similarity_row(const Plane& plane, int y, Ring& moments, float* (&derivatives)[3], float* ones) {
+// Weighted 1 - SSIM of row y summed; its derivatives into three rows.
+double similarity_row(const Plane& plane, int y, Ring& moments, float* (&derivatives)[3]) {
     const ColumnBlur mean(moments, y, 0), square(moments, y, 1), product(moments, y, 2);
     const size_t at = size_t(y) * plane.width;
-    const float* weights = plane.weights ? plane.weights + at : ones;
-    double sum = 0;
+    Vec sum{};
     for (int x = 0; x < plane.width; x += kLanes) {
-        const int valid = std::min(kLanes, plane.width - x);
-        alignas(64) float cached[3][kLanes] = {};
-        const float* from[3] = {plane.target_mean + at + x, plane.target_variance + at + x, weights + (plane.weights ? x : 0)};
-        for (int i = 0; i < 3; ++i) {
-            if (valid == kLanes) std::memcpy(cached[i], from[i], sizeof(float) * kLanes);
-            else std::memcpy(cached[i], from[i], sizeof(float) * valid);
-        }
-        const Vec m1 = mean.at(x), m2 = load(cached[0]), weight = load(cached[2]);
+        const int valid = plane.width - x;
+        const Vec m1 = mean.at(x), m2 = load_part(plane.target_mean + at + x, valid);
+        const Vec variance2 = load_part(plane.target_variance + at + x, valid);
         const Vec a1 = 2.0f * m1 * m2 + kC1, a2 = 2.0f * (product.at(x) - m1 * m2) + kC2;
-        const Vec b1 = m1 * m1 + m2 * m2 + kC1, b2 = square.at(x) - m1 * m1 + load(cached[1]) + kC2;
+        const Vec b1 = m1 * m1 + m2 * m2 + kC1, b2 = square.at(x) - m1 * m1 + variance2 + kC2;
         const Vec inverse = 1.0f / (b1 * b2), similarity = a1 * a2 * inverse;
+        const Vec weight = load_part(plane.weights ? plane.weights + at + x : kOnes, valid);
         store(derivatives[0] + x, weight * inverse * 2.0f * (m2 * (a2 - a1) - m1 * similarity * (b2 - b1)));
         store(derivatives[1] + x, -weight * similarity * b1 * inverse);
         store(derivatives[2] + x, weight * 2.0f * a1 * inverse);
-        const Vec lost = weight * (1.0f - similarity);
-        float row_sum = 0;
-        for (int lane = 0; lane < kLanes; ++lane) row_sum += lost[lane];
-        sum += row_sum;
+        sum += weight * (1.0f - similarity);
     }
-    return sum;
+    return sum_lanes(sum);
 }
 
 // Gradient of row y, and the sum of its weighted absolute differences.
 double gradient_row(const Plane& plane, int y, Ring& derivatives, float l1_factor, float ssim_factor) {
     const ColumnBlur mean(derivatives, y, 0), square(derivatives, y, 1), product(derivatives, y, 2);
     const size_t at = size_t(y) * plane.width;
-    double sum = 0;
+    const Vec one = splat(1.0f);
+    Vec sum{};
     for (int x = 0; x < plane.width; x += kLanes) {
-        const size_t bytes = sizeof(float) * std::min(kLanes, plane.width - x);
-        alignas(64) float image_row[kLanes] = {}, target_row[kLanes] = {}, weight_row[kLanes] = {};
-        std::memcpy(image_row, plane.image + at + x, bytes);
-        std::memcpy(target_row, plane.target + at + x, bytes);
-        const Vec image = load(image_row), target = load(target_row), difference = image - target;
-        Vec weight = splat(1.0f);
-        if (plane.weights) std::memcpy(weight_row, plane.weights + at + x, bytes), weight = load(weight_row);
-        const Vec lost = weight * absolute(difference);
-        float row_sum = 0;
-        for (int lane = 0; lane < kLanes; ++lane) row_sum += lost[lane];
-        sum += row_sum;
+        const int valid = plane.width - x;
+        const Vec image = load_part(plane.image + at + x, valid), target = load_part(plane.target + at + x, valid);
+        const Vec weight = load_part(plane.weights ? plane.weights + at + x : kOnes, valid);
+        const Vec difference = image - target;
+        sum += weight * absolute(difference);
         if (!plane.gradient) continue;
-        const Vec one = splat(1.0f), sign = keep(less(Vec{}, difference), one) - keep(less(difference, Vec{}), one);
+        const Vec sign = keep(less(Vec{}, difference), one) - keep(less(difference, Vec{}), one);
         const Vec structure = mean.at(x) + 2.0f * image * square.at(x) + target * product.at(x);
         const Vec gradient = keep(less(Vec{}, weight), l1_factor * weight * sign - ssim_factor * structure);
-        alignas(64) float out[kLanes];
-        store(out, gradient);
-        std::memcpy(plane.gradient + at + x, out, bytes);
+        store_part(plane.gradient + at + x, gradient, valid);
     }
-    return sum;
+    return sum_lanes(sum);
 }
 
 Sums sweep(const Plane& plane, int begin, int end, float l1_factor, float ssim_factor, Scratch& scratch) {
@@ -187,8 +197,6 @@ Sums sweep(const Plane& plane, int begin, int end, float l1_factor, float ssim_f
     float *image = scratch.rows.row(0), *target = scratch.rows.row(1);
     float *square = scratch.rows.row(2), *product = scratch.rows.row(3);
     float* derivatives[3] = {scratch.rows.row(4), scratch.rows.row(5), scratch.rows.row(6)};
-    alignas(64) float ones[kLanes];
-    store(ones, splat(1.0f));
 
     Sums sums;
     // `y` is the row that comes in; its moments are whole 5 rows later, its derivatives after 10.
@@ -210,7 +218,7 @@ Sums sweep(const Plane& plane, int begin, int end, float l1_factor, float ssim_f
         const int middle = y - kRadius;
         if (middle < begin - kRadius) continue;
         if (middle >= 0 && middle < height) {
-            const double lost = similarity_row(plane, middle, scratch.moments, derivatives, ones);
+            const double lost = similarity_row(plane, middle, scratch.moments, derivatives);
             if (middle >= begin && middle < end) sums.dissimilarity += lost;
             for (int map = 0; map < 3 && plane.gradient; ++map) {
                 std::fill(derivatives[map] + width, derivatives[map] + padded(width), 0.0f);
@@ -244,13 +252,9 @@ void target_moments(const float* target, int width, int height, float* mean_out,
         if (out < 0) continue;
         const ColumnBlur mean(ring, out, 0), square(ring, out, 1);
         for (int x = 0; x < width; x += kLanes) {
-            alignas(64) float values[2][kLanes];
             const Vec m = mean.at(x);
-            store(values[0], m);
-            store(values[1], square.at(x) - m * m);
-            const size_t bytes = sizeof(float) * std::min(kLanes, width - x);
-            std::memcpy(mean_out + size_t(out) * width + x, values[0], bytes);
-            std::memcpy(variance_out + size_t(out) * width + x, values[1], bytes);
+            store_part(mean_out + size_t(out) * width + x, m, width - x);
+            store_part(variance_out + size_t(out) * width + x, square.at(x) - m * m, width - x);
         }
     }
 }
