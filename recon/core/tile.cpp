@@ -62,6 +62,7 @@ void load_splats(const Raster& raster, int tile, TileSplat* splats) {
 
 void find_blocks(Raster& raster, int tile) {
     const uint32_t count = raster.num_entries(tile), words = raster.num_words(tile);
+    if (!count) return;
     const uint64_t* entries = raster.entries.data() + raster.first_entries[tile];
     uint64_t* block_bits = raster.block_bits.data() + raster.first_words[tile];
     std::memset(block_bits, 0, sizeof(uint64_t) * kBlocks * words);
