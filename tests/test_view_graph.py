@@ -1,0 +1,64 @@
+"""The view graph: every pair is compared once, and its components are what verified pairs connect."""
+
+from __future__ import annotations
+
+import pytest
+
+from recon.keyframe import Keyframe, modelled_image
+from recon.registration import features, register
+from recon.view_graph import ViewGraph
+from tests.synthetic import photographs, places
+
+
+def graph_of(frames, config: register.Config | None = None) -> ViewGraph:
+    config = config or register.Config()
+    graph = ViewGraph(config)
+    for frame in frames:
+        found = features.extract(frame.image, config.features)
+        graph.add(Keyframe(frame, modelled_image(frame.image, 320), found))
+    return graph
+
+
+@pytest.fixture
+def compared(monkeypatch) -> list[tuple[str, str]]:
+    """The names of the pairs that were compared; those of one initial letter match."""
+    calls: list[tuple[str, str]] = []
+
+    def compare(first, second, config):
+        calls.append((first, second))
+        return f"{first}{second}" if first[0] == second[0] else None
+
+    monkeypatch.setattr(register, "compare", compare)
+    return calls
+
+
+def test_each_new_keyframe_is_compared_with_all_before_it(compared):
+    graph = ViewGraph(register.Config())
+    for name in ("a1", "b1", "a2"):
+        graph.add(name)
+    assert compared == [("a1", "b1"), ("a1", "a2"), ("b1", "a2")]
+    assert graph.pairs == {(0, 2): "a1a2"}
+    assert graph.keyframes == ["a1", "b1", "a2"]
+
+
+def test_components_are_the_largest_first(compared):
+    graph = ViewGraph(register.Config())
+    assert graph.components() == []
+    for name in ("c1", "a1", "b1", "a2", "b2", "a3"):
+        graph.add(name)
+    assert graph.components() == [[1, 3, 5], [2, 4], [0]]
+
+
+@pytest.mark.parametrize("pairs", [[(0, 1), (1, 2), (2, 3)], [(2, 3), (0, 1), (1, 2)], [(0, 3), (2, 3), (1, 2)]])
+def test_a_chain_is_one_component_in_whatever_order_its_pairs_were_found(pairs):
+    graph = ViewGraph(register.Config())
+    graph.keyframes = ["a", "b", "c", "d", "e"]
+    graph.pairs = dict.fromkeys(pairs)
+    assert graph.components() == [[0, 1, 2, 3], [4]]
+
+
+def test_photographs_of_one_place_are_a_pair_and_those_of_two_are_not():
+    here, there = photographs()[2:4], places()[5:]
+    graph = graph_of([*here, *there])
+    assert set(graph.pairs) == {(0, 1)}
+    assert len(graph.pairs[0, 1].matches) > 100 and not graph.pairs[0, 1].turned_only
