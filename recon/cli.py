@@ -44,7 +44,7 @@ def replay(args: argparse.Namespace) -> int:
 def run(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:
     """The final snapshot; progress goes to the terminal, if there is one."""
     snapshot = None
-    for snapshot in reconstruct(frames, config):
+    for snapshot in reconstruct(list(frames), config):
         _progress(snapshot)
     if snapshot is None:
         raise AssertionError("reconstruct always yields a last snapshot")

@@ -1,8 +1,9 @@
 """What no two views confirm: filled from its surroundings where nothing speaks against it, else left empty.
 
-A plain wall or the sky gives stereo nothing to match. Left empty it would be black in every new view. So where no
-other view shows a known point, a pixel gets the first of three depths that does not hide a known surface from any other
-view: stereo's own doubtful one, the smoothest that agrees with the image's edges (the stated prior), a far background.
+A plain wall or the sky gives stereo nothing to match. Left empty it would be black in every new view. So a pixel on
+which no other view's point of like colour falls gets the first of these depths that does not hide a known surface from
+any other view: stereo's own doubtful one; the smoothest that agrees with the image's edges (the stated prior); a far
+background. Where points of other colour fall, something nearer stands before them: it is put close to the camera.
 """
 
 from __future__ import annotations
@@ -24,7 +25,10 @@ Mask = npt.NDArray[np.bool_]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    min_confidence: float = 0.3  # depths below are doubtful
+    min_confidence: float = 0.12  # depths below are doubtful
+    like: float = 0.12  # difference of colour, in [0, 1], up to which a point explains a pixel
+    object_px: int = 15  # least width of a region of other colour that is taken for a foreground object
+    foreground: float = 0.4  # depth of an unknown foreground in units of the nearest known depth of its view
     background: float = 1.5  # depth of the background in units of the farthest known depth of a view
     confidence: float = 0.1  # of what is filled in
     reduction: int = 4  # the smooth depth is found at this part of the resolution
@@ -37,20 +41,27 @@ def complete(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint
     known = [_only(pointmap, pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
     completed = list(known)
     for j in sorted(range(len(known)), key=lambda i: -float(known[i].confidence.mean())):
-        others = [completed[i] for i in range(len(known)) if i != j]
-        hole = (known[j].depth <= 0) & ~_covered(known[j], others)
+        rest = [i for i in range(len(known)) if i != j]
+        falls, explained = _seen_by_others(known[j], images[j], [(completed[i], images[i]) for i in rest], config.like)
+        unknown = known[j].depth <= 0
+        # Single pixels of another colour are noise and edges; an object that only this view sees is larger.
+        object_size = np.ones((config.object_px, config.object_px), np.uint8)
+        occluded = cv2.morphologyEx((unknown & falls & ~explained).astype(np.uint8), cv2.MORPH_OPEN, object_size) > 0
+        hole = unknown & (~falls | occluded)
         if not hole.any() or not (known[j].depth > 0).any():
             continue
         facing = _facing(known[j])
-        far = np.full_like(known[j].depth, config.background * known[j].depth.max())
+        near, far = np.percentile(known[j].depth[known[j].depth > 0], [2.0, 100.0])
+        near_guess = replace(known[j], depth=np.full_like(known[j].depth, config.foreground * near), normal=facing)
         guesses = (
             pointmaps[j],
-            replace(known[j], depth=smooth_depth(known[j], images[j], config), normal=facing),
-            replace(known[j], depth=far, normal=facing),
+            _only(replace(known[j], depth=smooth_depth(known[j], images[j], config), normal=facing), ~falls),
+            _only(replace(known[j], depth=np.full_like(known[j].depth, config.background * far), normal=facing), ~falls),
+            _only(near_guess, occluded),
         )
         for guess in guesses:
             guess = _only(guess, hole)
-            guess = _only(guess, ~_hides_known(guess, [known[i] for i in range(len(known)) if i != j], config.in_front))
+            guess = _only(guess, ~_hides_known(guess, [known[i] for i in rest], config.in_front))
             completed[j] = replace(
                 completed[j],
                 depth=completed[j].depth + guess.depth,
@@ -94,13 +105,28 @@ def _only(pointmap: Pointmap, keep: Mask) -> Pointmap:
     )
 
 
-def _covered(target: Pointmap, others: Sequence[Pointmap]) -> Mask:
-    """Pixels of the target onto which a point of another view falls, small gaps between them closed."""
-    covered = np.zeros(target.depth.shape, np.uint8)
-    for other in others:
-        pixel, _ = project_points(other.points[other.depth > 0], target)
-        covered.ravel()[pixel[pixel >= 0]] = 1
-    return cv2.morphologyEx(covered, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+def _seen_by_others(
+    target: Pointmap,
+    image: npt.NDArray[np.uint8],
+    others: Sequence[tuple[Pointmap, npt.NDArray[np.uint8]]],
+    like: float,
+) -> tuple[Mask, Mask]:
+    """Pixels of the target on which other views' points fall, and those of which one has the pixel's colour.
+
+    Small gaps between the points are closed.
+    """
+    falls, explained = np.zeros(target.depth.shape, np.uint8), np.zeros(target.depth.shape, np.uint8)
+    wanted = cv2.GaussianBlur(image, (5, 5), 0).reshape(-1, 3).astype(np.int16)
+    for other, other_image in others:
+        known = other.depth > 0
+        pixel, _ = project_points(other.points[known], target)
+        inside = pixel >= 0
+        pixel, colour = pixel[inside], cv2.GaussianBlur(other_image, (5, 5), 0)[known][inside].astype(np.int16)
+        falls.ravel()[pixel] = 1
+        explained.ravel()[pixel[np.abs(wanted[pixel] - colour).max(1) <= 255 * like]] = 1
+    kernel = np.ones((5, 5), np.uint8)
+    falls, explained = (cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel) for mask in (falls, explained))
+    return falls > 0, explained > 0
 
 
 def _hides_known(filled: Pointmap, others: Sequence[Pointmap], in_front: float) -> Mask:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from capture.frame import DroppedFrame, Frame
@@ -27,22 +27,31 @@ log = logging.getLogger(__name__)
 
 
 def reconstruct(frames: Iterable[Frame | DroppedFrame], config: Config) -> Iterator[Snapshot]:
-    """A snapshot after every frame, at every checkpoint and at the end of the refinement, and one with `final` set.
+    """Snapshots of the scene while it grows and is refined, the last of them with `final` set.
 
-    Every frame becomes a keyframe of the view graph, from which the prior estimates cameras and points anew; what the
-    scene has already learnt is carried over. A dropped frame is named in the snapshots that follow. A snapshot holds
-    Gaussians only if its verdict is publishable.
+    Every frame becomes a keyframe of the view graph. Frames from a stream are worked in one at a time: cameras and
+    points are estimated anew, what the scene has already learnt is carried over, and there is a snapshot after each.
+    Frames in a sequence are all at hand and are worked in together. Either way the refinement starts afresh from the
+    last estimate, so that the result depends on which frames there were and not on how they came.
+    A dropped frame is named in the snapshots that follow. A snapshot holds Gaussians only if its verdict is
+    publishable.
     """
     run = _Run(config)
+    all_at_hand = isinstance(frames, Sequence)
     for frame in frames:
         if isinstance(frame, DroppedFrame):
             run.dropped.append(frame)
             continue
         run.take(frame)
+        if not all_at_hand:
+            run.estimate()
+            for _ in run.refine(config.preview):
+                pass
+            yield run.snapshot()
+    if all_at_hand:
         run.estimate()
-        for _ in run.refine(config.preview):
-            pass
         yield run.snapshot()
+    run.scene = run.begun
     for _ in run.refine(config.optimize):
         yield run.snapshot()
     yield run.snapshot(final=True)
@@ -78,6 +87,7 @@ class _Run:
         self.prior = classical.load(config.prior)
         self.dropped: list[DroppedFrame] = []
         self.verdict: Verdict = judge(self.graph, None, config.judge)
+        self.begun: Scene | None = None  # from the last estimate, not optimised
         self.scene: Scene | None = None
         self.sequence = 0
 
@@ -92,6 +102,9 @@ class _Run:
         self.clock.lap("wait")
         found = features.extract(frame.image, self.config.prior.registration.features)
         self.graph.add(Keyframe(frame, modelled_image(frame.image, self.config.size), found))
+        newest = len(self.graph.keyframes) - 1
+        overlapping = sum(newest in pair for pair in self.graph.pairs)
+        log.info("%s: %d features, overlaps %d of %d frames", frame.name, len(found.points), overlapping, newest)
         self.clock.lap("poses")
 
     def estimate(self) -> None:
@@ -101,11 +114,11 @@ class _Run:
         self.clock.book("points", estimate.seconds_points)
         self.verdict = judge(self.graph, estimate.registration, self.config.judge)
         if not self.verdict.publishable or estimate.registration is None:
-            self.scene = None
+            self.begun = self.scene = None
             return
         images = {keyframe.name: keyframe.image for keyframe in self.graph.keyframes}
         config = self.config
-        begun = begin(
+        self.begun = begin(
             estimate.pointmaps,
             images,
             estimate.registration.cameras,
@@ -114,9 +127,9 @@ class _Run:
             config.background,
             config.max_gaussians,
         )
-        grown = extend(self.scene, begun) if self.scene is not None else begun
+        grown = extend(self.scene, self.begun) if self.scene is not None else self.begun
         fits = config.max_gaussians is None or len(grown.gaussians) <= config.max_gaussians
-        self.scene = grown if fits else begun
+        self.scene = grown if fits else self.begun
         self.clock.lap("points")
 
     def refine(self, config: optimize.Config) -> Iterator[None]:
