@@ -26,7 +26,7 @@ struct Transfer {
 // A view that the reference view is compared with. The layout is repeated in recon/priors/patchmatch.py.
 struct Source {
     const int32_t* packed;       // (height, width) 2x2 neighbourhoods of grey values, see pack_neighbourhoods
-    const float* inverse_depth;  // (height, width), 0 where unknown; null: no geometric term for this source
+    const float* inverse_depth;  // (height, width), 0 where unknown; read only where Problem.geometric is not 0
     int32_t width, height;
     Transfer from_reference;
     Transfer to_reference;
@@ -46,6 +46,7 @@ struct Problem {
     const Source* sources;
     int32_t num_sources;
 
+    int32_t active_sources;  // of each pixel, those that explain its plane best: new planes are compared in these
     int32_t random_starts;   // planes tried per pixel before the first iteration, beside the one given
     int32_t iterations;      // each visits every pixel once, in two half-steps of a checkerboard
     uint32_t stream, seed;   // choose the random numbers

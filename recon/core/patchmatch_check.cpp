@@ -44,16 +44,17 @@ void check_pixel(
     int consistent = 0, inside = 0, conflicting = 0;
     for (int n = 0; n < num_others && w > 0; ++n) {
         const Other& other = others[n];
-        const Ray there = at_inverse_depth(ray_through(other.from_reference, u, v), other.from_reference, w);
-        float other_u, other_v;
-        if (!lands_inside(there, other.width, other.height, other_u, other_v)) continue;
+        const Point there = at_inverse_depth(ray_through(other.from_reference, u, v), other.from_reference, w);
+        const Landing landing(there, other.width, other.height);
+        if (!landing.inside) continue;
         ++inside;
-        const int column = int(other_u), row = int(other_v);
+        const int column = int(landing.u), row = int(landing.v);
         const Plane& seen = other.planes[size_t(row) * other.width + column];
         if (!(seen.inverse_depth > 0)) continue;
-        const float seen_w = seen.at(other_u - column - 0.5f, other_v - row - 0.5f);
-        const Ray back = at_inverse_depth(ray_through(other.to_reference, other_u, other_v), other.to_reference, seen_w);
-        if (!(seen_w > 0 && back.z > 1e-6f)) continue;
+        const float seen_w = seen.at(landing.u - column - 0.5f, landing.v - row - 0.5f);
+        const Point ray_back = ray_through(other.to_reference, landing.u, landing.v);
+        const Point back = at_inverse_depth(ray_back, other.to_reference, seen_w);
+        if (!(seen_w > 0 && back.z > kSmallestZ)) continue;
         // `there` and `back` are scaled by the inverse depth that they were made from.
         const float back_w = seen_w / back.z;
         const float ratio = there.z * seen_w / w;  // depth of the point in the other view / depth that it sees there

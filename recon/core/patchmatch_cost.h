@@ -1,21 +1,59 @@
-// How well a plane explains the reference window in one source: bilaterally weighted normalised cross-correlation.
+// How well planes explain a pixel's window in other views: bilaterally weighted normalised cross-correlation.
+//
+// Nothing in here branches on a result. A matching cost ends a long chain of dependent instructions, and a branch
+// that is predicted wrongly at its end costs as much as the chain (measured: a third of the time of a cost).
 #pragma once
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 
 #include "patchmatch.h"
-#include "patchmatch_simd.h"
+#include "simd.h"
 
 namespace patchmatch {
+
+using core::IntVec;
+using core::kLanes;
+using core::maximum;
+using core::minimum;
+using core::splat;
+using core::Vec;
 
 constexpr int kRadius = 5;    // the window is 11 x 11 pixels ...
 constexpr int kSamples = 32;  // ... sampled at odd offsets without the corners: a whole number of vectors
 constexpr int kVectors = kSamples / kLanes;
+constexpr int kMaxCandidates = 4;  // planes that are compared at once
+constexpr float kSmallestZ = 1e-6f;
+
+// base[index] in every lane.
+inline IntVec gather(const int32_t* base, IntVec index) {
+#if CORE_LANES == 16
+    return (IntVec)_mm512_mask_i32gather_epi32(_mm512_setzero_si512(), 0xffff, (__m512i)index, base, 4);
+#elif CORE_LANES == 8
+    return (IntVec)_mm256_i32gather_epi32(base, (__m256i)index, 4);
+#else
+    IntVec result;
+    for (int lane = 0; lane < kLanes; ++lane) result[lane] = base[index[lane]];
+    return result;
+#endif
+}
+
+// The sum over all lanes: folded by halves to four, so that no lane is read one at a time before that.
+inline float sum(Vec x) {
+    typedef float Float4 __attribute__((vector_size(16)));
+    Float4 parts[kLanes / 4];
+    std::memcpy(parts, &x, sizeof x);
+    for (int count = kLanes / 8; count > 0; count /= 2)
+        for (int i = 0; i < count; ++i) parts[i] += parts[i + count];
+    return (parts[0][0] + parts[0][2]) + (parts[0][1] + parts[0][3]);
+}
+
+inline Vec to_float(IntVec x) { return __builtin_convertvector(x, Vec); }
 
 // Offsets of the samples from the centre, and their places in a row-major image that is `stride` wide.
 struct Pattern {
-    FloatVec right[kVectors], down[kVectors], closeness[kVectors];
+    Vec right[kVectors], down[kVectors], closeness[kVectors];
     IntVec place[kVectors];
 
     Pattern(int stride, float sigma_space) {
@@ -33,22 +71,22 @@ struct Pattern {
     }
 };
 
-// The reference window: weights that sum to 1 and weighted grey values about their mean.
+// The window of a pixel: weights that sum to 1, and weighted grey values about their mean.
 struct Window {
-    FloatVec weight[kVectors], weighted[kVectors];
+    Vec weight[kVectors], weighted[kVectors];
     float mean, variance;
 
-    // `centre` points into an image of floats, stored as the bits of int32, with kRadius pixels around it.
+    // `centre` points into an image of the bits of floats with kRadius pixels around it.
     Window(const Pattern& pattern, const int32_t* centre, float sigma_grey) {
         float centre_grey;
         std::memcpy(&centre_grey, centre, sizeof centre_grey);
-        FloatVec grey[kVectors], total = {}, first = {};
+        Vec grey[kVectors], total = {}, first = {};
         const float falloff = 1.0f / (16.0f * sigma_grey * sigma_grey);
         for (int k = 0; k < kVectors; ++k) {
-            grey[k] = (FloatVec)gather(centre, pattern.place[k]);
-            const FloatVec difference = grey[k] - centre_grey;
+            grey[k] = (Vec)gather(centre, pattern.place[k]);
+            const Vec difference = grey[k] - centre_grey;
             // (1 - x / 8)^8 for exp(-x): no call, and exactly zero far away.
-            FloatVec w = max(1.0f - difference * difference * falloff, FloatVec{});
+            Vec w = maximum(1.0f - difference * difference * falloff, Vec{});
             w *= w;
             w *= w;
             w *= w;
@@ -58,10 +96,10 @@ struct Window {
         }
         const float scale = 1.0f / sum(total);
         mean = sum(first) * scale;
-        FloatVec second = {};
+        Vec second = {};
         for (int k = 0; k < kVectors; ++k) {
             weight[k] *= scale;
-            const FloatVec centred = grey[k] - mean;
+            const Vec centred = grey[k] - mean;
             weighted[k] = weight[k] * centred;
             second += weighted[k] * centred;
         }
@@ -69,65 +107,128 @@ struct Window {
     }
 };
 
-// A (u, v, 1) of a transfer, to which every hypothesis of that pixel adds t w.
-struct Ray {
+// A homogeneous pixel.
+struct Point {
     float x, y, z;
 };
 
-inline Ray ray_through(const Transfer& transfer, float u, float v) {
+// A (u, v, 1) of a transfer, to which every hypothesis of that pixel adds t w.
+inline Point ray_through(const Transfer& transfer, float u, float v) {
     const float* A = transfer.A;
     return {A[0] * u + A[1] * v + A[2], A[3] * u + A[4] * v + A[5], A[6] * u + A[7] * v + A[8]};
 }
 
-inline Ray at_inverse_depth(const Ray& ray, const Transfer& transfer, float w) {
+inline Point at_inverse_depth(const Point& ray, const Transfer& transfer, float w) {
     return {ray.x + transfer.t[0] * w, ray.y + transfer.t[1] * w, ray.z + transfer.t[2] * w};
 }
 
-// Whether a homogeneous pixel is in front of the camera and inside its image; then (u, v) is where.
-inline bool lands_inside(const Ray& point, int width, int height, float& u, float& v) {
-    if (!(point.z > 1e-6f)) return false;
-    u = point.x / point.z;
-    v = point.y / point.z;
-    return u >= 0 && v >= 0 && u < float(width) && v < float(height);
-}
+// Where a homogeneous pixel falls: (u, v), moved into the image where it is outside or behind the camera.
+struct Landing {
+    float u, v;
+    bool inside;
 
-// 1 - NCC of the window with its image in the source under the plane, limited to [0, 1]. `centre` is the homogeneous
-// source pixel of the window's centre and must be inside the image; samples outside repeat the border.
-inline float matching_cost(
-    const Window& window, const Pattern& pattern, const Source& source, const Plane& plane, const Ray& centre,
-    float noise_variance
+    Landing(const Point& point, int width, int height) {
+        const float inverse_z = 1.0f / std::max(point.z, kSmallestZ);
+        const float x = point.x * inverse_z, y = point.y * inverse_z;
+        inside = (point.z > kSmallestZ) & (x >= 0) & (y >= 0) & (x < float(width)) & (y < float(height));
+        u = std::min(std::max(x, 0.0f), float(width) - 0.5f);
+        v = std::min(std::max(y, 0.0f), float(height) - 0.5f);
+    }
+};
+
+// What the costs of many planes and sources are made of, one entry a pair, so that the square roots and divisions are
+// done for all at once.
+struct Pairs {
+    static constexpr int kMost = kMaxCandidates * kMaxSources;
+    // Weighted moments of the source's grey values under the plane, about the mean of the reference window.
+    float first[kMost], second[kMost], product[kMost];
+    // The source's own point, where the plane's point lands, back in the reference: a homogeneous pixel; z is 0 where
+    // the source knows no depth.
+    float back_x[kMost], back_y[kMost], back_z[kMost];
+    float outside[kMost];  // 1 where the plane's point lands outside the source's image, else 0
+    int count = 0;
+};
+
+// `centre` is the homogeneous source pixel of the window's centre. Samples outside the image repeat its border.
+inline void add_moments(
+    const Plane& plane, const Window& window, const Pattern& pattern, const Source& source, const Point& centre,
+    Pairs& pairs
 ) {
     const float* A = source.from_reference.A;
     const float* t = source.from_reference.t;
     const float xu = A[0] + t[0] * plane.du, xv = A[1] + t[0] * plane.dv;
     const float yu = A[3] + t[1] * plane.du, yv = A[4] + t[1] * plane.dv;
     const float zu = A[6] + t[2] * plane.du, zv = A[7] + t[2] * plane.dv;
-    const FloatVec max_x = splat(float(source.width - 1)), max_y = splat(float(source.height - 1));
-    const FloatVec zero = {}, smallest_z = splat(1e-6f);
+    const Vec max_x = splat(float(source.width - 1)), max_y = splat(float(source.height - 1));
+    const Vec zero = {}, smallest_z = splat(kSmallestZ);
 
-    FloatVec first = {}, second = {}, product = {};
+    Vec first = {}, second = {}, product = {};
     for (int k = 0; k < kVectors; ++k) {
-        const FloatVec dx = pattern.right[k], dy = pattern.down[k];
-        const FloatVec inverse_z = 1.0f / max(centre.z + zu * dx + zv * dy, smallest_z);
-        const FloatVec x = min(max((centre.x + xu * dx + xv * dy) * inverse_z - 0.5f, zero), max_x);
-        const FloatVec y = min(max((centre.y + yu * dx + yv * dy) * inverse_z - 0.5f, zero), max_y);
-        const IntVec column = truncate(x), row = truncate(y);
-        const FloatVec right = x - to_float(column), below = y - to_float(row);
+        const Vec dx = pattern.right[k], dy = pattern.down[k];
+        const Vec inverse_z = 1.0f / maximum(centre.z + zu * dx + zv * dy, smallest_z);
+        const Vec x = minimum(maximum((centre.x + xu * dx + xv * dy) * inverse_z - 0.5f, zero), max_x);
+        const Vec y = minimum(maximum((centre.y + yu * dx + yv * dy) * inverse_z - 0.5f, zero), max_y);
+        const IntVec column = __builtin_convertvector(x, IntVec), row = __builtin_convertvector(y, IntVec);
+        const Vec right = x - to_float(column), below = y - to_float(row);
         const IntVec four = gather(source.packed, row * source.width + column);
-        const FloatVec top_left = to_float(four & 255), top_right = to_float((four >> 8) & 255);
-        const FloatVec bottom_left = to_float((four >> 16) & 255), bottom_right = to_float((four >> 24) & 255);
-        const FloatVec top = top_left + right * (top_right - top_left);
-        const FloatVec bottom = bottom_left + right * (bottom_right - bottom_left);
-        const FloatVec grey = top + below * (bottom - top) - window.mean;
-        const FloatVec weighted = window.weight[k] * grey;
+        const Vec top_left = to_float(four & 255), top_right = to_float((four >> 8) & 255);
+        const Vec bottom_left = to_float((four >> 16) & 255), bottom_right = to_float((four >> 24) & 255);
+        const Vec top = top_left + right * (top_right - top_left);
+        const Vec bottom = bottom_left + right * (bottom_right - bottom_left);
+        const Vec grey = top + below * (bottom - top) - window.mean;
+        const Vec weighted = window.weight[k] * grey;
         first += weighted;
         second += weighted * grey;
         product += window.weighted[k] * grey;
     }
-    const float mean = sum(first);
-    const float variance = std::max(sum(second) - mean * mean, 0.0f);
-    const float normaliser = (window.variance + noise_variance) * (variance + noise_variance);
-    return std::min(1.0f - sum(product) / std::sqrt(normaliser), 1.0f);
+    pairs.first[pairs.count] = sum(first);
+    pairs.second[pairs.count] = sum(second);
+    pairs.product[pairs.count] = sum(product);
+}
+
+// The source's own depth where a plane's point lands, carried back to the reference.
+inline void add_return(const Source& source, const Landing& there, Pairs& pairs) {
+    const float w = source.inverse_depth[size_t(there.v) * source.width + size_t(there.u)];
+    const Point back = at_inverse_depth(ray_through(source.to_reference, there.u, there.v), source.to_reference, w);
+    pairs.back_x[pairs.count] = back.x;
+    pairs.back_y[pairs.count] = back.y;
+    pairs.back_z[pairs.count] = w > 0 ? back.z : 0;
+}
+
+// 1 - NCC, limited to [0, 1]. The noise variance makes flat windows match nothing rather than anything.
+inline void matching_costs(const Pairs& pairs, float reference_variance, float noise_variance, float* costs) {
+    for (int i = 0; i < pairs.count; ++i) {
+        const float variance = std::max(pairs.second[i] - pairs.first[i] * pairs.first[i], 0.0f);
+        const float normaliser = (reference_variance + noise_variance) * (variance + noise_variance);
+        costs[i] = std::min(1.0f - pairs.product[i] / std::sqrt(normaliser), 1.0f);
+    }
+}
+
+// Adds `weight` times the distance in pixels between (u, v) and where the source's own point returns to, limited.
+inline void add_reprojection_errors(const Pairs& pairs, float u, float v, float weight, float limit, float* costs) {
+    for (int i = 0; i < pairs.count; ++i) {
+        const float inverse_z = 1.0f / std::max(pairs.back_z[i], kSmallestZ);
+        const float du = pairs.back_x[i] * inverse_z - u, dv = pairs.back_y[i] * inverse_z - v;
+        const float error = std::min(std::sqrt(du * du + dv * dv), limit);
+        costs[i] += weight * (pairs.back_z[i] > kSmallestZ ? error : limit);
+    }
+}
+
+// The mean of the `best` lowest of `count` costs, with weights that fall by `ratio` from each to the next: an occluded
+// source hardly counts, and two agreeing ones beat a single one. Sorts `costs`.
+inline float combine(float* costs, int count, int best, float ratio) {
+    for (int end = count - 1; end > 0; --end)
+        for (int i = 0; i < end; ++i) {
+            const float low = std::min(costs[i], costs[i + 1]), high = std::max(costs[i], costs[i + 1]);
+            costs[i] = low;
+            costs[i + 1] = high;
+        }
+    float total = 0, weights = 0, weight = 1;
+    for (int i = 0; i < best; ++i, weight *= ratio) {
+        total += weight * costs[i];
+        weights += weight;
+    }
+    return total / weights;
 }
 
 }  // namespace patchmatch
