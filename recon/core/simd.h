@@ -100,25 +100,33 @@ inline Vec square_root(Vec value) {
 #endif
 }
 
-// 2^x to 2e-7 relative for x in [-126, 0]. Smaller x give rubbish, never a trap: mask them.
-inline Vec exp2_nonpositive(Vec x) {
-    // Adding 1.5 * 2^23 rounds to an integer and leaves it in the low bits. The compiler must not see through it.
-    const Vec magic = splat(12582912.0f);
-    Vec shifted = x + magic;
+// The nearest integers; rubbish, but never a trap, for what no int32 can hold.
+inline IntVec nearest_int(Vec value) {
 #if CORE_LANES == 16
-    __asm__("" : "+v"(shifted));
+    return (IntVec)_mm512_cvtps_epi32((__m512)value);
+#elif CORE_LANES == 8
+    return (IntVec)_mm256_cvtps_epi32((__m256)value);
 #elif defined(__x86_64__)
-    __asm__("" : "+x"(shifted));
+    return (IntVec)_mm_cvtps_epi32((__m128)value);
 #elif defined(__aarch64__)
-    __asm__("" : "+w"(shifted));
+    return (IntVec)vcvtnq_s32_f32((float32x4_t)value);
+#else
+    IntVec nearest;
+    for (int lane = 0; lane < kLanes; ++lane) nearest[lane] = std::abs(value[lane]) < 1e9f ? int(std::lrint(value[lane])) : 0;
+    return nearest;
 #endif
-    const Vec fraction = x - (shifted - magic);
+}
+
+// 2^x to 2e-7 relative for x in [-126, 0]. Other x give rubbish, never a trap: mask them.
+inline Vec exp2_nonpositive(Vec x) {
+    const IntVec exponent = nearest_int(x);
+    const Vec fraction = x - __builtin_convertvector(exponent, Vec);
     Vec power = fraction * 1.326472721e-3f + 9.671512813e-3f;
     power = power * fraction + 5.550733745e-2f;
     power = power * fraction + 2.402224208e-1f;
     power = power * fraction + 6.931469776e-1f;
     power = power * fraction + 1.0f;
-    return (Vec)(((BitVec)shifted << 23) + (BitVec)power);
+    return (Vec)(((BitVec)exponent << 23) + (BitVec)power);
 }
 
 // log2(x) to 1e-7 absolute for normal positive x.
