@@ -13,10 +13,12 @@ from capture.frame import Frame
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Local features of a frame at full size."""
+    """Local features of a frame at full size. A point may have several descriptors: how it looks from elsewhere."""
 
     points: npt.NDArray[np.float64]  # (M, 2) pixels of the full-size image, top-left pixel centre at (0.5, 0.5)
-    descriptors: npt.NDArray[np.float32]  # (M, 128) unit length
+    descriptors: npt.NDArray[np.uint8]  # (D, 128) as recon.registration.matching.quantise makes them
+    point_of: npt.NDArray[np.int64]  # (D,) the point that a descriptor describes
+    squeeze: npt.NDArray[np.float64]  # (D,) how much narrower than the frame the image was that it was found in
 
 
 @dataclass(frozen=True, eq=False)

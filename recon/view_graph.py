@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from recon.keyframe import Keyframe
-from recon.registration import register
+from recon.registration import features, register
 from recon.registration.two_view import TwoView
 
 
@@ -16,13 +18,40 @@ class ViewGraph:
         self.pairs: dict[tuple[int, int], TwoView] = {}
 
     def add(self, keyframe: Keyframe) -> None:
-        """Takes in `keyframe` and verifies it against every other keyframe."""
+        """Takes in `keyframe` and verifies it against every other keyframe.
+
+        Where two frames share little and one of them has few firm partners, they are compared again with squeezed
+        features, which find each other from further to the side and cost as much again.
+        """
         new = len(self.keyframes)
-        for index, other in enumerate(self.keyframes):
-            pair = register.compare(other, keyframe, self._config)
-            if pair is not None:
-                self.pairs[index, new] = pair
         self.keyframes.append(keyframe)
+        for index in range(new):
+            self._compare(index, new)
+        for index in range(new) if self._config.squeezes else ():
+            needed = min(self._num_firm(index), self._num_firm(new)) < self._config.enough_firm_pairs
+            if needed and not self._is_firm(index, new):
+                self._squeeze(index)
+                self._squeeze(new)
+                self._compare(index, new)
+
+    def _compare(self, first: int, second: int) -> None:
+        pair = register.compare(self.keyframes[first], self.keyframes[second], self._config)
+        if pair is not None:
+            self.pairs[first, second] = pair
+
+    def _is_firm(self, first: int, second: int) -> bool:
+        pair = self.pairs.get((first, second))
+        return pair is not None and len(pair.matches) >= self._config.firm_matches
+
+    def _num_firm(self, index: int) -> int:
+        return sum(self._is_firm(*pair) for pair in self.pairs if index in pair)
+
+    def _squeeze(self, index: int) -> None:
+        keyframe = self.keyframes[index]
+        widened = features.add_squeezed(
+            keyframe.features, keyframe.frame.image, self._config.squeezes, self._config.features
+        )
+        self.keyframes[index] = replace(keyframe, features=widened)
 
     def components(self) -> list[list[int]]:
         """Sets of keyframes that verified pairs connect, the largest first."""

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from capture.frame import Frame
 from recon.keyframe import Features, Keyframe, modelled_image, modelled_size
 
-NO_FEATURES = Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+NO_FEATURES = Features(np.zeros((0, 2)), np.zeros((0, 128), np.uint8), np.zeros(0, np.int64), np.zeros(0))
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def compared(monkeypatch) -> list[tuple[str, str]]:
 
 
 def test_each_new_keyframe_is_compared_with_all_before_it(compared):
-    graph = ViewGraph(register.Config())
+    graph = ViewGraph(register.Config(squeezes=()))
     for name in ("a1", "b1", "a2"):
         graph.add(name)
     assert compared == [("a1", "b1"), ("a1", "a2"), ("b1", "a2")]
@@ -42,7 +42,7 @@ def test_each_new_keyframe_is_compared_with_all_before_it(compared):
 
 
 def test_components_are_the_largest_first(compared):
-    graph = ViewGraph(register.Config())
+    graph = ViewGraph(register.Config(squeezes=()))
     assert graph.components() == []
     for name in ("c1", "a1", "b1", "a2", "b2", "a3"):
         graph.add(name)
@@ -51,7 +51,7 @@ def test_components_are_the_largest_first(compared):
 
 @pytest.mark.parametrize("pairs", [[(0, 1), (1, 2), (2, 3)], [(2, 3), (0, 1), (1, 2)], [(0, 3), (2, 3), (1, 2)]])
 def test_a_chain_is_one_component_in_whatever_order_its_pairs_were_found(pairs):
-    graph = ViewGraph(register.Config())
+    graph = ViewGraph(register.Config(squeezes=()))
     graph.keyframes = ["a", "b", "c", "d", "e"]
     graph.pairs = dict.fromkeys(pairs)
     assert graph.components() == [[0, 1, 2, 3], [4]]

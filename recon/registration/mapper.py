@@ -161,7 +161,7 @@ def _relative_pose(
 ) -> tuple[Array, Array] | None:
     """Rotation (3, 3) and translation (3,) of the second camera for known focal lengths."""
     view1, view2 = views[key[0]], views[key[1]]
-    cameras = [{"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [focals[v.lens], 0, 0]} for v in (view1, view2)]  # fmt: skip
+    cameras = [_pinhole(focals[view.lens]) for view in (view1, view2)]
     pose, info = poselib.estimate_relative_pose(
         view1.points[pair.matches[:, 0]],
         view2.points[pair.matches[:, 1]],
@@ -172,6 +172,11 @@ def _relative_pose(
     if sum(info["inliers"]) < config.min_points:
         return None
     return np.asarray(pose.R), np.asarray(pose.t)
+
+
+def _pinhole(focal: float) -> dict[str, object]:
+    """PoseLib's camera for pixels relative to the principal point."""
+    return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [focal, 0, 0]}
 
 
 def _absolute_pose(
@@ -195,7 +200,7 @@ def _absolute_pose(
     pose, info = poselib.estimate_absolute_pose(
         all_tracks.pixels[mine][known],
         state.points[position[known]],
-        {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [focal, 0, 0]},
+        _pinhole(focal),
         {"max_reproj_error": 3.0 * config.max_error_px * scale, "seed": 0, "min_iterations": 200},
     )
     num_inliers = sum(info["inliers"])

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from capture.frame import Frame
-from recon.keyframe import Keyframe
+from recon.keyframe import Features, Keyframe
 from recon.registration import bundle, features, focal, mapper, matching, two_view
 from recon.registration.two_view import TwoView
 
@@ -22,6 +22,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     matching: matching.Config = matching.Config()
     two_view: two_view.Config = two_view.Config()
     mapper: mapper.Config = mapper.Config()
+    squeezes: tuple[float, ...] = (1.6,)  # of the image's width, for pairs that share little
+    firm_matches: int = 150  # verified matches from which on a pair needs no squeezed features
+    enough_firm_pairs: int = 2  # of a frame, so that it needs no more
     exif_sigma: float = 0.05  # of log focal: nominal focal lengths are rounded, and focusing changes them
     voted_sigma: float = 0.3  # of log focal when frames voted for it
 
@@ -56,15 +59,37 @@ Pairs = dict[tuple[int, int], TwoView]
 
 
 def compare(keyframe1: Keyframe, keyframe2: Keyframe, config: Config) -> TwoView | None:
-    """Matches and verifies one pair of keyframes."""
-    matches = matching.match(keyframe1.features, keyframe2.features, config.matching)
+    """Matches and verifies one pair of keyframes, by the squeezed features too where they have them."""
+    matches = _matches(keyframe1.features, keyframe2.features, config.matching)
     points1 = keyframe1.features.points[matches[:, 0]] - principal_point(keyframe1.frame)
     points2 = keyframe2.features.points[matches[:, 1]] - principal_point(keyframe2.frame)
     size = (keyframe2.frame.width, keyframe2.frame.height)
     return two_view.verify(points1, points2, matches, size, config.two_view)
 
 
-def register(keyframes: Sequence[Keyframe], pairs: Mapping[tuple[int, int], TwoView], config: Config) -> Registration | None:  # fmt: skip
+def _matches(features1: Features, features2: Features, config: matching.Config) -> npt.NDArray[np.int64]:
+    """(M, 2) indices of points, most distinct first; every point is in one match at most.
+
+    One of the two images is always the plain one: a surface is seen from the side in one image, not in both.
+    """
+    found, rank = [], []
+    seen_from_the_side = {(1.0, squeeze) for squeeze in set(features2.squeeze)}
+    seen_from_the_side |= {(squeeze, 1.0) for squeeze in set(features1.squeeze)}
+    for squeeze1, squeeze2 in sorted(seen_from_the_side):
+        (chosen1,), (chosen2,) = np.nonzero(features1.squeeze == squeeze1), np.nonzero(features2.squeeze == squeeze2)
+        match = matching.match(features1.descriptors[chosen1], features2.descriptors[chosen2], config)
+        found.append(np.stack([features1.point_of[chosen1[match[:, 0]]], features2.point_of[chosen2[match[:, 1]]]], 1))
+        rank.append(np.arange(len(match)) / max(1, len(match)))
+    matches = np.concatenate(found)[np.argsort(np.concatenate(rank), kind="stable")]
+    for side in (0, 1):
+        _, first = np.unique(matches[:, side], return_index=True)
+        matches = matches[np.sort(first)]
+    return matches
+
+
+def register(
+    keyframes: Sequence[Keyframe], pairs: Mapping[tuple[int, int], TwoView], config: Config
+) -> Registration | None:
     """Cameras of as many keyframes as hang together, or None when no two do.
 
     `pairs` holds the verified pairs by position (i < j).
@@ -133,15 +158,16 @@ def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe]) -> Regist
         T_world_camera[:3, 3] = scale * (rotation0 @ centres[i] + translation0)
         lens = state.lens_of_camera[i]
         # The centre is -R^T t: its covariance follows from that of rotation and translation.
-        jacobian = np.hstack([-state.rotations[i].T @ bundle.cross_matrix(state.translations[i][None])[0], -state.rotations[i].T])  # fmt: skip
-        centre_covariance = jacobian @ covariances[i] @ jacobian.T
+        inverse = state.rotations[i].T
+        jacobian = np.hstack([-inverse @ bundle.cross_matrix(state.translations[i][None])[0], -inverse])
+        centre_covariance = jacobian @ covariances.cameras[i] @ jacobian.T
         cameras.append(
             RegisteredCamera(
                 index=i,
                 T_world_camera=T_world_camera,
                 focal=float(np.exp(state.log_focals[lens])),
                 radial=float(state.radials[lens]),
-                rotation_sigma_deg=float(np.degrees(np.sqrt(np.trace(covariances[i][:3, :3])))),
+                rotation_sigma_deg=float(np.degrees(np.sqrt(np.trace(covariances.cameras[i][:3, :3])))),
                 centre_sigma_rel=float(np.sqrt(max(np.trace(centre_covariance), 0.0)) / max(spread, 1e-12)),
             )
         )

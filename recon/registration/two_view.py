@@ -47,16 +47,16 @@ def verify(
 ) -> TwoView | None:
     """The pair's geometry, or None when chance explains the agreement of `points1` and `points2` (both (M, 2)).
 
-    Pixels are relative to the principal points; `size` is the second image's (width, height). The test is a contrario
-    (Moisan and Stival, 2004): the expected number of fundamental matrices, among all that the matches define, that as
-    many unrelated points would fit within the threshold.
+    The most distinct matches come first. Pixels are relative to the principal points; `size` is the second image's
+    (width, height). The test is a contrario (Moisan and Stival, 2004): the expected number of fundamental matrices,
+    among all that the matches define, that as many unrelated points would fit within the threshold.
     """
     longer_side = max(size)
     scale = longer_side / 1024.0
     if len(matches) < config.min_inliers:
         return None
     threshold = config.epipolar_px * scale
-    fundamental, mask = cv2.findFundamentalMat(points1, points2, cv2.USAC_MAGSAC, threshold, 0.9999, 10000)
+    fundamental, mask = cv2.findFundamentalMat(points1, points2, _magsac(threshold))
     if fundamental is None or mask is None:
         return None
     inlier = mask.ravel() > 0
@@ -79,6 +79,16 @@ def verify(
         focal_ratio=_shared_focal(points1, points2, threshold) / longer_side,
         rotation_focal_ratio=rotation_focal / longer_side,
     )
+
+
+def _magsac(threshold: float) -> cv2.UsacParams:
+    """MAGSAC++ (Barath et al., 2020) that draws its samples from the most distinct matches first (PROSAC)."""
+    params = cv2.UsacParams()
+    params.threshold, params.confidence, params.maxIterations = threshold, 0.9999, 10000
+    params.sampler, params.score = cv2.SAMPLING_PROSAC, cv2.SCORE_METHOD_MAGSAC
+    params.loMethod, params.loIterations, params.loSampleSize = cv2.LOCAL_OPTIM_SIGMA, 10, 20
+    params.final_polisher, params.final_polisher_iterations = cv2.MAGSAC, 10
+    return params
 
 
 def log10_number_of_false_alarms(num_matches: int, num_inliers: int, sample_size: int, chance: float) -> float:
@@ -117,7 +127,7 @@ def fit_rotation(points1: Array, points2: Array, threshold: float, longer_side: 
             if agreed.sum() < 8 or (agreed == inlier).all():
                 break
             inlier = agreed
-        count = int((error < threshold).sum())
+        count = int(np.count_nonzero(error < threshold))
         if count > best[0]:
             best = (count, float(focal))
     return best
