@@ -92,15 +92,7 @@ def project(
     R_world_camera, centre = T_world_camera[:3, :3], T_world_camera[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means_camera = (means - centre) @ R_world_camera
-    with torch.no_grad():
-        x, y, z = means_camera.unbind(1)
-        u, v = fx * x / z + cx, fy * y / z + cy
-        inside = (
-            (u >= -GUARD * width) & (u <= (1 + GUARD) * width) & (v >= -GUARD * height) & (v <= (1 + GUARD) * height)
-        )
-        seen = torch.nonzero((z >= near) & inside).squeeze(1)
-        seen = seen[torch.argsort(z[seen], stable=True)]
-
+    seen = nearest_first(means_camera, K, width, height, near)
     x, y, z = means_camera[seen].unbind(1)
     axes = R_world_camera.T @ rotations(quats[seen])  # (M, 3, 3), columns in the camera frame
     zero = torch.zeros_like(z)
@@ -119,8 +111,18 @@ def project(
         opacities=visible_opacities,
         colours=colours(sh[seen], means[seen] - centre),
         depths=z,
-        normals=_normals(axes, scales[seen], means_camera[seen]),
+        normals=normals(axes, scales[seen], means_camera[seen]),
     )
+
+
+@torch.no_grad()
+def nearest_first(means_camera: Tensor, K: Tensor, width: int, height: int, near: float) -> Tensor:
+    """(M,) which of the means (N, 3) in the camera frame are drawn: in front and inside the guard, sorted by depth."""
+    x, y, z = means_camera.unbind(1)
+    u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+    inside = (u >= -GUARD * width) & (u <= (1 + GUARD) * width) & (v >= -GUARD * height) & (v <= (1 + GUARD) * height)
+    seen = torch.nonzero((z >= near) & inside).squeeze(1)
+    return seen[torch.argsort(z[seen], stable=True)]
 
 
 def blend_weights(splats: Splats, width: int, height: int) -> Tensor:
@@ -184,10 +186,10 @@ def sh_basis(directions: Tensor, bases: int) -> Tensor:
     return torch.stack(basis, 1)
 
 
-def _normals(axes: Tensor, scales: Tensor, means_camera: Tensor) -> Tensor:
+def normals(axes: Tensor, scales: Tensor, means_camera: Tensor) -> Tensor:
     """(N, 3) the axis of least scale (of equal ones the first), turned to face the camera."""
     first, second, third = scales.unbind(1)
     thinnest = torch.where((first <= second) & (first <= third), 0, torch.where(second <= third, 1, 2))
-    normals = axes.gather(2, thinnest[:, None, None].expand(-1, 3, 1)).squeeze(2)
-    away = (normals * means_camera).sum(1, keepdim=True) > 0
-    return torch.where(away, -normals, normals)
+    axis = axes.gather(2, thinnest[:, None, None].expand(-1, 3, 1)).squeeze(2)
+    away = (axis * means_camera).sum(1, keepdim=True) > 0
+    return torch.where(away, -axis, axis)
