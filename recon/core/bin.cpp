@@ -50,11 +50,15 @@ int bin(Raster& raster) {
     run_parallel(chunks, [&](int chunk, int) {
         uint32_t* next = &raster.counts[size_t(chunk) * tiles];
         const int end = std::min(raster.num_gaussians, (chunk + 1) * raster.chunk);
+        uint32_t slot = raster.chunk_slots[chunk];
         for (int gaussian = chunk * raster.chunk; gaussian < end; ++gaussian) {
-            raster.first_slots[gaussian] += raster.chunk_slots[chunk];
             const TileRect rect = raster.rects[gaussian];
             if (!rect.count()) continue;
-            const uint64_t entry = make_entry(raster.splats[gaussian].features[3], uint32_t(gaussian));
+            Splat& splat = raster.splats[gaussian];
+            splat.slot_row = rect.width();
+            splat.slot_origin = slot - rect.y0 * rect.width() - rect.x0;
+            slot += rect.count();
+            const uint64_t entry = make_entry(splat.features[3], uint32_t(gaussian));
             for (int y = rect.y0; y < rect.y1; ++y)
                 for (int x = rect.x0; x < rect.x1; ++x) raster.entries[next[y * raster.tiles_x + x]++] = entry;
         }

@@ -163,13 +163,6 @@ void differentiate_block(const Raster& raster, int tile, int block, const Raster
     add_sums<Channels>(places, count, pairs, columns, scratch.sums.data());
 }
 
-// Where the splat of an entry in a tile keeps its gradient.
-SplatGradient* find_slot(Raster& raster, int tile, uint32_t gaussian) {
-    const TileRect rect = raster.rects[gaussian];
-    const int row = tile / raster.tiles_x - rect.y0, column = tile % raster.tiles_x - rect.x0;
-    return &raster.slots[raster.first_slots[gaussian] + row * (rect.x1 - rect.x0) + column];
-}
-
 // Sums become the gradients of kLanes splats: from monomials in the tile's pixels to
 // u and w, which are of order one wherever a splat is seen.
 template <int Channels>
@@ -199,6 +192,24 @@ void store_gradients(const TileSplat* splats, const Sums* sums, SplatGradient* c
     store_transposed(out, slot_rows);
 }
 
+// The rows of a tile lie far apart in each plane, so the processor does not foresee them.
+template <int Channels>
+void prefetch_images(const Camera& camera, TileOrigin origin, const RasterImages& images, const RasterImages& gradients) {
+    using F = Features<Channels>;
+    const size_t plane_size = size_t(camera.width) * camera.height;
+    const float* planes[10];
+    int count = 0;
+    for (int c = 0; c < F::kColours; ++c) planes[count++] = gradients.rgb + c * plane_size;
+    for (int c = 0; c < F::kNormals; ++c) planes[count++] = gradients.normal + c * plane_size;
+    if (F::kDepths)
+        for (const float* plane : {gradients.depth, images.depth, images.alpha}) planes[count++] = plane;
+    if (gradients.alpha) planes[count++] = gradients.alpha;
+    for (int y = origin.y; y < std::min(origin.y + kTile, camera.height); ++y)
+        for (int i = 0; i < count; ++i)
+            for (int x = origin.x; x < std::min(origin.x + kTile, camera.width); x += 16)
+                __builtin_prefetch(planes[i] + size_t(y) * camera.width + x);
+}
+
 template <int Channels>
 void differentiate_tile(Raster& raster, int tile, const RasterImages& images, const RasterImages& gradients,
                         Scratch& scratch) {
@@ -209,16 +220,16 @@ void differentiate_tile(Raster& raster, int tile, const RasterImages& images, co
     scratch.sums.resize(padded);
     scratch.places.resize(padded);
     scratch.pairs.resize(size_t(padded) * kPairFloats);
+    prefetch_images<Channels>(raster.camera, tile_origin(raster, tile), images, gradients);
     load_splats(raster, tile, scratch.splats.data());
     std::memset(scratch.sums.data(), 0, sizeof(Sums) * padded);
     for (int block = 0; block < kBlocks; ++block)
         differentiate_block<Channels>(raster, tile, block, images, gradients, scratch);
 
-    const uint64_t* entries = raster.entries.data() + raster.first_entries[tile];
     for (uint32_t first = 0; first < count; first += kLanes) {
         SplatGradient unwanted, *slots[kLanes];
         for (uint32_t lane = 0; lane < kLanes; ++lane)
-            slots[lane] = first + lane < count ? find_slot(raster, tile, entry_gaussian(entries[first + lane])) : &unwanted;
+            slots[lane] = first + lane < count ? &raster.slots[scratch.splats[first + lane].slot] : &unwanted;
         store_gradients<Channels>(&scratch.splats[first], &scratch.sums[first], slots);
     }
 }

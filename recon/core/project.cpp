@@ -74,9 +74,8 @@ int project_lanes(const RasterInput& input, Raster& raster, int first, int valid
     unsigned seen = inside_frustum(p, camera) & bits(at_least(opacity, splat(kAlphaMin))) &
                     bits(less(Vec{}, p.factor_x)) & bits(finite(p.xx)) & bits(finite(p.yy)) & ((1u << valid) - 1);
     TileRect* rects = &raster.rects[first];
-    uint32_t* first_slots = &raster.first_slots[first];
     if (!seen || errors) {
-        for (int lane = 0; lane < valid; ++lane) rects[lane] = {0, 0, 0, 0}, first_slots[lane] = slots;
+        std::fill(rects, rects + valid, TileRect{0, 0, 0, 0});
         return errors;
     }
 
@@ -91,8 +90,8 @@ int project_lanes(const RasterInput& input, Raster& raster, int first, int valid
     const Vec radius = square_root(maximum(row[5] - kLog2AlphaMin, Vec{})) * (1 / kRootHalfLog2e);
     const Vec deviation_x = square_root(p.xx);
     const Vec extent_x = radius * deviation_x * 1.0001f + 0.005f, extent_y = radius / p.factor_y * 1.0001f + 0.005f;
-    row[6] = extent_x;
-    row[7] = p.slope * p.yy / deviation_x * radius;
+    row[6] = p.slope * p.yy / deviation_x * radius;
+    row[7] = Vec{};
     Vec colours[3] = {};
     if (input.channels & kRgb) evaluate_colours(input, first, valid, p, colours);
     for (int c = 0; c < 3; ++c) {
@@ -109,17 +108,17 @@ int project_lanes(const RasterInput& input, Raster& raster, int first, int valid
     row[15] = Vec{};
     store_rows(&raster.splats[first].x, valid, row);
 
-    alignas(64) float extents_y[kLanes];
+    alignas(64) float extents_x[kLanes], extents_y[kLanes];
+    store(extents_x, extent_x);
     store(extents_y, extent_y);
     for (int lane = 0; lane < valid; ++lane) {
         TileRect rect = {0, 0, 0, 0};
         if (seen >> lane & 1) {
             const Splat& splat = raster.splats[first + lane];
-            tile_range(splat.x, splat.extent_x, raster.tiles_x, rect.x0, rect.x1);
+            tile_range(splat.x, extents_x[lane], raster.tiles_x, rect.x0, rect.x1);
             tile_range(splat.y, extents_y[lane], raster.tiles_y, rect.y0, rect.y1);
         }
         rects[lane] = rect;
-        first_slots[lane] = slots;
         slots += rect.count();
         for (int y = rect.y0; y < rect.y1; ++y)
             for (int x = rect.x0; x < rect.x1; ++x) ++tile_counts[y * raster.tiles_x + x];
@@ -154,7 +153,6 @@ int project(const RasterInput& input, Raster& raster) {
     raster.num_chunks = (n + raster.chunk - 1) / raster.chunk;
     raster.splats.resize(n);
     raster.rects.resize(n);
-    raster.first_slots.resize(n);
     raster.counts.resize(size_t(raster.num_chunks) * raster.num_tiles());
     raster.chunk_slots.resize(raster.num_chunks);
 

@@ -21,20 +21,21 @@ struct SplatLanes {
     Vec colour[3], depth, normal[3];
 };
 
-// Sums the slots of each Gaussian, in the order of its tiles.
-SplatLanes gather(const Raster& raster, int first, int valid) {
+// Sums the slots of each Gaussian, in the order of its tiles. `slots` moves on to those of the next Gaussians.
+SplatLanes gather(const Raster& raster, int first, int valid, const SplatGradient*& slots) {
     constexpr int kParts = 16 / kLanes;
     alignas(64) float rows[kLanes][16] = {};
+    const float* row_starts[kLanes];
+    for (int lane = 0; lane < kLanes; ++lane) row_starts[lane] = rows[lane];
     for (int lane = 0; lane < valid; ++lane) {
-        const int count = raster.rects[first + lane].count();
-        const SplatGradient* slots = raster.slots.data() + raster.first_slots[first + lane];
+        const SplatGradient* end = slots + raster.rects[first + lane].count();
         Vec sums[kParts] = {};
-        for (int i = 0; i < count; ++i)
-            for (int part = 0; part < kParts; ++part) sums[part] += load(slots[i].moments + part * kLanes);
+        for (; slots < end; ++slots)
+            for (int part = 0; part < kParts; ++part) sums[part] += load(slots->moments + part * kLanes);
         for (int part = 0; part < kParts; ++part) store(rows[lane] + part * kLanes, sums[part]);
     }
     Vec columns[16];
-    load_rows(rows[0], kLanes, columns);
+    load_transposed(row_starts, columns);
     SplatLanes g;
     g.v = columns[0];
     g.a = columns[1] * kInverseScale, g.b = columns[2] * kInverseScale;
@@ -182,8 +183,10 @@ void clear_gradients(const RasterInput& input, int first, int valid, RasterGradi
     std::memset(gradients.sh + row * first, 0, sizeof(float) * row * valid);
 }
 
-void differentiate_range(const RasterInput& input, const Raster& raster, int begin, int end, RasterGradients& gradients,
+void differentiate_chunk(const RasterInput& input, const Raster& raster, int chunk, RasterGradients& gradients,
                          double* camera_sums) {
+    const int begin = chunk * raster.chunk, end = std::min(raster.num_gaussians, begin + raster.chunk);
+    const SplatGradient* slots = raster.slots.data() + raster.chunk_slots[chunk];
     Vec sums[kCameraSums] = {};
     const auto flush = [&] {
         for (int i = 0; i < kCameraSums; ++i) {
@@ -204,7 +207,7 @@ void differentiate_range(const RasterInput& input, const Raster& raster, int beg
         }
         const Gaussians gaussians = load_gaussians(input, first, valid);
         const Projection p = project_gaussians(gaussians, raster.camera, input.antialias);
-        const SplatLanes g = gather(raster, first, valid);
+        const SplatLanes g = gather(raster, first, valid, slots);
         Vec to_mean[3] = {};
         colours_backward(input, raster, first, valid, seen, p, g, gradients.sh, to_mean);
         Vec camera_part[kCameraSums];
@@ -231,8 +234,7 @@ void project_backward(const RasterInput& input, Raster& raster, RasterGradients&
     run_parallel(raster.num_chunks, [&](int chunk, int) {
         double* sums = camera_sums + size_t(chunk) * kCameraSums;
         std::fill(sums, sums + kCameraSums, 0.0);
-        const int begin = chunk * raster.chunk, end = std::min(raster.num_gaussians, begin + raster.chunk);
-        differentiate_range(input, raster, begin, end, gradients, sums);
+        differentiate_chunk(input, raster, chunk, gradients, sums);
     });
 
     double total[kCameraSums] = {};

@@ -76,16 +76,17 @@ struct Camera {
 // for a long thin splat, u and w keep theirs.
 struct alignas(64) Splat {
     float x, y, k0, slope, k2, log2_opacity;
-    float extent_x;   // half the width of the ellipse on which alpha = 1/255
-    float extent_at;  // dy of the ellipse's rightmost point
+    float extent_at;  // dy of the rightmost point of the ellipse on which alpha = 1/255
+    uint32_t slot_row;
     float features[kFeatures];
-    float unused;
+    uint32_t slot_origin;  // its gradient from tile (x, y) is in slot slot_origin + y * slot_row + x
 };
 
 // Tiles [x0, x1) x [y0, y1) that a splat may touch; empty for a Gaussian that is not seen.
 struct TileRect {
     uint16_t x0, x1, y0, y1;
-    int count() const { return (x1 - x0) * (y1 - y0); }
+    uint32_t width() const { return x1 - x0; }
+    uint32_t count() const { return width() * (y1 - y0); }
 };
 
 // Sums over a tile's pixels of v = dL/d(ln alpha) times 1, u, w, u^2, u w, w^2, and of the blending weight times the
@@ -107,14 +108,13 @@ struct Raster {
 
     Buffer<Splat> splats;           // (N)
     Buffer<TileRect> rects;         // (N)
-    Buffer<uint32_t> first_slots;   // (N) a Gaussian's slots are those of its tiles, row by row
     Buffer<uint32_t> counts;        // (chunks, tiles) splats of a chunk in a tile, later where they start
     Buffer<uint32_t> chunk_slots;   // (chunks) slots of a chunk, later where they start
     Buffer<uint32_t> first_entries;  // (tiles + 1)
     Buffer<uint64_t> entries;       // (E) depth and Gaussian of each splat of each tile, nearest first
     Buffer<uint64_t> first_words;   // (tiles) where a tile's bits start
     Buffer<uint64_t> block_bits;    // (tiles, blocks, words) which of the tile's splats a block blends
-    Buffer<SplatGradient> slots;    // (E)
+    Buffer<SplatGradient> slots;    // (E) by Gaussian, then by the tiles of its rectangle, row by row
     Buffer<double> camera_sums;     // (chunks, 16)
     double seconds[kStages], processor_seconds[kStages];  // spent in the last forward and backward
 

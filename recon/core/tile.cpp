@@ -42,6 +42,7 @@ void load_splats(const Raster& raster, int tile, TileSplat* splats) {
     const uint32_t count = raster.num_entries(tile);
     const uint64_t* entries = raster.entries.data() + raster.first_entries[tile];
     const TileOrigin origin = tile_origin(raster, tile);
+    const uint32_t tile_x = tile % raster.tiles_x, tile_y = tile / raster.tiles_x;
     for (uint32_t i = 0; i < count; ++i) {
         if (i + kAhead < count) __builtin_prefetch(&raster.splats[entry_gaussian(entries[i + kAhead])]);
         const Splat& splat = raster.splats[entry_gaussian(entries[i])];
@@ -53,6 +54,7 @@ void load_splats(const Raster& raster, int tile, TileSplat* splats) {
         here.k2 = splat.k2;
         here.w0 = -splat.k2 * y;
         here.log2_opacity = splat.log2_opacity;
+        here.slot = splat.slot_origin + tile_y * splat.slot_row + tile_x;
         std::memcpy(here.features, splat.features, sizeof here.features);
     }
     TileSplat unseen = {};
@@ -71,17 +73,17 @@ void find_blocks(Raster& raster, int tile) {
 
     // A lane is a splat. For each row of blocks: where the ellipse starts and ends in it.
     for (uint32_t first = 0; first < count; first += kLanes) {
-        alignas(64) float columns[8][kLanes];
+        alignas(64) float columns[7][kLanes];
         for (int lane = 0; lane < kLanes; ++lane) {
             const uint32_t entry = std::min(first + lane, count - 1);
             const float* splat = &raster.splats[entry_gaussian(entries[entry])].x;
-            for (int column = 0; column < 8; ++column) columns[column][lane] = splat[column];
+            for (int column = 0; column < 7; ++column) columns[column][lane] = splat[column];
         }
         const Vec x = load(columns[0]) - float(origin.x), y = load(columns[1]) - float(origin.y);
         const Vec slope = load(columns[3]), k2 = load(columns[4]);
         const Vec radius2 = maximum(load(columns[5]) - kLog2AlphaMin, Vec{});
         const Vec inverse_k0 = 1.0f / load(columns[2]), extent_y = square_root(radius2) / k2 + slack;
-        const Vec extent_at = load(columns[7]);
+        const Vec extent_at = load(columns[6]);
         const unsigned valid = (count - first < uint32_t(kLanes) ? (1u << (count - first)) : (1u << (kLanes - 1)) * 2) - 1;
 
         for (int row = 0; row < kBlocksDown; ++row) {

@@ -9,7 +9,8 @@ namespace core {
 //   u = k0 * x + k1 * y + u0,  w = k2 * y + w0.
 struct alignas(64) TileSplat {
     float k0, k1, u0, k2, w0, log2_opacity;
-    float unused[2];
+    uint32_t slot;  // of its gradient from this tile
+    float unused;
     float features[kFeatures];
     float unused2;
 };
