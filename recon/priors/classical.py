@@ -32,7 +32,9 @@ class ClassicalPrior:
 
     def estimate(self, graph: ViewGraph) -> Estimate:
         started = time.monotonic()
-        registration = register.register(graph.keyframes, graph.pairs, self._config.registration)
+        registration = (
+            register.register(graph.keyframes, graph.pairs, self._config.registration) if graph.pairs else None
+        )
         registered = time.monotonic()
         pointmaps = self._pointmaps(graph, registration) if registration is not None else ()
         return Estimate(registration, pointmaps, registered - started, time.monotonic() - registered)
