@@ -23,10 +23,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 PRESETS: dict[str, Config] = {
-    "preview": Config(size=384, optimize=optimize.Config(iterations=200)),
-    "fast": Config(optimize=optimize.Config(iterations=400)),
+    "preview": Config(size=384, optimize=optimize.Config(iterations=150)),
+    "fast": Config(optimize=optimize.Config(iterations=250)),
     "balanced": Config(),
-    "quality": Config(optimize=optimize.Config(iterations=3000)),
+    "quality": Config(optimize=optimize.Config(iterations=1500, checkpoints=(150, 500))),
 }
 
 

@@ -24,19 +24,19 @@ from recon.scene import Scene, View
 class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Adam's step sizes at the start. Lengths are relative to the median depth of the scene, which is 1."""
 
-    means: float = 4e-4
-    quats: float = 1e-2
-    log_scales: float = 1.5e-2
-    logit_opacities: float = 5e-2
-    sh: float = 1e-2
+    means: float = 8e-4
+    quats: float = 2e-2
+    log_scales: float = 3e-2
+    logit_opacities: float = 1e-1
+    sh: float = 2e-2
     translation: float = 2e-4
     rotation: float = 2e-4  # radians
     final: float = 0.1  # all of them have fallen to this part at the end, exponentially
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    iterations: int = 1000
-    checkpoints: tuple[int, ...] = (200,)  # iterations after which the scene is shown, besides the last one
+    iterations: int = 500
+    checkpoints: tuple[int, ...] = (150,)  # iterations after which the scene is shown, besides the last one
     half_resolution_share: float = 0.25  # of the iterations, at the start
     dssim: float = 0.2  # lambda of (1 - lambda) L1 + lambda D-SSIM
     refine_poses: bool = True
