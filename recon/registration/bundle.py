@@ -67,6 +67,12 @@ def reprojection_errors(problem: Problem) -> Array:
     return np.where(depth > 0, np.linalg.norm(predicted - problem.pixels, axis=1), np.inf)
 
 
+def robust_cost(problem: Problem, config: Config) -> float:
+    """The Cauchy loss of all observations, pixels squared; priors left out. One behind its camera costs as 1000 px."""
+    squared = np.minimum(reprojection_errors(problem), 1e3) ** 2
+    return float(config.robust_px**2 * np.log1p(squared / config.robust_px**2).sum())
+
+
 def adjust(problem: Problem, prior: FocalPrior, config: Config, fixed_camera: int = 0) -> Problem:
     """The problem after minimising the robust cost. Camera `fixed_camera` stays where it is."""
     problem = _copy(_by_point(problem))

@@ -6,28 +6,37 @@ that explains most of ALL the pairwise matches, those included that it was not b
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
-import poselib
 
-from recon.registration import bundle, tracks
+from recon.registration import bundle, placement, tracks
 from recon.registration.two_view import TwoView
 
 Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
 Pairs = Mapping[tuple[int, int], TwoView]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    placement: placement.Config = placement.Config()
     max_error_px: float = 2.5  # reprojection error of a kept observation, at 1024 px on the longer side
+    robust_px: float = 1.0  # scale of the robust loss, at 1024 px on the longer side
     min_angle_deg: float = 1.0  # between the rays of a kept point
-    min_points: int = 15  # 2D-3D inliers that a new view needs
-    observations_per_view: int = 700  # more tracks cost time and add nothing to a pose
+    min_points: int = 15  # of a map
+    growing_tracks: int = 350  # a view, while views are added: more cost time and change no decision
+    final_tracks: int = 1500  # a view, in the end
     max_attempts: int = 6  # (focal, first pair) combinations tried
-    good_agreement: float = 0.9  # an attempt with all views and this much agreement ends the search
+    score_px: float = 1.25  # error at which a match counts no more for an attempt, at 1024 px on the longer side
+    same_rotation_deg: float = 0.5  # two attempts whose cameras and
+    same_focal: float = 0.02  # focal lengths differ by less have found the same
+    doubted_share: float = 0.6  # a view that explains less of its matches is placed anew
+    radial_sigma: float = 0.1  # of the radial coefficient where it is free
+    radial_evidence: float = 20.0  # decrease of the cost, in variances of an observation, that frees it
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +62,7 @@ class Map:
     views: tuple[int, ...]  # indices of the registered views; the first is the world's origin
     problem: bundle.Problem
     prior: bundle.FocalPrior
+    loss: bundle.Config
     agreement: dict[tuple[int, int], float]  # share of each pair's inliers that the map explains
     median_angle_deg: float  # of the points' widest rays
     rms_px: float
@@ -60,26 +70,28 @@ class Map:
 
 def build_map(views: Sequence[View], lenses: Sequence[Lens], pairs: Pairs, config: Config) -> Map | None:
     """The best map over several starts, or None when no two views can be connected."""
-    all_tracks = tracks.build([view.points for view in views], pairs)
-    best: tuple[float, Map] | None = None
-    all_tracks = tracks.thin(all_tracks, len(views), config.observations_per_view)
-    num_matches = sum(len(pair.matches) for pair in pairs.values())
-    num_focals = max(len(lens.focals) for lens in lenses)
-    attempts = [
-        (pair, [lens.focals[min(choice, len(lens.focals) - 1)] for lens in lenses])
-        for choice in range(num_focals)
-        for pair in _first_pairs(pairs)[: 3 if choice == 0 else 1]
-    ]
-    for pair, focals in attempts[: config.max_attempts]:
-        grown = _grow(views, lenses, focals, pairs, all_tracks, pair, config)
+    search = _Search(views, lenses, pairs, config)
+    best: tuple[float, _Growth] | None = None
+    for pair, focals in _attempts(lenses, pairs, config.max_attempts):
+        grown = search.grow(focals, pair)
         if grown is None:
             continue
-        score = sum(grown.agreement[key] * len(pairs[key].matches) for key in grown.agreement)
+        score = search.score(grown)
+        found_again = best is not None and search.same(best[1], grown)
         if best is None or score > best[0]:
             best = (score, grown)
-        if len(grown.views) == len(views) and score >= config.good_agreement * num_matches:
+        if found_again and len(grown.registered) == len(views):
             break
-    return best[1] if best else None
+    return search.finish(best[1]) if best else None
+
+
+def _attempts(lenses: Sequence[Lens], pairs: Pairs, limit: int) -> list[tuple[tuple[int, int], list[float]]]:
+    """First pairs with focal lengths (one a lens), the likeliest of both first."""
+    first = _first_pairs(pairs)
+    num_focals = max(len(lens.focals) for lens in lenses)
+    focals = [[lens.focals[min(choice, len(lens.focals) - 1)] for lens in lenses] for choice in range(num_focals)]
+    order = sorted(itertools.product(range(len(first)), range(num_focals)), key=lambda place: (sum(place), place[0]))
+    return [(first[pair], focals[choice]) for pair, choice in order[:limit]]
 
 
 def _first_pairs(pairs: Pairs) -> list[tuple[int, int]]:
@@ -93,130 +105,205 @@ def _first_pairs(pairs: Pairs) -> list[tuple[int, int]]:
     return sorted(pairs, key=lambda key: (-strength(key), key))
 
 
-def _grow(
-    views: Sequence[View],
-    lenses: Sequence[Lens],
-    focals: list[float],
-    pairs: Pairs,
-    all_tracks: tracks.Tracks,
-    first: tuple[int, int],
-    config: Config,
-) -> Map | None:
-    start = _relative_pose(views, focals, pairs[first], first, config)
-    if start is None:
-        return None
-    registered = list(first)
-    prior = bundle.FocalPrior(
-        log_focals=np.log(focals),
-        sigmas=np.array([lens.sigma for lens in lenses]),
-        radial_sigmas=np.zeros(len(lenses)),
-    )
-    rotations = np.tile(np.eye(3), (len(views), 1, 1))
-    translations = np.zeros((len(views), 3))
-    rotations[first[1]], translations[first[1]] = start
-    state = bundle.Problem(
-        rotations=rotations,
-        translations=translations,
-        lens_of_camera=np.array([view.lens for view in views]),
-        log_focals=np.log(focals),
-        radials=np.array([lens.radial for lens in lenses]),
-        points=np.zeros((0, 3)),
-        camera_of=np.zeros(0, np.int64),
-        point_of=np.zeros(0, np.int64),
-        pixels=np.zeros((0, 2)),
-    )
-    scale = np.array([view.longer_side for view in views]) / 1024.0
-    # Two views say little about the focal length: it is held close to its candidate until a third view is in.
-    tight = replace(prior, sigmas=np.minimum(prior.sigmas, 0.03))
-    quick = bundle.Config(max_iterations=12, tolerance=1e-3)
-    state, track_of_point = _retriangulate(state, all_tracks, registered, scale, config, widen=4.0)
-    state = bundle.adjust(state, tight, quick, first[0])
-    failed: set[int] = set()
-    while len(registered) + len(failed) < len(views):
-        counts = {
-            view: int(np.isin(all_tracks.track_of[all_tracks.camera_of == view], track_of_point).sum())
-            for view in range(len(views))
-            if view not in registered and view not in failed
-        }
-        view = max(counts, key=lambda key: (counts[key], -key))
-        pose = _absolute_pose(state, all_tracks, track_of_point, view, scale[view], config)
-        if pose is None:
-            failed.add(view)
-            continue
-        state.rotations[view], state.translations[view] = pose
-        registered.append(view)
-        failed.clear()  # A new view brings new points, from which others may now be found.
-        state, track_of_point = _retriangulate(state, all_tracks, registered, scale, config, widen=3.0)
-        state = bundle.adjust(state, prior, quick, first[0])
-    for widen in (2.0, 1.0):
-        state, track_of_point = _retriangulate(state, all_tracks, registered, scale, config, widen=widen)
-        if len(state.points) < config.min_points:
+@dataclass(frozen=True, eq=False)
+class _Growth:
+    """A map while it grows."""
+
+    registered: tuple[int, ...]
+    state: bundle.Problem
+    track_of_point: Index  # (P,)
+    prior: bundle.FocalPrior
+
+
+class _Search:
+    """What all attempts share."""
+
+    def __init__(self, views: Sequence[View], lenses: Sequence[Lens], pairs: Pairs, config: Config) -> None:
+        self._views, self._lenses, self._pairs, self._config = views, lenses, pairs, config
+        self._scale = np.array([view.longer_side for view in views]) / 1024.0
+        all_tracks = tracks.build([view.points for view in views], pairs)
+        self._coarse = tracks.thin(all_tracks, len(views), config.growing_tracks)
+        self._fine = tracks.thin(all_tracks, len(views), config.final_tracks)
+        robust_px = config.robust_px * float(np.median(self._scale))
+        self._quick = bundle.Config(robust_px=robust_px, max_iterations=10, tolerance=1e-3)
+        self._thorough = bundle.Config(robust_px=robust_px)
+
+    def grow(self, focals: list[float], first: tuple[int, int]) -> _Growth | None:
+        """A map from the pair `first` on, with every view that finds its place."""
+        growth = self._begin(focals, first)
+        failed: set[int] = set()
+        while growth and len(growth.registered) + len(failed) < len(self._views):
+            view = self._next_view(growth, failed)
+            placed = self._place(growth, view)
+            if placed is None:
+                failed.add(view)
+                continue
+            growth = placed
+            failed.clear()  # A new view brings new points, from which others may now be found.
+        return self._repair(growth) if growth else None
+
+    def score(self, growth: _Growth) -> float:
+        """Matches of all pairs that the map explains, the exact ones more."""
+        return sum(
+            float(np.maximum(0.0, 1.0 - (errors / self._config.score_px) ** 2).sum())
+            for errors in self._pair_errors(growth).values()
+        )
+
+    def same(self, one: _Growth, other: _Growth) -> bool:
+        """Whether both have the same views, turned in the same way."""
+        if set(one.registered) != set(other.registered):
+            return False
+        members = list(one.registered)
+        # Each map has a world of its own: the turn from one to the other must be the same for every camera.
+        turns = one.state.rotations[members].transpose(0, 2, 1) @ other.state.rotations[members]
+        differences = turns[0].T @ turns
+        cosine = (np.trace(differences, axis1=1, axis2=2) - 1.0) / 2.0
+        turned = float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max())
+        zoomed = float(np.abs(one.state.log_focals - other.state.log_focals).max())
+        return turned < self._config.same_rotation_deg and zoomed < self._config.same_focal
+
+    def finish(self, growth: _Growth) -> Map | None:
+        """The map of all tracks, adjusted to the end; the radial coefficient freed where that pays."""
+        for widen in (3.0, 2.0, 1.0):
+            growth = self._adjusted(growth, self._fine, self._thorough, widen)
+            if len(growth.state.points) < self._config.min_points:
+                return None
+        growth = self._with_radial(growth)
+        state = growth.state
+        centres = -np.einsum("cji,cj->ci", state.rotations, state.translations)
+        angles = tracks.largest_angles(centres, state.points, state.camera_of, state.point_of)
+        errors = bundle.reprojection_errors(state)
+        return Map(
+            views=growth.registered,
+            problem=state,
+            prior=growth.prior,
+            loss=self._thorough,
+            agreement=self._agreement(growth),
+            median_angle_deg=float(np.median(angles)),
+            rms_px=float(np.sqrt(np.mean(errors**2))),
+        )
+
+    def _begin(self, focals: list[float], first: tuple[int, int]) -> _Growth | None:
+        views, count = self._views, len(self._views)
+        rotation, direction, num_inliers = placement.relative_pose(
+            self._pairs[first],
+            focals[views[first[0]].lens],
+            focals[views[first[1]].lens],
+            self._config.max_error_px * float(self._scale[first[0]]),
+        )
+        if num_inliers < self._config.min_points:
             return None
-        state = bundle.adjust(state, prior, bundle.Config(), first[0])
-    return _finish(state, prior, pairs, registered, scale, config)
+        rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+        rotations[first[1]], translations[first[1]] = rotation, direction
+        state = bundle.Problem(
+            rotations=rotations,
+            translations=translations,
+            lens_of_camera=np.array([view.lens for view in views]),
+            log_focals=np.log(focals),
+            radials=np.array([lens.radial for lens in self._lenses]),
+            points=np.zeros((0, 3)),
+            camera_of=np.zeros(0, np.int64),
+            point_of=np.zeros(0, np.int64),
+            pixels=np.zeros((0, 2)),
+        )
+        prior = bundle.FocalPrior(
+            log_focals=np.log(focals),
+            sigmas=np.array([lens.sigma for lens in self._lenses]),
+            radial_sigmas=np.zeros(len(self._lenses)),
+        )
+        # Two views say little about the focal length: it is held close to its candidate until a third view is in.
+        tight = replace(prior, sigmas=np.minimum(prior.sigmas, 0.03))
+        start = _Growth(first, state, np.zeros(0, np.int64), tight)
+        grown = self._adjusted(start, self._coarse, self._quick, widen=4.0)
+        return replace(grown, prior=prior) if len(grown.state.points) >= self._config.min_points else None
 
+    def _next_view(self, growth: _Growth, failed: set[int]) -> int:
+        """The view that observes most of the map's points."""
+        in_map = np.isin(self._coarse.track_of, growth.track_of_point)
+        counts = np.bincount(self._coarse.camera_of[in_map], minlength=len(self._views))
+        waiting = [view for view in range(len(self._views)) if view not in growth.registered and view not in failed]
+        return max(waiting, key=lambda view: (counts[view], -view))
 
-def _relative_pose(
-    views: Sequence[View], focals: list[float], pair: TwoView, key: tuple[int, int], config: Config
-) -> tuple[Array, Array] | None:
-    """Rotation (3, 3) and translation (3,) of the second camera for known focal lengths."""
-    view1, view2 = views[key[0]], views[key[1]]
-    cameras = [_pinhole(focals[view.lens]) for view in (view1, view2)]
-    pose, info = poselib.estimate_relative_pose(
-        view1.points[pair.matches[:, 0]],
-        view2.points[pair.matches[:, 1]],
-        cameras[0],
-        cameras[1],
-        {"max_epipolar_error": config.max_error_px * view1.longer_side / 1024, "seed": 0, "min_iterations": 100},
-    )
-    if sum(info["inliers"]) < config.min_points:
-        return None
-    return np.asarray(pose.R), np.asarray(pose.t)
+    def _place(self, growth: _Growth, view: int) -> _Growth | None:
+        """The map with `view`, or None when it finds no place."""
+        placed = placement.place(
+            growth.state,
+            self._coarse,
+            growth.track_of_point,
+            view,
+            growth.registered,
+            self._pairs,
+            self._scale,
+            self._config.placement,
+        )
+        if placed is None:
+            return None
+        state = placement.with_pose(growth.state, view, placed.rotation, placed.translation)
+        larger = replace(growth, state=state, registered=(*growth.registered, view))
+        return self._adjusted(larger, self._coarse, self._quick, widen=3.0)
 
+    def _repair(self, growth: _Growth) -> _Growth:
+        """Views that explain little of their matches are taken out and placed anew, from the whole map."""
+        for view in growth.registered[1:]:
+            if len(growth.registered) < 4:
+                break
+            agreement = {key: share for key, share in self._agreement(growth).items() if view in key}
+            matched = sum(len(self._pairs[key].matches) for key in agreement)
+            explained = sum(share * len(self._pairs[key].matches) for key, share in agreement.items())
+            if explained >= self._config.doubted_share * matched:
+                continue
+            others = tuple(other for other in growth.registered if other != view)
+            without = self._adjusted(replace(growth, registered=others), self._coarse, self._quick, widen=2.0)
+            again = self._place(without, view)
+            if again and self.score(again) > 1.05 * self.score(growth):
+                growth = again
+        return growth
 
-def _pinhole(focal: float) -> dict[str, object]:
-    """PoseLib's camera for pixels relative to the principal point."""
-    return {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [focal, 0, 0]}
+    def _adjusted(self, growth: _Growth, of_tracks: tracks.Tracks, loss: bundle.Config, widen: float) -> _Growth:
+        """Points made anew from the registered views, then everything adjusted."""
+        state, track_of_point = _retriangulate(
+            growth.state, of_tracks, growth.registered, self._scale, self._config, widen
+        )
+        if len(state.points) >= self._config.min_points:
+            state = bundle.adjust(state, growth.prior, loss, growth.registered[0])
+        return replace(growth, state=state, track_of_point=track_of_point)
 
+    def _with_radial(self, growth: _Growth) -> _Growth:
+        """The map with free radial coefficients if the observations ask for them, else as it was."""
+        if (growth.prior.sigmas == 0).all():
+            return growth
+        prior = replace(growth.prior, radial_sigmas=np.where(growth.prior.sigmas > 0, self._config.radial_sigma, 0.0))
+        state = bundle.adjust(growth.state, prior, self._thorough, growth.registered[0])
+        before = bundle.robust_cost(growth.state, self._thorough)
+        after = bundle.robust_cost(state, self._thorough)
+        variance = after / max(1, 2 * len(state.pixels) - 3 * len(state.points))
+        if before - after < self._config.radial_evidence * variance:
+            return growth
+        freed = replace(growth, state=state, prior=prior)
+        return self._adjusted(freed, self._fine, self._thorough, widen=1.0)
 
-def _absolute_pose(
-    state: bundle.Problem,
-    all_tracks: tracks.Tracks,
-    track_of_point: npt.NDArray[np.int64],
-    view: int,
-    scale: float,
-    config: Config,
-) -> tuple[Array, Array] | None:
-    """The pose of `view` from the points that it sees, or None when too few agree."""
-    mine = all_tracks.camera_of == view
-    if len(track_of_point) == 0 or not mine.any():
-        return None
-    position = np.searchsorted(track_of_point, all_tracks.track_of[mine])
-    position = np.minimum(position, len(track_of_point) - 1)
-    known = track_of_point[position] == all_tracks.track_of[mine]
-    if known.sum() < config.min_points:
-        return None
-    focal = float(np.exp(state.log_focals[state.lens_of_camera[view]]))
-    pose, info = poselib.estimate_absolute_pose(
-        all_tracks.pixels[mine][known],
-        state.points[position[known]],
-        _pinhole(focal),
-        {"max_reproj_error": 3.0 * config.max_error_px * scale, "seed": 0, "min_iterations": 200},
-    )
-    num_inliers = sum(info["inliers"])
-    if num_inliers < max(config.min_points, 0.2 * known.sum()):
-        return None
-    return np.asarray(pose.R), np.asarray(pose.t)
+    def _agreement(self, growth: _Growth) -> dict[tuple[int, int], float]:
+        return {
+            key: float((errors < self._config.max_error_px).mean()) for key, errors in self._pair_errors(growth).items()
+        }
+
+    def _pair_errors(self, growth: _Growth) -> dict[tuple[int, int], Array]:
+        """Of the matches of all pairs of registered views, pixels at 1024 px on the longer side."""
+        return {
+            key: placement.pair_errors(growth.state, key, pair) / self._scale[key[0]]
+            for key, pair in self._pairs.items()
+            if key[0] in growth.registered and key[1] in growth.registered
+        }
 
 
 def _retriangulate(
     state: bundle.Problem,
     all_tracks: tracks.Tracks,
-    registered: list[int],
+    registered: Sequence[int],
     scale: Array,
     config: Config,
     widen: float,
-) -> tuple[bundle.Problem, npt.NDArray[np.int64]]:
+) -> tuple[bundle.Problem, Index]:
     """All points that the registered cameras agree on, and their tracks.
 
     An observation stays when its error is at most `widen` times the limit; the worst one of a track that fails is left
@@ -225,9 +312,11 @@ def _retriangulate(
     mine = np.isin(all_tracks.camera_of, registered)
     camera, track, pixels = all_tracks.camera_of[mine], all_tracks.track_of[mine], all_tracks.pixels[mine]
     lens = state.lens_of_camera[camera]
-    rays = undistort(pixels / np.exp(state.log_focals[lens])[:, None], state.radials[lens])
+    rays = placement.undistort(pixels / np.exp(state.log_focals[lens])[:, None], state.radials[lens])
     matrices = np.concatenate([state.rotations, state.translations[:, :, None]], 2)
     limit = widen * config.max_error_px * scale
+    errors = np.zeros(0)
+    points = np.zeros((all_tracks.num_tracks, 3))
     for _ in range(3):
         points = tracks.triangulate(matrices, rays, camera, track, all_tracks.num_tracks)
         errors = bundle.reprojection_errors(
@@ -239,12 +328,12 @@ def _retriangulate(
         keep = (worst[track] <= 1.0) | (errors < worst[track])
         if keep.all():
             break
-        camera, track, pixels, rays = camera[keep], track[keep], pixels[keep], rays[keep]
+        camera, track, pixels, rays, errors = camera[keep], track[keep], pixels[keep], rays[keep], errors[keep]
     centres = -np.einsum("cji,cj->ci", state.rotations, state.translations)
     angles = tracks.largest_angles(centres, np.nan_to_num(points), camera, track)
     count = np.bincount(track, minlength=all_tracks.num_tracks)
     worst = np.zeros(all_tracks.num_tracks)
-    np.maximum.at(worst, track, errors[keep] if len(errors) != len(track) else errors)
+    np.maximum.at(worst, track, errors)
     good = (count >= 2) & (worst <= 1.0) & (angles >= config.min_angle_deg) & ~np.isnan(points[:, 0])
     (kept,) = np.nonzero(good)
     observed = good[track]
@@ -258,53 +347,3 @@ def _retriangulate(
         ),
         kept,
     )
-
-
-def undistort(distorted: Array, radials: Array) -> Array:
-    """Normalised coordinates (M, 2) without their radial distortion, by fixed-point iteration."""
-    result = distorted
-    for _ in range(5):
-        result = distorted / (1.0 + radials * (result**2).sum(1))[:, None]
-    return result
-
-
-def _finish(
-    state: bundle.Problem,
-    prior: bundle.FocalPrior,
-    pairs: Pairs,
-    registered: list[int],
-    scale: Array,
-    config: Config,
-) -> Map:
-    centres = -np.einsum("cji,cj->ci", state.rotations, state.translations)
-    angles = tracks.largest_angles(centres, state.points, state.camera_of, state.point_of)
-    errors = bundle.reprojection_errors(state)
-    return Map(
-        views=tuple(registered),
-        problem=state,
-        prior=prior,
-        agreement={
-            key: pair_agreement(state, key, pair, config.max_error_px * scale[key[0]])
-            for key, pair in pairs.items()
-            if key[0] in registered and key[1] in registered
-        },
-        median_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
-        rms_px=float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0,
-    )
-
-
-def pair_agreement(state: bundle.Problem, key: tuple[int, int], pair: TwoView, limit: float) -> float:
-    """Share of a pair's matches whose Sampson error under the estimated cameras is within `limit` pixels."""
-    rays = []
-    for view, points in zip(key, (pair.points1, pair.points2), strict=True):
-        lens = state.lens_of_camera[view]
-        normalised = undistort(points / np.exp(state.log_focals[lens]), np.full(len(points), state.radials[lens]))
-        rays.append(np.column_stack([normalised, np.ones(len(points))]))
-    rotation = state.rotations[key[1]] @ state.rotations[key[0]].T
-    translation = state.translations[key[1]] - rotation @ state.translations[key[0]]
-    essential = bundle.cross_matrix(translation[None])[0] @ rotation
-    line2, line1 = rays[0] @ essential.T, rays[1] @ essential
-    residual = np.abs((rays[1] * line2).sum(1))
-    focal1, focal2 = np.exp(state.log_focals[state.lens_of_camera[list(key)]])
-    gradient = (line2[:, :2] ** 2).sum(1) / focal2**2 + (line1[:, :2] ** 2).sum(1) / focal1**2
-    return float((residual / np.sqrt(np.maximum(gradient, 1e-30)) < limit).mean())

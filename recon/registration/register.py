@@ -144,7 +144,7 @@ def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe]) -> Regist
     """The map with the first registered keyframe as the world's frame and a median point depth of 1."""
     state = built.problem
     order = sorted(built.views)
-    covariances = bundle.covariance(state, built.prior, bundle.Config(), built.views[0])
+    covariances = bundle.covariance(state, built.prior, built.loss, built.views[0])
     _, depths = bundle.project(state)
     scale = 1.0 / max(float(np.median(depths)), 1e-9)
     rotation0, translation0 = state.rotations[order[0]], state.translations[order[0]]
