@@ -7,6 +7,7 @@
 // which are blurred the same way five rows later. The rings stay in the cache; nothing of image size is stored.
 #include <algorithm>
 #include <cmath>
+#include <cstdlib>
 #include <cstring>
 
 #include "buffer.h"
@@ -19,7 +20,7 @@ namespace {
 constexpr int kRadius = 5;
 constexpr int kWindow = 2 * kRadius + 1;
 constexpr int kMargin = 16;     // zeros on both sides of a row, at least kRadius and aligned
-constexpr int kBandRows = 96;   // rows of a task: fixed, so that the sums do not depend on the threads
+constexpr int kBandRows = 96;     // rows of a task: fixed, so that the sums do not depend on the threads
 constexpr float kC1 = 0.01f * 0.01f, kC2 = 0.03f * 0.03f;
 
 // The weights of an image without weights.
@@ -80,13 +81,32 @@ void blur_along_x(const float* row, float* out, int width) {
     }
 }
 
+// The same of the image, its square and its product with the target, which are not stored before.
+void blur_moments_along_x(const float* image, const float* target, float* mean, float* square, float* product,
+                          int width) {
+    for (int x = 0; x < width; x += kLanes) {
+        Vec sums[3] = {};
+        for (int i = -kRadius; i <= kRadius; ++i) {
+            const Vec value = load_unaligned(image + x + i), other = load_unaligned(target + x + i);
+            const Vec weighted = kKernel.half[kRadius - std::abs(i)] * value;
+            sums[0] += weighted;
+            sums[1] += weighted * value;
+            sums[2] += weighted * other;
+        }
+        store(mean + x, sums[0]);
+        store(square + x, sums[1]);
+        store(product + x, sums[2]);
+    }
+}
+
 // The last kWindow rows of several maps.
 struct Ring {
     Buffer<float> memory;
     int maps, row_stride;
 
     void reset(int map_count, int width) {
-        maps = map_count, row_stride = padded(width);
+        // One cache line more than the row: at a power of two, the rows' columns would share a few sets of the cache.
+        maps = map_count, row_stride = padded(width) + 16;
         memory.resize(size_t(kWindow) * maps * row_stride);
     }
     float* row(int y, int map) { return &memory[size_t((y + 2 * kWindow) % kWindow * maps + map) * row_stride]; }
@@ -142,8 +162,8 @@ void read_image_row(const Plane& plane, int y, float* row) {
 }
 
 struct Scratch {
-    Rows rows;        // image, target, squares, products, and the three derivatives
-    Ring moments;     // blurred along x: image, its square, its product with the target
+    Rows rows;         // image, target, and the three derivatives
+    Ring moments;      // blurred along x: image, its square, its product with the target
     Ring derivatives;  // blurred along x
 };
 
@@ -191,12 +211,11 @@ double gradient_row(const Plane& plane, int y, Ring& derivatives, float l1_facto
 
 Sums sweep(const Plane& plane, int begin, int end, float l1_factor, float ssim_factor, Scratch& scratch) {
     const int width = plane.width, height = plane.height;
-    scratch.rows.reset(7, width);
+    scratch.rows.reset(5, width);
     scratch.moments.reset(3, width);
     scratch.derivatives.reset(3, width);
     float *image = scratch.rows.row(0), *target = scratch.rows.row(1);
-    float *square = scratch.rows.row(2), *product = scratch.rows.row(3);
-    float* derivatives[3] = {scratch.rows.row(4), scratch.rows.row(5), scratch.rows.row(6)};
+    float* derivatives[3] = {scratch.rows.row(2), scratch.rows.row(3), scratch.rows.row(4)};
 
     Sums sums;
     // `y` is the row that comes in; its moments are whole 5 rows later, its derivatives after 10.
@@ -204,13 +223,8 @@ Sums sweep(const Plane& plane, int begin, int end, float l1_factor, float ssim_f
         if (y >= 0 && y < height) {
             read_image_row(plane, y, image);
             std::memcpy(target, plane.target + size_t(y) * width, sizeof(float) * width);
-            for (int x = 0; x < width; x += kLanes) {
-                const Vec value = load(image + x);
-                store(square + x, value * value);
-                store(product + x, value * load(target + x));
-            }
-            const float* maps[3] = {image, square, product};
-            for (int map = 0; map < 3; ++map) blur_along_x(maps[map], scratch.moments.row(y, map), width);
+            blur_moments_along_x(image, target, scratch.moments.row(y, 0), scratch.moments.row(y, 1),
+                                 scratch.moments.row(y, 2), width);
         } else {
             scratch.moments.clear(y);
         }
