@@ -17,7 +17,10 @@ from capture.diorama.cast import Camera, cast
 from capture.diorama.layout import BRICK_WALL, place
 from capture.frame import Frame
 from recon.gaussians import Gaussians
+from recon.keyframe import Keyframe, modelled_image
 from recon.priors.pointmap import Pointmap
+from recon.registration import features, register
+from recon.view_graph import ViewGraph
 
 SMALL = synthetic.Config(views=6, width=320, height=240)
 
@@ -103,6 +106,16 @@ def exposed(frame: Frame, gain: float) -> Frame:
 
 def _eight_bit(image: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
+
+
+def view_graph(frames: Iterable[Frame]) -> ViewGraph:
+    """The frames as keyframes, each compared with all before it."""
+    config = register.Config()
+    graph = ViewGraph(config)
+    for frame in frames:
+        found = features.extract(frame.image, config.features)
+        graph.add(Keyframe(frame, modelled_image(frame.image, 320), found))
+    return graph
 
 
 @dataclass(frozen=True, eq=False)

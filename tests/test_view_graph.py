@@ -4,19 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from recon.keyframe import Keyframe, modelled_image
-from recon.registration import features, register
+from recon.registration import register
 from recon.view_graph import ViewGraph
-from tests.synthetic import photographs, places
-
-
-def graph_of(frames, config: register.Config | None = None) -> ViewGraph:
-    config = config or register.Config()
-    graph = ViewGraph(config)
-    for frame in frames:
-        found = features.extract(frame.image, config.features)
-        graph.add(Keyframe(frame, modelled_image(frame.image, 320), found))
-    return graph
+from tests.synthetic import photographs, places, view_graph
 
 
 @pytest.fixture
@@ -59,6 +49,6 @@ def test_a_chain_is_one_component_in_whatever_order_its_pairs_were_found(pairs):
 
 def test_photographs_of_one_place_are_a_pair_and_those_of_two_are_not():
     here, there = photographs()[2:4], places()[5:]
-    graph = graph_of([*here, *there])
+    graph = view_graph([*here, *there])
     assert set(graph.pairs) == {(0, 1)}
     assert len(graph.pairs[0, 1].matches) > 100 and not graph.pairs[0, 1].turned_only
