@@ -160,5 +160,6 @@ def _tell(snapshot: Snapshot, out: Path, report: dict[str, object], *, as_json: 
     if isinstance(held_out, dict):
         print(f"held-out views: {held_out['psnr']:.1f} dB PSNR, {held_out['ssim']:.3f} SSIM")
     if verdict.publishable:
-        print(f"{snapshot.seconds['total']:.1f} s, {len(snapshot.gaussians)} Gaussians, {len(snapshot.cameras)} cameras")
+        counts = f"{len(snapshot.gaussians)} Gaussians, {len(snapshot.cameras)} cameras"
+        print(f"{snapshot.seconds['total']:.1f} s, {counts}")
     print(f"results: {out}/ ({'scene.ply, cameras.json, preview.png, ' if verdict.publishable else ''}report.json)")

@@ -8,7 +8,7 @@ background. Where points of other colour fall, something nearer stands before th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import cv2
@@ -50,16 +50,7 @@ def complete(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint
         hole = unknown & (~falls | occluded)
         if not hole.any() or not (known[j].depth > 0).any():
             continue
-        facing = _facing(known[j])
-        near, far = np.percentile(known[j].depth[known[j].depth > 0], [2.0, 100.0])
-        near_guess = replace(known[j], depth=np.full_like(known[j].depth, config.foreground * near), normal=facing)
-        guesses = (
-            pointmaps[j],
-            _only(replace(known[j], depth=smooth_depth(known[j], images[j], config), normal=facing), ~falls),
-            _only(replace(known[j], depth=np.full_like(known[j].depth, config.background * far), normal=facing), ~falls),
-            _only(near_guess, occluded),
-        )
-        for guess in guesses:
+        for guess in _guesses(pointmaps[j], known[j], images[j], falls, occluded, config):
             guess = _only(guess, hole)
             guess = _only(guess, ~_hides_known(guess, [known[i] for i in rest], config.in_front))
             completed[j] = replace(
@@ -70,6 +61,17 @@ def complete(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint
             )
             hole &= guess.depth <= 0
     return completed
+
+
+def _guesses(
+    doubtful: Pointmap, known: Pointmap, image: npt.NDArray[np.uint8], falls: Mask, occluded: Mask, config: Config
+) -> Iterator[Pointmap]:
+    """What a hole may be filled with, the best first."""
+    near, far = np.percentile(known.depth[known.depth > 0], [2.0, 100.0])
+    yield doubtful
+    yield _only(_facing(known, smooth_depth(known, image, config)), ~falls)
+    yield _only(_facing(known, config.background * far), ~falls)
+    yield _only(_facing(known, config.foreground * near), occluded)
 
 
 def smooth_depth(pointmap: Pointmap, image: npt.NDArray[np.uint8], config: Config) -> Float32:
@@ -141,10 +143,11 @@ def _hides_known(filled: Pointmap, others: Sequence[Pointmap], in_front: float) 
     return wrong
 
 
-def _facing(pointmap: Pointmap) -> Float32:
-    """(h, w, 3) normals that look straight at the camera."""
+def _facing(pointmap: Pointmap, depth: Float32 | float) -> Pointmap:
+    """The point map at another depth, with normals that look straight at the camera."""
     height, width = pointmap.depth.shape
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     K = pointmap.K
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1)
-    return (-rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    normal = (-rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
+    return replace(pointmap, depth=np.full_like(pointmap.depth, depth), normal=normal)

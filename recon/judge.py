@@ -29,7 +29,7 @@ def judge(graph: ViewGraph, registration: Registration | None, config: Config) -
             "Take more photographs of the same place, each from a step further to the side.",
             tuple(names),
         )
-    plain = [name for name, keyframe in zip(names, graph.keyframes, strict=True) if len(keyframe.features.points) < config.min_features]  # fmt: skip
+    plain = [keyframe.name for keyframe in graph.keyframes if len(keyframe.features.points) < config.min_features]
     if not graph.pairs:
         if len(plain) > len(names) / 2:
             return Verdict(

@@ -130,3 +130,24 @@ def test_a_view_that_knows_nothing_stays_empty():
 def test_views_keep_their_order():
     pointmaps = [replace(wall(confidence=c), frame_id=i) for i, c in enumerate((0.4, 0.9, 0.6))]
     assert [pointmap.frame_id for pointmap in complete(pointmaps, [GREY] * 3, Config())] == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("step", "depth"), [(0.9, 0.8), (0.1, 0.0)])
+def test_what_stands_before_another_views_surface_is_put_close_to_the_camera(step, depth):
+    """Red where the other view shows grey wall. That view, if it is near, would see something at 0.4 * 2 as well."""
+    hole = box(slice(16, 32), slice(40, 56))
+    image = GREY.copy()
+    image[hole] = 255, 0, 0
+    pointmaps = [without(wall(confidence=0.9), hole), wall(x=step)]
+    filled, _ = complete(pointmaps, [image, GREY], Config(foreground=0.4))
+    inside = box(slice(19, 29), slice(43, 53))
+    np.testing.assert_allclose(filled.depth[inside], depth, rtol=1e-5)
+    assert np.array_equal(filled.depth[~hole], pointmaps[0].depth[~hole])
+
+
+def test_a_few_pixels_of_another_colour_are_noise_and_not_an_object():
+    hole = box(slice(20, 23), slice(45, 48))
+    image = GREY.copy()
+    image[hole] = 255, 0, 0
+    filled, _ = complete([without(wall(confidence=0.9), hole), wall(x=0.9)], [image, GREY], Config(object_px=7))
+    assert not filled.depth[hole].any()

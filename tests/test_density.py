@@ -224,7 +224,7 @@ def test_cells_that_do_not_halve_into_the_smallest_are_refused():
 
 def render(gaussians: Gaussians, pointmap: Pointmap) -> torch.Tensor:
     height, width = pointmap.depth.shape
-    return rasterize(
+    image = rasterize(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
@@ -236,3 +236,5 @@ def render(gaussians: Gaussians, pointmap: Pointmap) -> torch.Tensor:
         height,
         channels=("rgb",),
     ).rgb
+    assert image is not None
+    return image

@@ -22,7 +22,7 @@ def covariances(gaussians: Gaussians) -> np.ndarray:
 
 
 def render(scene: TinyScene, gaussians: Gaussians, T_world_camera: torch.Tensor) -> torch.Tensor:
-    return rasterize(
+    image = rasterize(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
@@ -34,6 +34,8 @@ def render(scene: TinyScene, gaussians: Gaussians, T_world_camera: torch.Tensor)
         scene.height,
         channels=("rgb",),
     ).rgb
+    assert image is not None
+    return image
 
 
 def test_activated_values():

@@ -42,8 +42,8 @@ def test_components_are_the_largest_first(compared):
 @pytest.mark.parametrize("pairs", [[(0, 1), (1, 2), (2, 3)], [(2, 3), (0, 1), (1, 2)], [(0, 3), (2, 3), (1, 2)]])
 def test_a_chain_is_one_component_in_whatever_order_its_pairs_were_found(pairs):
     graph = ViewGraph(register.Config(squeezes=()))
-    graph.keyframes = ["a", "b", "c", "d", "e"]
-    graph.pairs = dict.fromkeys(pairs)
+    graph.keyframes.extend(["a", "b", "c", "d", "e"])
+    graph.pairs.update(dict.fromkeys(pairs))
     assert graph.components() == [[0, 1, 2, 3], [4]]
 
 

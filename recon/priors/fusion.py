@@ -89,7 +89,12 @@ def agreement(
         )
     )  # fmt: skip
     result = Agreement(
-        *(np.empty(view.shape, np.float32) for _ in range(3)), *(np.empty(view.shape, np.uint8) for _ in range(3))
+        inverse_depth=np.empty(view.shape, np.float32),
+        relative_spread=np.empty(view.shape, np.float32),
+        angle=np.empty(view.shape, np.float32),
+        num_consistent=np.empty(view.shape, np.uint8),
+        num_inside=np.empty(view.shape, np.uint8),
+        num_conflicting=np.empty(view.shape, np.uint8),
     )
     pinhole = (ctypes.c_float * 4)(view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2])
     library().patchmatch_check(

@@ -181,10 +181,12 @@ def _start(view: View, level: Level, sparse: Sparse | None) -> Planes:
     if sparse is not None and len(sparse.points):
         height, width = level.shape
         scale = np.array([width / view.image.shape[1], height / view.image.shape[0]])
-        x, y = np.clip((sparse.points * scale).astype(int), 0, [width - 1, height - 1]).T
+        pixels: npt.NDArray[np.int64] = np.clip((sparse.points * scale).astype(int), 0, [width - 1, height - 1])
+        x, y = pixels.T
         elsewhere = np.ones(level.shape, np.uint8)
         elsewhere[y, x] = 0
-        _, labels = cv2.distanceTransformWithLabels(elsewhere, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+        nearest = cv2.distanceTransformWithLabels(elsewhere, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
+        labels = nearest.astype(np.int64)
         inverse_depths = np.zeros(labels.max() + 1, np.float32)
         inverse_depths[labels[y, x]] = 1 / sparse.depths
         values[..., 0] = inverse_depths[labels]
