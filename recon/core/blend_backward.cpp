@@ -194,7 +194,8 @@ void store_gradients(const TileSplat* splats, const Sums* sums, SplatGradient* c
 
 // The rows of a tile lie far apart in each plane, so the processor does not foresee them.
 template <int Channels>
-void prefetch_images(const Camera& camera, TileOrigin origin, const RasterImages& images, const RasterImages& gradients) {
+void prefetch_images(const Camera& camera, TileOrigin origin, const RasterImages& images,
+                     const RasterImages& gradients) {
     using F = Features<Channels>;
     const size_t plane_size = size_t(camera.width) * camera.height;
     const float* planes[10];

@@ -73,7 +73,8 @@ CORE_API int64_t core_raster_block_pairs(const Raster* raster) {
     int64_t pairs = 0;
     for (int tile = 0; tile < raster->num_tiles(); ++tile) {
         const uint64_t* words = raster->block_bits.data() + raster->first_words[tile];
-        for (uint32_t word = 0; word < kBlocks * raster->num_words(tile); ++word) pairs += __builtin_popcountll(words[word]);
+        for (uint32_t word = 0; word < kBlocks * raster->num_words(tile); ++word)
+            pairs += __builtin_popcountll(words[word]);
     }
     return pairs;
 }

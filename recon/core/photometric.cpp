@@ -121,7 +121,8 @@ struct ColumnBlur {
     }
     Vec at(int x) const {
         Vec sum = kKernel.half[kRadius] * load(rows[kRadius] + x);
-        for (int i = 0; i < kRadius; ++i) sum += kKernel.half[i] * (load(rows[i] + x) + load(rows[kWindow - 1 - i] + x));
+        for (int i = 0; i < kRadius; ++i)
+            sum += kKernel.half[i] * (load(rows[i] + x) + load(rows[kWindow - 1 - i] + x));
         return sum;
     }
 };

@@ -64,7 +64,8 @@ void tile_range(float centre, float extent, int tiles, uint16_t& begin, uint16_t
 }
 
 // Projects Gaussians [first, first + valid) and counts their splats by tile. Returns InputError bits.
-int project_lanes(const RasterInput& input, Raster& raster, int first, int valid, uint32_t* tile_counts, uint32_t& slots) {
+int project_lanes(const RasterInput& input, Raster& raster, int first, int valid, uint32_t* tile_counts,
+                  uint32_t& slots) {
     const Camera& camera = raster.camera;
     const Gaussians gaussians = load_gaussians(input, first, valid);
     int errors = check_input(gaussians);

@@ -94,11 +94,13 @@ void colours_backward(const RasterInput& input, const Raster& raster, int first,
 void quat_backward(const Projection& p, const Vec (&axes)[3][3], Vec (&gradient)[4]) {
     const Vec w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3];
     const Vec(&d)[3][3] = axes;
+    const Vec turn_x = d[2][1] - d[1][2], turn_y = d[0][2] - d[2][0], turn_z = d[1][0] - d[0][1];
+    const Vec xy = d[0][1] + d[1][0], xz = d[0][2] + d[2][0], yz = d[1][2] + d[2][1];
     const Vec unit[4] = {
-        2.0f * (x * (d[2][1] - d[1][2]) + y * (d[0][2] - d[2][0]) + z * (d[1][0] - d[0][1])),
-        2.0f * (w * (d[2][1] - d[1][2]) + y * (d[0][1] + d[1][0]) + z * (d[0][2] + d[2][0]) - 2.0f * x * (d[1][1] + d[2][2])),
-        2.0f * (w * (d[0][2] - d[2][0]) + x * (d[0][1] + d[1][0]) + z * (d[1][2] + d[2][1]) - 2.0f * y * (d[0][0] + d[2][2])),
-        2.0f * (w * (d[1][0] - d[0][1]) + x * (d[0][2] + d[2][0]) + y * (d[1][2] + d[2][1]) - 2.0f * z * (d[0][0] + d[1][1])),
+        2.0f * (x * turn_x + y * turn_y + z * turn_z),
+        2.0f * (w * turn_x + y * xy + z * xz - 2.0f * x * (d[1][1] + d[2][2])),
+        2.0f * (w * turn_y + x * xy + z * yz - 2.0f * y * (d[0][0] + d[2][2])),
+        2.0f * (w * turn_z + x * xz + y * yz - 2.0f * z * (d[0][0] + d[1][1])),
     };
     const Vec along = w * unit[0] + x * unit[1] + y * unit[2] + z * unit[3];
     for (int i = 0; i < 4; ++i) gradient[i] = (unit[i] - along * p.quat[i]) * p.inverse_norm;
@@ -165,7 +167,8 @@ GaussianGradients projection_backward(const Gaussians& gaussians, const Projecti
             axes_world[j][k] = axes_camera[0][k] * R[0][j] + axes_camera[1][k] * R[1][j] + axes_camera[2][k] * R[2][j];
     quat_backward(p, axes_world, out.quat);
     for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) camera_sums[3 * i + j] = in_camera[i] * p.to_mean[j] + dot(axes_camera[i], p.axes_world[j]);
+        for (int j = 0; j < 3; ++j)
+            camera_sums[3 * i + j] = in_camera[i] * p.to_mean[j] + dot(axes_camera[i], p.axes_world[j]);
     for (int j = 0; j < 3; ++j) camera_sums[9 + j] = -to_mean[j];
     camera_sums[12] = centre_x * p.x_by_z + focal_x * p.inverse_z;
     camera_sums[13] = centre_y * p.y_by_z + focal_y * p.inverse_z;

@@ -56,7 +56,8 @@ struct Projection {
     Vec normal_to_rows[3];  // rows[0] x rows[1]; its squared length is the covariance's determinant before the low pass
     Vec area2;              // that squared length
     Vec xx, yy, slope;      // covariance: variances, and covariance over yy
-    Vec factor_x, factor_y;  // a = factor_x * (dx - slope * dy), b = factor_y * dy, alpha = opacity * exp(-(a^2 + b^2) / 2)
+    // a = factor_x * (dx - slope * dy), b = factor_y * dy, alpha = opacity * exp(-(a^2 + b^2) / 2)
+    Vec factor_x, factor_y;
     Vec compensation;       // of the opacity for the low pass; 1 without antialiasing
 };
 
@@ -99,7 +100,8 @@ inline Projection project_gaussians(const Gaussians& gaussians, const Camera& ca
     for (int k = 0; k < 3; ++k) {
         for (int i = 0; i < 3; ++i) {
             const float* row = camera.rotation[i];
-            p.axes_camera[i][k] = p.axes_world[0][k] * row[0] + p.axes_world[1][k] * row[1] + p.axes_world[2][k] * row[2];
+            const Vec(&axes)[3][3] = p.axes_world;
+            p.axes_camera[i][k] = axes[0][k] * row[0] + axes[1][k] * row[1] + axes[2][k] * row[2];
         }
         p.rows[0][k] = p.focal_x * (p.axes_camera[0][k] - p.x_by_z * p.axes_camera[2][k]) * gaussians.scale[k];
         p.rows[1][k] = p.focal_y * (p.axes_camera[1][k] - p.y_by_z * p.axes_camera[2][k]) * gaussians.scale[k];

@@ -112,7 +112,8 @@ inline IntVec nearest_int(Vec value) {
     return (IntVec)vcvtnq_s32_f32((float32x4_t)value);
 #else
     IntVec nearest;
-    for (int lane = 0; lane < kLanes; ++lane) nearest[lane] = std::abs(value[lane]) < 1e9f ? int(std::lrint(value[lane])) : 0;
+    for (int lane = 0; lane < kLanes; ++lane)
+        nearest[lane] = std::abs(value[lane]) < 1e9f ? int(std::lrint(value[lane])) : 0;
     return nearest;
 #endif
 }

@@ -84,7 +84,7 @@ void find_blocks(Raster& raster, int tile) {
         const Vec radius2 = maximum(load(columns[5]) - kLog2AlphaMin, Vec{});
         const Vec inverse_k0 = 1.0f / load(columns[2]), extent_y = square_root(radius2) / k2 + slack;
         const Vec extent_at = load(columns[6]);
-        const unsigned valid = (count - first < uint32_t(kLanes) ? (1u << (count - first)) : (1u << (kLanes - 1)) * 2) - 1;
+        const unsigned valid = (1u << std::min(count - first, uint32_t(kLanes))) - 1;
 
         for (int row = 0; row < kBlocksDown; ++row) {
             const Vec top = float(row * kBlockHeight) + 0.5f - y, bottom = top + float(kBlockHeight - 1);
