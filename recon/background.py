@@ -43,8 +43,9 @@ def background(
 def _shell(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config) -> Gaussians:
     """The Gaussians `config.spacing_deg` apart.
 
-    Each has the colour of the image, strongly blurred, of the view that it lies deepest in, at the nearest pixel of
-    that image.
+    Each has a view's colour at the nearest pixel, strongly blurred over what is far or unknown there: a wall that is
+    near says nothing about what lies behind it. Views that see far in that direction count, and of these the one that
+    the Gaussian lies deepest in.
     """
     centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps])
     centre = centres.mean(0)
@@ -53,6 +54,7 @@ def _shell(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]
     radius = config.distance * max(farthest, spread)
     directions = _sphere(config.spacing_deg)
     outside = np.full(len(directions), np.inf)
+    best = np.full(len(directions), -np.inf)
     colours = np.zeros((len(directions), 3))
     for pointmap, image in zip(pointmaps, images, strict=True):
         height, width = image.shape[:2]
@@ -62,11 +64,12 @@ def _shell(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]
         pixels += pointmap.K[:2, 2]
         relative = pixels / (width, height) - 0.5
         distance = np.where(ahead, np.abs(relative).max(1) - 0.5, np.inf)
-        blurred = cv2.GaussianBlur(image, (0, 0), 0.04 * max(height, width)).astype(np.float64) / 255.0
+        blurred, sees_far = _far_colours(image, pointmap.depth / farthest, 0.04 * max(height, width))
         column = np.clip(pixels[:, 0], 0, width - 1).astype(int)
         row = np.clip(pixels[:, 1], 0, height - 1).astype(int)
-        nearer = distance < outside
-        colours[nearer] = blurred[row[nearer], column[nearer]]
+        score = np.log(sees_far[row, column]) - 10.0 * distance
+        better = score > best
+        colours[better], best[better] = blurred[row, column][better], score[better]
         outside = np.minimum(outside, distance)
     kept = outside < config.margin
     directions, colours = directions[kept], colours[kept]
@@ -81,6 +84,19 @@ def _shell(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]
         sh=torch.from_numpy((colours - 0.5) / SH_C0).float()[:, None],
         source_frame=torch.full((count,), SOURCE_FRAME, dtype=torch.int32),
     )
+
+
+def _far_colours(
+    image: npt.NDArray[np.uint8], relative_depth: npt.NDArray[np.float32], sigma_px: float
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """(h, w, 3) colours in [0, 1] blurred over far and unknown pixels, and (h, w) the weight of these around a pixel.
+
+    `relative_depth` is 1 at the farthest known depth and 0 where the depth is unknown.
+    """
+    far = np.where(relative_depth > 0, relative_depth.astype(np.float64) ** 4, 1.0) + 1e-3
+    weight = cv2.GaussianBlur(far, (0, 0), sigma_px)
+    blurred = cv2.GaussianBlur(image * far[..., None] / 255.0, (0, 0), sigma_px)
+    return blurred / weight[..., None], weight
 
 
 def _sphere(spacing_deg: float) -> npt.NDArray[np.float64]:
