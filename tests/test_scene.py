@@ -147,8 +147,9 @@ def begun(max_gaussians: int | None = None) -> Scene:
         plane_pointmap(T, confidence=c, frame_id=i) for i, (T, c) in enumerate([(np.eye(4), 0.9), (step, 0.5)])
     )
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    principal = np.array([WIDTH / 2, HEIGHT / 2])
     cameras = tuple(
-        RegisteredCamera(i, pointmap.T_world_camera, 1.1 * WIDTH, 0.0, 0.1 + i, 0.01)
+        RegisteredCamera(i, pointmap.T_world_camera, 1.1 * WIDTH, principal, 0.0, 0.1 + i, 0.01)
         for i, pointmap in enumerate(pointmaps)
     )
     images = {pointmap.name: noise for pointmap in pointmaps}

@@ -18,17 +18,19 @@ namespace {
 constexpr int kChunks = 16;
 constexpr double kBehind = 1e6;     // squared pixels: the error of a point behind a camera
 constexpr double kFloor = 1e-12;    // added to diagonals that damping scales
-constexpr int kPose = 6, kLens = 2;  // numbers of a camera's pose and of a lens
+constexpr int kPose = 6, kLens = 4;  // numbers of a camera's pose and of a lens
+constexpr int kOwn = kPose + kLens;  // parameters of an observation but its point
 
 }  // namespace
 
 // As recon.registration.bundle.Problem; observations ordered by point. Parameters are the cameras' poses (rotation
-// vector applied from the left, translation), then the lenses' (log focal, radial).
+// vector applied from the left, translation), then the lenses' (log focal, radial, shift of the principal point).
 struct Bundle {
-    double *rotations, *translations, *log_focals, *radials, *points;  // (C, 3, 3), (C, 3), (G,), (G,), (P, 3)
-    const int32_t *lens_of_camera, *camera_of, *first_of_point;        // (C,), (O,), (P + 1,)
-    const double* pixels;                                              // (O, 2)
-    const double *prior_log_focals, *prior_sigmas, *radial_sigmas;     // (G,); a sigma of 0 fixes the parameter
+    double *rotations, *translations;                            // (C, 3, 3), (C, 3)
+    double *log_focals, *radials, *shifts, *points;              // (G,), (G,), (G, 2), (P, 3)
+    const int32_t *lens_of_camera, *camera_of, *first_of_point;  // (C,), (O,), (P + 1,)
+    const double* pixels;                                        // (O, 2)
+    const double *prior_log_focals, *prior_sigmas, *radial_sigmas, *shift_sigmas;  // (G,); 0 fixes the parameter
     int32_t num_cameras, num_lenses, num_points, fixed_camera;
     double robust_squared;
 };
@@ -54,11 +56,24 @@ Projection project(const Bundle& bundle, int camera, const double* point, const 
     p.radial = bundle.radials[lens];
     p.squared_radius = p.u * p.u + p.v * p.v;
     p.distortion = 1 + p.radial * p.squared_radius;
-    p.residual[0] = p.focal * p.distortion * p.u - pixel[0];
-    p.residual[1] = p.focal * p.distortion * p.v - pixel[1];
+    p.residual[0] = p.focal * p.distortion * p.u + bundle.shifts[2 * lens] - pixel[0];
+    p.residual[1] = p.focal * p.distortion * p.v + bundle.shifts[2 * lens + 1] - pixel[1];
     p.squared = p.residual[0] * p.residual[0] + p.residual[1] * p.residual[1];
     return p;
 }
+
+// What pulls a lens' parameters; those without weight are fixed.
+struct LensPrior {
+    double deviations[kLens], weights[kLens];
+
+    LensPrior(const Bundle& bundle, int g)
+        : deviations{bundle.log_focals[g] - bundle.prior_log_focals[g], bundle.radials[g], bundle.shifts[2 * g],
+                     bundle.shifts[2 * g + 1]} {
+        const double sigmas[kLens] = {bundle.prior_sigmas[g], bundle.radial_sigmas[g], bundle.shift_sigmas[g],
+                                      bundle.shift_sigmas[g]};
+        for (int k = 0; k < kLens; ++k) weights[k] = sigmas[k] > 0 ? 1 / (sigmas[k] * sigmas[k]) : 0.0;
+    }
+};
 
 double total_cost(const Bundle& bundle) {
     std::vector<double> costs(kChunks, 0.0);
@@ -76,16 +91,15 @@ double total_cost(const Bundle& bundle) {
     double cost = 0;
     for (const double value : costs) cost += value;
     for (int g = 0; g < bundle.num_lenses; ++g) {
-        if (bundle.prior_sigmas[g] > 0)
-            cost += std::pow((bundle.log_focals[g] - bundle.prior_log_focals[g]) / bundle.prior_sigmas[g], 2);
-        if (bundle.radial_sigmas[g] > 0) cost += std::pow(bundle.radials[g] / bundle.radial_sigmas[g], 2);
+        const LensPrior prior(bundle, g);
+        for (int k = 0; k < kLens; ++k) cost += prior.deviations[k] * prior.deviations[k] * prior.weights[k];
     }
     return cost;
 }
 
-// Derivatives of a residual (2) by its camera's pose and lens (8) and by its point (3), and its weight.
+// Derivatives of a residual (2) by its camera's pose and lens (10) and by its point (3), and its weight.
 struct Derivatives {
-    double by_camera[2][kPose + kLens], by_point[2][3], weight;
+    double by_camera[2][kOwn], by_point[2][3], weight;
 };
 
 Derivatives differentiate(const Bundle& bundle, const Projection& p, int camera) {
@@ -106,6 +120,8 @@ Derivatives differentiate(const Bundle& bundle, const Projection& p, int camera)
         for (int i = 0; i < 3; ++i) d.by_camera[k][3 + i] = position[i];
         d.by_camera[k][6] = normalised[k] * p.focal * p.distortion;
         d.by_camera[k][7] = normalised[k] * p.focal * p.squared_radius;
+        d.by_camera[k][8] = k == 0;
+        d.by_camera[k][9] = k == 1;
         for (int i = 0; i < 3; ++i)
             d.by_point[k][i] =
                 position[0] * rotation[i] + position[1] * rotation[3 + i] + position[2] * rotation[6 + i];
@@ -140,18 +156,18 @@ struct System {
     int size;                      // parameters
     std::vector<double> matrix;    // (size, size), lower triangle
     std::vector<double> gradient;  // (size,)
-    std::vector<double> spread;    // (O, 8, 3): (J_camera^T w J_point) (J_point^T w J_point)^-1
+    std::vector<double> spread;    // (O, 10, 3): (J_camera^T w J_point) (J_point^T w J_point)^-1
     std::vector<double> shift;     // (P, 3): (J_point^T w J_point)^-1 J_point^T w residual
 
     explicit System(const Bundle& bundle)
         : size(kPose * bundle.num_cameras + kLens * bundle.num_lenses),
           matrix(size_t(size) * size),
           gradient(size),
-          spread(size_t(bundle.first_of_point[bundle.num_points]) * 24),
+          spread(size_t(bundle.first_of_point[bundle.num_points]) * 3 * kOwn),
           shift(size_t(bundle.num_points) * 3) {}
 };
 
-// Where the k-th of an observation's eight parameters is among all.
+// Where the k-th of an observation's ten parameters is among all.
 inline int parameter(const Bundle& bundle, int camera, int k) {
     return k < kPose ? kPose * camera + k
                      : kPose * bundle.num_cameras + kLens * bundle.lens_of_camera[camera] + k - kPose;
@@ -174,8 +190,8 @@ void eliminate(const Bundle& bundle, int point, double damping, System& system, 
         const int camera = bundle.camera_of[o];
         const Projection p = project(bundle, camera, bundle.points + 3 * point, bundle.pixels + 2 * o);
         const Derivatives d = differentiate(bundle, p, camera);
-        int at[kPose + kLens];
-        for (int k = 0; k < kPose + kLens; ++k) {
+        int at[kOwn];
+        for (int k = 0; k < kOwn; ++k) {
             at[k] = parameter(bundle, camera, k);
             if (sums.place[at[k]] < 0) {
                 sums.place[at[k]] = int(sums.columns.size());
@@ -183,13 +199,13 @@ void eliminate(const Bundle& bundle, int point, double damping, System& system, 
                 sums.mixed.insert(sums.mixed.end(), 3, 0.0);
             }
         }
-        for (int k = 0; k < kPose + kLens; ++k) {
+        for (int k = 0; k < kOwn; ++k) {
             const double w0 = d.weight * d.by_camera[0][k], w1 = d.weight * d.by_camera[1][k];
             for (int j = 0; j <= k; ++j)
                 sums.matrix[size_t(at[k]) * size + at[j]] += w0 * d.by_camera[0][j] + w1 * d.by_camera[1][j];
             sums.gradient[at[k]] += w0 * p.residual[0] + w1 * p.residual[1];
             double* mixed = &sums.mixed[size_t(sums.place[at[k]]) * 3];
-            double* own = &system.spread[(size_t(o) * 8 + k) * 3];
+            double* own = &system.spread[(size_t(o) * kOwn + k) * 3];
             for (int i = 0; i < 3; ++i) {
                 own[i] = w0 * d.by_point[0][i] + w1 * d.by_point[1][i];
                 mixed[i] += own[i];
@@ -207,8 +223,8 @@ void eliminate(const Bundle& bundle, int point, double damping, System& system, 
     double* shift = &system.shift[size_t(point) * 3];
     multiply(inverse, right, shift);
     for (int o = first; o < last; ++o)
-        for (int k = 0; k < kPose + kLens; ++k) {
-            double* own = &system.spread[(size_t(o) * 8 + k) * 3];
+        for (int k = 0; k < kOwn; ++k) {
+            double* own = &system.spread[(size_t(o) * kOwn + k) * 3];
             const double mixed[3] = {own[0], own[1], own[2]};
             multiply(inverse, mixed, own);
         }
@@ -247,13 +263,11 @@ void assemble(const Bundle& bundle, double damping, System& system) {
     std::vector<double> priors(size, 0.0);
     for (int g = 0; g < bundle.num_lenses; ++g) {
         const int at = kPose * bundle.num_cameras + kLens * g;
-        const double sigmas[2] = {bundle.prior_sigmas[g], bundle.radial_sigmas[g]};
-        const double deviations[2] = {bundle.log_focals[g] - bundle.prior_log_focals[g], bundle.radials[g]};
-        for (int k = 0; k < 2; ++k)
-            if (sigmas[k] > 0) {
-                priors[at + k] = 1 / (sigmas[k] * sigmas[k]);
-                system.gradient[at + k] += deviations[k] / (sigmas[k] * sigmas[k]);
-            }
+        const LensPrior prior(bundle, g);
+        for (int k = 0; k < kLens; ++k) {
+            priors[at + k] = prior.weights[k];
+            system.gradient[at + k] += prior.weights[k] * prior.deviations[k];
+        }
     }
     for (int i = 0; i < size; ++i)
         for (int j = 0; j <= i; ++j) {
@@ -272,9 +286,9 @@ std::vector<int> free_parameters(const Bundle& bundle) {
     for (int i = 0; i < kPose * bundle.num_cameras; ++i)
         if (i / kPose != bundle.fixed_camera) kept.push_back(i);
     for (int g = 0; g < bundle.num_lenses; ++g) {
-        const int at = kPose * bundle.num_cameras + kLens * g;
-        if (bundle.prior_sigmas[g] > 0) kept.push_back(at);
-        if (bundle.radial_sigmas[g] > 0) kept.push_back(at + 1);
+        const LensPrior prior(bundle, g);
+        for (int k = 0; k < kLens; ++k)
+            if (prior.weights[k] > 0) kept.push_back(kPose * bundle.num_cameras + kLens * g + k);
     }
     return kept;
 }
@@ -321,13 +335,14 @@ void turn(double* rotation, const double* vector) {
 
 // The parameters of a bundle, to be kept and put back.
 struct State {
-    std::vector<double> rotations, translations, log_focals, radials, points;
+    std::vector<double> rotations, translations, log_focals, radials, shifts, points;
 
     explicit State(const Bundle& b)
         : rotations(b.rotations, b.rotations + 9 * b.num_cameras),
           translations(b.translations, b.translations + 3 * b.num_cameras),
           log_focals(b.log_focals, b.log_focals + b.num_lenses),
           radials(b.radials, b.radials + b.num_lenses),
+          shifts(b.shifts, b.shifts + 2 * b.num_lenses),
           points(b.points, b.points + 3 * size_t(b.num_points)) {}
 
     void put_back(const Bundle& b) const {
@@ -335,6 +350,7 @@ struct State {
         std::copy(translations.begin(), translations.end(), b.translations);
         std::copy(log_focals.begin(), log_focals.end(), b.log_focals);
         std::copy(radials.begin(), radials.end(), b.radials);
+        std::copy(shifts.begin(), shifts.end(), b.shifts);
         std::copy(points.begin(), points.end(), b.points);
     }
 };
@@ -344,9 +360,9 @@ void move(const Bundle& bundle, const System& system, const std::vector<double>&
         double* at = bundle.points + 3 * size_t(point);
         for (int i = 0; i < 3; ++i) at[i] -= system.shift[3 * size_t(point) + i];
         for (int o = bundle.first_of_point[point]; o < bundle.first_of_point[point + 1]; ++o)
-            for (int k = 0; k < kPose + kLens; ++k) {
+            for (int k = 0; k < kOwn; ++k) {
                 const double by = step[parameter(bundle, bundle.camera_of[o], k)];
-                for (int i = 0; i < 3; ++i) at[i] -= system.spread[(size_t(o) * 8 + k) * 3 + i] * by;
+                for (int i = 0; i < 3; ++i) at[i] -= system.spread[(size_t(o) * kOwn + k) * 3 + i] * by;
             }
     }
     for (int camera = 0; camera < bundle.num_cameras; ++camera) {
@@ -357,6 +373,8 @@ void move(const Bundle& bundle, const System& system, const std::vector<double>&
         const double* of_lens = &step[kPose * bundle.num_cameras + kLens * g];
         bundle.log_focals[g] += std::clamp(of_lens[0], -0.5, 0.5);
         bundle.radials[g] += std::clamp(of_lens[1], -0.2, 0.2);
+        bundle.shifts[2 * g] += of_lens[2];
+        bundle.shifts[2 * g + 1] += of_lens[3];
     }
 }
 
@@ -396,7 +414,7 @@ CORE_API double core_bundle_adjust(const Bundle* bundle, int max_iterations, dou
     return cost;
 }
 
-// The normal matrix of all poses and lenses with the points eliminated, (6 C + 2 G, 6 C + 2 G), without damping.
+// The normal matrix of all poses and lenses with the points eliminated, (6 C + 4 G, 6 C + 4 G), without damping.
 CORE_API void core_bundle_information(const Bundle* bundle, double* matrix) {
     System system(*bundle);
     assemble(*bundle, 0.0, system);

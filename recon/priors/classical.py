@@ -22,9 +22,6 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     registration: register.Config = register.Config()
     stereo: stereo.Config = stereo.Config()
     seed: int = 0
-    # Sparse points are rare on what is far: how much further than they reach stereo searches. In inverse depth, in which
-    # it samples, that is a small part of the range.
-    far_margin: float = 8.0
 
 
 class ClassicalPrior:
@@ -47,8 +44,7 @@ class ClassicalPrior:
         for camera in registration.cameras:
             keyframe = graph.keyframes[camera.index]
             points = _sparse_points(registration, camera, keyframe.scale)
-            near, far = stereo.depth_range(points.depths)
-            near_far = (near, self._config.far_margin * far)
+            near_far = stereo.depth_range(points.depths)
             views.append(stereo.View(keyframe.image, modelled_K(graph, camera), camera.T_world_camera, near_far))
             sparse.append(points)
         maps = stereo.depth_maps(views, self._config.stereo, seed=self._config.seed, sparse=sparse)
@@ -73,7 +69,7 @@ def load(config: Config) -> ClassicalPrior:
 def modelled_K(graph: ViewGraph, camera: register.RegisteredCamera) -> Array:
     """(3, 3) intrinsics of a registered camera for its image at modelled size."""
     keyframe = graph.keyframes[camera.index]
-    (sx, sy), (cx, cy) = keyframe.scale, register.principal_point(keyframe.frame)
+    (sx, sy), (cx, cy) = keyframe.scale, camera.principal
     return np.array([[camera.focal * sx, 0.0, cx * sx], [0.0, camera.focal * sy, cy * sy], [0.0, 0.0, 1.0]])
 
 

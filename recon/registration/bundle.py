@@ -28,10 +28,11 @@ class Problem:
     lens_of_camera: Index  # (C,)
     log_focals: Array  # (G,) log of the focal length in pixels
     radials: Array  # (G,) first radial coefficient: distorted = undistorted * (1 + k r^2)
+    shifts: Array  # (G, 2) of the principal point, pixels
     points: Array  # (P, 3)
     camera_of: Index  # (O,)
     point_of: Index  # (O,)
-    pixels: Array  # (O, 2) relative to the principal point
+    pixels: Array  # (O, 2) relative to the nominal principal point
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -42,15 +43,16 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class FocalPrior:
-    """Gaussian priors on the logarithm of each lens' focal length and on its radial coefficient."""
+    """Gaussian priors on each lens' log focal length, radial coefficient and principal point; a sigma of 0 fixes."""
 
     log_focals: Array  # (G,)
-    sigmas: Array  # (G,) of log focal; 0 fixes it
-    radial_sigmas: Array  # (G,) around zero; 0 fixes the coefficient at its value
+    sigmas: Array  # (G,) of log focal
+    radial_sigmas: Array  # (G,) around zero
+    shift_sigmas: Array  # (G,) pixels around the nominal principal point
 
 
 def project(problem: Problem) -> tuple[Array, Array]:
-    """Predicted pixels (O, 2) relative to the principal point, and depths (O,)."""
+    """Predicted pixels (O, 2) relative to the nominal principal point, and depths (O,)."""
     camera, lens = problem.camera_of, problem.lens_of_camera[problem.camera_of]
     in_camera = (
         np.einsum("oij,oj->oi", problem.rotations[camera], problem.points[problem.point_of])
@@ -58,7 +60,8 @@ def project(problem: Problem) -> tuple[Array, Array]:
     )
     normalised = in_camera[:, :2] / _safe_depth(in_camera[:, 2:])
     distortion = 1.0 + problem.radials[lens] * (normalised**2).sum(1)
-    return normalised * (np.exp(problem.log_focals[lens]) * distortion)[:, None], in_camera[:, 2]
+    focal = np.exp(problem.log_focals[lens])
+    return normalised * (focal * distortion)[:, None] + problem.shifts[lens], in_camera[:, 2]
 
 
 def reprojection_errors(problem: Problem) -> Array:
@@ -96,27 +99,40 @@ def covariance(problem: Problem, prior: FocalPrior, config: Config, fixed_camera
     problem = _by_point(problem)
     native, _arrays = _native(problem, prior, config, fixed_camera)
     count, num_lenses = len(problem.rotations), len(problem.log_focals)
-    information = np.empty((6 * count + 2 * num_lenses,) * 2)
+    information = np.empty((6 * count + 4 * num_lenses,) * 2)
     library().core_bundle_information(ctypes.byref(native), _pointer(information))
     free = np.ones(len(information), bool)
     free[6 * fixed_camera : 6 * fixed_camera + 6] = False
-    free[6 * count :: 2], free[6 * count + 1 :: 2] = prior.sigmas > 0, prior.radial_sigmas > 0
+    of_lens = np.stack([prior.sigmas, prior.radial_sigmas, prior.shift_sigmas, prior.shift_sigmas], 1)
+    free[6 * count :] = of_lens.ravel() > 0
     seen = np.bincount(problem.camera_of, minlength=count) > 0
     free[: 6 * count] &= np.repeat(seen, 6)
     (kept,) = np.nonzero(free)
     errors = np.minimum(reprojection_errors(problem), 10.0)
     freedom = max(1, 2 * len(errors) - len(kept) - 3 * len(problem.points))
     variance = float((errors**2 / (1.0 + errors**2 / config.robust_px**2)).sum()) / freedom
-    # Parameters differ in unit: scaled to equal curvature, the scale of the scene is the flattest direction.
+    # Parameters differ in unit: they are scaled to equal curvature. The scale of the scene is free; it is held.
     unit = 1.0 / np.sqrt(np.maximum(np.diag(information)[kept], 1e-30))
-    values, vectors = np.linalg.eigh(information[np.ix_(kept, kept)] * unit[:, None] * unit)
-    values, vectors = np.maximum(values[1:], 1e-14), vectors[:, 1:]
+    free_scale = _growth_of_scene(problem, fixed_camera)[kept] / unit
+    free_scale /= max(float(np.linalg.norm(free_scale)), 1e-30)
+    held = np.outer(free_scale, free_scale)
+    values, vectors = np.linalg.eigh(information[np.ix_(kept, kept)] * unit[:, None] * unit + len(kept) * held)
+    inverse = (vectors / np.maximum(values, 1e-14)) @ vectors.T - held / len(kept)
     full = np.zeros_like(information)
-    full[np.ix_(kept, kept)] = (vectors / values) @ vectors.T * unit[:, None] * unit * variance
+    full[np.ix_(kept, kept)] = inverse * unit[:, None] * unit * variance
     return Covariance(
         cameras=np.stack([full[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] for c in range(count)]),
-        log_focals=np.diag(full)[6 * count :: 2],
+        log_focals=np.diag(full)[6 * count :: 4],
     )
+
+
+def _growth_of_scene(problem: Problem, fixed_camera: int) -> Array:
+    """(6 C + 4 G,) how the parameters change when the scene grows around the fixed camera: no observation does."""
+    rotations, translations = problem.rotations, problem.translations
+    fixed_centre = -rotations[fixed_camera].T @ translations[fixed_camera]
+    poses = np.zeros((len(rotations), 6))
+    poses[:, 3:] = translations + rotations @ fixed_centre
+    return np.concatenate([poses.ravel(), np.zeros(4 * len(problem.log_focals))])
 
 
 def _by_point(problem: Problem) -> Problem:
@@ -138,7 +154,7 @@ def _copy(problem: Problem) -> Problem:
         problem,
         **{
             name: np.array(getattr(problem, name), dtype=np.float64, order="C")
-            for name in ("rotations", "translations", "log_focals", "radials", "points")
+            for name in ("rotations", "translations", "log_focals", "radials", "shifts", "points")
         },
     )
 
@@ -147,9 +163,12 @@ class _Native(ctypes.Structure):
     """`Bundle` of recon/core/bundle.cpp."""
 
     _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("rotations", "translations", "log_focals", "radials", "points")),
+        *(
+            (name, ctypes.c_void_p)
+            for name in ("rotations", "translations", "log_focals", "radials", "shifts", "points")
+        ),
         *((name, ctypes.c_void_p) for name in ("lens_of_camera", "camera_of", "first_of_point", "pixels")),
-        *((name, ctypes.c_void_p) for name in ("prior_log_focals", "prior_sigmas", "radial_sigmas")),
+        *((name, ctypes.c_void_p) for name in ("prior_log_focals", "prior_sigmas", "radial_sigmas", "shift_sigmas")),
         *((name, ctypes.c_int32) for name in ("num_cameras", "num_lenses", "num_points", "fixed_camera")),
         ("robust_squared", ctypes.c_double),
     )
@@ -160,9 +179,10 @@ def _native(
 ) -> tuple[_Native, list[npt.NDArray[np.generic]]]:
     """The problem as the core reads it, and the arrays that must live as long."""
     first = np.searchsorted(problem.point_of, np.arange(len(problem.points) + 1))
-    parameters = (problem.rotations, problem.translations, problem.log_focals, problem.radials, problem.points)
+    lenses = (problem.log_focals, problem.radials, problem.shifts)
+    parameters = (problem.rotations, problem.translations, *lenses, problem.points)
     indices = (problem.lens_of_camera, problem.camera_of, first)
-    observed = (problem.pixels, prior.log_focals, prior.sigmas, prior.radial_sigmas)
+    observed = (problem.pixels, prior.log_focals, prior.sigmas, prior.radial_sigmas, prior.shift_sigmas)
     arrays: list[npt.NDArray[np.generic]] = [
         *(np.ascontiguousarray(values, dtype=np.float64) for values in parameters),
         *(np.ascontiguousarray(values, dtype=np.int32) for values in indices),

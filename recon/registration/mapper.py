@@ -25,7 +25,8 @@ Pairs = Mapping[tuple[int, int], TwoView]
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     placement: placement.Config = placement.Config()
     max_error_px: float = 2.5  # reprojection error of a kept observation, at 1024 px on the longer side
-    robust_px: float = 1.0  # scale of the robust loss, at 1024 px on the longer side
+    robust_px: float = 1.0  # scale of the robust loss while the map grows, at 1024 px on the longer side
+    robust_range_px: tuple[float, float] = (0.4, 1.5)  # in the end: three times the median error, within these limits
     min_angle_deg: float = 1.0  # between the rays of a kept point
     min_points: int = 15  # of a map
     growing_tracks: int = 350  # a view, while views are added: more cost time and change no decision
@@ -36,7 +37,11 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     same_focal: float = 0.02  # focal lengths differ by less have found the same
     doubted_share: float = 0.6  # a view that explains less of its matches is placed anew
     radial_sigma: float = 0.1  # of the radial coefficient where it is free
+    shift_sigma: float = 0.01  # of the principal point where it is free, of the longer side
     radial_evidence: float = 20.0  # decrease of the cost, in variances of an observation, that frees it
+    shift_evidence: float = 100.0  # the same for the principal point, which hides behind a turn of the cameras
+    shift_views: int = 6  # that it takes
+    min_decrease: float = 0.01  # as a share of the cost: what is systematic grows with the number of observations
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +70,7 @@ class Map:
     loss: bundle.Config
     agreement: dict[tuple[int, int], float]  # share of each pair's inliers that the map explains
     median_angle_deg: float  # of the points' widest rays
-    rms_px: float
+    rms_px: float  # at 1024 px on the longer side
 
 
 def build_map(views: Sequence[View], lenses: Sequence[Lens], pairs: Pairs, config: Config) -> Map | None:
@@ -168,7 +173,18 @@ class _Search:
             growth = self._adjusted(growth, self._fine, self._thorough, widen)
             if len(growth.state.points) < self._config.min_points:
                 return None
-        growth = self._with_radial(growth)
+            errors = bundle.reprojection_errors(growth.state) / self._scale[growth.state.camera_of]
+            robust_px = float(np.clip(3.0 * np.median(errors), *self._config.robust_range_px))
+            self._thorough = bundle.Config(robust_px=robust_px * float(np.median(self._scale)))
+        lenses = len(self._lenses)
+        longer_side = np.array([max(v.longer_side for v in self._views if v.lens == g) for g in range(lenses)])
+        config, prior = self._config, growth.prior
+        growth = self._freed(
+            growth, replace(prior, radial_sigmas=np.full(lenses, config.radial_sigma)), config.radial_evidence
+        )
+        if len(growth.registered) >= config.shift_views:
+            shifted = replace(growth.prior, shift_sigmas=config.shift_sigma * longer_side)
+            growth = self._freed(growth, shifted, config.shift_evidence)
         state = growth.state
         centres = -np.einsum("cji,cj->ci", state.rotations, state.translations)
         angles = tracks.largest_angles(centres, state.points, state.camera_of, state.point_of)
@@ -180,7 +196,7 @@ class _Search:
             loss=self._thorough,
             agreement=self._agreement(growth),
             median_angle_deg=float(np.median(angles)),
-            rms_px=float(np.sqrt(np.mean(errors**2))),
+            rms_px=float(np.sqrt(np.mean((errors / self._scale[state.camera_of]) ** 2))),
         )
 
     def _begin(self, focals: list[float], first: tuple[int, int]) -> _Growth | None:
@@ -201,6 +217,7 @@ class _Search:
             lens_of_camera=np.array([view.lens for view in views]),
             log_focals=np.log(focals),
             radials=np.array([lens.radial for lens in self._lenses]),
+            shifts=np.zeros((len(self._lenses), 2)),
             points=np.zeros((0, 3)),
             camera_of=np.zeros(0, np.int64),
             point_of=np.zeros(0, np.int64),
@@ -210,6 +227,7 @@ class _Search:
             log_focals=np.log(focals),
             sigmas=np.array([lens.sigma for lens in self._lenses]),
             radial_sigmas=np.zeros(len(self._lenses)),
+            shift_sigmas=np.zeros(len(self._lenses)),
         )
         # Two views say little about the focal length: it is held close to its candidate until a third view is in.
         tight = replace(prior, sigmas=np.minimum(prior.sigmas, 0.03))
@@ -268,19 +286,19 @@ class _Search:
             state = bundle.adjust(state, growth.prior, loss, growth.registered[0])
         return replace(growth, state=state, track_of_point=track_of_point)
 
-    def _with_radial(self, growth: _Growth) -> _Growth:
-        """The map with free radial coefficients if the observations ask for them, else as it was."""
-        if (growth.prior.sigmas == 0).all():
-            return growth
-        prior = replace(growth.prior, radial_sigmas=np.where(growth.prior.sigmas > 0, self._config.radial_sigma, 0.0))
+    def _freed(self, growth: _Growth, prior: bundle.FocalPrior, evidence: float) -> _Growth:
+        """The map under a prior with more freedom if the observations ask for it, else as it was.
+
+        Lenses whose focal length is known are calibrated: nothing of them is freed.
+        """
+        unknown = prior.sigmas > 0
+        prior = replace(prior, radial_sigmas=prior.radial_sigmas * unknown, shift_sigmas=prior.shift_sigmas * unknown)
         state = bundle.adjust(growth.state, prior, self._thorough, growth.registered[0])
-        before = bundle.robust_cost(growth.state, self._thorough)
-        after = bundle.robust_cost(state, self._thorough)
+        before, after = (bundle.robust_cost(problem, self._thorough) for problem in (growth.state, state))
         variance = after / max(1, 2 * len(state.pixels) - 3 * len(state.points))
-        if before - after < self._config.radial_evidence * variance:
+        if before - after < max(evidence * variance, self._config.min_decrease * before):
             return growth
-        freed = replace(growth, state=state, prior=prior)
-        return self._adjusted(freed, self._fine, self._thorough, widen=1.0)
+        return self._adjusted(replace(growth, state=state, prior=prior), self._fine, self._thorough, widen=1.0)
 
     def _agreement(self, growth: _Growth) -> dict[tuple[int, int], float]:
         return {
@@ -311,8 +329,7 @@ def _retriangulate(
     """
     mine = np.isin(all_tracks.camera_of, registered)
     camera, track, pixels = all_tracks.camera_of[mine], all_tracks.track_of[mine], all_tracks.pixels[mine]
-    lens = state.lens_of_camera[camera]
-    rays = placement.undistort(pixels / np.exp(state.log_focals[lens])[:, None], state.radials[lens])
+    rays = placement.normalise(state, camera, pixels)
     matrices = np.concatenate([state.rotations, state.translations[:, :, None]], 2)
     limit = widen * config.max_error_px * scale
     errors = np.zeros(0)

@@ -104,8 +104,7 @@ def pair_errors(state: bundle.Problem, key: tuple[int, int], pair: TwoView) -> A
     """(M,) Sampson errors of a pair's matches, pixels; infinite for what is not in front of both cameras."""
     rays = []
     for view, points in zip(key, (pair.points1, pair.points2), strict=True):
-        lens = state.lens_of_camera[view]
-        normalised = undistort(points / np.exp(state.log_focals[lens]), np.full(len(points), state.radials[lens]))
+        normalised = normalise(state, np.full(len(points), view), points)
         rays.append(np.column_stack([normalised, np.ones(len(points))]))
     rotation = state.rotations[key[1]] @ state.rotations[key[0]].T
     translation = state.translations[key[1]] - rotation @ state.translations[key[0]]
@@ -125,11 +124,13 @@ def pair_errors(state: bundle.Problem, key: tuple[int, int], pair: TwoView) -> A
     return np.where(in_front, errors, np.inf)
 
 
-def undistort(distorted: Array, radials: Array) -> Array:
-    """Normalised coordinates (M, 2) without their radial distortion, by fixed-point iteration."""
+def normalise(state: bundle.Problem, camera: Index, pixels: Array) -> Array:
+    """Coordinates (M, 2) at depth 1, without distortion, of `pixels` (M, 2) of the cameras `camera` (M,)."""
+    lens = state.lens_of_camera[camera]
+    distorted = (pixels - state.shifts[lens]) / np.exp(state.log_focals[lens])[:, None]
     result = distorted
-    for _ in range(5 if np.any(radials) else 0):
-        result = distorted / (1.0 + radials * (result**2).sum(1))[:, None]
+    for _ in range(5 if np.any(state.radials) else 0):  # fixed-point iteration
+        result = distorted / (1.0 + state.radials[lens] * (result**2).sum(1))[:, None]
     return result
 
 

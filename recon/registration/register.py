@@ -36,6 +36,7 @@ class RegisteredCamera:
     index: int  # position among the keyframes
     T_world_camera: Array  # (4, 4)
     focal: float  # pixels of the full-size image
+    principal: Array  # (2,) pixels of the full-size image
     radial: float  # first radial distortion coefficient
     rotation_sigma_deg: float
     centre_sigma_rel: float  # relative to the spread of the centres
@@ -51,8 +52,9 @@ class Registration:
     observed_point: npt.NDArray[np.int64]  # (O,)
     observed_pixels: Array  # (O, 2) full-size pixels
     agreement: dict[tuple[int, int], float]  # share of each pair's matches that the cameras explain
+    focal_sigma: float  # of the logarithm of the least certain focal length
     median_angle_deg: float
-    rms_px: float
+    rms_px: float  # of the observations, at 1024 px on the longer side
 
 
 Pairs = dict[tuple[int, int], TwoView]
@@ -166,6 +168,7 @@ def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe]) -> Regist
                 index=i,
                 T_world_camera=T_world_camera,
                 focal=float(np.exp(state.log_focals[lens])),
+                principal=principal_point(keyframes[i].frame) + state.shifts[lens],
                 radial=float(state.radials[lens]),
                 rotation_sigma_deg=float(np.degrees(np.sqrt(np.trace(covariances.cameras[i][:3, :3])))),
                 centre_sigma_rel=float(np.sqrt(max(np.trace(centre_covariance), 0.0)) / max(spread, 1e-12)),
@@ -179,6 +182,7 @@ def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe]) -> Regist
         observed_point=state.point_of,
         observed_pixels=state.pixels + principal[state.camera_of],
         agreement=built.agreement,
+        focal_sigma=float(np.sqrt(covariances.log_focals.max())),
         median_angle_deg=built.median_angle_deg,
         rms_px=built.rms_px,
     )
