@@ -40,28 +40,6 @@ private:
     uint32_t state_;
 };
 
-// Grey values as floats with kRadius repeated pixels on every side, so that windows need no bounds.
-class Padded {
-public:
-    Padded(const uint8_t* grey, int width, int height) : stride_(width + 2 * kRadius) {
-        bits_.resize(size_t(stride_) * (height + 2 * kRadius));
-        for (int y = -kRadius; y < height + kRadius; ++y)
-            for (int x = -kRadius; x < width + kRadius; ++x) {
-                const int row = std::clamp(y, 0, height - 1), column = std::clamp(x, 0, width - 1);
-                const float value = grey[size_t(row) * width + column];
-                std::memcpy(&bits_[place(x, y)], &value, sizeof value);
-            }
-    }
-    int stride() const { return stride_; }
-    const int32_t* at(int x, int y) const { return &bits_[place(x, y)]; }
-
-private:
-    size_t place(int x, int y) const { return size_t(y + kRadius) * stride_ + x + kRadius; }
-
-    int stride_;
-    std::vector<int32_t> bits_;
-};
-
 // What all pixels share.
 struct Task {
     const Problem& problem;

@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <vector>
 
 #include "patchmatch.h"
 #include "simd.h"
@@ -51,6 +52,29 @@ inline float sum(Vec x) {
 
 inline Vec to_float(IntVec x) { return __builtin_convertvector(x, Vec); }
 
+// Grey values as floats with kRadius repeated pixels on every side, so that windows need no bounds.
+class Padded {
+public:
+    Padded(const uint8_t* grey, int width, int height) : stride_(width + 2 * kRadius) {
+        bits_.resize(size_t(stride_) * (height + 2 * kRadius));
+        for (int y = -kRadius; y < height + kRadius; ++y)
+            for (int x = -kRadius; x < width + kRadius; ++x) {
+                const int row = std::clamp(y, 0, height - 1), column = std::clamp(x, 0, width - 1);
+                const float value = grey[size_t(row) * width + column];
+                std::memcpy(&bits_[place(x, y)], &value, sizeof value);
+            }
+    }
+    int stride() const { return stride_; }
+    // The bits of a float, with as many around it as a window needs.
+    const int32_t* at(int x, int y) const { return &bits_[place(x, y)]; }
+
+private:
+    size_t place(int x, int y) const { return size_t(y + kRadius) * stride_ + x + kRadius; }
+
+    int stride_;
+    std::vector<int32_t> bits_;
+};
+
 // Offsets of the samples from the centre, and their places in a row-major image that is `stride` wide.
 struct Pattern {
     Vec right[kVectors], down[kVectors], closeness[kVectors];
@@ -76,7 +100,7 @@ struct Window {
     Vec weight[kVectors], weighted[kVectors];
     float mean, variance;
 
-    // `centre` points into an image of the bits of floats with kRadius pixels around it.
+    // `centre` points into a padded image.
     Window(const Pattern& pattern, const int32_t* centre, float sigma_grey) {
         float centre_grey;
         std::memcpy(&centre_grey, centre, sizeof centre_grey);

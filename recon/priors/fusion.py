@@ -4,22 +4,42 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from recon.core import library
-from recon.priors.patchmatch import Level, Planes, Transfer, pointer, transfer
+from recon.priors.patchmatch import Level, Matching, Planes, Transfer, pointer, transfer
 
 Float32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Confidence:
+    """Log-odds that a depth is within 1 %, linear in what is known of it.
+
+    Fitted by logistic regression on 13 sets of 3 and 6 views of seven scenes, to points triangulated from features and
+    to depth on which many further views agree. On scenes left out of the fit the mean calibration error is 0.07
+    and the area under the ROC curve 0.86.
+    """
+
+    constant: float = -4.3
+    per_support: float = 4.95  # share of neighbours on the same plane
+    per_consistent: float = 0.17  # views that agree, up to 3
+    per_conflicting: float = -0.67  # share of the views that look through the point
+    per_log_contrast: float = 0.7  # logarithm of the standard deviation of the window's grey levels
+    per_cosine: float = 0.9  # of the angle between line of sight and surface normal
 
 
 @dataclass(frozen=True)
 class Config:
     max_error: float = 2.0  # forward-backward reprojection error of agreeing views, pixels
     max_relative_difference: float = 0.01  # of the depth of agreeing views
-    min_consistent: int = 1  # other views that must agree
+    min_support: float = 0.3  # share of neighbours on the same plane that keeps a pixel which no other view confirms
+    min_borrowed_support: float = 0.5  # the same for a neighbour's plane that fills such a pixel
+    min_confidence: float = 0.1  # below, the depth is unknown
+    confidence: Confidence = field(default_factory=Confidence)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,22 +75,27 @@ class Agreement:
     num_conflicting: npt.NDArray[np.uint8]  # (h, w) views that see something behind the point
 
 
+class _Surface(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("grey", "planes", "num_consistent")),
+        *((name, ctypes.c_int32) for name in ("width", "height")),
+        *((name, ctypes.c_float) for name in ("sigma_grey", "sigma_space")),
+    )
+
+
 class _Agreement(ctypes.Structure):
     _fields_ = tuple((name, ctypes.c_void_p) for name in Agreement.__dataclass_fields__)
 
 
-def cross_check(views: Sequence[Level], planes: Sequence[Planes], config: Config) -> list[DepthMap]:
+def cross_check(views: Sequence[Level], planes: Sequence[Planes], matching: Matching, config: Config) -> list[DepthMap]:
     """The depth maps of all views, each compared with all others."""
-    return [
-        depth_map(
-            view,
-            planes[index],
-            agreement(view, planes[index], [*views[:index], *views[index + 1 :]],
-                      [*planes[:index], *planes[index + 1 :]], config),
-            config,
-        )
-        for index, view in enumerate(views)
-    ]  # fmt: skip
+    maps = []
+    for index, view in enumerate(views):
+        others = [*views[:index], *views[index + 1 :]]
+        other_planes = [*planes[:index], *planes[index + 1 :]]
+        agreeing = agreement(view, planes[index], others, other_planes, config)
+        maps.append(depth_map(view, planes[index], agreeing, matching, config))
+    return maps
 
 
 def agreement(
@@ -105,28 +130,71 @@ def agreement(
     return result
 
 
-def depth_map(view: Level, planes: Planes, agreement: Agreement, config: Config) -> DepthMap:
-    """The depth that other views agree with, its normal and its confidence."""
-    known = (agreement.num_consistent >= config.min_consistent) & (agreement.inverse_depth > 0)
-    depth = np.zeros(view.shape, np.float32)
-    np.divide(1.0, agreement.inverse_depth, out=depth, where=known)
-    confidence = np.where(known, 1 - 0.5 ** agreement.num_consistent.astype(np.float32), 0)
+def depth_map(view: Level, planes: Planes, agreement: Agreement, matching: Matching, config: Config) -> DepthMap:
+    """What other views and the neighbours confirm of a view's planes, with normals and confidence."""
+    surface, support, contrast = supported(view, planes, agreement, matching, config)
+    confirmed = agreement.num_consistent > 0
+    inverse_depth = np.where(confirmed, agreement.inverse_depth, surface.inverse_depth)
+    normal, cosine = normals(view, surface)
+    probability = confidence(support, contrast, cosine, agreement, config.confidence)
+    known = (confirmed | (support >= config.min_support)) & (probability >= config.min_confidence) & (inverse_depth > 0)
+    depth = np.divide(1.0, inverse_depth, out=np.zeros(view.shape, np.float32), where=known)
     return DepthMap(
         depth,
-        normals(view, planes) * known[..., None],
-        (confidence * (1 - np.clip(planes.costs, 0, 0.99))).astype(np.float32),
+        normal * known[..., None],
+        np.where(known, probability, 0).astype(np.float32),
         np.where(known, agreement.num_consistent, 0).astype(np.uint8),
     )
 
 
-def normals(view: Level, planes: Planes) -> Float32:
-    """(h, w, 3) unit normals in the camera frame, facing the camera; 0 where the plane is unknown.
+def supported(
+    view: Level, planes: Planes, agreement: Agreement, matching: Matching, config: Config
+) -> tuple[Planes, Float32, Float32]:
+    """The planes with small holes filled from neighbours, and what tells right ones from wrong ones.
+
+    The latter are (h, w) the share of neighbours that lie on each plane, and (h, w) the standard deviation of the grey
+    levels that it was matched by.
+    """
+    values = np.ascontiguousarray(planes.values, np.float32)
+    surface = _Surface(
+        pointer(view.grey), pointer(values), pointer(agreement.num_consistent), view.shape[1], view.shape[0],
+        matching.sigma_grey, matching.sigma_space,
+    )  # fmt: skip
+    filled = np.empty_like(values)
+    support, contrast = np.empty(view.shape, np.float32), np.empty(view.shape, np.float32)
+    library().patchmatch_support(
+        ctypes.byref(surface), ctypes.c_float(config.min_support), ctypes.c_float(config.min_borrowed_support),
+        pointer(filled), pointer(support), pointer(contrast),
+    )  # fmt: skip
+    return Planes(filled, planes.costs), support, contrast
+
+
+def confidence(
+    support: Float32, contrast: Float32, cosine: Float32, agreement: Agreement, model: Confidence
+) -> Float32:
+    """(h, w) about the probability that the depth is within 1 %."""
+    log_odds = (
+        model.constant
+        + model.per_support * support
+        + model.per_consistent * np.minimum(agreement.num_consistent, 3)
+        + model.per_conflicting * agreement.num_conflicting / np.maximum(agreement.num_inside, 1)
+        + model.per_log_contrast * np.log(contrast + 0.5)
+        + model.per_cosine * cosine
+    )
+    return 1 / (1 + np.exp(-log_odds))
+
+
+def normals(view: Level, planes: Planes) -> tuple[Float32, Float32]:
+    """(h, w, 3) unit normals in the camera frame, facing the camera; (h, w) cosines of their angles to the rays.
 
     Points with n . X = d have inverse depth n . ray / d, so n / d follows from the gradient of the inverse depth.
     """
     height, width = view.shape
     w, du, dv = np.moveaxis(planes.values, -1, 0)
-    u, v = np.arange(width, dtype=np.float32) + 0.5, np.arange(height, dtype=np.float32)[:, None] + 0.5
     fx, fy, cx, cy = (np.float32(view.K[i]) for i in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    towards = -np.stack([fx * du, fy * dv, w - du * (u - cx) - dv * (v - cy)], -1)
-    return towards / np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), 1e-20)
+    u = np.arange(width, dtype=np.float32) + np.float32(0.5) - cx
+    v = np.arange(height, dtype=np.float32)[:, None] + np.float32(0.5) - cy
+    away = np.stack([fx * du, fy * dv, w - du * u - dv * v], -1)
+    length = np.maximum(np.sqrt((away * away).sum(-1)), np.float32(1e-20))
+    ray_length = np.sqrt(1 + (u / fx) ** 2 + (v / fy) ** 2)
+    return -away / length[..., None], w / (length * ray_length)

@@ -106,7 +106,7 @@ def depth_maps(
             else planes[i]
             for i in range(len(views))
         ]  # fmt: skip
-    return fusion.cross_check(levels[config.stages[-1].level], planes, config.fusion)
+    return fusion.cross_check(levels[config.stages[-1].level], planes, config.matching, config.fusion)
 
 
 def estimate(
@@ -138,6 +138,12 @@ def estimate(
     if planes is None:
         raise ValueError("config.stages is empty: at least one stage is needed")
     return planes
+
+
+def cross_check(views: Sequence[View], planes: Sequence[Planes], config: Config) -> list[DepthMap]:
+    """The depth maps of all views from their planes, as `estimate` gives them."""
+    levels = [_level(view, config.stages[-1].level) for view in views]
+    return fusion.cross_check(levels, planes, config.matching, config.fusion)
 
 
 def choose_sources(views: Sequence[View], index: int, config: Config, sparse: Sparse | None = None) -> list[int]:
