@@ -22,6 +22,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     registration: register.Config = register.Config()
     stereo: stereo.Config = stereo.Config()
     seed: int = 0
+    # Sparse points are rare on what is far: how much further than they reach stereo searches. In inverse depth, in which
+    # it samples, that is a small part of the range.
+    far_margin: float = 8.0
 
 
 class ClassicalPrior:
@@ -44,7 +47,8 @@ class ClassicalPrior:
         for camera in registration.cameras:
             keyframe = graph.keyframes[camera.index]
             points = _sparse_points(registration, camera, keyframe.scale)
-            near_far = stereo.depth_range(points.depths)
+            near, far = stereo.depth_range(points.depths)
+            near_far = (near, self._config.far_margin * far)
             views.append(stereo.View(keyframe.image, modelled_K(graph, camera), camera.T_world_camera, near_far))
             sparse.append(points)
         maps = stereo.depth_maps(views, self._config.stereo, seed=self._config.seed, sparse=sparse)
