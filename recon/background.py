@@ -94,9 +94,9 @@ def _far_colours(
     `relative_depth` is 1 at the farthest known depth and 0 where the depth is unknown.
     """
     far = np.where(relative_depth > 0, relative_depth.astype(np.float64) ** 4, 1.0) + 1e-3
-    weight = cv2.GaussianBlur(far, (0, 0), sigma_px)
+    weight = np.asarray(cv2.GaussianBlur(far, (0, 0), sigma_px), np.float64)
     blurred = cv2.GaussianBlur(image * far[..., None] / 255.0, (0, 0), sigma_px)
-    return blurred / weight[..., None], weight
+    return np.asarray(blurred / weight[..., None], np.float64), weight
 
 
 def _sphere(spacing_deg: float) -> npt.NDArray[np.float64]:

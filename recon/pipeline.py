@@ -11,12 +11,15 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
+import msgspec
+
 from capture.frame import DroppedFrame, Frame
 from recon import optimize
 from recon.config import Config
 from recon.judge import judge
 from recon.keyframe import Keyframe, modelled_image
 from recon.priors import classical
+from recon.priors.prior import Prior
 from recon.registration import features
 from recon.scene import Scene, begin, extend
 from recon.snapshot import GaussianArrays, Snapshot
@@ -71,11 +74,6 @@ class _Clock:
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
         self.last = now
 
-    def book(self, stage: str, seconds: float) -> None:
-        """Books `seconds` of the time since the last lap."""
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
-        self.last += seconds
-
 
 class _Run:
     """What lives as long as the stream of frames does."""
@@ -84,7 +82,7 @@ class _Run:
         self.config = config
         self.clock = _Clock()
         self.graph = ViewGraph(config.prior.registration)
-        self.prior = classical.load(config.prior)
+        self.prior: Prior = classical.load(msgspec.structs.replace(config.prior, seed=config.seed))
         self.dropped: list[DroppedFrame] = []
         self.verdict: Verdict = judge(self.graph, None, config.judge)
         self.begun: Scene | None = None  # from the last estimate, not optimised
@@ -109,19 +107,18 @@ class _Run:
 
     def estimate(self) -> None:
         """Cameras, points and verdict for all keyframes; the scene begun, extended, or given up."""
-        estimate = self.prior.estimate(self.graph)
-        self.clock.book("poses", estimate.seconds_poses)
-        self.clock.book("points", estimate.seconds_points)
-        self.verdict = judge(self.graph, estimate.registration, self.config.judge)
-        if not self.verdict.publishable or estimate.registration is None:
+        registration = self.prior.register(self.graph)
+        self.verdict = judge(self.graph, registration, self.config.judge)
+        self.clock.lap("poses")
+        if not self.verdict.publishable or registration is None:
             self.begun = self.scene = None
             return
         images = {keyframe.name: keyframe.image for keyframe in self.graph.keyframes}
         config = self.config
         self.begun = begin(
-            estimate.pointmaps,
+            self.prior.pointmaps(self.graph, registration),
             images,
-            estimate.registration.cameras,
+            registration.cameras,
             config.completion,
             config.density,
             config.background,

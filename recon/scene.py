@@ -24,7 +24,6 @@ class View:
     name: str
     frame_id: int
     image: npt.NDArray[np.uint8]  # (h, w, 3) RGB
-    pointmap: Pointmap
     T_world_camera: Tensor  # (4, 4), refined
     K: Tensor  # (3, 3)
     rotation_sigma_deg: float
@@ -92,7 +91,6 @@ def begin(
             name=pointmap.name,
             frame_id=pointmap.frame_id,
             image=images[pointmap.name],
-            pointmap=pointmap,
             T_world_camera=torch.from_numpy(pointmap.T_world_camera).float(),
             K=torch.from_numpy(pointmap.K).float(),
             rotation_sigma_deg=camera.rotation_sigma_deg,

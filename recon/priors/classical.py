@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import time
-
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from recon.priors import stereo
-from recon.priors.estimate import Estimate
 from recon.priors.pointmap import Pointmap
 from recon.registration import register
 from recon.registration.register import Registration
@@ -22,8 +19,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     registration: register.Config = register.Config()
     stereo: stereo.Config = stereo.Config()
     seed: int = 0
-    # Sparse points are rare on what is far: how much further than they reach stereo searches. In inverse depth, in which
-    # it samples, that is a small part of the range.
+    # Few sparse points lie on what is far, so stereo searches this many times further than they reach; in inverse
+    # depth, in which it samples, that is a small part of the range.
     far_margin: float = 8.0
 
 
@@ -33,16 +30,12 @@ class ClassicalPrior:
     def __init__(self, config: Config) -> None:
         self._config = config
 
-    def estimate(self, graph: ViewGraph) -> Estimate:
-        started = time.monotonic()
-        registration = (
-            register.register(graph.keyframes, graph.pairs, self._config.registration) if graph.pairs else None
-        )
-        registered = time.monotonic()
-        pointmaps = self._pointmaps(graph, registration) if registration is not None else ()
-        return Estimate(registration, pointmaps, registered - started, time.monotonic() - registered)
+    def register(self, graph: ViewGraph) -> Registration | None:
+        if not graph.pairs:
+            return None
+        return register.register(graph.keyframes, graph.pairs, self._config.registration)
 
-    def _pointmaps(self, graph: ViewGraph, registration: Registration) -> tuple[Pointmap, ...]:
+    def pointmaps(self, graph: ViewGraph, registration: Registration) -> tuple[Pointmap, ...]:
         views, sparse = [], []
         for camera in registration.cameras:
             keyframe = graph.keyframes[camera.index]

@@ -59,7 +59,6 @@ class _Other(ctypes.Structure):
         ("height", ctypes.c_int32),
         ("from_reference", Transfer),
         ("to_reference", Transfer),
-        ("centre", ctypes.c_float * 3),
     )
 
 
@@ -68,8 +67,6 @@ class Agreement:
     """What the other views say about each pixel of a view."""
 
     inverse_depth: Float32  # (h, w) mean over the pixel and the views that agree with it
-    relative_spread: Float32  # (h, w) root mean square relative difference of depth of the views that agree
-    angle: Float32  # (h, w) largest triangulation angle with a view that agrees, radians
     num_consistent: npt.NDArray[np.uint8]  # (h, w) views that agree
     num_inside: npt.NDArray[np.uint8]  # (h, w) views whose image the point falls into
     num_conflicting: npt.NDArray[np.uint8]  # (h, w) views that see something behind the point
@@ -102,29 +99,17 @@ def agreement(
     view: Level, planes: Planes, others: Sequence[Level], other_planes: Sequence[Planes], config: Config
 ) -> Agreement:
     """What `others` say about the planes of `view`."""
-    T_camera_world = np.linalg.inv(view.T_world_camera)
     values = [np.ascontiguousarray(p.values, np.float32) for p in (planes, *other_planes)]
     array = (_Other * len(others))(
         *(
-            _Other(
-                pointer(value), other.shape[1], other.shape[0], transfer(view, other), transfer(other, view),
-                (ctypes.c_float * 3)(*(T_camera_world @ other.T_world_camera)[:3, 3]),
-            )
+            _Other(pointer(value), other.shape[1], other.shape[0], transfer(view, other), transfer(other, view))
             for other, value in zip(others, values[1:], strict=True)
         )
-    )  # fmt: skip
-    result = Agreement(
-        inverse_depth=np.empty(view.shape, np.float32),
-        relative_spread=np.empty(view.shape, np.float32),
-        angle=np.empty(view.shape, np.float32),
-        num_consistent=np.empty(view.shape, np.uint8),
-        num_inside=np.empty(view.shape, np.uint8),
-        num_conflicting=np.empty(view.shape, np.uint8),
     )
-    pinhole = (ctypes.c_float * 4)(view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2])
+    result = Agreement(np.empty(view.shape, np.float32), *(np.empty(view.shape, np.uint8) for _ in range(3)))
     library().patchmatch_check(
-        pointer(values[0]), view.shape[1], view.shape[0], pinhole, array, len(others),
-        ctypes.c_float(config.max_error), ctypes.c_float(config.max_relative_difference),
+        pointer(values[0]), view.shape[1], view.shape[0], array, len(others),
+        (ctypes.c_float * 2)(config.max_error, config.max_relative_difference),
         ctypes.byref(_Agreement(*(pointer(getattr(result, name)) for name in Agreement.__dataclass_fields__))),
     )  # fmt: skip
     return result

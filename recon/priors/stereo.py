@@ -200,12 +200,12 @@ def _start(view: View, level: Level, sparse: Sparse | None) -> Planes:
 
 
 def _probes(view: View) -> tuple[Float64, Float64]:
-    """(M, 2) pixels and (M,) depths of a grid in the view's frustum, even in inverse depth."""
+    """(M, 2) pixels and (M,) depths of a grid in the view's frustum, even in the logarithm of depth."""
     height, width = view.image.shape[:2]
     near, far = view.depth_range
-    inverse_depths = np.linspace(1 / far, 1 / near, 7)[1:-1]
-    u, v, w = np.meshgrid((np.arange(8) + 0.5) * width / 8, (np.arange(6) + 0.5) * height / 6, inverse_depths)
-    return np.stack([u.ravel(), v.ravel()], 1), 1 / w.ravel()
+    depths = np.geomspace(near, far, 7)[1:-1]
+    u, v, z = np.meshgrid((np.arange(8) + 0.5) * width / 8, (np.arange(6) + 0.5) * height / 6, depths)
+    return np.stack([u.ravel(), v.ravel()], 1), z.ravel()
 
 
 def _inside(view: View, world: Float64) -> npt.NDArray[np.bool_]:

@@ -1,0 +1,24 @@
+"""The interface of priors: what gives cameras and points before there is a scene."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from recon.priors.pointmap import Pointmap
+from recon.registration.register import Registration
+from recon.view_graph import ViewGraph
+
+
+class Prior(Protocol):
+    """A loaded prior. A prior file has `Config` and `load(config)`.
+
+    The two steps are apart because the verdict stands between them: refused cameras cost no dense points.
+    """
+
+    def register(self, graph: ViewGraph) -> Registration | None:
+        """Cameras of the keyframes that hang together, with the evidence for them; None when no two do."""
+        ...
+
+    def pointmaps(self, graph: ViewGraph, registration: Registration) -> tuple[Pointmap, ...]:
+        """A point map for each registered camera, in the same order and the same world."""
+        ...
