@@ -12,7 +12,7 @@ import numpy as np
 from recon.registration.register import Registration
 from recon.registration.two_view import TwoView
 from recon.verdict import Code, Verdict
-from recon.view_graph import ViewGraph
+from recon.view_graph import ViewGraph, connected
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -23,6 +23,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     planar_share: float = 0.9  # of a pair's matches on one plane; entry_p10, a facade, reaches 0.84
     min_angle_deg: float = 1.5  # median of the points' widest viewing angles; right from 3.1
     min_agreement: float = 0.78  # of all matches that the cameras explain; right from 0.82, wrong up to 0.76
+    firm_agreement: float = 0.82  # of a pair that may join two groups of views; two places were joined by up to 0.80
     blurred_px: float = 0.7  # residual of blurred images; right above it only with nearly full agreement
     blurred_agreement: float = 0.95
     max_rotation_sigma_deg: float = 0.6  # right up to 0.29, wrong from 0.33
@@ -139,6 +140,17 @@ def _contradicted(graph: ViewGraph, registration: Registration, config: Config) 
             f"The frames contradict each other: only {100 * agreement:.0f} % of their matches fit together.",
             "Add photographs between those named; look out for repeated or mirrored structures and moving things.",
             tuple(sorted({names[i] for pair in contradicting for i in pair})),
+        )
+    firm = [pair for pair, share in registration.agreement.items() if share >= config.firm_agreement]
+    groups = connected([camera.index for camera in registration.cameras], firm)
+    if len(groups) > 1:
+        return Verdict(
+            Code.SPLIT,
+            f"{len(groups)} groups of frames are joined only by matches that contradict each other: "
+            + "; ".join(", ".join(names[i] for i in group) for group in groups)
+            + ".",
+            "Add photographs that connect the groups, or take the places one after the other.",
+            tuple(names[i] for group in groups[1:] for i in group),
         )
     return None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 from recon.keyframe import Keyframe
@@ -55,9 +56,14 @@ class ViewGraph:
 
     def components(self) -> list[list[int]]:
         """Sets of keyframes that verified pairs connect, the largest first."""
-        label = list(range(len(self.keyframes)))
-        for i, j in self.pairs:
-            old, new = max(label[i], label[j]), min(label[i], label[j])
-            label = [new if value == old else value for value in label]
-        groups = [[i for i, value in enumerate(label) if value == name] for name in sorted(set(label))]
-        return sorted(groups, key=lambda group: (-len(group), group))
+        return connected(range(len(self.keyframes)), self.pairs)
+
+
+def connected(nodes: Iterable[int], pairs: Iterable[tuple[int, int]]) -> list[list[int]]:
+    """The sets of `nodes` that `pairs` of them connect, the largest first."""
+    label = {node: node for node in nodes}
+    for i, j in pairs:
+        old, new = max(label[i], label[j]), min(label[i], label[j])
+        label = {node: new if name == old else name for node, name in label.items()}
+    groups = [[node for node, name in label.items() if name == group] for group in sorted(set(label.values()))]
+    return sorted(groups, key=lambda group: (-len(group), group))

@@ -234,7 +234,6 @@ def test_three_different_places_are_refused():
     assert refused(places(replace(SMALL, views=3), seeds=(0, 1, 2))).code == Code.NO_OVERLAP
 
 
-@pytest.mark.xfail(strict=True, reason="few contradicted matches between two places join them into one scene")
 def test_of_two_different_places_one_is_told_to_be_missing():
     final = last(places(), QUICK)
     assert final.verdict.code != Code.OK
