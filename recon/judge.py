@@ -84,14 +84,9 @@ def _no_motion(graph: ViewGraph, config: Config) -> Verdict | None:
             "Step to the side between photographs, about a tenth of the distance to the scene.",
             frames(still),
         )
-    turned = [pair for pair, view in graph.pairs.items() if view.turned_only]
+    turned = _turned(graph)
     if len(turned) >= config.turned_share * num_pairs:
-        return Verdict(
-            Code.NO_PARALLAX,
-            f"The camera only turned: {len(turned)} of {num_pairs} overlapping pairs show no parallax.",
-            "Step at least 20 cm to the side between photographs instead of turning on the spot.",
-            frames(turned),
-        )
+        return _no_parallax(graph, turned)
     planar = [
         pair for pair, view in graph.pairs.items() if view.num_homography >= config.planar_share * len(view.matches)
     ]
@@ -103,6 +98,19 @@ def _no_motion(graph: ViewGraph, config: Config) -> Verdict | None:
             frames(planar),
         )
     return None
+
+
+def _turned(graph: ViewGraph) -> list[tuple[int, int]]:
+    return [pair for pair, view in graph.pairs.items() if view.turned_only]
+
+
+def _no_parallax(graph: ViewGraph, turned: list[tuple[int, int]]) -> Verdict:
+    return Verdict(
+        Code.NO_PARALLAX,
+        f"The camera only turned: {len(turned)} of {len(graph.pairs)} overlapping pairs show no parallax.",
+        "Step at least 20 cm to the side between photographs instead of turning on the spot.",
+        tuple(sorted({graph.keyframes[i].name for pair in turned for i in pair})),
+    )
 
 
 def _motion_px(graph: ViewGraph, pair: tuple[int, int], view: TwoView) -> float:
@@ -117,6 +125,9 @@ def _not_placed(graph: ViewGraph, registration: Registration | None, config: Con
     components = graph.components()
     if len(components[0]) < config.min_cameras:
         return _no_overlap(names, f"Only {len(components[0])} of {len(names)} frames overlap.")
+    turned = _turned(graph)
+    if 2 * len(turned) >= len(graph.pairs):
+        return _no_parallax(graph, turned)
     found = 0 if registration is None else len(registration.cameras)
     return _no_overlap(names, f"Only {found} of {len(names)} frames could be placed with certainty.")
 

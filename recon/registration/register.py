@@ -75,9 +75,9 @@ def _matches(features1: Features, features2: Features, config: matching.Config) 
     One of the two images is always the plain one: a surface is seen from the side in one image, not in both.
     """
     found, rank = [], []
-    seen_from_the_side = {(1.0, squeeze) for squeeze in set(features2.squeeze)}
-    seen_from_the_side |= {(squeeze, 1.0) for squeeze in set(features1.squeeze)}
-    for squeeze1, squeeze2 in sorted(seen_from_the_side):
+    from_the_side = {(1.0, squeeze) for squeeze in set(features2.squeeze)}
+    from_the_side |= {(squeeze, 1.0) for squeeze in set(features1.squeeze)}
+    for squeeze1, squeeze2 in sorted({(1.0, 1.0)} | from_the_side):
         (chosen1,), (chosen2,) = np.nonzero(features1.squeeze == squeeze1), np.nonzero(features2.squeeze == squeeze2)
         match = matching.match(features1.descriptors[chosen1], features2.descriptors[chosen2], config)
         found.append(np.stack([features1.point_of[chosen1[match[:, 0]]], features2.point_of[chosen2[match[:, 1]]]], 1))

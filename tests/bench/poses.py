@@ -1,0 +1,147 @@
+"""How right and how fast the cameras are: `python -m tests.bench.poses [SCENE ...] --out poses.json`.
+
+Every set of splits.json goes through the same steps as in the pipeline: features, view graph, registration, verdict.
+An answer is right when every relative rotation is within 2 degrees and the centres are within 1.5 % of their spread;
+the truth is used for nothing else. Seconds are of the wall and of the processor; the latter divided by the cores bounds
+the former from below on a machine that does nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from recon.config import Config
+from recon.evaluate.alignment import camera_errors
+from recon.evaluate.splits import load_split
+from recon.evaluate.truth import EvaluationScene, load_scene
+from recon.judge import judge
+from recon.keyframe import Keyframe, modelled_image
+from recon.registration import features, register
+from recon.registration.register import Registration
+from recon.view_graph import ViewGraph
+
+RIGHT_ROTATION_DEG = 2.0
+RIGHT_CENTRE_PCT = 1.5
+
+
+@dataclass(frozen=True)
+class Row:
+    scene: str
+    views: int
+    code: str
+    publishable: bool
+    registered: int
+    right: bool | None  # None: nothing was placed, or the truth is unknown
+    rotation_deg: float | None  # the largest error of any relative rotation
+    rotation_median_deg: float | None  # the median error of the relative rotations
+    centre_pct: float | None
+    focal_pct: float | None
+    seconds_features: float
+    seconds_matching: float
+    seconds_mapping: float
+    seconds_processor: float
+
+    @property
+    def false_accept(self) -> bool:
+        return self.publishable and self.right is False
+
+
+def measure(scene: EvaluationScene, names: tuple[str, ...], config: Config) -> Row:
+    """One set of photographs from pixels to a verdict."""
+    frames = scene.frames(names)
+    registering = config.prior.registration
+    graph = ViewGraph(registering)
+    processor, laps = time.process_time(), [time.perf_counter()]
+    found = [features.extract(frame.image, registering.features) for frame in frames]
+    laps.append(time.perf_counter())
+    for frame, of_frame in zip(frames, found, strict=True):
+        graph.add(Keyframe(frame, modelled_image(frame.image, config.size), of_frame))
+    laps.append(time.perf_counter())
+    registration = register.register(graph.keyframes, graph.pairs, registering) if graph.pairs else None
+    laps.append(time.perf_counter())
+    verdict = judge(graph, registration, config.judge)
+    seconds = np.diff(laps).tolist()
+    errors = against_truth(scene, names, registration)
+    return Row(
+        scene=scene.name,
+        views=len(names),
+        code=verdict.code.name,
+        publishable=verdict.publishable,
+        registered=0 if registration is None else len(registration.cameras),
+        **errors,
+        seconds_features=seconds[0],
+        seconds_matching=seconds[1],
+        seconds_mapping=seconds[2],
+        seconds_processor=time.process_time() - processor,
+    )
+
+
+def against_truth(
+    scene: EvaluationScene, names: tuple[str, ...], registration: Registration | None
+) -> dict[str, bool | float | None]:
+    """The fields of `Row` that the truth decides."""
+    known = [c for c in registration.cameras if names[c.index] in scene.cameras] if registration is not None else []
+    if len(known) < 2:
+        keys = ("right", "rotation_deg", "rotation_median_deg", "centre_pct", "focal_pct")
+        return dict.fromkeys(keys)
+    truth = [scene.cameras[names[camera.index]] for camera in known]
+    estimated = np.stack([camera.T_world_camera for camera in known])
+    true = np.stack([camera.T_world_camera for camera in truth])
+    errors = camera_errors(
+        estimated,
+        true,
+        np.stack([np.diag([camera.focal, camera.focal, 1.0]) for camera in known]),
+        np.stack([camera.K for camera in truth]),
+    )
+    first, second = np.triu_indices(len(known), 1)
+    relative = [
+        rotations[first].transpose(0, 2, 1) @ rotations[second] for rotations in (estimated[:, :3, :3], true[:, :3, :3])
+    ]
+    cosine = ((relative[0] * relative[1]).sum((1, 2)) - 1.0) / 2.0
+    return {
+        "right": (errors.rotation_pair_deg or 0.0) < RIGHT_ROTATION_DEG
+        and (errors.centre_pct or 0.0) < RIGHT_CENTRE_PCT,
+        "rotation_deg": errors.rotation_pair_deg,
+        "rotation_median_deg": float(np.degrees(np.median(np.arccos(np.clip(cosine, -1.0, 1.0))))),
+        "centre_pct": errors.centre_pct,
+        "focal_pct": errors.focal_pct,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", help="default: all of splits.json")
+    parser.add_argument("--views", type=int, nargs="+", default=[3, 6, 12])
+    parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/")
+    parser.add_argument("--out", type=Path, help="JSON file to write")
+    arguments = parser.parse_args()
+    splits = json.loads((arguments.shared / "scenes" / "splits.json").read_text())
+    rows = []
+    for name in arguments.scenes or sorted(splits):
+        scene = load_scene(arguments.shared / "scenes" / name)
+        for views in arguments.views:
+            if f"train{views}" in splits[name]:
+                split = load_split(arguments.shared / "scenes" / name, list(scene.paths), views)
+                rows.append(measure(scene, split.train, Config()))
+                print(json.dumps(asdict(rows[-1])), flush=True)
+    published = [row for row in rows if row.publishable]
+    summary = {
+        "sets": len(rows),
+        "published": len(published),
+        "right": sum(row.right is True for row in published),
+        "false_accepts": [f"{row.scene} {row.views}" for row in rows if row.false_accept],
+    }
+    print(json.dumps(summary))
+    if arguments.out:
+        arguments.out.parent.mkdir(parents=True, exist_ok=True)
+        arguments.out.write_text(json.dumps({"summary": summary, "rows": [asdict(row) for row in rows]}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
