@@ -23,7 +23,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     planar_share: float = 0.9  # of a pair's matches on one plane; entry_p10, a facade, reaches 0.84
     min_angle_deg: float = 1.5  # median of the points' widest viewing angles; right from 3.1
     min_agreement: float = 0.78  # of all matches that the cameras explain; right from 0.82, wrong up to 0.76
-    firm_agreement: float = 0.82  # of a pair that may join two groups of views; two places were joined by up to 0.80
+    strong_link: int = 60  # explained matches of a pair; unrelated places reach 39 by chance
+    enough_links: int = 120  # explained matches of several pairs; unrelated places reach 81, a right answer has 166
+    min_link_agreement: float = 0.85  # of fewer that alone hold two groups together; two places reach 0.6
     blurred_px: float = 0.7  # residual of blurred images; right above it only with nearly full agreement
     blurred_agreement: float = 0.95
     max_rotation_sigma_deg: float = 0.6  # right up to 0.29, wrong from 0.33
@@ -152,18 +154,33 @@ def _contradicted(graph: ViewGraph, registration: Registration, config: Config) 
             "Add photographs between those named; look out for repeated or mirrored structures and moving things.",
             tuple(sorted({names[i] for pair in contradicting for i in pair})),
         )
-    firm = [pair for pair, share in registration.agreement.items() if share >= config.firm_agreement]
-    groups = connected([camera.index for camera in registration.cameras], firm)
-    if len(groups) > 1:
+    loose = _loosely_held(graph, registration, config)
+    if loose:
         return Verdict(
             Code.SPLIT,
-            f"{len(groups)} groups of frames are joined only by matches that contradict each other: "
-            + "; ".join(", ".join(names[i] for i in group) for group in groups)
-            + ".",
-            "Add photographs that connect the groups, or take the places one after the other.",
-            tuple(names[i] for group in groups[1:] for i in group),
+            f"{len(loose)} frames may show another place: only a few contradicted matches hold them to the others.",
+            "Add photographs that connect the places, or take them one after the other.",
+            tuple(names[i] for i in loose),
         )
     return None
+
+
+def _loosely_held(graph: ViewGraph, registration: Registration, config: Config) -> list[int]:
+    """Cameras outside the largest group that strong pairs connect, if what joins them to it contradicts itself.
+
+    The share that a pair explains does not tell alone: pairs of a right answer may explain half of their matches each
+    where structures repeat, but they are many, or strong.
+    """
+    explained = {pair: share * len(graph.pairs[pair].matches) for pair, share in registration.agreement.items()}
+    strong = [pair for pair, matches in explained.items() if matches >= config.strong_link]
+    loose = []
+    for group in connected([camera.index for camera in registration.cameras], strong)[1:]:
+        across = [pair for pair in explained if (pair[0] in group) != (pair[1] in group)]
+        matched = sum(len(graph.pairs[pair].matches) for pair in across)
+        held_by = sum(explained[pair] for pair in across)
+        if held_by < min(config.enough_links, config.min_link_agreement * matched):
+            loose += group
+    return loose
 
 
 def _uncertain(graph: ViewGraph, registration: Registration, config: Config) -> Verdict | None:
