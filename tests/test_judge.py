@@ -60,7 +60,7 @@ def registration(
     agreement: dict[tuple[int, int], float] | None = None,
     median_angle_deg: float = 10.0,
 ) -> Registration:
-    """Cameras a step apart on a line, known to 0.05 degrees and 0.5 % of their spread, which all see the same points."""
+    """Cameras a step apart on a line, known to 0.05 degrees and 0.5 % of their spread, that see the same points."""
     num_points = 20
     cameras = []
     for index in indices:

@@ -166,7 +166,7 @@ def confidence(
         + model.per_log_contrast * np.log(contrast + 0.5)
         + model.per_cosine * cosine
     )
-    return 1 / (1 + np.exp(-log_odds))
+    return (1 / (1 + np.exp(-log_odds))).astype(np.float32)
 
 
 def normals(view: Level, planes: Planes) -> tuple[Float32, Float32]:
