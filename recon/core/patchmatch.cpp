@@ -63,8 +63,8 @@ constexpr int kNear[4][2] = {{-1, 0}, {1, 0}, {0, -1}, {0, 1}};
 class Pixel {
 public:
     Pixel(const Task& task, int x, int y)
-        : task_(task), problem_(task.problem), index_(size_t(y) * task.problem.width + x), x_(x), y_(y), u_(x + 0.5f),
-          v_(y + 0.5f), window_(task.pattern, task.padded.at(x, y), task.problem.sigma_grey) {
+        : task_(task), problem_(task.problem), index_(size_t(y) * task.problem.width + x), u_(x + 0.5f), v_(y + 0.5f),
+          window_(task.pattern, task.padded.at(x, y), task.problem.sigma_grey) {
         for (int s = 0; s < problem_.num_sources; ++s)
             rays_[s] = ray_through(problem_.sources[s].from_reference, u_, v_);
         const float ray_x = (u_ - problem_.cx) / problem_.fx, ray_y = (v_ - problem_.cy) / problem_.fy;
@@ -142,7 +142,6 @@ private:
     const Task& task_;
     const Problem& problem_;
     const size_t index_;
-    const int x_, y_;
     const float u_, v_;
     const Window window_;
     Point rays_[kMaxSources];
@@ -208,7 +207,7 @@ private:
     bool nearly_best(const Plane& plane) const {
         const float depth = std::fabs(plane.inverse_depth - best_.inverse_depth);
         const float slope = std::fabs(plane.du - best_.du) + std::fabs(plane.dv - best_.dv);
-        return (depth + kRadius * slope) * parallax_ < 0.05f;
+        return (depth + kRadius * slope) * parallax_ < 0.1f;
     }
 
     const Task& task_;
@@ -278,19 +277,17 @@ void spread(const Problem& problem, int x, int y, Contest& contest) {
     contest.decide();
 }
 
-// Random changes of the depth, of the slope, and of both a quarter as large.
+// A random change of the depth, and one of the slope with a small one of the depth.
 void perturb(float size, Random random, Contest& contest) {
     if (contest.parallax() == 0) return;
     const float depth_step = size / contest.parallax(), slope_step = depth_step / kRadius;
-    const Plane best = contest.best();
-    const auto change = [&](float depth, float slope) {
-        const float w = depth * random.symmetric();
-        const float du = slope * random.symmetric(), dv = slope * random.symmetric();
-        contest.add({best.inverse_depth + w, best.du + du, best.dv + dv});
-    };
-    change(depth_step, 0);
-    change(0, slope_step);
-    change(0.25f * depth_step, 0.25f * slope_step);
+    Plane deeper = contest.best(), steeper = contest.best();
+    deeper.inverse_depth += depth_step * random.symmetric();
+    steeper.inverse_depth += 0.25f * depth_step * random.symmetric();
+    steeper.du += slope_step * random.symmetric();
+    steeper.dv += slope_step * random.symmetric();
+    contest.add(deeper);
+    contest.add(steeper);
     contest.decide();
 }
 

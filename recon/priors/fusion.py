@@ -127,7 +127,7 @@ def depth_map(view: Level, planes: Planes, agreement: Agreement, matching: Match
     return DepthMap(
         depth,
         normal * known[..., None],
-        np.where(known, probability, 0).astype(np.float32),
+        np.where(known, probability, np.float32(0)),
         np.where(known, agreement.num_consistent, 0).astype(np.uint8),
     )
 

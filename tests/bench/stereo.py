@@ -1,8 +1,9 @@
 """How good and how fast dense stereo is with the true cameras: `python -m tests.bench.stereo fountain_p11 sceaux`.
 
 The reference are SIFT points of the larger images, matched between all views, triangulated with the true cameras and
-kept where every ray agrees: sparse, biased to textured places, but independent of the method. Coverage counts pixels
-whose nearest reference depth puts them inside a second view, so occluded pixels and the sky count against it.
+kept where every ray agrees: sparse, biased to textured places, but independent of the method. Coverage is the share of
+pixels with a depth among those whose nearest reference depth puts them inside a second view: occluded pixels, bare
+ground and the sky count against it. The same among pixels close to a reference point leaves most of those out.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from recon.priors.stereo import Config, Sparse, View, depth_maps, depth_range
 Float64 = npt.NDArray[np.float64]
 LONGER_SIDE = 512  # of the images that stereo works on
 REPROJECTION_PX = 1.0  # largest residual of a reference point, pixels of the large image
+NEAR_PX = 16.0  # how far a pixel may be from a reference point to count as close
 RELATIVE_SIGMA = 0.004  # largest expected relative error of a reference depth, for 0.3 px of image noise
 
 
@@ -125,14 +127,16 @@ def perturbed(view: View, angle_deg: float, generator: np.random.Generator) -> V
     return replace(view, T_world_camera=T_world_camera)
 
 
-def seen_twice(views: list[View], index: int, points: Float64, depths: Float64) -> npt.NDArray[np.bool_]:
-    """(h, w) whether the nearest reference depth puts a pixel into another view's image."""
+def seen_twice(
+    views: list[View], index: int, points: Float64, depths: Float64
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """(h, w) pixels that the nearest reference depth puts into another view's image; (h, w) the ones close to it."""
     view = views[index]
     height, width = view.image.shape[:2]
     elsewhere = np.ones((height, width), np.uint8)
     x, y = np.clip(points.astype(int), 0, [width - 1, height - 1]).T
     elsewhere[y, x] = 0
-    _, labels = cv2.distanceTransformWithLabels(elsewhere, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    distance, labels = cv2.distanceTransformWithLabels(elsewhere, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     by_label = np.zeros(labels.max() + 1)
     by_label[labels[y, x]] = depths
     depth = by_label[labels].ravel()
@@ -145,7 +149,8 @@ def seen_twice(views: list[View], index: int, points: Float64, depths: Float64) 
         px, py, pz = other.K @ (T_camera_world[:3, :3] @ world.T + T_camera_world[:3, 3:])
         other_height, other_width = other.image.shape[:2]
         result |= (pz > 0) & (px >= 0) & (py >= 0) & (px < other_width * pz) & (py < other_height * pz)
-    return result.reshape(height, width)
+    seen = result.reshape(height, width)
+    return seen, seen & (distance < NEAR_PX)
 
 
 def sparsification(errors: Float64, confidence: Float64) -> tuple[Float64, float, float]:
@@ -166,6 +171,7 @@ class Case:
     points: list[Float64]  # (M, 2) each
     depths: list[Float64]  # (M,) each
     seen_twice: list[npt.NDArray[np.bool_]]  # (h, w) each
+    seen_twice_close: list[npt.NDArray[np.bool_]]  # (h, w) each, of these the ones close to a reference point
 
 
 def make_case(scene: Path, names: list[str], reference_names: list[str]) -> Case:
@@ -179,39 +185,42 @@ def make_case(scene: Path, names: list[str], reference_names: list[str]) -> Case
         for name, view, (points, _) in zip(names, views, references, strict=True)
     ]
     depths = [depths for _, depths in references]
-    return Case(views, points, depths, [seen_twice(views, i, points[i], depths[i]) for i in range(len(views))])
+    seen = [seen_twice(views, i, points[i], depths[i]) for i in range(len(views))]
+    return Case(views, points, depths, [all_of_them for all_of_them, _ in seen], [close for _, close in seen])
 
 
 def measure(case: Case, maps: list[DepthMap]) -> dict:
     """Errors at the reference points that a second view can see, coverage, calibration and ranking."""
-    errors, confidences, missing, total, covered, confident, seen = [], [], 0, 0, 0, 0, 0
+    errors, confidences, total = [], [], 0
     for points, depths, visible, depth_map in zip(case.points, case.depths, case.seen_twice, maps, strict=True):
         x, y = points.astype(int).T
-        used = visible[y, x]
-        found = used & (depth_map.depth[y, x] > 0)
-        total += used.sum()
-        missing += (used & ~found).sum()
+        found = visible[y, x] & (depth_map.depth[y, x] > 0)
+        total += int(visible[y, x].sum())
         errors.append(np.abs(depth_map.depth[y, x][found] / depths[found] - 1))
         confidences.append(depth_map.confidence[y, x][found])
-        covered += (visible & (depth_map.depth > 0)).sum()
-        confident += (visible & (depth_map.confidence > 0.5)).sum()
-        seen += visible.sum()
     error, confidence = np.concatenate(errors), np.concatenate(confidences)
+    known = [depth_map.depth > 0 for depth_map in maps]
+    sure = [depth_map.confidence > 0.5 for depth_map in maps]
     curve, area, best_area = sparsification(np.minimum(error, 0.1), confidence)
     return {
-        "points": int(total),
+        "points": total,
         "median_relative_error": float(np.median(error)),
         "p90_relative_error": float(np.percentile(error, 90)),
         "share_within_1pct": float((error < 0.01).mean()),
         "share_within_1pct_of_all": float((error < 0.01).sum() / total),
-        "points_missing": float(missing / total),
-        "coverage": float(covered / seen),
-        "coverage_confident": float(confident / seen),
+        "points_missing": 1 - len(error) / total,
+        "coverage": _share(known, case.seen_twice),
+        "coverage_confident": _share(sure, case.seen_twice),
+        "coverage_close": _share(known, case.seen_twice_close),
         "mean_confidence": float(confidence.mean()),
         "sparsification": [round(float(value), 6) for value in curve],
         "sparsification_area": area,
         "sparsification_area_best": best_area,
     }
+
+
+def _share(masks: list[npt.NDArray[np.bool_]], among: list[npt.NDArray[np.bool_]]) -> float:
+    return float(sum((m & a).sum() for m, a in zip(masks, among, strict=True)) / sum(a.sum() for a in among))
 
 
 def run(case: Case, config: Config, *, seed: int = 0, pose_error_deg: float = 0.0, seeded: float = 0.0) -> tuple:
