@@ -23,7 +23,7 @@ WORLD = Similarity(1.7, Rotation.from_euler("xyz", [20, -40, 10], degrees=True).
 def view(index: int, T_world_camera: torch.Tensor, K: torch.Tensor) -> View:
     pointmap = plane_pointmap(T_world_camera.double().numpy(), frame_id=index)
     image = np.full((HEIGHT, WIDTH, 3), 10 * index, np.uint8)
-    return View(pointmap.name, index, image, pointmap, T_world_camera, K, 0.1 * (index + 1), 0.01 * (index + 1))
+    return View(pointmap.name, index, image, T_world_camera, K, 0.1 * (index + 1), 0.01 * (index + 1))
 
 
 def scene_of(tiny: TinyScene, num_views: int, similarity: Similarity | None = None, iterations: int = 0) -> Scene:
