@@ -220,3 +220,8 @@ def test_wrong_input_says_what_was_expected(views):
         depth_maps(views, Config(), sparse=[None])
     with pytest.raises(ValueError, match="sources are needed"):
         estimate(views[0], [], Config())
+
+
+def test_a_view_without_sparse_points_still_finds_its_sources(views):
+    none = Sparse(np.empty((0, 2)), np.empty(0))
+    assert choose_sources(views, 1, Config(), none) == choose_sources(views, 1, Config())

@@ -153,7 +153,7 @@ def choose_sources(views: Sequence[View], index: int, config: Config, sparse: Sp
     small tells nothing, too large does not match. The probes are the sparse points, or a grid over the depth range.
     """
     view = views[index]
-    pixels, depths = (sparse.points, sparse.depths) if sparse is not None else _probes(view)
+    pixels, depths = (sparse.points, sparse.depths) if sparse is not None and len(sparse.points) else _probes(view)
     rays = np.c_[pixels, np.ones(len(pixels))] @ np.linalg.inv(view.K).T
     world = (rays * depths[:, None]) @ view.T_world_camera[:3, :3].T + view.T_world_camera[:3, 3]
     scores = {
