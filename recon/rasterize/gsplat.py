@@ -103,11 +103,11 @@ def _rasterization(
     """The features (H, W, D) and their weights (H, W), blended by gsplat with the camera at the origin."""
     import gsplat
 
-    placeholder = means_camera.new_zeros(len(means_camera), 4)  # quats and scales are not looked at beside covars
+    unused = means_camera.new_zeros(len(means_camera), 4)  # quats and scales are not looked at beside covars
     accumulated, alpha, _ = gsplat.rasterization(  # pyright: ignore[reportAttributeAccessIssue]
         means_camera.contiguous(),
-        placeholder,
-        placeholder[:, :3],
+        unused,
+        unused[:, :3],
         opacities,
         features,
         torch.eye(4, dtype=K.dtype, device=K.device)[None],
