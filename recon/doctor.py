@@ -111,7 +111,7 @@ def _lpips(network: str) -> Finding:
     """Loads the network, because a file of that name may hold something else."""
     name = f"lpips-{network}"
     try:
-        from recon.evaluate.lpips import load_lpips
+        from recon.losses.lpips import load_lpips
 
         loaded = load_lpips(network)
     except (ImportError, OSError, ValueError) as error:

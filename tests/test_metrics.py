@@ -8,8 +8,8 @@ import pytest
 import torch
 from scipy.signal import convolve2d
 
-from recon.evaluate.lpips import load_lpips, weights_folder
 from recon.evaluate.metrics import psnr, ssim
+from recon.losses.lpips import load_lpips, weights_folder
 
 
 def random_image(seed: int, height: int = 20, width: int = 27) -> torch.Tensor:

@@ -11,7 +11,6 @@ import numpy.typing as npt
 import torch
 
 from recon.evaluate.alignment import CameraErrors, Rasterize, align_test_pose, camera_errors, render_rgb
-from recon.evaluate.lpips import Lpips, load_lpips
 from recon.evaluate.metrics import psnr, ssim
 from recon.evaluate.splits import Split
 from recon.evaluate.truth import EvaluationScene
@@ -19,6 +18,7 @@ from recon.export import viewer_safe
 from recon.export.ply import ply_bytes
 from recon.geometry import align_cameras
 from recon.keyframe import modelled_image
+from recon.losses.lpips import Lpips, load_lpips
 from recon.snapshot import CameraEstimate, Snapshot
 
 STAGES = ("poses", "points", "optimise")

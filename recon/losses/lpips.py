@@ -1,14 +1,14 @@
 """LPIPS, the learned perceptual distance of Zhang et al. 2018 (version 0.1), without torchvision.
 
-The weights are data that the user supplies (see `weights_folder`); without them the metric is not measured. Images are
-mapped to [-1, 1], as the metric is defined. The 3DGS and InstantSplat code feeds it [0, 1], so published figures of
-that family are not exactly comparable.
+It is a metric of the benchmark and, with gradients, the perceptual loss of equation 7. The weights are data that the
+user supplies (see `weights_folder`); without them nothing is measured. Images are mapped to [-1, 1], as the metric is
+defined. The 3DGS and InstantSplat code feeds it [0, 1], so published figures of that family are not exactly comparable.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,7 +47,7 @@ _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 
 @dataclass(frozen=True, eq=False)
 class Lpips:
-    """A loaded network. Calling it compares two images."""
+    """A loaded network."""
 
     layers: tuple[Layer, ...]
     weights: Mapping[str, Tensor]  # net.I.weight, net.I.bias: convolutions; linK.weight (1, C, 1, 1): heads
@@ -55,24 +55,34 @@ class Lpips:
     @torch.no_grad()
     def __call__(self, image: Tensor, truth: Tensor) -> float:
         """The distance of two images (H, W, 3) in [0, 1]; 0 for equal ones. Sides must be at least 64 pixels."""
-        if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 64:
-            raise ValueError(
-                f"images must both be (H, W, 3) of at least 64x64, got {tuple(image.shape)} and {tuple(truth.shape)}"
-            )
-        x = torch.stack([image, truth]).to(torch.float32).permute(0, 3, 1, 2) * 2 - 1
+        return float(self.distance(image, self.features(truth)))
+
+    def features(self, image: Tensor) -> tuple[Tensor, ...]:
+        """What the network sees in an image (H, W, 3) in [0, 1]: unit vectors (1, C, h, w) of each tapped layer."""
+        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 64:
+            raise ValueError(f"image must be (H, W, 3) of at least 64x64, got {tuple(image.shape)}")
+        x = image.to(torch.float32).permute(2, 0, 1)[None] * 2 - 1
         x = (x - x.new_tensor(_SHIFT).view(3, 1, 1)) / x.new_tensor(_SCALE).view(3, 1, 1)
-        distance, head = 0.0, 0
+        tapped = []
         for i, layer in enumerate(self.layers):
             if layer.pool:
                 x = functional.max_pool2d(x, layer.pool, stride=2)
             weight, bias = self.weights[f"net.{i}.weight"].float(), self.weights[f"net.{i}.bias"].float()
             x = functional.relu(functional.conv2d(x, weight, bias, layer.stride, layer.padding))
             if layer.tap:
-                unit = x / (x.norm(dim=1, keepdim=True) + 1e-10)
-                difference = (unit[:1] - unit[1:]) ** 2
-                distance += float(functional.conv2d(difference, self.weights[f"lin{head}.weight"].float()).mean())
-                head += 1
-        return distance
+                tapped.append(x / ((x * x).sum(1, keepdim=True) + 1e-20).sqrt())
+        return tuple(tapped)
+
+    def distance(self, image: Tensor, truth: Sequence[Tensor]) -> Tensor:
+        """Scalar distance of `image` (H, W, 3) from the image whose `features` are `truth`, with gradients."""
+        found = self.features(image)
+        if [layer.shape for layer in found] != [layer.shape for layer in truth]:
+            raise ValueError(f"images must have equal sizes, got features {found[0].shape} and {truth[0].shape}")
+        parts = [
+            functional.conv2d((mine - true) ** 2, self.weights[f"lin{head}.weight"].float()).mean()
+            for head, (mine, true) in enumerate(zip(found, truth, strict=True))
+        ]
+        return torch.stack(parts).sum()
 
 
 def load_lpips(network: str, weights_dir: Path | None = None) -> Lpips | None:

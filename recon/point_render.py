@@ -1,0 +1,98 @@
+"""Images of a point cloud: each pixel takes the colours of the nearest points, and is white where there are none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class PointRender:
+    """What the points show from a camera; `seen` says where there are any."""
+
+    rgb: Array  # (H, W, 3) in [0, 1], white where nothing is seen
+    depth: Array  # (H, W) z in the camera frame of the frontmost point, 0 where nothing is seen
+    normal: Array  # (H, W, 3) camera frame, unit length, facing the camera, 0 where nothing is seen
+    seen: npt.NDArray[np.bool_]  # (H, W)
+
+
+def render_points(
+    points: Array,  # (M, 3) world
+    colours: Array,  # (M, 3) in [0, 1]
+    normals: Array,  # (M, 3) world, unit length
+    T_world_camera: npt.NDArray[np.float64],  # (4, 4)
+    K: npt.NDArray[np.float64],  # (3, 3)
+    width: int,
+    height: int,
+    *,
+    nearest: int = 8,
+    radius: float = 1.5,
+    same_surface: float = 0.02,
+) -> PointRender:
+    """The point-rendered image of equation 6.
+
+    A point is a candidate for the pixels whose centres lie within `radius` pixels of its projection. Of a pixel's
+    candidates those count that lie on the frontmost surface (z at most `same_surface` behind the first, relatively):
+    a surface hides what is behind it. The `nearest` K of them by image distance d are blended with weights
+    exp(-d) / sum of exp(-d). Points seen from behind are left out.
+    """
+    to_camera = np.linalg.inv(T_world_camera).astype(np.float32)
+    in_camera = points @ to_camera[:3, :3].T + to_camera[:3, 3]
+    turned = normals @ to_camera[:3, :3].T
+    in_front = (in_camera[:, 2] > 1e-6) & ((turned * in_camera).sum(1) <= 0)
+    index = np.flatnonzero(in_front)
+    z = in_camera[index, 2]
+    u = in_camera[index, 0] / z * np.float32(K[0, 0]) + np.float32(K[0, 2])
+    v = in_camera[index, 1] / z * np.float32(K[1, 1]) + np.float32(K[1, 2])
+    visible = (np.abs(u - 0.5 * width) < 0.5 * width + radius) & (np.abs(v - 0.5 * height) < 0.5 * height + radius)
+    index, z, u, v = index[visible], z[visible], u[visible], v[visible]
+
+    pixel, point, distance = _candidates(u, v, width, height, radius)
+    depth = np.full(height * width, np.inf, np.float32)
+    np.minimum.at(depth, pixel, z[point])
+    front = z[point] <= depth[pixel] * (1 + same_surface)
+    pixel, point, distance = pixel[front], point[front], distance[front]
+    order = np.lexsort((distance, pixel))
+    pixel, point, distance = pixel[order], point[order], distance[order]
+    rank = np.arange(len(pixel)) - np.searchsorted(pixel, pixel)
+    chosen = rank < nearest
+    pixel, point, weight = pixel[chosen], index[point[chosen]], np.exp(-distance[chosen])
+
+    total = np.bincount(pixel, weight, height * width)
+    seen = total > 0
+
+    def blended(values: Array) -> Array:
+        sums = [np.bincount(pixel, weight * values[point, k], height * width) for k in range(3)]
+        return (np.stack(sums, 1) / np.where(seen, total, 1.0)[:, None]).astype(np.float32)
+
+    rgb = np.where(seen[:, None], blended(colours), np.float32(1.0))
+    normal = blended(turned)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return PointRender(
+        rgb=rgb.reshape(height, width, 3),
+        depth=np.where(seen, depth, 0).astype(np.float32).reshape(height, width),
+        normal=np.where(seen[:, None], normal, 0).reshape(height, width, 3),
+        seen=seen.reshape(height, width),
+    )
+
+
+def _candidates(
+    u: Array, v: Array, width: int, height: int, radius: float
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
+    """(pixel, point, distance) of every pixel centre within `radius` of a projection (u, v), each of shape (C,)."""
+    reach = int(np.ceil(radius))
+    column, row = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+    pixels, members, distances = [], [], []
+    for down in range(-reach, reach + 1):
+        for right in range(-reach, reach + 1):
+            x, y = column + right, row + down
+            distance = np.hypot(x + np.float32(0.5) - u, y + np.float32(0.5) - v)
+            inside = np.flatnonzero((distance <= radius) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
+            pixels.append(y[inside] * width + x[inside])
+            members.append(inside)
+            distances.append(distance[inside])
+    return np.concatenate(pixels), np.concatenate(members), np.concatenate(distances)
