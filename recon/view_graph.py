@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 from recon.keyframe import Keyframe
@@ -53,6 +53,15 @@ class ViewGraph:
             keyframe.features, keyframe.frame.image, self._config.squeezes, self._config.features
         )
         self.keyframes[index] = replace(keyframe, features=widened)
+
+    def without(self, names: Collection[str]) -> ViewGraph:
+        """A view graph of the other keyframes, with what their pairs say."""
+        kept = [index for index, keyframe in enumerate(self.keyframes) if keyframe.name not in names]
+        rest = ViewGraph(self._config)
+        rest.keyframes = [self.keyframes[index] for index in kept]
+        place = {index: position for position, index in enumerate(kept)}
+        rest.pairs = {(place[i], place[j]): pair for (i, j), pair in self.pairs.items() if i in place and j in place}
+        return rest
 
     def components(self) -> list[list[int]]:
         """Sets of keyframes that verified pairs connect, the largest first."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 
 from recon.registration import register
@@ -15,6 +17,7 @@ def compared(monkeypatch) -> list[tuple[str, str]]:
     calls: list[tuple[str, str]] = []
 
     def compare(first, second, config):
+        first, second = (getattr(keyframe, "name", keyframe) for keyframe in (first, second))
         calls.append((first, second))
         return f"{first}{second}" if first[0] == second[0] else None
 
@@ -37,6 +40,18 @@ def test_components_are_the_largest_first(compared):
     for name in ("c1", "a1", "b1", "a2", "b2", "a3"):
         graph.add(name)
     assert graph.components() == [[1, 3, 5], [2, 4], [0]]
+
+
+def test_without_a_keyframe_the_pairs_of_the_others_stay_and_a_new_one_is_compared_with_them(compared):
+    graph = ViewGraph(register.Config(squeezes=()))
+    for name in ("a1", "a2", "b1", "a3"):
+        graph.add(SimpleNamespace(name=name))
+    rest = graph.without({"a1", "b1"})
+    assert [keyframe.name for keyframe in rest.keyframes] == ["a2", "a3"]
+    assert rest.pairs == {(0, 1): "a2a3"}
+    rest.add(SimpleNamespace(name="a4"))
+    assert set(rest.pairs) == {(0, 1), (0, 2), (1, 2)}
+    assert len(graph.keyframes) == 4 and len(graph.pairs) == 3
 
 
 @pytest.mark.parametrize("pairs", [[(0, 1), (1, 2), (2, 3)], [(2, 3), (0, 1), (1, 2)], [(0, 3), (2, 3), (1, 2)]])
