@@ -1,34 +1,32 @@
-"""preview.png: what the cameras saw beside what the Gaussians show."""
+"""preview.png: what the cameras saw beside what the Gaussians show. It needs no torch."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 import numpy.typing as npt
-import torch
 
-from recon.rasterize.cpu import rasterize
+from recon.picture import take_picture
 from recon.snapshot import CameraEstimate, GaussianArrays, Snapshot
 
 Image = npt.NDArray[np.uint8]
 
 
+def render_rgb(
+    gaussians: GaussianArrays,
+    T_world_camera: npt.NDArray[np.float64],
+    K: npt.NDArray[np.float64],
+    width: int,
+    height: int,
+) -> npt.NDArray[np.float32]:
+    """(H, W, 3) the Gaussians' image on black, in [0, 1]."""
+    return np.clip(take_picture(gaussians, T_world_camera, K, width, height).rgb, 0.0, 1.0)
+
+
 def render_camera(gaussians: GaussianArrays, camera: CameraEstimate) -> Image:
     """(H, W, 3) RGB of the Gaussians from an estimated camera."""
-    render = rasterize(
-        torch.from_numpy(gaussians.means),
-        torch.from_numpy(gaussians.quats),
-        torch.from_numpy(gaussians.scales),
-        torch.from_numpy(gaussians.opacities),
-        torch.from_numpy(gaussians.sh),
-        torch.from_numpy(camera.T_world_camera).float(),
-        torch.from_numpy(camera.K).float(),
-        camera.width,
-        camera.height,
-        channels=("rgb",),
-    )
-    assert render.rgb is not None
-    return (render.rgb.clamp(0, 1) * 255).round().byte().numpy()
+    rgb = render_rgb(gaussians, camera.T_world_camera, camera.K, camera.width, camera.height)
+    return np.rint(rgb * 255).astype(np.uint8)
 
 
 def contact_sheet(snapshot: Snapshot, max_views: int = 4, height: int = 240) -> bytes:

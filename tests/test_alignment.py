@@ -12,10 +12,10 @@ from recon.evaluate.alignment import (
     ate_instantsplat,
     camera_errors,
     centre_error_pct,
-    render_rgb,
     umeyama,
 )
 from recon.geometry import Similarity, exp_se3
+from recon.preview import render_rgb
 from recon.rasterize.cpu import rasterize
 from recon.snapshot import GaussianArrays
 
@@ -152,7 +152,7 @@ def make_wall(num_gaussians: int = 600) -> GaussianArrays:
 @pytest.mark.parametrize(("levels", "steps"), [(1, 150), (3, 150)])
 def test_test_pose_is_found_again(levels, steps):
     gaussians, true = make_wall(), motion(5, 0.05)
-    image = render_rgb(gaussians, true, K, WIDTH, HEIGHT, rasterize)
+    image = torch.from_numpy(render_rgb(gaussians, true, K, WIDTH, HEIGHT))
     start = true @ motion(6, 0.02)
     found = align_test_pose(gaussians, image, start, K, rasterize, steps=steps, levels=levels)
     assert float(np.linalg.norm(start[:3, 3] - true[:3, 3])) > 0.02
@@ -164,7 +164,7 @@ def test_test_pose_is_found_again(levels, steps):
 
 def test_search_never_ends_worse_than_it_started():
     gaussians = make_wall()
-    image = render_rgb(gaussians, np.eye(4), K, WIDTH, HEIGHT, rasterize)
+    image = torch.from_numpy(render_rgb(gaussians, np.eye(4), K, WIDTH, HEIGHT))
     found = align_test_pose(gaussians, image, np.eye(4), K, rasterize, steps=3, levels=2, learning_rate=0.5)
     assert found.loss == pytest.approx(0.0, abs=1e-6)
     assert np.array_equal(found.T_world_camera, np.eye(4))

@@ -19,7 +19,16 @@ assert not [name for name in sys.modules if name.startswith("torch.")]
 
 @pytest.mark.parametrize(
     "module",
-    ["capture.frame", "capture.cameras.folder", "recon", "recon.snapshot", "recon.verdict", "recon.export", "viewer"],
+    [
+        "capture.frame",
+        "capture.cameras.folder",
+        "recon",
+        "recon.snapshot",
+        "recon.verdict",
+        "recon.export",
+        "recon.preview",
+        "viewer",
+    ],
 )
 def test_loads_without_torch(module):
     result = subprocess.run(

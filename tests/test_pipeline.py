@@ -18,7 +18,7 @@ from capture.cameras import synthetic
 from capture.frame import DroppedFrame, Frame
 from recon import optimize
 from recon.config import Config
-from recon.evaluate.alignment import CameraErrors, align_test_pose, camera_errors, render_rgb
+from recon.evaluate.alignment import CameraErrors, align_test_pose, camera_errors
 from recon.evaluate.metrics import psnr
 from recon.evaluate.protocol import mean_intrinsics
 from recon.evaluate.splits import load_split
@@ -26,6 +26,7 @@ from recon.evaluate.truth import load_scene
 from recon.geometry import align_cameras
 from recon.judge import judge
 from recon.pipeline import reconstruct
+from recon.preview import render_rgb
 from recon.rasterize.cpu import rasterize
 from recon.registration import register
 from recon.snapshot import Snapshot
@@ -100,7 +101,8 @@ def held_out_psnr(snapshot: Snapshot, index: int) -> float:
     K = mean_intrinsics(snapshot.cameras, SMALL.width, SMALL.height)
     start = to_estimated.camera(T_world_camera)
     aligned = align_test_pose(snapshot.gaussians, image, start, K, rasterize, steps=60, levels=2)
-    return psnr(render_rgb(snapshot.gaussians, aligned.T_world_camera, K, SMALL.width, SMALL.height, rasterize), image)
+    rendered = render_rgb(snapshot.gaussians, aligned.T_world_camera, K, SMALL.width, SMALL.height)
+    return psnr(torch.from_numpy(rendered), image)
 
 
 def test_a_stream_gives_a_snapshot_after_every_frame_and_at_every_checkpoint(streamed):

@@ -15,7 +15,6 @@ import pytest
 import torch
 
 from capture.frame import Frame
-from recon.evaluate.alignment import render_rgb
 from recon.evaluate.bench import Plan, run_alone, run_bench
 from recon.evaluate.protocol import Networks, Run, Settings, evaluate, mean_intrinsics
 from recon.evaluate.splits import Split, load_split, paper_split
@@ -24,6 +23,7 @@ from recon.export import write_result
 from recon.export.cameras import encode_cameras, encode_colmap, encode_nerfstudio
 from recon.export.ply import encode_ply
 from recon.geometry import Similarity, exp_se3
+from recon.preview import render_rgb
 from recon.rasterize.cpu import rasterize
 from recon.report import build_report
 from recon.snapshot import CameraEstimate, GaussianArrays, Snapshot
@@ -95,8 +95,8 @@ def perfect_snapshot() -> Snapshot:
 def write_images(folder: Path) -> None:
     (folder / "images").mkdir(parents=True)
     for name in NAMES:
-        image = render_rgb(make_gaussians(), true_pose(int(name[:2])), K, WIDTH, HEIGHT, rasterize)
-        pixels = np.rint(image.numpy() * 255).astype(np.uint8)
+        image = render_rgb(make_gaussians(), true_pose(int(name[:2])), K, WIDTH, HEIGHT)
+        pixels = np.rint(image * 255).astype(np.uint8)
         cv2.imwrite(str(folder / "images" / name), pixels[..., ::-1])
 
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from recon import core
-from recon.rasterize import cpu, reference
+from recon.rasterize import cpu, native, reference
 from recon.rasterize.render import Render
 
 NAMES = ("means", "quats", "scales", "opacities", "sh", "T_world_camera", "K")
@@ -265,7 +265,7 @@ def test_near_plane_and_frustum_guard(rasterize, mean, seen):
 
 @pytest.mark.parametrize("instruction_set", core.instruction_sets())
 def test_instruction_sets_agree(instruction_set, monkeypatch):
-    monkeypatch.setattr(cpu, "library", lambda: core.library(instruction_set))
+    monkeypatch.setattr(native, "library", lambda: core.library(instruction_set))
     case = needles(1)
     expected_images, expected = render_and_differentiate(reference.rasterize, case)
     actual_images, actual = render_and_differentiate(cpu.rasterize, case)

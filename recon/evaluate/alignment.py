@@ -181,16 +181,6 @@ def align_test_pose(
     return AlignedPose(best_T.numpy(), best_loss)
 
 
-@torch.no_grad()
-def render_rgb(
-    gaussians: GaussianArrays, T_world_camera: Array, K: Array, width: int, height: int, rasterize: Rasterize
-) -> Tensor:
-    """(H, W, 3) the Gaussians' image on black, in [0, 1]."""
-    tensors = [torch.from_numpy(array) for array in _parameters(gaussians)]
-    pose, intrinsics = (torch.from_numpy(matrix).float() for matrix in (T_world_camera, K))
-    return _rasterize_rgb(tensors, pose, intrinsics, width, height, rasterize).clamp(0.0, 1.0)
-
-
 def _loss_and_gradient(
     tensors: list[Tensor], image: Tensor, T_world_camera: Tensor, K: Tensor, rasterize: Rasterize
 ) -> tuple[float, Tensor]:

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from recon.evaluate.alignment import CameraErrors, Rasterize, align_test_pose, camera_errors, render_rgb
+from recon.evaluate.alignment import CameraErrors, Rasterize, align_test_pose, camera_errors
 from recon.evaluate.metrics import psnr, ssim
 from recon.evaluate.splits import Split
 from recon.evaluate.truth import EvaluationScene
@@ -19,6 +19,7 @@ from recon.export.ply import ply_bytes
 from recon.geometry import align_cameras
 from recon.keyframe import modelled_image
 from recon.losses.lpips import Lpips, load_lpips
+from recon.preview import render_rgb
 from recon.snapshot import CameraEstimate, Snapshot
 
 STAGES = ("poses", "points", "optimise")
@@ -176,7 +177,7 @@ def _score_test_views(
             steps=settings.alignment_steps,
             levels=settings.alignment_levels,
         )
-        image = render_rgb(gaussians, aligned.T_world_camera, K, width, height, rasterize)
+        image = torch.from_numpy(render_rgb(gaussians, aligned.T_world_camera, K, width, height))
         scores.append(
             _ViewScore(
                 psnr=psnr(image, truth),

@@ -14,21 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon.core import library
 from recon.rasterize.check import check_input
+from recon.rasterize.native import CHANNEL_BITS, RasterGradients, RasterImages, raster_forward, raster_input
 from recon.rasterize.reference import CHANNELS, NEAR
 from recon.rasterize.render import Render
-
-_CHANNEL_BITS = {"rgb": 1, "depth": 2, "normal": 4, "alpha": 8}
-_INPUT_ERRORS = {
-    1: "means must be finite",
-    2: "quats must be finite and not of zero length",
-    4: "scales must be finite and not negative (pass log_scales.exp())",
-    8: "opacities must be from 0 to 1 (pass logit_opacities.sigmoid())",
-    16: "sh must be finite",
-    32: "the Gaussians cover more than 2^31 tiles of 32 x 32 pixels: there are too many or their scales are too large",
-}
-STAGES = ("project", "bin", "blend", "blend_backward", "project_backward")
 
 
 def rasterize(
@@ -53,82 +42,39 @@ def rasterize(
     """
     check_input(means, quats, scales, opacities, sh, T_world_camera, K, width, height, channels, near, "cpu")
     parameters = (tensor.to(torch.float32).contiguous() for tensor in (means, quats, scales, opacities, sh))
-    settings = (width, height, sum(_CHANNEL_BITS[name] for name in set(channels)), antialias, near)
+    settings = (width, height, frozenset(channels), antialias, near)
     rgb, depth, normal, alpha = _Rasterize.apply(*parameters, T_world_camera, K, settings)
     return Render(rgb, depth, normal, alpha)
-
-
-class _Input(ctypes.Structure):
-    """RasterInput of recon/core/rasterize.h."""
-
-    _fields_ = [
-        *((name, ctypes.c_int32) for name in ("num_gaussians", "sh_bases", "width", "height", "antialias", "channels")),
-        ("near_plane", ctypes.c_float),
-        *((name, ctypes.c_void_p) for name in ("means", "quats", "scales", "opacities", "sh")),
-        ("T_world_camera", ctypes.c_double * 16),
-        ("focal", ctypes.c_double * 2),
-        ("principal", ctypes.c_double * 2),
-    ]
-
-
-class _Images(ctypes.Structure):
-    """RasterImages of recon/core/rasterize.h."""
-
-    _fields_ = [(name, ctypes.c_void_p) for name in ("rgb", "depth", "normal", "alpha")]
-
-
-class _Gradients(ctypes.Structure):
-    """RasterGradients of recon/core/rasterize.h."""
-
-    _fields_ = [
-        *((name, ctypes.c_void_p) for name in ("means", "quats", "scales", "opacities", "sh")),
-        ("T_world_camera", ctypes.c_double * 16),
-        ("focal", ctypes.c_double * 2),
-        ("principal", ctypes.c_double * 2),
-    ]
-
-
-class _Raster:
-    """What the core keeps of a rendered view for its gradient. Gives it back when nothing refers to it any more."""
-
-    def __init__(self, core: ctypes.CDLL, handle: ctypes.c_void_p):
-        self.core = core
-        self.handle = handle
-
-    def __del__(self):
-        self.core.core_raster_release(self.handle)
-
-    def seconds(self) -> tuple[dict[str, float], dict[str, float]]:
-        """By stage, of the last forward and backward: seconds on the clock, and of all processors together."""
-        values = (ctypes.c_double * (2 * len(STAGES)))()
-        self.core.core_raster_seconds(self.handle, values)
-        clock, processors = values[: len(STAGES)], values[len(STAGES) :]
-        return dict(zip(STAGES, clock, strict=True)), dict(zip(STAGES, processors, strict=True))
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means, quats, scales, opacities, sh, T_world_camera, K, settings):
         width, height, channels, antialias, near = settings
-        source = _Input(
-            means.shape[0], sh.shape[1], width, height, antialias, channels, near,
-            *(tensor.data_ptr() for tensor in (means, quats, scales, opacities, sh)),
-            (ctypes.c_double * 16)(*T_world_camera.flatten().tolist()),
-            (ctypes.c_double * 2)(float(K[0, 0]), float(K[1, 1])),
-            (ctypes.c_double * 2)(float(K[0, 2]), float(K[1, 2])),
-        )  # fmt: skip
+        source = raster_input(
+            means.shape[0],
+            sh.shape[1],
+            [tensor.data_ptr() for tensor in (means, quats, scales, opacities, sh)],
+            T_world_camera.flatten().tolist(),
+            K.flatten().tolist(),
+            width,
+            height,
+            channels,
+            antialias,
+            near,
+        )
         rgb, depth, normal = (
-            means.new_empty(shape) if channels & _CHANNEL_BITS[name] else None
+            means.new_empty(shape) if name in channels else None
             for name, shape in (("rgb", (3, height, width)), ("depth", (height, width)), ("normal", (3, height, width)))
         )
         alpha = means.new_empty(height, width)
-        raster = _forward(source, _Images(*map(_address, (rgb, depth, normal, alpha))))
+        raster = raster_forward(source, RasterImages(*map(_address, (rgb, depth, normal, alpha))))
 
         ctx.source, ctx.raster = source, raster
         ctx.save_for_backward(means, quats, scales, opacities, sh, depth, alpha)
         ctx.camera_like = T_world_camera.detach(), K.detach()
         ctx.set_materialize_grads(False)
-        shown_alpha = alpha if channels & _CHANNEL_BITS["alpha"] else None
+        shown_alpha = alpha if "alpha" in channels else None
         return _channels_last(rgb), depth, _channels_last(normal), shown_alpha
 
     @staticmethod
@@ -136,19 +82,17 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *image_gradients):  # pyright: ignore[reportIncompatibleMethodOverride]
         means, quats, scales, opacities, sh, depth, alpha = ctx.saved_tensors
         planar = [_planar(gradient) for gradient in image_gradients]
-        channels = sum(
-            bit for bit, gradient in zip(_CHANNEL_BITS.values(), planar, strict=True) if gradient is not None
-        )
+        channels = sum(bit for bit, gradient in zip(CHANNEL_BITS.values(), planar, strict=True) if gradient is not None)
         if not channels:
             return (None,) * 8
         parameters = [torch.empty_like(tensor) for tensor in (means, quats, scales, opacities, sh)]
-        gradients = _Gradients(*map(_address, parameters))
+        gradients = RasterGradients(*map(_address, parameters))
         ctx.raster.core.core_raster_backward(
             ctypes.byref(ctx.source),
             ctx.raster.handle,
             channels,
-            ctypes.byref(_Images(None, _address(depth), None, _address(alpha))),
-            ctypes.byref(_Images(*map(_address, planar))),
+            ctypes.byref(RasterImages(None, _address(depth), None, _address(alpha))),
+            ctypes.byref(RasterImages(*map(_address, planar))),
             ctypes.byref(gradients),
         )
         T_world_camera, K = (torch.zeros_like(tensor) for tensor in ctx.camera_like)
@@ -156,15 +100,6 @@ class _Rasterize(torch.autograd.Function):
         (fx, fy), (cx, cy) = gradients.focal, gradients.principal
         K += torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 0]], dtype=torch.float64)
         return *parameters, T_world_camera, K, None
-
-
-def _forward(source: _Input, images: _Images) -> _Raster:
-    core = library()
-    handle = ctypes.c_void_p()
-    errors = core.core_raster_forward(ctypes.byref(source), ctypes.byref(images), ctypes.byref(handle))
-    if errors:
-        raise ValueError("; ".join(message for bit, message in _INPUT_ERRORS.items() if errors & bit))
-    return _Raster(core, handle)
 
 
 def _address(tensor: Tensor | None) -> int | None:
