@@ -15,10 +15,10 @@ from recon.priors.stereo import (
     Stage,
     View,
     choose_sources,
-    cross_check,
     depth_maps,
     depth_range,
     estimate,
+    further_depth_map,
 )
 from tests.bench import stereo as bench
 
@@ -124,13 +124,26 @@ def test_one_view_alone_with_known_depth_of_the_others(views, maps):
     assert np.median(error) < 0.005
 
 
-def test_views_estimated_one_by_one_and_checked_together_are_as_good(views):
-    planes = [estimate(view, [v for v in views if v is not view], Config(), seed=1) for view in views]
-    for T, result in zip(CAMERAS, cross_check(views, planes, Config()), strict=True):
-        _, depth, _ = render(T)
-        known = result.depth > 0
-        assert known.mean() > 0.75
-        assert np.median(np.abs(result.depth[known] / depth[known] - 1)) < 0.005
+def test_a_further_view_is_as_good_and_no_map_but_its_own_is_needed_again(views, maps):
+    further = further_depth_map(views, 1, {0: maps[0].depth, 2: maps[2].depth}, Config(), seed=1)
+    _, depth, _ = render(CAMERAS[1])
+    known = further.depth > 0
+    assert known.mean() > 0.75
+    assert np.median(np.abs(further.depth[known] / depth[known] - 1)) < 0.005
+    assert (further.num_consistent[known] > 0).mean() > 0.7
+
+
+def test_the_work_can_be_abandoned_between_views(views):
+    calls = []
+
+    def pause() -> None:
+        calls.append(None)
+        if len(calls) == 2:
+            raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        depth_maps(views, Config(), pause=pause)
+    assert len(calls) == 2
 
 
 def flat_planes(inverse_depth: float) -> Planes:

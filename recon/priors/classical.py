@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from recon.keyframe import Keyframe
 from recon.priors import stereo
+from recon.priors.fusion import DepthMap
 from recon.priors.pointmap import Pointmap
 from recon.registration import register
 from recon.registration.register import Registration
@@ -35,7 +39,30 @@ class ClassicalPrior:
             return None
         return register.register(graph.keyframes, graph.pairs, self._config.registration)
 
-    def pointmaps(self, graph: ViewGraph, registration: Registration) -> tuple[Pointmap, ...]:
+    def pointmaps(
+        self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
+    ) -> tuple[Pointmap, ...]:
+        views, sparse = self._views(graph, registration)
+        maps = stereo.depth_maps(views, self._config.stereo, seed=self._config.seed, sparse=sparse, pause=pause)
+        return tuple(map(_pointmap, _keyframes(graph, registration), views, maps))
+
+    def further_pointmaps(
+        self, graph: ViewGraph, registration: Registration, known: Mapping[str, Pointmap]
+    ) -> tuple[Pointmap, ...]:
+        views, sparse = self._views(graph, registration)
+        keyframes = _keyframes(graph, registration)
+        depths = {i: known[keyframe.name].depth for i, keyframe in enumerate(keyframes) if keyframe.name in known}
+        found = []
+        for i in (i for i, keyframe in enumerate(keyframes) if keyframe.name not in known):
+            depth_map = stereo.further_depth_map(
+                views, i, depths, self._config.stereo, seed=self._config.seed, sparse=sparse[i]
+            )
+            depths[i] = depth_map.depth
+            found.append(_pointmap(keyframes[i], views[i], depth_map))
+        return tuple(found)
+
+    def _views(self, graph: ViewGraph, registration: Registration) -> tuple[list[stereo.View], list[stereo.Sparse]]:
+        """The registered cameras as stereo wants them, with the points that they see."""
         views, sparse = [], []
         for camera in registration.cameras:
             keyframe = graph.keyframes[camera.index]
@@ -44,19 +71,23 @@ class ClassicalPrior:
             near_far = (near, self._config.far_margin * far)
             views.append(stereo.View(keyframe.image, modelled_K(graph, camera), camera.T_world_camera, near_far))
             sparse.append(points)
-        maps = stereo.depth_maps(views, self._config.stereo, seed=self._config.seed, sparse=sparse)
-        return tuple(
-            Pointmap(
-                name=graph.keyframes[camera.index].name,
-                frame_id=graph.keyframes[camera.index].frame.frame_id,
-                depth=depth_map.depth,
-                confidence=depth_map.confidence,
-                normal=depth_map.normal,
-                T_world_camera=camera.T_world_camera,
-                K=view.K,
-            )
-            for camera, view, depth_map in zip(registration.cameras, views, maps, strict=True)
-        )
+        return views, sparse
+
+
+def _keyframes(graph: ViewGraph, registration: Registration) -> list[Keyframe]:
+    return [graph.keyframes[camera.index] for camera in registration.cameras]
+
+
+def _pointmap(keyframe: Keyframe, view: stereo.View, depth_map: DepthMap) -> Pointmap:
+    return Pointmap(
+        name=keyframe.name,
+        frame_id=keyframe.frame.frame_id,
+        depth=depth_map.depth,
+        confidence=depth_map.confidence,
+        normal=depth_map.normal,
+        T_world_camera=view.T_world_camera,
+        K=view.K,
+    )
 
 
 def load(config: Config) -> ClassicalPrior:

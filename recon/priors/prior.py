@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Protocol
 
 from recon.priors.pointmap import Pointmap
@@ -19,6 +20,17 @@ class Prior(Protocol):
         """Cameras of the keyframes that hang together, with the evidence for them; None when no two do."""
         ...
 
-    def pointmaps(self, graph: ViewGraph, registration: Registration) -> tuple[Pointmap, ...]:
-        """A point map for each registered camera, in the same order and the same world."""
+    def pointmaps(
+        self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = ...
+    ) -> tuple[Pointmap, ...]:
+        """A point map for each registered camera, in the same order and the same world.
+
+        `pause` is called several times a second; it may raise to abandon the work.
+        """
+        ...
+
+    def further_pointmaps(
+        self, graph: ViewGraph, registration: Registration, known: Mapping[str, Pointmap]
+    ) -> tuple[Pointmap, ...]:
+        """Point maps of the registered cameras that `known` (by name, in the same world) does not have, in order."""
         ...

@@ -1,12 +1,12 @@
 """Dense multi-view stereo: a depth, a normal and a confidence for every pixel of views with known cameras.
 
-`depth_maps` does it for a set of views. For a single new keyframe, `choose_sources` names the views to compare it with,
-`estimate` matches it alone and `cross_check` compares it with the others.
+`depth_maps` does it for a set of views, `further_depth_map` for one more beside those that have a map: there
+`choose_sources` names the views to compare it with, and `estimate` matches it alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import cv2
@@ -77,11 +77,17 @@ class Sparse:
 
 
 def depth_maps(
-    views: Sequence[View], config: Config, *, seed: int = 0, sparse: Sequence[Sparse | None] | None = None
+    views: Sequence[View],
+    config: Config,
+    *,
+    seed: int = 0,
+    sparse: Sequence[Sparse | None] | None = None,
+    pause: Callable[[], None] = lambda: None,
 ) -> list[DepthMap]:
     """A depth map for every view, in order. A view that overlaps with no other comes back without any depth.
 
-    The result depends on the arguments only, not on the number of threads.
+    The result depends on the arguments only, not on the number of threads. `pause` is called several times a second;
+    it may raise to abandon the work.
     """
     known_points = list(sparse) if sparse is not None else [None] * len(views)
     if len(known_points) != len(views):
@@ -96,17 +102,41 @@ def depth_maps(
         if not planes:
             planes = [_start(*start) for start in zip(views, at_level, known_points, strict=True)]
         planes = [resized(p, level) for p, level in zip(planes, at_level, strict=True)]
-        planes = [
-            improve(
+        improved = list(planes)
+        for i in (index for index, chosen in enumerate(sources) if chosen):
+            pause()
+            improved[i] = improve(
                 at_level[i], [at_level[j] for j in sources[i]], planes[i], stage.search, config.matching,
                 known={n: planes[j].inverse_depth for n, j in enumerate(sources[i])} if stage.geometric else {},
                 seed=seed, stream=stream,
-            )
-            if sources[i]
-            else planes[i]
-            for i in range(len(views))
-        ]  # fmt: skip
+            )  # fmt: skip
+        planes = improved
     return fusion.cross_check(levels[config.stages[-1].level], planes, config.matching, config.fusion)
+
+
+def further_depth_map(
+    views: Sequence[View],
+    index: int,
+    depths: Mapping[int, Float32],
+    config: Config,
+    *,
+    seed: int = 0,
+    sparse: Sparse | None = None,
+) -> DepthMap:
+    """The depth map of view `index` alone, beside those that have one already.
+
+    `depths` holds the depth maps (h, w), 0 where unknown, of other views by their index. They stay as they are, and
+    the new map is checked against them.
+    """
+    sources = choose_sources(views, index, config, sparse)
+    known = {n: depths[j] for n, j in enumerate(sources) if j in depths}
+    planes = estimate(views[index], [views[j] for j in sources], config, seed=seed, sparse=sparse, known=known)
+    finest = config.stages[-1].level
+    checked = [j for j in depths if j != index]
+    levels = {j: _level(views[j], finest) for j in (index, *checked)}
+    others = [resized(_flat(depths[j]), levels[j]) for j in checked]
+    agreeing = fusion.agreement(levels[index], planes, [levels[j] for j in checked], others, config.fusion)
+    return fusion.depth_map(levels[index], planes, agreeing, config.matching, config.fusion)
 
 
 def estimate(
@@ -122,10 +152,7 @@ def estimate(
 
     `known` gives the depth maps (h, w), 0 where unknown, of the sources with these positions that have one already.
     """
-    known_planes = {
-        n: Planes(np.stack([_inverse(depth), np.zeros_like(depth), np.zeros_like(depth)], -1), np.zeros_like(depth))
-        for n, depth in (known or {}).items()
-    }
+    known_planes = {n: _flat(depth) for n, depth in (known or {}).items()}
     planes: Planes | None = None
     for stream, stage in enumerate(config.stages):
         level, source_levels = _level(view, stage.level), [_level(source, stage.level) for source in sources]
@@ -138,12 +165,6 @@ def estimate(
     if planes is None:
         raise ValueError("config.stages is empty: at least one stage is needed")
     return planes
-
-
-def cross_check(views: Sequence[View], planes: Sequence[Planes], config: Config) -> list[DepthMap]:
-    """The depth maps of all views from their planes, as `estimate` gives them."""
-    levels = [_level(view, config.stages[-1].level) for view in views]
-    return fusion.cross_check(levels, planes, config.matching, config.fusion)
 
 
 def choose_sources(views: Sequence[View], index: int, config: Config, sparse: Sparse | None = None) -> list[int]:
@@ -225,5 +246,7 @@ def _angle_score(view: View, other: View, world: Float64, best_angle_deg: float)
     return np.exp(-0.5 * ((angle - best_angle_deg) / spread) ** 2)
 
 
-def _inverse(depth: Float32) -> Float32:
-    return np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
+def _flat(depth: Float32) -> Planes:
+    """Planes of these depths (h, w), 0 where unknown, that face the camera."""
+    inverse = np.divide(1.0, depth, out=np.zeros_like(depth), where=depth > 0)
+    return Planes(np.stack([inverse, np.zeros_like(depth), np.zeros_like(depth)], -1), np.zeros_like(depth))
