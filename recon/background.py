@@ -65,8 +65,8 @@ def _shell(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]
         relative = pixels / (width, height) - 0.5
         distance = np.where(ahead, np.abs(relative).max(1) - 0.5, np.inf)
         blurred, sees_far = _far_colours(image, pointmap.depth / farthest, 0.04 * max(height, width))
-        column = np.clip(pixels[:, 0], 0, width - 1).astype(int)
-        row = np.clip(pixels[:, 1], 0, height - 1).astype(int)
+        size = np.array([blurred.shape[1], blurred.shape[0]])
+        column, row = np.clip(pixels * (size / (width, height)), 0, size - 1).astype(int).T
         score = np.log(sees_far[row, column]) - 10.0 * distance
         better = score > best
         colours[better], best[better] = blurred[row, column][better], score[better]
@@ -88,15 +88,20 @@ def _shell(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]
 
 def _far_colours(
     image: npt.NDArray[np.uint8], relative_depth: npt.NDArray[np.float32], sigma_px: float
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """(h, w, 3) colours in [0, 1] blurred over far and unknown pixels, and (h, w) the weight of these around a pixel.
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Colours (h', w', 3) in [0, 1] blurred over far and unknown pixels, and the weight (h', w') of these around.
 
-    `relative_depth` is 1 at the farthest known depth and 0 where the depth is unknown.
+    `relative_depth` is 1 at the farthest known depth and 0 where the depth is unknown. The blur leaves nothing finer
+    than a quarter of `sigma_px`, so that is the size of the result's pixels.
     """
-    far = np.where(relative_depth > 0, relative_depth.astype(np.float64) ** 4, 1.0) + 1e-3
-    weight = np.asarray(cv2.GaussianBlur(far, (0, 0), sigma_px), np.float64)
-    blurred = cv2.GaussianBlur(image * far[..., None] / 255.0, (0, 0), sigma_px)
-    return np.asarray(blurred / weight[..., None], np.float64), weight
+    far = np.where(relative_depth > 0, relative_depth**4, np.float32(1)) + np.float32(1e-3)
+    shrink = max(1.0, sigma_px / 4)
+    size = (max(1, round(image.shape[1] / shrink)), max(1, round(image.shape[0] / shrink)))
+    weighted = cv2.resize(image * (far / 255)[..., None], size, interpolation=cv2.INTER_AREA)
+    sigma = sigma_px / shrink
+    weight = cv2.GaussianBlur(cv2.resize(far, size, interpolation=cv2.INTER_AREA), (0, 0), sigma)
+    blurred = cv2.GaussianBlur(weighted, (0, 0), sigma)
+    return np.asarray(blurred / weight[..., None], np.float32), np.asarray(weight, np.float32)
 
 
 def _sphere(spacing_deg: float) -> npt.NDArray[np.float64]:

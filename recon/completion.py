@@ -18,9 +18,11 @@ import numpy.typing as npt
 from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 
-from recon.priors.pointmap import Pointmap, project_points
+from recon.priors import reprojection
+from recon.priors.pointmap import Pointmap
 
 Float32 = npt.NDArray[np.float32]
+Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
 
@@ -36,13 +38,15 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     in_front: float = 0.03  # relative depth by which a filled point may lie before a known one
 
 
-def complete(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config) -> list[Pointmap]:
+def complete(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Config) -> list[Pointmap]:
     """The point maps with their unknown pixels filled or, where that would contradict another view, empty."""
     known = [_only(pointmap, pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
+    # Blurred, so that a pixel's noise and a point's being half a pixel beside it make no difference.
+    calm = [np.asarray(cv2.GaussianBlur(image, (5, 5), 0), np.uint8) for image in images]
     completed = list(known)
     for j in sorted(range(len(known)), key=lambda i: -float(known[i].confidence.mean())):
         rest = [i for i in range(len(known)) if i != j]
-        falls, explained = _seen_by_others(known[j], images[j], [(completed[i], images[i]) for i in rest], config.like)
+        falls, explained = _seen_by_others(known[j], calm[j], [(completed[i], calm[i]) for i in rest], config.like)
         unknown = known[j].depth <= 0
         # Single pixels of another colour are noise and edges; an object that only this view sees is larger.
         object_size = np.ones((config.object_px, config.object_px), np.uint8)
@@ -64,7 +68,7 @@ def complete(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint
 
 
 def _guesses(
-    doubtful: Pointmap, known: Pointmap, image: npt.NDArray[np.uint8], falls: Mask, occluded: Mask, config: Config
+    doubtful: Pointmap, known: Pointmap, image: Image, falls: Mask, occluded: Mask, config: Config
 ) -> Iterator[Pointmap]:
     """What a hole may be filled with, the best first."""
     near, far = np.percentile(known.depth[known.depth > 0], [2.0, 100.0])
@@ -74,7 +78,7 @@ def _guesses(
     yield _only(_facing(known, config.foreground * near), occluded)
 
 
-def smooth_depth(pointmap: Pointmap, image: npt.NDArray[np.uint8], config: Config) -> Float32:
+def smooth_depth(pointmap: Pointmap, image: Image, config: Config) -> Float32:
     """(h, w) the smoothest inverse depth through the known ones that may jump at the image's edges, as a depth."""
     height, width = pointmap.depth.shape
     size = (max(2, width // config.reduction), max(2, height // config.reduction))
@@ -108,38 +112,26 @@ def _only(pointmap: Pointmap, keep: Mask) -> Pointmap:
 
 
 def _seen_by_others(
-    target: Pointmap,
-    image: npt.NDArray[np.uint8],
-    others: Sequence[tuple[Pointmap, npt.NDArray[np.uint8]]],
-    like: float,
+    target: Pointmap, image: Image, others: Sequence[tuple[Pointmap, Image]], like: float
 ) -> tuple[Mask, Mask]:
     """Pixels of the target on which other views' points fall, and those of which one has the pixel's colour.
 
     Small gaps between the points are closed.
     """
-    falls, explained = np.zeros(target.depth.shape, np.uint8), np.zeros(target.depth.shape, np.uint8)
-    wanted = cv2.GaussianBlur(image, (5, 5), 0).reshape(-1, 3).astype(np.int16)
-    for other, other_image in others:
-        known = other.depth > 0
-        pixel, _ = project_points(other.points[known], target)
-        inside = pixel >= 0
-        pixel, colour = pixel[inside], cv2.GaussianBlur(other_image, (5, 5), 0)[known][inside].astype(np.int16)
-        falls.ravel()[pixel] = 1
-        explained.ravel()[pixel[np.abs(wanted[pixel] - colour).max(1) <= 255 * like]] = 1
+    seen = [reprojection.explained(other, other_image, target, image, like) for other, other_image in others]
     kernel = np.ones((5, 5), np.uint8)
-    falls, explained = (cv2.morphologyEx(mask, cv2.MORPH_CLOSE, kernel) for mask in (falls, explained))
-    return falls > 0, explained > 0
+    falls, explained = (
+        cv2.morphologyEx(np.logical_or.reduce(masks).astype(np.uint8), cv2.MORPH_CLOSE, kernel) > 0
+        for masks in zip(*seen, strict=True)
+    )
+    return falls, explained
 
 
 def _hides_known(filled: Pointmap, others: Sequence[Pointmap], in_front: float) -> Mask:
     """Filled pixels whose point lies clearly before a known surface of another view."""
     wrong = np.zeros(filled.depth.shape, bool)
-    candidates = filled.depth > 0
-    points = filled.points[candidates]
     for other in others:
-        pixel, depth = project_points(points, other)
-        known = np.where(pixel >= 0, other.depth.ravel()[np.maximum(pixel, 0)], 0)
-        wrong[candidates] |= (known > 0) & (depth < (1.0 - in_front) * known)
+        wrong |= reprojection.hiding(filled, other, in_front)
     return wrong
 
 

@@ -11,7 +11,8 @@ import torch
 
 from recon.gaussians import SH_C0, Gaussians, concatenate
 from recon.geometry import quat_from_matrix
-from recon.priors.pointmap import Pointmap, project_points
+from recon.priors import reprojection
+from recon.priors.pointmap import Pointmap
 
 Mask = npt.NDArray[np.bool_]
 
@@ -47,26 +48,12 @@ def redundant(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
         covered = np.zeros(target.depth.shape, bool)
         for i, source in enumerate(pointmaps):
             if (score[i], -i) > (score[j], -j):
-                projected, footprint = _project(source, target)
+                projected, footprint = reprojection.nearest(source, target)
                 near = np.abs(projected - target.depth) < config.depth_tolerance * target.depth
                 own = target.depth / target.K[0, 0]
                 covered |= near & (footprint < config.coarser * own)
         masks.append(covered & (target.depth > 0))
     return masks
-
-
-def _project(source: Pointmap, target: Pointmap) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Nearest depth of the source's points in each pixel of the target (infinite where none), and their footprint."""
-    known = source.depth > 0
-    pixel, z = project_points(source.points[known], target)
-    inside = pixel >= 0
-    pixel, z, own = pixel[inside], z[inside], source.depth[known][inside] / np.float32(source.K[0, 0])
-    order = np.argsort(-z)  # the nearest is written last and stays
-    depth = np.full(target.depth.size, np.inf, np.float32)
-    footprint = np.full(target.depth.size, np.inf, np.float32)
-    depth[pixel[order]] = z[order]
-    footprint[pixel[order]] = own[order]
-    return depth.reshape(target.depth.shape), footprint.reshape(target.depth.shape)
 
 
 def gaussians_from_pointmap(

@@ -1,0 +1,87 @@
+"""What the points of one view are in another: where they fall, which is nearest, and what they would hide."""
+
+from __future__ import annotations
+
+import ctypes
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.core import library
+from recon.priors.pointmap import Pointmap
+
+Float32 = npt.NDArray[np.float32]
+Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+
+
+def nearest(source: Pointmap, target: Pointmap) -> tuple[Float32, Float32]:
+    """Of the source's points that fall into each pixel of the target, the nearest: its depth there (h, w), and its
+    footprint, which is its depth in the source over the focal length. Both are infinite where none falls.
+    """
+    depth, footprint = (np.full(target.depth.shape, np.inf, np.float32) for _ in range(2))
+    call = _reprojection(source, target)
+    focal = ctypes.c_float(source.K[0, 0])
+    library().core_reproject_nearest(ctypes.byref(call.native), focal, _pointer(depth), _pointer(footprint))
+    return depth, footprint
+
+
+def explained(
+    source: Pointmap, source_image: Image, target: Pointmap, target_image: Image, like: float
+) -> tuple[Mask, Mask]:
+    """(h, w) pixels of the target on which points of the source fall; (h, w) those of which one has the pixel's colour.
+
+    Colours are alike when no channel differs by more than `like`, in [0, 1]. Images are (h, w, 3).
+    """
+    falls, alike = np.zeros(target.depth.shape, np.uint8), np.zeros(target.depth.shape, np.uint8)
+    call = _reprojection(source, target)
+    images = [np.ascontiguousarray(image) for image in (source_image, target_image)]
+    library().core_reproject_explained(
+        ctypes.byref(call.native), *map(_pointer, images), int(255 * like), _pointer(falls), _pointer(alike)
+    )
+    return falls > 0, alike > 0
+
+
+def hiding(source: Pointmap, target: Pointmap, in_front: float) -> Mask:
+    """(h, w) pixels of the source whose point lies before the target's surface by more than `in_front` of its depth."""
+    marks = np.zeros(source.depth.shape, np.uint8)
+    call = _reprojection(source, target)
+    surface = np.ascontiguousarray(target.depth, np.float32)
+    library().core_reproject_hiding(
+        ctypes.byref(call.native), _pointer(surface), ctypes.c_float(in_front), _pointer(marks)
+    )
+    return marks > 0
+
+
+class _Native(ctypes.Structure):
+    """Reprojection of recon/core/reproject.cpp."""
+
+    _fields_ = [
+        ("depth", ctypes.c_void_p),
+        *((name, ctypes.c_int32) for name in ("width", "height", "target_width", "target_height")),
+        ("A", ctypes.c_float * 9),
+        ("t", ctypes.c_float * 3),
+    ]
+
+
+class _Call:
+    """The structure for one call, and the array that it points to."""
+
+    def __init__(self, depth: Float32, target: Pointmap, A: npt.NDArray[np.float64], t: npt.NDArray[np.float64]):
+        self.depth = depth
+        height, width = depth.shape
+        target_height, target_width = target.depth.shape
+        self.native = _Native(
+            depth.ctypes.data, width, height, target_width, target_height,
+            (ctypes.c_float * 9)(*A.ravel()), (ctypes.c_float * 3)(*t),
+        )  # fmt: skip
+
+
+def _reprojection(source: Pointmap, target: Pointmap) -> _Call:
+    T_target_source = np.linalg.inv(target.T_world_camera) @ source.T_world_camera
+    A = target.K @ T_target_source[:3, :3] @ np.linalg.inv(source.K)
+    return _Call(np.ascontiguousarray(source.depth, np.float32), target, A, target.K @ T_target_source[:3, 3])
+
+
+def _pointer(array: npt.NDArray) -> ctypes.c_void_p:
+    return ctypes.c_void_p(array.ctypes.data)
