@@ -1,63 +1,72 @@
 """Frames in, snapshots of a growing Gaussian scene out: read this first.
 
-`reconstruct` is the one function that the daemon, the offline replay, the tests and the benchmarks call; only the
-iterator of frames differs.
+`reconstruct` is the one function that the offline replay, the tests and the benchmarks call; only the frames differ.
+The daemon (recon/daemon) takes the same steps of `Reconstruction`, in the order in which frames happen to come.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import msgspec
 
 from capture.frame import DroppedFrame, Frame
-from recon import optimize
+from recon import growth, optimize
 from recon.config import Config
 from recon.judge import judge
 from recon.keyframe import Keyframe, modelled_image
 from recon.priors import classical
+from recon.priors.pointmap import Pointmap
 from recon.priors.prior import Prior
 from recon.registration import features
-from recon.scene import Scene, begin, extend
+from recon.registration.register import Registration
+from recon.scene import Scene, begin
 from recon.snapshot import GaussianArrays, Snapshot
 from recon.verdict import Verdict
 from recon.view_graph import ViewGraph
 
 log = logging.getLogger(__name__)
 
+FITS = 0.02  # of the scene's depth: a scene grows while a new estimate moves its cameras by less
+
 
 def reconstruct(frames: Iterable[Frame | DroppedFrame], config: Config) -> Iterator[Snapshot]:
     """Snapshots of the scene while it grows and is refined, the last of them with `final` set.
 
-    Every frame becomes a keyframe of the view graph. Frames from a stream are worked in one at a time: cameras and
-    points are estimated anew, what the scene has already learnt is carried over, and there is a snapshot after each.
-    Frames in a sequence are all at hand and are worked in together. Either way the refinement starts afresh from the
-    last estimate, so that the result depends on which frames there were and not on how they came.
+    Every frame becomes a keyframe of the view graph. Frames from a stream are worked in one at a time: the scene grows
+    by what each adds, and there is a snapshot after each. Frames in a sequence are all at hand and are worked in
+    together. Either way the refinement starts afresh from an estimate of all, so that the result depends on which
+    frames there were and not on how they came.
     A dropped frame is named in the snapshots that follow. A snapshot holds Gaussians only if its verdict is
     publishable.
     """
-    run = _Run(config)
+    work = Reconstruction(config)
     all_at_hand = isinstance(frames, Sequence)
     for frame in frames:
         if isinstance(frame, DroppedFrame):
-            run.dropped.append(frame)
+            work.drop(frame)
             continue
-        run.take(frame)
+        work.take(frame)
         if not all_at_hand:
-            run.estimate()
-            for _ in run.refine(config.preview):
-                pass
-            yield run.snapshot()
+            work.work_in()
+            yield work.snapshot()
+    work.estimate()
+    work.show(work.begun)
     if all_at_hand:
-        run.estimate()
-        yield run.snapshot()
-    run.scene = run.begun
-    for _ in run.refine(config.optimize):
-        yield run.snapshot()
-    yield run.snapshot(final=True)
+        yield work.snapshot()
+    for scene in work.refine(work.begun, config.optimize, work.deadline):
+        work.show(scene)
+        yield work.snapshot()
+    yield work.snapshot(final=True)
+
+
+def prepare(frame: Frame, config: Config) -> Keyframe:
+    """The frame with its features and its image at modelled size. It depends on no other frame."""
+    found = features.extract(frame.image, config.prior.registration.features)
+    return Keyframe(frame, modelled_image(frame.image, config.size), found)
 
 
 @dataclass
@@ -75,77 +84,136 @@ class _Clock:
         self.last = now
 
 
-class _Run:
-    """What lives as long as the stream of frames does."""
+class Reconstruction:
+    """What lives as long as the stream of frames does: keyframes, their cameras and verdict, and the scene."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
         self.clock = _Clock()
         self.graph = ViewGraph(config.prior.registration)
-        self.prior: Prior = classical.load(msgspec.structs.replace(config.prior, seed=config.seed))
         self.dropped: list[DroppedFrame] = []
-        self.verdict: Verdict = judge(self.graph, None, config.judge)
-        self.begun: Scene | None = None  # from the last estimate, not optimised
-        self.scene: Scene | None = None
+        self.begun: Scene | None = None  # from the last estimate of all frames, not optimised
+        self.scene: Scene | None = None  # what is shown
         self.sequence = 0
+        self._prior: Prior = classical.load(msgspec.structs.replace(config.prior, seed=config.seed))
+        self._judged: tuple[Registration | None, Verdict] | None = None  # of the keyframes as they are
+        self._pointmaps: dict[str, Pointmap] = {}  # by keyframe, as they were last computed
 
     @property
     def deadline(self) -> float | None:
         return None if self.config.budget_s is None else self.clock.started + self.config.budget_s
 
+    @property
+    def names(self) -> list[str]:
+        """Of the keyframes, in their order."""
+        return [keyframe.name for keyframe in self.graph.keyframes]
+
+    def drop(self, frame: DroppedFrame) -> None:
+        """Keeps in mind that there was a frame that was left out."""
+        self.dropped.append(frame)
+
     def take(self, frame: Frame) -> None:
-        """The frame as a keyframe of the view graph. Time counts from the first one."""
+        """Adds a frame to the view graph. Time counts from the first one."""
         if not self.graph.keyframes:
             self.clock = _Clock()
         self.clock.lap("wait")
-        found = features.extract(frame.image, self.config.prior.registration.features)
-        self.graph.add(Keyframe(frame, modelled_image(frame.image, self.config.size), found))
+        self.add(prepare(frame, self.config))
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Adds a frame that was prepared elsewhere to the view graph."""
+        self.graph.add(keyframe)
+        self._judged = None
         newest = len(self.graph.keyframes) - 1
         overlapping = sum(newest in pair for pair in self.graph.pairs)
-        log.info("%s: %d features, overlaps %d of %d frames", frame.name, len(found.points), overlapping, newest)
+        num_features = len(keyframe.features.points)
+        log.info("%s: %d features, overlaps %d of %d frames", keyframe.name, num_features, overlapping, newest)
         self.clock.lap("poses")
 
-    def estimate(self) -> None:
-        """Cameras, points and verdict for all keyframes; the scene begun, extended, or given up."""
-        registration = self.prior.register(self.graph)
-        self.verdict = judge(self.graph, registration, self.config.judge)
+    def retract(self, names: Collection[str]) -> None:
+        """Forgets keyframes and what the scene has from them alone. What is shown waits for the next estimate."""
+        self.graph = self.graph.without(names)
+        self._judged = self.begun = None
+        self._pointmaps = {name: pointmap for name, pointmap in self._pointmaps.items() if name not in names}
+        if self.scene is not None:
+            self.scene = growth.without(self.scene, names) if len(self.scene.views) > len(names) else None
+
+    def judge(self) -> tuple[Registration | None, Verdict]:
+        """Cameras of the keyframes and the verdict on them; at once where no keyframe came since the last time."""
+        self.clock.lap("wait")
+        if self._judged is None:
+            registration = self._prior.register(self.graph)
+            self._judged = registration, judge(self.graph, registration, self.config.judge)
         self.clock.lap("poses")
-        if not self.verdict.publishable or registration is None:
-            self.begun = self.scene = None
+        return self._judged
+
+    def work_in(self) -> None:
+        """Shows a scene of all keyframes as soon as possible: grown from the one that is shown, else begun."""
+        if not self.grow():
+            self.estimate()
+            self.show(self.begun)
+        for scene in self.refine(self.scene, self.config.preview):
+            self.show(scene)
+
+    def grow(self) -> bool:
+        """Adds to the shown scene what new keyframes show; False where it has to be begun anew, or given up."""
+        registration, verdict = self.judge()
+        if self.scene is None or registration is None or not verdict.publishable:
+            return False
+        placed = growth.in_world_of(self.scene, registration, self.graph, FITS)
+        known = growth.carried(self._pointmaps, placed, self.graph) if placed else {}
+        if placed is None or any(view.name not in known for view in self.scene.views):
+            return False
+        further = self._prior.further_pointmaps(self.graph, placed, known)
+        self._pointmaps = known | {pointmap.name: pointmap for pointmap in further}
+        self.show(growth.grow(self.scene, self._pointmaps, self.graph, placed, self.config))
+        self.clock.lap("points")
+        return True
+
+    def estimate(self, pause: Callable[[], None] = lambda: None) -> None:
+        """Begins a scene from all keyframes, which is not shown yet; none where the verdict forbids it.
+
+        `pause` is called several times a second; it may raise to abandon the work, and nothing has happened then.
+        """
+        registration, verdict = self.judge()
+        pause()
+        if registration is None or not verdict.publishable:
+            self.begun = None
             return
-        images = {keyframe.name: keyframe.image for keyframe in self.graph.keyframes}
+        pointmaps = self._prior.pointmaps(self.graph, registration, pause)
         config = self.config
         self.begun = begin(
-            self.prior.pointmaps(self.graph, registration),
-            images,
+            pointmaps,
+            {keyframe.name: keyframe.image for keyframe in self.graph.keyframes},
             registration.cameras,
             config.completion,
             config.density,
             config.background,
             config.max_gaussians,
         )
-        grown = extend(self.scene, self.begun) if self.scene is not None else self.begun
-        fits = config.max_gaussians is None or len(grown.gaussians) <= config.max_gaussians
-        self.scene = grown if fits else self.begun
+        self._pointmaps = {pointmap.name: pointmap for pointmap in pointmaps}
         self.clock.lap("points")
 
-    def refine(self, config: optimize.Config) -> Iterator[None]:
-        """Refines the scene, if there is one; stops for a look at every checkpoint and at the end."""
-        if self.scene is None:
+    def refine(self, scene: Scene | None, config: optimize.Config, deadline: float | None = None) -> Iterator[Scene]:
+        """`scene`, if there is one, at every checkpoint of its refinement and at the end."""
+        if scene is None:
             return
         self.clock.lap("wait")
-        for scene in optimize.refine(self.scene, config, seed=self.config.seed, deadline=self.deadline):
-            self.scene = scene
+        for refined in optimize.refine(scene, config, seed=self.config.seed, deadline=deadline):
             self.clock.lap("optimise")
-            yield
+            yield refined
             self.clock.lap("wait")
+
+    def show(self, scene: Scene | None) -> None:
+        """Makes `scene` the one that snapshots show."""
+        self.scene = scene
 
     def snapshot(self, final: bool = False) -> Snapshot:
         self.sequence += 1
-        scene = self.scene
+        _, verdict = self.judge()
+        scene = self.scene if verdict.publishable else None
         snapshot = Snapshot(
             sequence=self.sequence,
-            verdict=self.verdict,
+            verdict=verdict,
             cameras=scene.cameras() if scene else (),
             gaussians=scene.arrays() if scene else GaussianArrays.empty(),
             images={view.name: view.image for view in scene.views} if scene else {},
@@ -154,5 +222,5 @@ class _Run:
             seconds={**self.clock.seconds, "total": time.monotonic() - self.clock.started},
             final=final,
         )
-        log.info("snapshot %d: %s, %d Gaussians", self.sequence, self.verdict.code.value, len(snapshot.gaussians))
+        log.info("snapshot %d: %s, %d Gaussians", self.sequence, verdict.code.value, len(snapshot.gaussians))
         return snapshot
