@@ -118,13 +118,16 @@ def _seen_by_others(
 
     Small gaps between the points are closed.
     """
-    seen = [reprojection.explained(other, other_image, target, image, like) for other, other_image in others]
-    kernel = np.ones((5, 5), np.uint8)
-    falls, explained = (
-        cv2.morphologyEx(np.logical_or.reduce(masks).astype(np.uint8), cv2.MORPH_CLOSE, kernel) > 0
-        for masks in zip(*seen, strict=True)
-    )
-    return falls, explained
+    falls, explained = (np.zeros(target.depth.shape, bool) for _ in range(2))
+    for other, other_image in others:
+        falls_here, explained_here = reprojection.explained(other, other_image, target, image, like)
+        falls |= falls_here
+        explained |= explained_here
+    return _closed(falls), _closed(explained)
+
+
+def _closed(mask: Mask) -> Mask:
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
 
 
 def _hides_known(filled: Pointmap, others: Sequence[Pointmap], in_front: float) -> Mask:
