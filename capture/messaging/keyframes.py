@@ -1,0 +1,305 @@
+"""Key frames from capture to recon, none of which is lost once it is offered.
+
+    capture                                      recon
+      offer: to the spool on disk     <------    Ready(capacity, holding): at start and every half second
+      send while there is capacity    ------>    receive: each frame once
+                                                 checkpoint
+      remove from the spool           <------    Acknowledge(session, sequence)
+
+Whatever dies in between: a frame that is not acknowledged lies in the spool and is sent to the next connection that
+says it is ready and does not hold it. One that was acknowledged is known to recon's checkpoint; should it come again,
+because capture died before it could remove it, it is acknowledged again and not delivered.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import msgspec
+import zmq
+
+from capture.frame import DroppedFrame, Frame, Intrinsics
+from capture.messaging.network import REQUEST_LIMITS, Endpoint, Network
+from capture.messaging.services import CAPTURE_KEYFRAMES
+from capture.messaging.spool import Key, Spool
+from capture.messaging.wire import (
+    Header,
+    Message,
+    Numbering,
+    Part,
+    Sequential,
+    SessionId,
+    WireError,
+    decode,
+    encode,
+)
+
+log = logging.getLogger(__name__)
+
+READY_EVERY_S = 0.5
+FORGET_CLIENT_S = 20.0  # one that is silent so long is gone
+REMEMBERED = 10_000  # acknowledged frames that recon knows again
+_LONGEST_NAME = 255
+
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=_LONGEST_NAME)]
+Text = Annotated[str, msgspec.Meta(max_length=1000)]
+
+
+class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="frame"):
+    """A Frame; its image is the only array."""
+
+    frame_id: Sequential
+    name: Name
+    stamp_ns: Sequential
+    intrinsics: Intrinsics | None
+
+
+class DroppedHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="dropped"):
+    """A DroppedFrame: that an image was left out is told like an image."""
+
+    name: Name
+    reason: Text
+
+
+class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="ready"):
+    """The sender takes frames until it has `capacity` that are not acknowledged; `holding` it has received already."""
+
+    capacity: Annotated[int, msgspec.Meta(ge=0, le=64)]
+    holding: Annotated[list[tuple[SessionId, Sequential]], msgspec.Meta(max_length=64)]
+
+
+class Acknowledge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="acknowledge"):
+    """The sender keeps this frame from now on."""
+
+    session: SessionId
+    sequence: Sequential
+
+
+@dataclass
+class _Client:
+    """What is known about one connection; what was sent over it arrives, or the connection ends."""
+
+    capacity: int = 0
+    outstanding: set[Key] = field(default_factory=set)  # sent or held, not acknowledged
+    heard: float = 0.0
+
+
+class KeyframeServer(Endpoint):
+    """Capture's end."""
+
+    def __init__(self, network: Network, spool: Spool) -> None:
+        """Raises AlreadyRunning where another process offers key frames."""
+        super().__init__(network, offers=CAPTURE_KEYFRAMES)
+        self.spool = spool
+        self.numbering = Numbering()
+        self.refused = 0  # malformed requests
+        self.acknowledged = 0
+        self._clients: dict[bytes, _Client] = {}
+        self._router = self._bind(CAPTURE_KEYFRAMES, zmq.ROUTER, queue=64)
+        self._router.router_mandatory = True  # a connection that is gone says so
+
+    @property
+    def queued(self) -> int:
+        """Frames that nobody has acknowledged."""
+        return len(self.spool)
+
+    @property
+    def connected(self) -> bool:
+        return bool(self._clients)
+
+    def offer(self, frame: Frame | DroppedFrame) -> Key:
+        """Takes the frame over: on the disk when this returns. Raises SpoolFull, OSError, WireError (too large)."""
+        message = _message(frame, self.numbering)
+        size = sum(memoryview(part).nbytes for part in message)
+        if size > self.network.limits.total_bytes:
+            raise WireError(f"{frame.name}: {size >> 20} MB; network.max_message_mb allows less")
+        key = Key(self.numbering.session, self.numbering.sequence - 1)
+        self.spool.put(key, message)
+        self._send_due()
+        return key
+
+    def serve(self, timeout_s: float) -> None:
+        """Answers what came, waiting at most `timeout_s` for the first."""
+        if self._router.poll(max(0, math.ceil(timeout_s * 1000))):
+            for _ in range(1000):
+                try:
+                    identity, *parts = self._router.recv_multipart(zmq.NOBLOCK)
+                except zmq.Again:
+                    break
+                self._answer(identity, parts)
+        now = time.monotonic()
+        self._clients = {name: client for name, client in self._clients.items() if now - client.heard < FORGET_CLIENT_S}
+        self._send_due()
+
+    def _answer(self, identity: bytes, parts: list[bytes]) -> None:
+        try:
+            request = decode(parts, Ready | Acknowledge, REQUEST_LIMITS).header
+        except WireError:
+            self.refused += 1
+            return
+        client = self._clients.setdefault(identity, _Client())
+        client.heard = time.monotonic()
+        if isinstance(request, Ready):
+            client.capacity = request.capacity
+            client.outstanding |= {key for pair in request.holding if (key := Key(*pair)) in self.spool}
+            return
+        key = Key(request.session, request.sequence)
+        if key in self.spool:
+            self.spool.remove(key)
+            self.acknowledged += 1
+        for each in self._clients.values():
+            each.outstanding.discard(key)
+
+    def _send_due(self) -> None:
+        for identity, client in tuple(self._clients.items()):
+            for key in self.spool:
+                if len(client.outstanding) >= client.capacity:
+                    break
+                if key not in client.outstanding and not self._send(identity, client, key):
+                    break
+
+    def _send(self, identity: bytes, client: _Client, key: Key) -> bool:
+        """False where this client cannot take more now."""
+        try:
+            parts = self.spool.get(key)
+        except (OSError, ValueError) as error:
+            log.error("a key frame is lost on the disk: %s", error)
+            self.spool.set_aside(key)
+            return True
+        try:
+            self._router.send_multipart([identity, *parts], zmq.NOBLOCK, copy=False)
+        except zmq.Again:
+            return False
+        except zmq.ZMQError:  # host unreachable: the connection is gone
+            del self._clients[identity]
+            return False
+        client.outstanding.add(key)
+        return True
+
+
+@dataclass(frozen=True)
+class ReceivedFrame:
+    session: str
+    sequence: int
+    frame: Frame | DroppedFrame
+
+    @property
+    def key(self) -> Key:
+        return Key(self.session, self.sequence)
+
+
+class KeyframeClient(Endpoint):
+    """Recon's end."""
+
+    def __init__(self, network: Network, seen: Iterable[tuple[str, int]] = (), capacity: int = 4) -> None:
+        """`seen`: what the checkpoint holds. `capacity`: frames that may be here without being acknowledged."""
+        super().__init__(network)
+        self.capacity = capacity
+        self.refused = 0  # malformed messages
+        self.duplicates = 0
+        self._held: dict[Key, None] = {}  # delivered, not acknowledged
+        self._seen: dict[Key, None] = dict.fromkeys(Key(*pair) for pair in seen)
+        self._received: deque[ReceivedFrame] = deque()
+        self._ready_said = -math.inf
+        self._dealer = self._connect(CAPTURE_KEYFRAMES, zmq.DEALER, queue=64)
+
+    def receive(self, timeout_s: float) -> ReceivedFrame | None:
+        """The next frame, oldest first, each once; None where none comes in `timeout_s`. Raises NotAllowed."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            self._check_links()
+            self._say_ready()
+            self._take_in()
+            if self._received:
+                return self._received.popleft()
+            remaining = deadline - time.monotonic()
+            if remaining <= 0:
+                return None
+            self._dealer.poll(math.ceil(1000 * min(remaining, READY_EVERY_S)))
+
+    def acknowledge(self, received: ReceivedFrame) -> None:
+        """To be called when the frame would survive the death of this process, and not before."""
+        self._held.pop(received.key, None)
+        self._seen[received.key] = None
+        while len(self._seen) > REMEMBERED:
+            del self._seen[next(iter(self._seen))]
+        self._say_acknowledged(received.key)
+
+    def _take_in(self) -> None:
+        for _ in range(self.capacity + 1):
+            try:
+                parts = self._dealer.recv_multipart(zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                return
+            try:
+                received = _received(decode(parts, FrameHeader | DroppedHeader, self.network.limits))
+            except WireError as error:
+                self.refused += 1
+                log.warning("refused a key frame: %s", error)
+                continue
+            if received.key in self._seen:
+                self.duplicates += 1
+                self._say_acknowledged(received.key)
+            elif received.key not in self._held:
+                self._held[received.key] = None
+                self._received.append(received)
+
+    def _say_ready(self) -> None:
+        if time.monotonic() - self._ready_said < READY_EVERY_S:
+            return
+        self._ready_said = time.monotonic()
+        self._say(Ready(self.capacity, [(key.session, key.sequence) for key in self._held]))
+
+    def _say_acknowledged(self, key: Key) -> None:
+        self._say(Acknowledge(*key))
+
+    def _say(self, request: Ready | Acknowledge) -> None:
+        """An acknowledgement that cannot be sent is no loss: the frame comes again and is known."""
+        try:
+            self._dealer.send_multipart(encode(request), zmq.NOBLOCK)
+        except zmq.Again:
+            log.debug("capture is not there")
+
+
+def _message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
+    name = frame.name[-_LONGEST_NAME:]
+    if isinstance(frame, DroppedFrame):
+        return encode(DroppedHeader(**numbering.next(), name=name, reason=frame.reason[:1000]))
+    header = FrameHeader(
+        **numbering.next(),
+        frame_id=frame.frame_id,
+        name=name,
+        stamp_ns=frame.stamp_ns,
+        intrinsics=frame.intrinsics,
+    )
+    return encode(header, [frame.image])
+
+
+def _received(message: Message) -> ReceivedFrame:
+    header = message.header
+    if isinstance(header, DroppedHeader):
+        if message.arrays:
+            raise WireError("a dropped frame has no image")
+        return ReceivedFrame(header.session, header.sequence, DroppedFrame(header.name, header.reason))
+    if len(message.arrays) != 1 or min(message.arrays[0].shape, default=0) < 1:
+        raise WireError("a frame has one image")
+    _check_intrinsics(header.intrinsics)
+    try:
+        frame = Frame(header.frame_id, header.name, header.stamp_ns, message.arrays[0], header.intrinsics)
+    except ValueError as error:
+        raise WireError(str(error)) from error
+    return ReceivedFrame(header.session, header.sequence, frame)
+
+
+def _check_intrinsics(intrinsics: Intrinsics | None) -> None:
+    if intrinsics is None:
+        return
+    lens = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, *intrinsics.distortion)
+    if min(intrinsics.width, intrinsics.height, intrinsics.fx, intrinsics.fy) <= 0 or not all(map(math.isfinite, lens)):
+        raise WireError(f"these are no intrinsics: {intrinsics}")

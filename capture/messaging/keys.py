@@ -1,0 +1,105 @@
+"""CURVE keys: who this machine is, whom it lets in, and whom it expects to meet.
+
+A folder holds `secret.key` (0600) and `public.key` of this machine, `allowed/NAME.key` with the public keys of other
+machines that may connect here, and, where this machine connects to another one, that one's public key as `server.key`.
+Processes on one machine share the folder; its own key is always let in. A key is 40 characters of Z85 text.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import zmq
+
+log = logging.getLogger(__name__)
+
+SECRET, PUBLIC, SERVER, ALLOWED = "secret.key", "public.key", "server.key", "allowed"
+_Z85 = re.compile(rb"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
+
+
+class KeyFileError(PermissionError):
+    """The keys cannot be used; the text names the file and what to do."""
+
+
+@dataclass(frozen=True)
+class Keys:
+    public: bytes
+    secret: bytes
+    server: bytes  # of the machine whose services are connected to
+
+
+def create_keys(folder: Path) -> bytes:
+    """A new pair in `folder`, whose public key is returned. Raises KeyFileError where there is one already."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    (folder / ALLOWED).mkdir(mode=0o700, exist_ok=True)
+    public, secret = zmq.curve_keypair()
+    try:
+        descriptor = os.open(folder / SECRET, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    except FileExistsError as error:
+        raise KeyFileError(f"{folder / SECRET} is there already; remove it to replace this machine's keys") from error
+    with open(descriptor, "wb") as file:
+        file.write(secret + b"\n")
+    (folder / PUBLIC).write_bytes(public + b"\n")
+    return public
+
+
+def allow(folder: Path, name: str, public: bytes) -> None:
+    """Lets the machine `name` connect, at once: the list is read at each handshake."""
+    if not re.fullmatch(r"[\w.-]{1,64}", name) or name.startswith("."):
+        raise ValueError(f"a machine's name has letters, digits, - and _, got {name!r}")
+    (folder / ALLOWED).mkdir(mode=0o700, parents=True, exist_ok=True)
+    (folder / ALLOWED / f"{name}.key").write_bytes(checked_key(public, name) + b"\n")
+
+
+def expect_server(folder: Path, public: bytes) -> None:
+    """Connects to services of the machine with this key, and to no other."""
+    (folder / SERVER).write_bytes(checked_key(public, SERVER) + b"\n")
+
+
+def read_keys(folder: Path) -> Keys:
+    """Raises KeyFileError where a key is missing, damaged, or the secret is readable by others."""
+    secret_file = folder / SECRET
+    secret = _read_key(secret_file)
+    if secret_file.stat().st_mode & 0o077:
+        raise KeyFileError(f"{secret_file} can be read by other users. Run: chmod 600 {secret_file}")
+    public = _read_key(folder / PUBLIC)
+    return Keys(public, secret, _read_key(folder / SERVER) if (folder / SERVER).exists() else public)
+
+
+def checked_key(text: bytes, where: object) -> bytes:
+    key = text.strip()
+    if not _Z85.fullmatch(key):
+        raise KeyFileError(f"{where}: expected a key of 40 characters, got {len(key)} bytes. Run: splatnode keys")
+    return key
+
+
+def _read_key(path: Path) -> bytes:
+    try:
+        return checked_key(path.read_bytes(), path)
+    except FileNotFoundError as error:
+        raise KeyFileError(f"no key {path}. Run: splatnode keys {path.parent}") from error
+
+
+class AllowList:
+    """Says at each handshake whether a key may connect; the interface is pyzmq's credentials provider."""
+
+    def __init__(self, folder: Path, own: bytes) -> None:
+        self.folder = folder
+        self.own = own
+
+    def callback(self, domain: str, key: bytes) -> bool:
+        try:
+            allowed = key == self.own or key in self._listed()
+        except OSError as error:
+            log.error("cannot read whom to let in, so nobody is: %s", error)
+            return False
+        if not allowed:
+            log.warning("refused a connection: key %s is not in %s", key.decode("ascii", "replace"), self.folder)
+        return allowed
+
+    def _listed(self) -> set[bytes]:
+        return {path.read_bytes().strip() for path in self.folder.glob("*.key")}

@@ -1,0 +1,248 @@
+"""Where services are and how their sockets are opened: ipc in a private folder, or tcp with CURVE keys.
+
+Measured pitfalls this file is built on: a second bind on an ipc path succeeds and steals it, hence the lock; a queue
+to nobody blocks for ever without a timeout; a pending message keeps a process from ending without LINGER; a plain tcp
+socket hands raw bytes of anybody to the application, hence no tcp without CURVE.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import logging
+import os
+import stat
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import zmq
+from zmq.utils.monitor import recv_monitor_message
+
+from capture.messaging import wire
+from capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
+from capture.messaging.services import Service
+
+log = logging.getLogger(__name__)
+
+REQUEST_BYTES = 64 << 10  # no request, acknowledgement or subscription is larger
+REQUEST_LIMITS = wire.Limits(header_bytes=REQUEST_BYTES, arrays=0, total_bytes=2 * REQUEST_BYTES)
+_ZAP_DOMAIN = "splatnode"
+_MOST_FAILED_HANDSHAKES = 5  # one may fail because the other process was just ending
+_LONGEST_IPC_PATH = 107  # sun_path, see unix(7)
+
+
+class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    # Of the ipc sockets and the locks. None: $RUNTIME_DIRECTORY, else $XDG_RUNTIME_DIR/splatnode, else under /tmp.
+    directory: Path | None = None
+    tcp: str | None = None  # the address to bind or connect to, instead of ipc; needs keys
+    keys: Path | None = None  # the folder that `splatnode keys` made
+    first_port: Annotated[int, msgspec.Meta(ge=1, le=65500)] = 47310
+    max_message_mb: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 256
+
+    @property
+    def limits(self) -> wire.Limits:
+        return wire.Limits(total_bytes=self.max_message_mb << 20)
+
+
+class NetworkError(PermissionError):
+    """The network cannot be used as configured; the text says what to do."""
+
+
+class AlreadyRunning(RuntimeError):
+    """Another process offers this service."""
+
+    exit_code = 75
+
+    def __init__(self, service: Service, pid: int | None) -> None:
+        who = f"process {pid}" if pid else "another process"
+        super().__init__(f"{service.name} is offered by {who} already; stop it, or give another network.directory")
+        self.pid = pid
+
+
+class NotAllowed(PermissionError):
+    """The other machine does not let this one in, or is not the one that was expected."""
+
+
+class Endpoint:
+    """Sockets with all that they need; closes everything it opened. Subclasses say what is spoken.
+
+    One that offers a service holds its lock until the last socket is gone: libzmq removes an ipc path only then.
+    """
+
+    def __init__(self, network: Network, offers: Service | None = None) -> None:
+        """Raises AlreadyRunning, NetworkError, KeyFileError."""
+        self.network = network
+        self._resources = contextlib.ExitStack()
+        with self._closed_on_error():
+            self._keys = _curve_keys(network)
+            self._links: list[_Link] = []
+            if offers is not None:
+                self._resources.enter_context(_service_lock(runtime_directory(network), offers))
+            self._context = zmq.Context()
+            self._resources.callback(self._context.term)
+            if offers is not None and self._keys is not None:
+                self._resources.enter_context(_authenticator(self._context, network, self._keys))
+
+    def close(self) -> None:
+        self._resources.close()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _bind(self, service: Service, kind: int, *, queue: int) -> zmq.Socket:
+        """Raises AlreadyRunning, NetworkError, OSError."""
+        with self._closed_on_error():
+            socket = self._socket(kind, queue, largest=REQUEST_BYTES)
+            if self._keys is not None:
+                socket.curve_server, socket.curve_secretkey = True, self._keys.secret
+                socket.zap_domain = _ZAP_DOMAIN.encode()
+            address = _address(self.network, service)
+            if address.startswith("ipc://"):  # the lock is ours: what lies there is a dead process's
+                Path(address.removeprefix("ipc://")).unlink(missing_ok=True)
+            try:
+                socket.bind(address)
+            except zmq.ZMQError as error:
+                if error.errno == errno.EADDRINUSE:
+                    raise AlreadyRunning(service, None) from error
+                raise OSError(error.errno, f"cannot offer {service.name} at {address}: {error.strerror}") from error
+            return socket
+
+    def _connect(self, service: Service, kind: int, *, queue: int) -> zmq.Socket:
+        """Succeeds whether or not somebody offers the service: it may come later, and go, and come back."""
+        with self._closed_on_error():
+            socket = self._socket(kind, queue, largest=self.network.max_message_mb << 20)
+            if self._keys is not None:
+                socket.curve_publickey, socket.curve_secretkey = self._keys.public, self._keys.secret
+                socket.curve_serverkey = self._keys.server
+            if kind == zmq.SUB:
+                socket.subscribe(b"")
+            if kind == zmq.DEALER:
+                socket.immediate = True  # what is meant for a process that is not there is not kept for a later one
+            if self._keys is not None:
+                self._links.append(_Link(self._resources, socket, _address(self.network, service)))
+            socket.connect(_address(self.network, service))
+            return socket
+
+    def _check_links(self) -> None:
+        """Raises NotAllowed."""
+        for link in self._links:
+            link.check()
+
+    @contextlib.contextmanager
+    def _closed_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self.close()
+            raise
+
+    def _socket(self, kind: int, queue: int, largest: int) -> zmq.Socket:
+        socket = self._resources.enter_context(self._context.socket(kind))
+        socket.linger = 0
+        socket.sndhwm = socket.rcvhwm = queue
+        socket.maxmsgsize = largest
+        socket.reconnect_ivl, socket.reconnect_ivl_max = 100, 1000
+        socket.handshake_ivl = 5000
+        if self.network.tcp is not None:  # a dead link is noticed, on both ends
+            socket.heartbeat_ivl, socket.heartbeat_timeout = 1000, 4000
+        return socket
+
+
+class _Link:
+    """What libzmq tells about the handshakes of a connecting socket."""
+
+    def __init__(self, resources: contextlib.ExitStack, socket: zmq.Socket, address: str) -> None:
+        self._address = address
+        self._failures = 0  # in a row
+        self._monitor = socket.get_monitor_socket(
+            zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_HANDSHAKE_FAILED_AUTH | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
+        )
+        resources.callback(self._monitor.close, linger=0)
+        resources.callback(socket.disable_monitor)
+
+    def check(self) -> None:
+        while self._monitor.poll(0):
+            event = recv_monitor_message(self._monitor)["event"]
+            if event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
+                raise NotAllowed(f"{self._address} does not let this machine in. Run there: splatnode keys --allow")
+            self._failures = 0 if event == zmq.EVENT_HANDSHAKE_SUCCEEDED else self._failures + 1
+        if self._failures >= _MOST_FAILED_HANDSHAKES:
+            raise NotAllowed(f"{self._address} does not have the key that server.key in network.keys expects of it")
+
+
+def runtime_directory(network: Network) -> Path:
+    """The private folder of sockets and locks, made where it is absent. Raises NetworkError where it is not private."""
+    directory = network.directory or _default_directory()
+    directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+    found = directory.stat()
+    if found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o077:
+        raise NetworkError(
+            f"{directory} must belong to this user and to nobody else (mode 0700), got mode "
+            f"{stat.S_IMODE(found.st_mode):04o} of user {found.st_uid}. Run: chmod 700 {directory}"
+        )
+    return directory
+
+
+def _default_directory() -> Path:
+    if os.environ.get("RUNTIME_DIRECTORY"):
+        return Path(os.environ["RUNTIME_DIRECTORY"].split(":")[0])
+    if os.environ.get("XDG_RUNTIME_DIR"):
+        return Path(os.environ["XDG_RUNTIME_DIR"], "splatnode")
+    return Path(tempfile.gettempdir(), f"splatnode-{os.getuid()}")
+
+
+def _address(network: Network, service: Service) -> str:
+    if network.tcp is not None:
+        host = f"[{network.tcp}]" if ":" in network.tcp else network.tcp
+        return f"tcp://{host}:{network.first_port + service.tcp_port}"
+    path = runtime_directory(network) / service.name
+    if len(os.fsencode(path)) > _LONGEST_IPC_PATH:
+        raise NetworkError(f"{path} is too long for a socket (at most {_LONGEST_IPC_PATH} bytes); shorten the folder")
+    return f"ipc://{path}"
+
+
+def _curve_keys(network: Network) -> Keys | None:
+    if network.tcp is None:
+        return None
+    if network.keys is None:
+        raise NetworkError("network.tcp needs network.keys, or anybody could speak. Run: splatnode keys FOLDER")
+    return read_keys(network.keys)
+
+
+@contextlib.contextmanager
+def _service_lock(directory: Path, service: Service) -> Iterator[None]:
+    """Held as long as this process offers the service; the kernel lets go of it when the process dies."""
+    with open(directory / f"{service.name}.lock", "a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            file.seek(0)
+            pid = file.read(32).strip()
+            raise AlreadyRunning(service, int(pid) if pid.isdecimal() else None) from error
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        yield
+
+
+@contextlib.contextmanager
+def _authenticator(context: zmq.Context, network: Network, keys: Keys) -> Iterator[None]:
+    """Answers libzmq's question, at each handshake, whether a key may connect (ZAP, RFC 27), in its own thread."""
+    from zmq.auth.thread import ThreadAuthenticator  # brings asyncio, which ipc does not need
+
+    if network.keys is None:
+        raise AssertionError("keys were read from network.keys")
+    authenticator = ThreadAuthenticator(context)
+    authenticator.start()
+    try:
+        authenticator.configure_curve_callback(_ZAP_DOMAIN, AllowList(network.keys / ALLOWED, keys.public))
+        yield
+    finally:
+        authenticator.stop()

@@ -1,0 +1,155 @@
+"""Key frames on disk until somebody else holds them: bounded, oldest first, whole or not there.
+
+A file is the message as it goes over the wire, with a checksum. Its name gives the order, which is kept from one
+process to the next: what a killed process left is delivered before what its successor adds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import logging
+import os
+import struct
+import zlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import msgspec
+
+from capture.durable import write_whole
+from capture.messaging.wire import Part
+
+log = logging.getLogger(__name__)
+
+_HEAD = struct.Struct("<8sIQI")  # magic, sequence, bytes of the body, its CRC-32
+_MAGIC = b"SPLSPOOL"
+_SIZE = struct.Struct("<Q")
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    # None: $STATE_DIRECTORY, else $XDG_STATE_HOME/splatnode, else ~/.local/state/splatnode
+    directory: Path | None = None
+    max_frames: Annotated[int, msgspec.Meta(ge=1)] = 200
+    max_mb: Annotated[int, msgspec.Meta(ge=1)] = 1024
+
+
+class SpoolFull(RuntimeError):
+    """The bound, or the disk, is reached: no key frame can be taken until one is acknowledged."""
+
+
+class Key(NamedTuple):
+    """What names a key frame for ever."""
+
+    session: str
+    sequence: int
+
+
+class Spool:
+    """Survives its process: what was put in is there until it is removed. One process at a time uses a directory."""
+
+    def __init__(self, config: Config) -> None:
+        """Takes over what lies in the directory; what is damaged is put aside. Raises OSError."""
+        self.config = config
+        self.directory = (config.directory or _default_directory()) / "spool"
+        self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._files: dict[Key, Path] = {}  # oldest first
+        self._bytes: dict[Key, int] = {}
+        for leftover in self.directory.glob(".*.tmp"):
+            leftover.unlink()
+        for path in sorted(self.directory.glob("*.frame")):
+            self._take_over(path)
+        self._number = max((int(path.stem.split("-")[0]) for path in self._files.values()), default=-1) + 1
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def __iter__(self) -> Iterator[Key]:
+        """Oldest first."""
+        return iter(tuple(self._files))
+
+    def __contains__(self, key: object) -> bool:
+        return key in self._files
+
+    @property
+    def size_bytes(self) -> int:
+        return sum(self._bytes.values())
+
+    def put(self, key: Key, parts: Sequence[Part]) -> None:
+        """Returns when the message is on the disk. Raises SpoolFull; OSError where the disk fails otherwise."""
+        body = [piece for part in parts for piece in (_SIZE.pack(memoryview(part).nbytes), part)]
+        size = sum(memoryview(piece).nbytes for piece in body)
+        self._make_sure_of_room(size)
+        checksum = 0
+        for piece in body:
+            checksum = zlib.crc32(piece, checksum)
+        path = self.directory / f"{self._number:012d}-{key.session}-{key.sequence}.frame"
+        try:
+            write_whole(path, [_HEAD.pack(_MAGIC, len(parts), size, checksum), *body])
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise SpoolFull(f"no space left for key frames in {self.directory}: {error.strerror}") from error
+            raise
+        self._files[key], self._bytes[key] = path, size
+        self._number += 1
+
+    def get(self, key: Key) -> list[Part]:
+        """The parts as they were put in. Raises OSError or ValueError where the disk has lost them."""
+        return _read(self._files[key])
+
+    def remove(self, key: Key) -> None:
+        """Somebody else holds it now. Nothing happens where it is gone already."""
+        path = self._files.pop(key, None)
+        self._bytes.pop(key, None)
+        if path is not None:
+            path.unlink(missing_ok=True)
+
+    def set_aside(self, key: Key) -> None:
+        """Keeps a message that cannot be delivered out of the way of the others, for a human to look at."""
+        path = self._files.pop(key)
+        self._bytes.pop(key)
+        with contextlib.suppress(OSError):
+            path.rename(path.with_suffix(".damaged"))
+
+    def _make_sure_of_room(self, size: int) -> None:
+        if len(self) >= self.config.max_frames or self.size_bytes + size > self.config.max_mb << 20:
+            raise SpoolFull(
+                f"{len(self)} key frames ({self.size_bytes >> 20} MB) wait in {self.directory}, which is the bound; "
+                "is splatnode recon running?"
+            )
+
+    def _take_over(self, path: Path) -> None:
+        try:
+            _, session, sequence = path.stem.split("-")
+            key = Key(session, int(sequence))
+            _read(path)
+        except (OSError, ValueError) as error:
+            log.error("put aside a damaged key frame: %s", error)
+            with contextlib.suppress(OSError):
+                path.rename(path.with_suffix(".damaged"))
+        else:
+            self._files[key], self._bytes[key] = path, path.stat().st_size
+
+
+def _read(path: Path) -> list[Part]:
+    content = memoryview(path.read_bytes())
+    if len(content) < _HEAD.size:
+        raise ValueError(f"{path} is no spooled message")
+    magic, count, size, checksum = _HEAD.unpack_from(content)
+    body = content[_HEAD.size :]
+    if magic != _MAGIC or len(body) != size or zlib.crc32(body) != checksum:
+        raise ValueError(f"{path} is damaged")
+    parts: list[Part] = []
+    position = 0
+    for _ in range(count):
+        (length,) = _SIZE.unpack_from(body, position)
+        parts.append(body[position + _SIZE.size : position + _SIZE.size + length])
+        position += _SIZE.size + length
+    return parts
+
+
+def _default_directory() -> Path:
+    if os.environ.get("STATE_DIRECTORY"):
+        return Path(os.environ["STATE_DIRECTORY"].split(":")[0])
+    return Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state").expanduser() / "splatnode"

@@ -1,0 +1,142 @@
+"""A whole state, of which the newest counts, also for those who come late: the scene for the viewers.
+
+It is published whenever it changes. Whoever has just subscribed, or has heard nothing for a while, asks for it and says
+what it has; the answer is the state, or nothing where that is the newest.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+import numpy.typing as npt
+import zmq
+
+from capture.messaging.network import REQUEST_LIMITS, Endpoint, Network
+from capture.messaging.services import Service
+from capture.messaging.wire import Message, Part, Sequential, SessionId, WireError, decode, encode
+
+ASK_EVERY_S = 1.0
+
+
+class Want(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="want"):
+    """The newest state, unless it is this one."""
+
+    session: SessionId | None
+    sequence: Sequential
+
+
+class StateServer(Endpoint):
+    """Offers `service`. Raises AlreadyRunning where somebody does."""
+
+    def __init__(self, service: Service, network: Network) -> None:
+        super().__init__(network, offers=service)
+        self.refused = 0  # malformed requests
+        self._newest: tuple[tuple[str, int], list[Part]] | None = None
+        self._publisher = self._bind(service, zmq.PUB, queue=4)
+        self._router = self._bind(service.requests, zmq.ROUTER, queue=2)
+
+    def publish(self, header: Any, arrays: Sequence[npt.NDArray] = ()) -> None:
+        """Sends a state (its header is a wire.Header) and keeps it. The arrays must not be written to afterwards."""
+        parts = encode(header, arrays)
+        self._newest = (header.session, header.sequence), parts
+        with contextlib.suppress(zmq.Again):
+            self._publisher.send_multipart(parts, zmq.NOBLOCK, copy=False)
+
+    def serve(self, timeout_s: float) -> None:
+        """Answers those who ask, waiting at most `timeout_s` for the first. To be called several times a second."""
+        if not self._router.poll(max(0, math.ceil(timeout_s * 1000))):
+            return
+        wanted: dict[bytes, Want] = {}  # one answer to each, however often it asks
+        for _ in range(1000):
+            try:
+                identity, *parts = self._router.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                break
+            try:
+                wanted[identity] = decode(parts, Want, REQUEST_LIMITS).header
+            except WireError:
+                self.refused += 1
+        for identity, want in wanted.items():
+            if self._newest is not None and self._newest[0] != (want.session, want.sequence):
+                with contextlib.suppress(zmq.Again):  # it has not taken the last answer yet
+                    self._router.send_multipart([identity, *self._newest[1]], zmq.NOBLOCK, copy=False)
+
+
+class StateClient(Endpoint):
+    """Hears `service`, whether it is there already or comes later."""
+
+    def __init__(self, service: Service, network: Network, schema: Any) -> None:
+        super().__init__(network)
+        self.schema = schema
+        self.refused = 0  # malformed
+        self._session: str | None = None
+        self._sequence = 0
+        self._ended: deque[str] = deque(maxlen=16)  # sessions that gave way to another: late messages of theirs are old
+        self._heard = self._asked = -math.inf
+        self._subscriber = self._connect(service, zmq.SUB, queue=4)
+        self._dealer = self._connect(service.requests, zmq.DEALER, queue=2)
+        self._poller = zmq.Poller()
+        self._poller.register(self._subscriber, zmq.POLLIN)
+        self._poller.register(self._dealer, zmq.POLLIN)
+
+    @property
+    def age_s(self) -> float:
+        """Seconds since a state came; infinite before the first."""
+        return time.monotonic() - self._heard
+
+    def poll(self, timeout_s: float) -> Message[Any] | None:
+        """A state that is newer than the last one given; None where none comes within `timeout_s`.
+
+        A header with another session than before is a restarted sender's: it knows nothing of what was before.
+        Raises NotAllowed.
+        """
+        deadline = time.monotonic() + timeout_s
+        while True:
+            newest = self._drain(self._subscriber) or self._drain(self._dealer)
+            if newest is not None:
+                return newest
+            self._check_links()
+            self._ask()
+            remaining = deadline - time.monotonic()
+            if remaining <= 0:
+                return None
+            self._poller.poll(math.ceil(1000 * min(remaining, ASK_EVERY_S / 4)))
+
+    def _ask(self) -> None:
+        if min(self.age_s, time.monotonic() - self._asked) < ASK_EVERY_S:
+            return
+        with contextlib.suppress(zmq.Again):  # nobody is there: ask again
+            self._dealer.send_multipart(encode(Want(self._session, self._sequence)), zmq.NOBLOCK)
+            self._asked = time.monotonic()
+
+    def _drain(self, socket: zmq.Socket) -> Message[Any] | None:
+        newest = None
+        for _ in range(8):
+            try:
+                parts = socket.recv_multipart(zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                break
+            try:
+                message = decode(parts, self.schema, self.network.limits)
+            except WireError:
+                self.refused += 1
+                continue
+            if self._is_newer(message.header):
+                newest = message
+        return newest
+
+    def _is_newer(self, header: Any) -> bool:
+        if header.session in self._ended:
+            return False
+        if header.session == self._session and header.sequence <= self._sequence:
+            return False
+        if self._session not in (None, header.session):
+            self._ended.append(self._session)
+        self._session, self._sequence, self._heard = header.session, header.sequence, time.monotonic()
+        return True

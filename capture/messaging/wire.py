@@ -1,0 +1,131 @@
+"""A message: a typed header and arrays. What does not fit its schema to the last byte is refused.
+
+    [magic, version] [MessagePack: header, (dtype, shape) of each array] [raw array] [raw array] ...
+
+Arrays are little-endian and C-contiguous. Nothing in a message is executed or believed: types are checked by msgspec,
+dtypes come from a list, and each part must be exactly as long as its shape says.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import time
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Generic, TypeVar
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import zmq
+
+MAGIC = b"SPLAT\x01"  # the last byte is the version
+DTYPES = {name: np.dtype(f"<{name}") for name in ("u1", "u2", "u4", "i4", "i8", "f4", "f8")}
+
+T = TypeVar("T")
+Part = bytes | memoryview
+SessionId = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
+Sequential = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+
+
+class WireError(ValueError):
+    """The parts are no message of this schema; the text says what is wrong with them."""
+
+
+class Header(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What every header has. A room's headers extend it; where several share a service they are tagged."""
+
+    session: SessionId  # of the process that sends: a new one begins to count anew
+    sequence: Sequential  # gaps are losses
+    mono_ns: Sequential  # the sender's monotonic clock
+
+
+class Numbering:
+    """The first fields of the headers that one sender sends: `PreviewHeader(**numbering.next(), name=...)`."""
+
+    def __init__(self, session: str | None = None) -> None:
+        self.session = session or uuid.uuid4().hex
+        self.sequence = 0  # of the next header
+
+    def next(self) -> dict[str, Any]:
+        fields = {"session": self.session, "sequence": self.sequence, "mono_ns": time.monotonic_ns()}
+        self.sequence += 1
+        return fields
+
+
+class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a receiver is ready to look at."""
+
+    header_bytes: int = 1 << 20
+    arrays: int = 4096
+    dimensions: int = 4
+    total_bytes: int = 256 << 20
+
+
+@dataclass(frozen=True)
+class Message(Generic[T]):
+    header: T
+    arrays: tuple[npt.NDArray, ...] = ()  # read-only; views of the received bytes where their alignment allows
+
+
+class _Envelope(msgspec.Struct, Generic[T], array_like=True, forbid_unknown_fields=True):
+    header: T
+    arrays: list[tuple[str, list[Sequential]]]  # dtype and shape of each
+
+
+def encode(header: msgspec.Struct, arrays: Sequence[npt.NDArray] = ()) -> list[Part]:
+    """The parts of a message; those of contiguous arrays are views of them. Raises ValueError for other dtypes."""
+    contiguous = [_little_endian(array) for array in arrays]
+    table = [(array.dtype.str[1:], list(array.shape)) for array in contiguous]
+    head = msgspec.msgpack.encode(_Envelope(header, table))
+    return [MAGIC, head, *(array.reshape(-1).view(np.uint8).data for array in contiguous)]
+
+
+def decode(parts: Sequence[Part | zmq.Frame], schema: Any, limits: Limits | None = None) -> Message[Any]:
+    """The message in `parts` if its header is a `schema` (a Struct, or a union of tagged ones). Raises WireError."""
+    limits = limits or Limits()
+    buffers = [memoryview(part.buffer if isinstance(part, zmq.Frame) else part) for part in parts]
+    if len(buffers) < 2 or buffers[0] != MAGIC:
+        raise WireError(f"no message of this version: {len(buffers)} parts, not {MAGIC!r} first")
+    if sum(buffer.nbytes for buffer in buffers) > limits.total_bytes or buffers[1].nbytes > limits.header_bytes:
+        raise WireError(f"too large: {sum(buffer.nbytes for buffer in buffers)} bytes")
+    envelope = _envelope(buffers[1], schema)
+    if len(envelope.arrays) > limits.arrays or len(envelope.arrays) != len(buffers) - 2:
+        raise WireError(f"{len(envelope.arrays)} arrays announced, {len(buffers) - 2} came, {limits.arrays} allowed")
+    pairs = zip(envelope.arrays, buffers[2:], strict=True)
+    return Message(envelope.header, tuple(_array(*entry, buffer, limits) for entry, buffer in pairs))
+
+
+def _envelope(head: memoryview, schema: Any) -> _Envelope[Any]:
+    decoder = _decoder(schema)
+    try:
+        return decoder.decode(head)
+    except (ValueError, RecursionError) as error:  # msgspec's own errors are ValueErrors
+        raise WireError(f"header refused: {error}") from error
+
+
+@functools.lru_cache(maxsize=64)
+def _decoder(schema: Any) -> msgspec.msgpack.Decoder:
+    return msgspec.msgpack.Decoder(_Envelope[schema])
+
+
+def _array(name: str, shape: list[int], buffer: memoryview, limits: Limits) -> npt.NDArray:
+    dtype = DTYPES.get(name)
+    if dtype is None or len(shape) > limits.dimensions:
+        raise WireError(f"array of dtype {name[:16]!r} with {len(shape)} dimensions refused")
+    if math.prod(shape) * dtype.itemsize != buffer.nbytes:
+        raise WireError(f"array {name} of shape {shape} does not have {buffer.nbytes} bytes")
+    array = np.frombuffer(buffer, dtype).reshape(shape)
+    if not array.flags.aligned:  # where a received message begins is chance; compiled code needs better
+        array = array.copy()
+    array.setflags(write=False)
+    return array
+
+
+def _little_endian(array: npt.NDArray) -> npt.NDArray:
+    contiguous = np.ascontiguousarray(array, array.dtype.newbyteorder("<")).reshape(array.shape)
+    if contiguous.dtype.str[1:] not in DTYPES:
+        raise ValueError(f"arrays of {array.dtype} cannot be sent; convert to one of {', '.join(DTYPES)}")
+    return contiguous

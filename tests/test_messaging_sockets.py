@@ -1,0 +1,335 @@
+"""Sockets over ipc and over tcp with CURVE: who comes late, comes twice, has no key or speaks rubbish."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+import time
+
+import msgspec
+import numpy as np
+import pytest
+import zmq
+
+from capture.messaging import keys
+from capture.messaging.broadcast import Publisher, Subscriber
+from capture.messaging.commands import CommandServer, NoAnswer, ask
+from capture.messaging.network import AlreadyRunning, Network, NetworkError, NotAllowed, runtime_directory
+from capture.messaging.services import CAPTURE_PREVIEW, RECON_CONTROL, RECON_SCENE
+from capture.messaging.state import StateClient, StateServer
+from capture.messaging.wire import Header, Numbering
+from tests.conftest import ROOT
+
+
+class Note(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    text: str = ""
+
+
+def free_ports(count=8):
+    """The first of `count` ports that were free just now."""
+    for first in range(47310, 60000, count):
+        try:
+            for port in range(first, first + count):
+                with socket.socket() as probe:
+                    probe.bind(("127.0.0.1", port))
+            return first
+        except OSError:
+            continue
+    raise AssertionError("no free ports")
+
+
+def ipc(folder):
+    return Network(directory=folder / "run")
+
+
+def tcp(folder):
+    keys.create_keys(folder / "keys")
+    return Network(directory=folder / "run", tcp="127.0.0.1", keys=folder / "keys", first_port=free_ports())
+
+
+@pytest.fixture(params=[ipc, tcp], ids=["ipc", "tcp+curve"])
+def network(request, tmp_path):
+    return request.param(tmp_path)
+
+
+def wait_for(what, seconds=5.0):
+    """The first true result of `what`."""
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        result = what()
+        if result:
+            return result
+    raise AssertionError(f"did not happen within {seconds} s")
+
+
+def heard(publisher, subscriber, numbering):
+    """Publishes until the subscriber hears it."""
+
+    def once():
+        publisher.send(Note(**numbering.next()))
+        return subscriber.latest(0.05)
+
+    return wait_for(once)
+
+
+def test_broadcast_whoever_starts_first(network):
+    image = np.arange(300_000, dtype=np.uint8)
+    numbering = Numbering()
+    with Subscriber(CAPTURE_PREVIEW, network, Note) as early, Publisher(CAPTURE_PREVIEW, network) as publisher:
+        assert early.latest(0) is None and early.age_s == float("inf")
+        with Subscriber(CAPTURE_PREVIEW, network, Note) as late:
+            heard(publisher, early, numbering)
+            heard(publisher, late, numbering)
+            publisher.send(Note(**numbering.next(), text="last"), [image])
+            for subscriber in (early, late):
+                message = subscriber.latest(1)
+                while message.header.text != "last":
+                    message = subscriber.latest(1)
+                assert np.array_equal(message.arrays[0], image)
+                assert subscriber.age_s < 1 and subscriber.refused == 0
+
+
+def test_losses_are_counted_and_a_new_session_counts_anew(tmp_path):
+    network, numbering = ipc(tmp_path), Numbering()
+    with Subscriber(CAPTURE_PREVIEW, network, Note) as subscriber:
+        with Publisher(CAPTURE_PREVIEW, network) as publisher:
+            heard(publisher, subscriber, numbering)
+            wait_for(lambda: subscriber.latest(0.1) is None)
+            before = subscriber.lost
+            numbering.sequence += 5
+            heard(publisher, subscriber, numbering)
+            assert subscriber.lost == before + 5
+        with Publisher(CAPTURE_PREVIEW, network) as publisher:
+            restarted = Numbering()
+            heard(publisher, subscriber, restarted)
+            wait_for(lambda: subscriber.latest(0.1) is None)
+            assert subscriber.lost == before + 5
+
+
+def test_the_newest_wins_when_the_reader_is_slow(tmp_path):
+    network, numbering = ipc(tmp_path), Numbering()
+    with Publisher(CAPTURE_PREVIEW, network) as publisher, Subscriber(CAPTURE_PREVIEW, network, Note) as subscriber:
+        heard(publisher, subscriber, numbering)
+        for index in range(20):
+            publisher.send(Note(**numbering.next(), text=str(index)))
+            time.sleep(0.005)
+        assert subscriber.latest(1).header.text == "19"
+        assert subscriber.latest(0) is None
+
+
+def test_a_sender_never_waits(tmp_path):
+    network, numbering = ipc(tmp_path), Numbering()
+    image = np.zeros(1_000_000, np.uint8)
+    with Publisher(CAPTURE_PREVIEW, network) as publisher, Subscriber(CAPTURE_PREVIEW, network, Note) as subscriber:
+        heard(publisher, subscriber, numbering)
+        start = time.monotonic()
+        for _ in range(300):
+            publisher.send(Note(**numbering.next()), [image])
+        assert time.monotonic() - start < 2  # the subscriber sleeps
+
+
+@pytest.mark.parametrize("count", [2, 3])
+def test_one_process_offers_a_service(network, count):
+    with Publisher(CAPTURE_PREVIEW, network):
+        for _ in range(count):
+            with pytest.raises(AlreadyRunning, match=f"offered by process {os.getpid()}") as caught:
+                Publisher(CAPTURE_PREVIEW, network)
+            assert caught.value.pid == os.getpid() and caught.value.exit_code == 75
+    Publisher(CAPTURE_PREVIEW, network).close()
+
+
+DIES = """
+import os, sys, pathlib
+from capture.messaging.broadcast import Publisher
+from capture.messaging.network import Network
+from capture.messaging.services import CAPTURE_PREVIEW
+publisher = Publisher(CAPTURE_PREVIEW, Network(directory=pathlib.Path(sys.argv[1])))
+os.kill(os.getpid(), 9)
+"""
+
+
+def test_a_killed_process_leaves_nothing_in_the_way(tmp_path):
+    network = ipc(tmp_path)
+    directory = runtime_directory(network)
+    assert subprocess.run([sys.executable, "-c", DIES, directory], cwd=ROOT).returncode == -9
+    assert (directory / CAPTURE_PREVIEW.name).exists()  # the socket of a dead process
+    with Publisher(CAPTURE_PREVIEW, network) as publisher, Subscriber(CAPTURE_PREVIEW, network, Note) as subscriber:
+        heard(publisher, subscriber, Numbering())
+
+
+def test_late_comers_get_the_state(network):
+    numbering = Numbering()
+    means = np.random.default_rng(0).normal(size=(1000, 3)).astype(np.float32)
+    with StateServer(RECON_SCENE, network) as server:
+        server.publish(Note(**numbering.next(), text="before"), [means])
+
+        def served(client):
+            server.serve(0.02)
+            return client.poll(0.02)
+
+        with StateClient(RECON_SCENE, network, Note) as client:
+            message = wait_for(lambda: served(client))
+            assert message.header.text == "before" and np.array_equal(message.arrays[0], means)
+            assert served(client) is None and client.age_s < 2
+            server.publish(Note(**numbering.next(), text="after"))
+            assert wait_for(lambda: served(client)).header.text == "after"
+            for _ in range(30):  # asks again, and is told nothing that it has
+                assert served(client) is None
+
+
+def test_a_restarted_sender_is_followed_and_its_predecessor_is_not(tmp_path):
+    network = ipc(tmp_path)
+    with StateClient(RECON_SCENE, network, Note) as client:
+        sessions = []
+        for _ in range(2):
+            numbering = Numbering()
+            with StateServer(RECON_SCENE, network) as server:
+                for _ in range(3):
+                    server.publish(Note(**numbering.next()))
+                server.publish(Note(**numbering.next(), text="newest"))
+
+                def served(server=server):
+                    server.serve(0.02)
+                    return client.poll(0.02)
+
+                message = wait_for(served)
+                assert message.header.text == "newest"
+                sessions.append(message.header.session)
+        assert sessions[0] != sessions[1]
+        assert not client._is_newer(Note(session=sessions[0], sequence=99, mono_ns=0))
+
+
+class Question(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="question"):
+    number: int
+
+
+def test_commands_are_answered(network):
+    import threading
+
+    with CommandServer(RECON_CONTROL, network, Question) as server:
+        done = threading.Event()
+        asked = []
+
+        def client():
+            asked.append(ask(RECON_CONTROL, network, Question(20), Question))
+            done.set()
+
+        thread = threading.Thread(target=client)
+        thread.start()
+        while not done.is_set():
+            server.serve(0.05, lambda question: Question(question.number + 1))
+        thread.join()
+        assert asked == [Question(21)]
+
+
+def test_a_command_to_nobody_says_so(tmp_path):
+    with pytest.raises(NoAnswer, match="recon.control did not answer"):
+        ask(RECON_CONTROL, ipc(tmp_path), Question(1), Question, timeout_s=0.1)
+
+
+def test_rubbish_on_a_socket_is_counted(tmp_path):
+    network = ipc(tmp_path)
+    with StateServer(RECON_SCENE, network) as server, zmq.Context() as context:
+        with context.socket(zmq.DEALER) as dealer:
+            dealer.linger = 0
+            dealer.connect(f"ipc://{runtime_directory(network) / RECON_SCENE.requests.name}")
+            for parts in ([b""], [b"hello"], [b"SPLAT\x01", b"\x90"], [b"x"] * 50):
+                dealer.send_multipart(parts)
+
+            def served():
+                server.serve(0.05)
+                return server.refused == 4
+
+            wait_for(served)
+        with context.socket(zmq.PUB) as impostor, Subscriber(CAPTURE_PREVIEW, network, Note) as subscriber:
+            impostor.linger = 0
+            impostor.bind(f"ipc://{runtime_directory(network) / CAPTURE_PREVIEW.name}")
+
+            def refused():
+                impostor.send_multipart([b"SPLAT\x01", b"no"])
+                assert subscriber.latest(0.02) is None
+                return subscriber.refused
+
+            wait_for(refused)
+
+
+def test_the_directory_must_be_private(tmp_path):
+    directory = runtime_directory(ipc(tmp_path))
+    assert directory.stat().st_mode & 0o777 == 0o700
+    directory.chmod(0o755)
+    with pytest.raises(NetworkError, match="chmod 700"):
+        Publisher(CAPTURE_PREVIEW, ipc(tmp_path))
+    with pytest.raises(NetworkError, match="shorten"):
+        Publisher(CAPTURE_PREVIEW, Network(directory=tmp_path / ("x" * 100)))
+
+
+def test_where_the_directory_is(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "user"))
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    assert runtime_directory(Network()) == tmp_path / "user" / "splatnode"
+    monkeypatch.setenv("RUNTIME_DIRECTORY", f"{tmp_path / 'service'}:{tmp_path / 'other'}")
+    assert runtime_directory(Network()) == tmp_path / "service"
+
+
+def test_tcp_needs_keys(tmp_path):
+    with pytest.raises(NetworkError, match="splatnode keys"):
+        Publisher(CAPTURE_PREVIEW, Network(directory=tmp_path / "run", tcp="127.0.0.1"))
+    with pytest.raises(keys.KeyFileError, match="no key"):
+        Subscriber(CAPTURE_PREVIEW, Network(directory=tmp_path, tcp="127.0.0.1", keys=tmp_path), Note)
+
+
+def other_machine(network, folder, knows_server=True):
+    """The network as another machine sees it, and that machine's public key."""
+    public = keys.create_keys(folder / "keys")
+    server = keys.read_keys(network.keys).public if knows_server else keys.create_keys(folder / "wrong")
+    keys.expect_server(folder / "keys", server)
+    return msgspec.structs.replace(network, directory=folder / "run", keys=folder / "keys"), public
+
+
+def test_the_allow_list_decides_at_each_handshake(tmp_path):
+    network, numbering = tcp(tmp_path), Numbering()
+    theirs, public = other_machine(network, tmp_path / "laptop")
+    with Publisher(CAPTURE_PREVIEW, network) as publisher:
+        with Subscriber(CAPTURE_PREVIEW, theirs, Note) as subscriber, pytest.raises(NotAllowed, match="--allow"):
+            heard(publisher, subscriber, numbering)
+        keys.allow(network.keys, "laptop", public)
+        with Subscriber(CAPTURE_PREVIEW, theirs, Note) as subscriber:
+            heard(publisher, subscriber, numbering)
+
+
+def test_a_wrong_server_is_not_spoken_to(tmp_path):
+    network, numbering = tcp(tmp_path), Numbering()
+    theirs, public = other_machine(network, tmp_path / "laptop", knows_server=False)
+    keys.allow(network.keys, "laptop", public)
+    with (
+        Publisher(CAPTURE_PREVIEW, network) as publisher,
+        Subscriber(CAPTURE_PREVIEW, theirs, Note) as subscriber,
+        pytest.raises(NotAllowed, match="server.key"),
+    ):
+        heard(publisher, subscriber, numbering)
+
+
+@pytest.mark.parametrize("junk", [b"\x01\x00\x06\x00hello", b"GET / HTTP/1.0\r\n\r\n", bytes(range(256)) * 40])
+def test_strangers_on_the_port_are_not_heard(tmp_path, junk):
+    network = tcp(tmp_path)
+    with StateServer(RECON_SCENE, network) as server:
+        with socket.create_connection(("127.0.0.1", network.first_port + RECON_SCENE.requests.tcp_port)) as stranger:
+            stranger.sendall(junk)
+            server.serve(0.2)
+        assert server.refused == 0
+
+
+def test_keys_are_private_and_not_overwritten(tmp_path):
+    public = keys.create_keys(tmp_path)
+    assert keys.read_keys(tmp_path) == keys.Keys(public, (tmp_path / "secret.key").read_bytes().strip(), public)
+    with pytest.raises(keys.KeyFileError, match="there already"):
+        keys.create_keys(tmp_path)
+    with pytest.raises(keys.KeyFileError, match="40 characters"):
+        keys.allow(tmp_path, "laptop", b"short")
+    with pytest.raises(ValueError, match="name"):
+        keys.allow(tmp_path, "../laptop", public)
+    (tmp_path / "secret.key").chmod(0o644)
+    with pytest.raises(keys.KeyFileError, match="chmod 600"):
+        keys.read_keys(tmp_path)
