@@ -83,9 +83,14 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def exit_code(error: BaseException) -> int:
-    """What an exception that ended a verb tells the shell. Rooms raise ValueError for what the user can put right."""
+    """What an exception that ended a verb tells the shell. Rooms raise ValueError for what the user can put right.
+
+    An exception of a room that knows better has an `exit_code` of its own.
+    """
     if isinstance(error, KeyboardInterrupt):
         return 130
+    if (own := getattr(error, "exit_code", None)) is not None:
+        return own
     if isinstance(error, OSError):
         return _os_exit_code(error)
     return 2 if isinstance(error, ValueError) else 70
