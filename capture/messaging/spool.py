@@ -1,7 +1,7 @@
 """Key frames on disk until somebody else holds them: bounded, oldest first, whole or not there.
 
-A file is the message as it goes over the wire, with a checksum. Its name gives the order, which is kept from one
-process to the next: what a killed process left is delivered before what its successor adds.
+The name of a message's file gives the order, which is kept from one process to the next: what a killed process left is
+delivered before what its successor adds.
 """
 
 from __future__ import annotations
@@ -10,22 +10,16 @@ import contextlib
 import errno
 import logging
 import os
-import struct
-import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import msgspec
 
-from capture.durable import write_whole
+from capture.messaging.message_file import read_message, size_in_file, write_message
 from capture.messaging.wire import Part
 
 log = logging.getLogger(__name__)
-
-_HEAD = struct.Struct("<8sIQI")  # magic, sequence, bytes of the body, its CRC-32
-_MAGIC = b"SPLSPOOL"
-_SIZE = struct.Struct("<Q")
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -78,15 +72,11 @@ class Spool:
 
     def put(self, key: Key, parts: Sequence[Part]) -> None:
         """Returns when the message is on the disk. Raises SpoolFull; OSError where the disk fails otherwise."""
-        body = [piece for part in parts for piece in (_SIZE.pack(memoryview(part).nbytes), part)]
-        size = sum(memoryview(piece).nbytes for piece in body)
+        size = size_in_file(parts)
         self._make_sure_of_room(size)
-        checksum = 0
-        for piece in body:
-            checksum = zlib.crc32(piece, checksum)
         path = self.directory / f"{self._number:012d}-{key.session}-{key.sequence}.frame"
         try:
-            write_whole(path, [_HEAD.pack(_MAGIC, len(parts), size, checksum), *body])
+            write_message(path, parts)
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise SpoolFull(f"no space left for key frames in {self.directory}: {error.strerror}") from error
@@ -96,7 +86,7 @@ class Spool:
 
     def get(self, key: Key) -> list[Part]:
         """The parts as they were put in. Raises OSError or ValueError where the disk has lost them."""
-        return _read(self._files[key])
+        return read_message(self._files[key])
 
     def remove(self, key: Key) -> None:
         """Somebody else holds it now. Nothing happens where it is gone already."""
@@ -123,30 +113,13 @@ class Spool:
         try:
             _, session, sequence = path.stem.split("-")
             key = Key(session, int(sequence))
-            _read(path)
+            read_message(path)
         except (OSError, ValueError) as error:
             log.error("put aside a damaged key frame: %s", error)
             with contextlib.suppress(OSError):
                 path.rename(path.with_suffix(".damaged"))
         else:
             self._files[key], self._bytes[key] = path, path.stat().st_size
-
-
-def _read(path: Path) -> list[Part]:
-    content = memoryview(path.read_bytes())
-    if len(content) < _HEAD.size:
-        raise ValueError(f"{path} is no spooled message")
-    magic, count, size, checksum = _HEAD.unpack_from(content)
-    body = content[_HEAD.size :]
-    if magic != _MAGIC or len(body) != size or zlib.crc32(body) != checksum:
-        raise ValueError(f"{path} is damaged")
-    parts: list[Part] = []
-    position = 0
-    for _ in range(count):
-        (length,) = _SIZE.unpack_from(body, position)
-        parts.append(body[position + _SIZE.size : position + _SIZE.size + length])
-        position += _SIZE.size + length
-    return parts
 
 
 def _default_directory() -> Path:
