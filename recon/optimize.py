@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -13,11 +13,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from recon import regularise
 from recon.adam import Adam
 from recon.gaussians import Gaussians
 from recon.geometry import exp_se3, twist_gradient
 from recon.photometric import PhotometricLoss
+from recon.pseudo_views import PseudoView
 from recon.rasterize.cpu import rasterize
+from recon.rasterize.render import Render
+from recon.regularise import Regularisation
 from recon.scene import Scene, View
 
 
@@ -41,6 +45,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     dssim: float = 0.2  # lambda of (1 - lambda) L1 + lambda D-SSIM
     refine_poses: bool = True
     rates: Rates = Rates()
+    regularise: regularise.Config = regularise.Config()  # losses beside the photometric one; none by default
 
 
 def refine(scene: Scene, config: Config, *, seed: int, deadline: float | None = None) -> Iterator[Scene]:
@@ -50,7 +55,7 @@ def refine(scene: Scene, config: Config, *, seed: int, deadline: float | None = 
     The first view stays where it is: it is the world.
     """
     with _single_torch_thread():
-        fit = _Fit(scene, config)
+        fit = _Fit(scene, config, seed)
         order = np.random.default_rng(seed)
         started = time.monotonic()
         queue: list[int] = []
@@ -92,7 +97,7 @@ class _Target:
 class _Fit:
     """Parameters, targets and optimisers of one refinement."""
 
-    def __init__(self, scene: Scene, config: Config) -> None:
+    def __init__(self, scene: Scene, config: Config, seed: int) -> None:
         self._scene, self._config = scene, config
         gaussians = scene.gaussians.map(lambda tensor: tensor.clone())
         self._gaussians = gaussians
@@ -107,35 +112,58 @@ class _Fit:
         self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
         self._pose_moments = [(torch.zeros(6), torch.zeros(6), 0) for _ in scene.views]
         self._targets = [[_target(view, scale, config.dssim) for view in scene.views] for scale in (1.0, 0.5)]
+        self._terms = _terms(scene, config.regularise, seed)
         self._iterations = scene.iterations
 
     def step(self, index: int, progress: float) -> None:
         """One iteration on view `index`; `progress` in [0, 1] sets resolution and step sizes."""
-        target = self._targets[progress < self._config.half_resolution_share][index]
+        half = progress < self._config.half_resolution_share
+        target = self._targets[half][index]
         decay = self._config.rates.final**progress
-        gaussians = self._gaussians
         refine_pose = self._config.refine_poses and index > 0
         T_world_camera = self._Ts_world_camera[index].requires_grad_(refine_pose)
-        render = rasterize(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.scales,
-            gaussians.opacities,
-            gaussians.sh,
-            T_world_camera,
-            target.K,
-            target.width,
-            target.height,
-            channels=("rgb",),
-        )
+        channels = self._terms.channels(progress) if self._terms else ("rgb",)
+        render = self._render(T_world_camera, target.K, target.width, target.height, channels)
         assert render.rgb is not None  # it was asked for
-        target.loss(render.rgb).backward()
+        loss = target.loss(render.rgb)
+        if self._terms is not None:
+            loss = loss + self._regularisation(self._terms, index, render, progress, 0.5 if half else 1.0)
+        loss.backward()
         self._adam.lrs = {name: rate * decay for name, rate in self._rates.items()}
         self._adam.step()
         self._adam.zero_grad()
         if refine_pose and T_world_camera.grad is not None:
             self._move_camera(index, twist_gradient(T_world_camera.detach(), T_world_camera.grad), decay)
         self._iterations += 1
+
+    def _render(self, T_world_camera: Tensor, K: Tensor, width: int, height: int, channels: Collection[str]) -> Render:
+        gaussians = self._gaussians
+        return rasterize(
+            gaussians.means,
+            gaussians.quats,
+            gaussians.scales,
+            gaussians.opacities,
+            gaussians.sh,
+            T_world_camera,
+            K,
+            width,
+            height,
+            channels=channels,
+        )
+
+    def _regularisation(
+        self, terms: Regularisation, index: int, render: Render, progress: float, scale: float
+    ) -> Tensor | float:
+        """The terms on training view `index`, as rendered, and on a pseudo view at `scale` of its resolution."""
+
+        def draw(view: PseudoView, channels: Collection[str]) -> Render:
+            T_world_camera = torch.from_numpy(view.T_world_camera).float()
+            return self._render(
+                T_world_camera, *_scaled(torch.from_numpy(view.K), view.width, view.height, scale), channels
+            )
+
+        parts = (terms.training_loss(index, render, progress), terms.pseudo_loss(draw, progress))
+        return sum((part for part in parts if part is not None), 0.0)
 
     def _move_camera(self, index: int, gradient: Tensor, decay: float) -> None:
         """An Adam step of the camera in its own frame."""
@@ -160,11 +188,31 @@ class _Fit:
 
 
 def _target(view: View, scale: float, dssim: float) -> _Target:
-    width, height = max(1, round(view.width * scale)), max(1, round(view.height * scale))
+    K, width, height = _scaled(view.K, view.width, view.height, scale)
     image = view.image
     if (width, height) != (view.width, view.height):
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    K = view.K.clone()
-    K[0] *= width / view.width
-    K[1] *= height / view.height
     return _Target(K, width, height, PhotometricLoss(torch.from_numpy(image).float() / 255.0, dssim))
+
+
+def _scaled(K: Tensor, width: int, height: int, scale: float) -> tuple[Tensor, int, int]:
+    """Intrinsics, width and height of the same view at `scale` of its resolution."""
+    scaled_width, scaled_height = max(1, round(width * scale)), max(1, round(height * scale))
+    sizes = torch.tensor([[scaled_width / width], [scaled_height / height], [1.0]])
+    return K.float() * sizes, scaled_width, scaled_height
+
+
+def _terms(scene: Scene, config: regularise.Config, seed: int) -> Regularisation | None:
+    """The losses beside the photometric one; None where all weights are 0.
+
+    Raises ValueError where they would compare with what is known of a view, and nothing is.
+    """
+    if not any(term.weight for term in (config.point_render, config.depth, config.normal, config.semantic)):
+        return None
+    pointmaps = []
+    for view in scene.views:
+        if view.pointmap is None:
+            raise ValueError(f"{view.name} has no point map, which the losses in `regularise` compare with")
+        T_world_camera = view.T_world_camera.double().numpy()
+        pointmaps.append(replace(view.pointmap, T_world_camera=T_world_camera, K=view.K.double().numpy()))
+    return Regularisation(pointmaps, [view.image for view in scene.views], config, seed=seed)

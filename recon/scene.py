@@ -27,6 +27,7 @@ class View:
     K: Tensor  # (3, 3)
     rotation_sigma_deg: float
     centre_sigma_rel: float
+    pointmap: Pointmap | None = None  # what stereo knows of it, with the camera as registered; None: nothing
 
     @property
     def width(self) -> int:
@@ -94,8 +95,9 @@ def begin(
             K=torch.from_numpy(pointmap.K).float(),
             rotation_sigma_deg=camera.rotation_sigma_deg,
             centre_sigma_rel=camera.centre_sigma_rel,
+            pointmap=pointmap,
         )
-        for pointmap, camera in zip(completed, cameras, strict=True)
+        for pointmap, camera in zip(pointmaps, cameras, strict=True)
     )
     behind = background.background(pointmaps, pictures, shell, None if max_gaussians is None else max_gaussians // 10)
     left = None if max_gaussians is None else max_gaussians - len(behind)

@@ -11,10 +11,12 @@ import pytest
 import torch
 from msgspec import structs
 
-from recon import optimize
+from recon import optimize, regularise
 from recon.gaussians import Gaussians
 from recon.geometry import exp_se3
 from recon.optimize import Config, Rates, refine
+from recon.priors.pointmap import Pointmap
+from recon.pseudo_views import PseudoView
 from recon.rasterize.cpu import rasterize
 from recon.scene import Scene, View
 from tests.synthetic import tiny_scene
@@ -217,3 +219,50 @@ def test_torch_gets_its_threads_back(truth, wholly):
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
+
+
+def with_pointmap(view: View) -> View:
+    shape = (view.height, view.width)
+    nothing = [np.zeros(size, np.float32) for size in (shape, shape, (*shape, 3))]
+    camera = view.T_world_camera.double().numpy(), view.K.double().numpy()
+    return replace(view, pointmap=Pointmap(view.name, view.frame_id, *nothing, *camera))
+
+
+class Brighter:
+    """Stands for the losses beside the photometric one: wants everything to be bright, also from a pseudo view."""
+
+    def __init__(self, pointmaps, images, config, *, seed):
+        self.names = [pointmap.name for pointmap in pointmaps]
+        camera = pointmaps[1]
+        self.view = PseudoView(camera.T_world_camera, camera.K, 64, 48, nearest=1)
+        self.shapes = []
+        Brighter.made = self
+
+    def channels(self, progress):
+        return ("rgb", "depth") if progress < 0.75 else ("rgb",)
+
+    def training_loss(self, index, render, progress):
+        self.shapes.append((render.depth is not None, tuple(render.rgb.shape[:2])))
+        return -10 * render.rgb.mean()
+
+    def pseudo_loss(self, draw, progress):
+        render = draw(self.view, ("rgb",))
+        assert render.rgb.shape[:2] == self.shapes[-1][1]
+        return -10 * render.rgb.mean()
+
+
+def test_further_losses_count_on_training_views_and_pseudo_views(truth, monkeypatch):
+    monkeypatch.setattr(optimize, "Regularisation", Brighter)
+    start = replace(truth, views=tuple(map(with_pointmap, truth.views)))
+    config = Config(iterations=8, checkpoints=(), half_resolution_share=0.5)
+    plain = last(start, config)
+    brighter = last(start, structs.replace(config, regularise=regularise.Config(depth=regularise.Term(1.0))))
+    assert Brighter.made.names == ["0.png", "1.png", "2.png"]
+    assert Brighter.made.shapes == [(True, (24, 32))] * 4 + [(True, (48, 64))] * 2 + [(False, (48, 64))] * 2
+    for shown in truth.views:
+        assert render(brighter.gaussians, shown).mean() > 1.1 * render(plain.gaussians, shown).mean()
+
+
+def test_a_term_without_a_point_map_names_the_view(truth):
+    with pytest.raises(ValueError, match=r"0\.png has no point map"):
+        last(truth, Config(iterations=1, regularise=regularise.Config(normal=regularise.Term(1.0))))
