@@ -178,7 +178,86 @@ def _bench_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--weights-dir", type=Path, metavar="DIR", help="LPIPS networks (default: $SPLATNODE_WEIGHTS)")
 
 
+def _stability_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "scenes", type=Path, nargs="*", metavar="SCENE", help="folders with images and true cameras (default: built in)"
+    )
+    parser.add_argument("--rows", type=_counts, default=(), metavar="N,N", help="rows of the matrix (default: all)")
+    parser.add_argument("--seeds", type=_positive, default=4, metavar="N", help="trials of each row (default: 4)")
+    parser.add_argument(
+        "--methods", type=_names, default=("splatnode",), metavar="A,B,C", help="splatnode, colmap, glomap"
+    )
+    parser.add_argument("--jobs", type=_positive, default=1, metavar="N", help="trials at a time (default: 1)")
+    parser.add_argument("--timeout-s", type=_seconds, default=120.0, metavar="S", help="of one trial (default: 120)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="trials that it holds are not run again")
+
+
+def _view_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "what",
+        type=Path,
+        nargs="?",
+        metavar="SCENE|DIR|CONFIG",
+        help="a scene file, a result's folder, or a node's configuration (.yaml); default: the node on this machine",
+    )
+    parser.add_argument("--photographs", type=Path, metavar="DIR", help="where a finished result's photographs are")
+    parser.add_argument("--headless", action="store_true", help="write pictures instead of opening a window")
+    parser.add_argument("--export", type=Path, metavar="FILE.mp4", help="write a turntable, without a window")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where pictures go (default: view, beside the scene)")
+    parser.add_argument("--size", type=_size, default=(960, 720), metavar="WxH", help="of pictures (default: 960x720)")
+    parser.add_argument("--pictures", type=_positive, default=100, metavar="N", help="of a turntable (default: 100)")
+
+
+def _camera_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML that names the camera; see configs/")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="a change to it, such as camera.loops=2"
+    )
+
+
+def _record_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="a new folder for the recording")
+    parser.add_argument("--seconds", type=_seconds, metavar="S", help="stop after so many seconds")
+    _camera_arguments(parser)
+
+
+def _recon_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("config", type=Path, nargs="?", metavar="CONFIG", help="YAML: what differs from the defaults")
+    parser.add_argument("--checkpoint", type=Path, metavar="DIR", help="what a killed daemon goes on from")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where finished scenes go (default: out)")
+
+
+def _retract_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", metavar="NAME", help="of the key frame, as the viewer and the report show it")
+    parser.add_argument("--config", type=Path, metavar="CONFIG", help="of the daemon; default: the one on this machine")
+
+
+def _find_arguments(parser: argparse.ArgumentParser) -> None:
+    _json_argument(parser)
+
+
+def _keys_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="where this machine's keys are, or will be made")
+    change = parser.add_mutually_exclusive_group()
+    change.add_argument("--allow", nargs=2, metavar=("NAME", "KEY"), help="let the machine with this public key in")
+    change.add_argument("--server", metavar="KEY", help="connect to the machine with this public key")
+
+
+def _status_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--config", type=Path, metavar="FILE", help="where it says how to reach the processes: network")
+    _json_argument(parser)
+
+
 def _doctor_arguments(parser: argparse.ArgumentParser) -> None:
+    _json_argument(parser)
+
+
+def _weights_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("action", choices=("list", "fetch", "verify"))
+    parser.add_argument("names", nargs="*", metavar="NAME", help="which (list and verify: all, if none is named)")
+    parser.add_argument(
+        "--from", dest="source", type=Path, metavar="FOLDER", help="take them from a folder: no network"
+    )
     _json_argument(parser)
 
 
@@ -226,6 +305,13 @@ def _names(text: str) -> tuple[str, ...]:
     return names
 
 
+def _size(text: str) -> tuple[int, int]:
+    sides = [int(side) for side in text.split("x") if side.isdecimal()]
+    if len(sides) != 2 or not 16 <= min(sides) <= max(sides) <= 4096:
+        raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT, from 16 to 4096 pixels; got {text!r}")
+    return sides[0], sides[1]
+
+
 def _counts(text: str) -> tuple[int, ...]:
     return tuple(_positive(name) for name in _names(text))
 
@@ -233,8 +319,28 @@ def _counts(text: str) -> tuple[int, ...]:
 VERBS = (
     Verb("demo", "reconstruct the built-in capture", _demo_arguments, _lazily("recon.cli", "demo")),
     Verb("replay", "reconstruct a folder of photographs", _replay_arguments, _lazily("recon.cli", "replay")),
+    Verb("view", "show a result, a scene or a running node", _view_arguments, _lazily("viewer.cli", "view")),
+    Verb("recon", "reconstruct what comes, for ever", _recon_arguments, _lazily("recon.daemon.daemon", "recon")),
+    Verb("retract", "take a key frame back", _retract_arguments, _lazily("recon.daemon.control", "retract")),
     Verb("export", "write a scene in another format", _export_arguments, _export),
     Verb("bench", "measure held-out quality, poses and seconds", _bench_arguments, _lazily("recon.cli", "bench")),
+    Verb(
+        "stability",
+        "measure how often the answer is wrong",
+        _stability_arguments,
+        _lazily("recon.evaluate.stability.command", "stability"),
+    ),
+    Verb(
+        "weights",
+        "get and check the weights of optional networks",
+        _weights_arguments,
+        _lazily("recon.weights", "command"),
+    ),
+    Verb("capture", "run the camera's process", _camera_arguments, _lazily("capture.cli", "capture")),
+    Verb("record", "write what a camera sees into a folder", _record_arguments, _lazily("capture.cli", "record")),
+    Verb("find", "list the cameras that are connected", _find_arguments, _lazily("capture.cli", "find")),
+    Verb("keys", "make this machine's keys; say who may connect", _keys_arguments, _lazily("capture.cli", "keys")),
+    Verb("status", "tell how the running processes are", _status_arguments, _lazily("capture.cli", "status")),
     Verb("doctor", "tell what is installed and what is missing", _doctor_arguments, _lazily("recon.doctor", "doctor")),
 )
 

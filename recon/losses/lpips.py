@@ -1,13 +1,12 @@
 """LPIPS, the learned perceptual distance of Zhang et al. 2018 (version 0.1), without torchvision.
 
 It is a metric of the benchmark and, with gradients, the perceptual loss of equation 7. The weights are data that the
-user supplies (see `weights_folder`); without them nothing is measured. Images are mapped to [-1, 1], as the metric is
+user supplies (see `recon.weights`); without them nothing is measured. Images are mapped to [-1, 1], as the metric is
 defined. The 3DGS and InstantSplat code feeds it [0, 1], so published figures of that family are not exactly comparable.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 from torch.nn import functional
+
+from recon.weights import located
 
 
 @dataclass(frozen=True)
@@ -92,9 +93,11 @@ def load_lpips(network: str, weights_dir: Path | None = None) -> Lpips | None:
     there but holds something else.
     """
     layers, file_name = _NETWORKS[network]
-    folder = weights_folder(weights_dir)
-    candidates = [] if folder is None else [folder / "lpips" / file_name, folder / file_name]
-    path = next((candidate for candidate in candidates if candidate.is_file()), None)
+    if weights_dir is None:
+        path = located(f"lpips/{file_name}")
+    else:
+        candidates = (weights_dir / "lpips" / file_name, weights_dir / file_name)
+        path = next((candidate for candidate in candidates if candidate.is_file()), None)
     if path is None:
         return None
     weights = torch.load(path, map_location="cpu", weights_only=True)
@@ -104,10 +107,3 @@ def load_lpips(network: str, weights_dir: Path | None = None) -> Lpips | None:
         missing = sorted(expected - set(weights))[:3]
         raise ValueError(f"{path} must hold the complete LPIPS network {network!r}; it lacks {missing}")
     return Lpips(layers, weights)
-
-
-def weights_folder(weights_dir: Path | None = None) -> Path | None:
-    """Where network weights lie: `weights_dir`, else $SPLATNODE_WEIGHTS, else shared/weights beside the project."""
-    named = weights_dir or os.environ.get("SPLATNODE_WEIGHTS")
-    folder = Path(named) if named else Path(__file__).resolve().parents[3] / "shared" / "weights"
-    return folder if folder.is_dir() else None

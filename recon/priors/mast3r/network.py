@@ -1,0 +1,220 @@
+"""The MASt3R network: two photographs in; for each a point map in the first one's frame, confidences and descriptors.
+
+"Grounding Image Matching in 3D with MASt3R" (Leroy et al. 2024) on "DUSt3R" (Wang et al. 2024) and "CroCo v2"
+(Weinzaepfel et al. 2023): a ViT encodes each image, two decoders look at their own and at the other's tokens, and each
+image's head gives points, confidence and descriptors. Written from the papers; modules carry the names of the official
+checkpoint, which `recon.priors.mast3r.checkpoint` reads.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from recon.priors.mast3r.dpt import DensePrediction
+from recon.priors.mast3r.rotary import Rotary, grid_positions
+
+
+@dataclass(frozen=True)
+class Size:
+    """Widths and depths. The defaults are those of the published ViT-Large."""
+
+    encoder_width: int = 1024
+    encoder_depth: int = 24
+    encoder_heads: int = 16
+    decoder_width: int = 768
+    decoder_depth: int = 12
+    decoder_heads: int = 12
+    patch: int = 16
+    descriptor: int = 24
+
+
+PUBLISHED = Size()
+
+
+@dataclass(frozen=True, eq=False)
+class Encoded:
+    """An image after the encoder. It serves every pair that the image is part of."""
+
+    tokens: Tensor  # (h w, encoder_width) for h x w patches
+    positions: Tensor  # (h w, 2) row and column of each patch
+    height: int  # of the image, pixels
+    width: int
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a pair says about one of its images. Points are in the frame of the pair's first camera."""
+
+    points: Tensor  # (H, W, 3), up to one scale for the pair
+    confidence: Tensor  # (H, W), from 1
+    descriptors: Tensor  # (H, W, D) of unit length
+    descriptor_confidence: Tensor  # (H, W), from 0
+
+
+class Mast3r(nn.Module):
+    def __init__(self, size: Size = PUBLISHED) -> None:
+        super().__init__()
+        self.size = size
+        encoder, decoder = size.encoder_width, size.decoder_width
+        self.mask_token = nn.Parameter(torch.zeros(1, 1, decoder))  # of the pre-training; the checkpoint holds it
+        self.patch_embed = _PatchEmbedding(size.patch, encoder)
+        self.enc_blocks = nn.ModuleList(_EncoderBlock(encoder, size.encoder_heads) for _ in range(size.encoder_depth))
+        self.enc_norm = _norm(encoder)
+        self.decoder_embed = nn.Linear(encoder, decoder)
+        self.dec_blocks = nn.ModuleList(_DecoderBlock(decoder, size.decoder_heads) for _ in range(size.decoder_depth))
+        self.dec_blocks2 = nn.ModuleList(_DecoderBlock(decoder, size.decoder_heads) for _ in range(size.decoder_depth))
+        self.dec_norm = _norm(decoder)
+        self.downstream_head1 = _Head(size)
+        self.downstream_head2 = _Head(size)
+
+    def encode(self, image: Tensor) -> Encoded:
+        """`image` (3, H, W) in [-1, 1], its sides multiples of the patch."""
+        _, height, width = image.shape
+        patch = self.size.patch
+        if image.shape[0] != 3 or height % patch or width % patch or not height * width:
+            raise ValueError(f"image must be (3, H, W) with H and W multiples of {patch}, got {tuple(image.shape)}")
+        positions = grid_positions(height // patch, width // patch).to(image.device)
+        tokens = self.patch_embed(image)
+        rotary = Rotary.of(positions, self.size.encoder_width // self.size.encoder_heads)
+        for block in self.enc_blocks:
+            tokens = block(tokens, rotary)
+        return Encoded(self.enc_norm(tokens), positions, height, width)
+
+    def decode(self, first: Encoded, second: Encoded) -> tuple[Prediction, Prediction]:
+        """What the pair says about the first and the second image, both in the first camera's frame."""
+        dimension = self.size.decoder_width // self.size.decoder_heads
+        rotary1, rotary2 = Rotary.of(first.positions, dimension), Rotary.of(second.positions, dimension)
+        tokens1, tokens2 = self.decoder_embed(first.tokens), self.decoder_embed(second.tokens)
+        layers1, layers2 = [first.tokens], [second.tokens]
+        for block1, block2 in zip(self.dec_blocks, self.dec_blocks2, strict=True):
+            # Both look at the other's tokens of the layer before.
+            tokens1, tokens2 = (
+                block1(tokens1, tokens2, rotary1, rotary2),
+                block2(tokens2, tokens1, rotary2, rotary1),
+            )
+            layers1.append(tokens1)
+            layers2.append(tokens2)
+        layers1[-1], layers2[-1] = self.dec_norm(tokens1), self.dec_norm(tokens2)
+        return (
+            self.downstream_head1(layers1, first.height, first.width),
+            self.downstream_head2(layers2, second.height, second.width),
+        )
+
+
+class _PatchEmbedding(nn.Module):
+    def __init__(self, patch: int, width: int) -> None:
+        super().__init__()
+        self.proj = nn.Conv2d(3, width, patch, stride=patch)
+
+    def forward(self, image: Tensor) -> Tensor:
+        """(h w, width) tokens, row by row, of an image (3, H, W)."""
+        return self.proj(image[None])[0].flatten(1).T
+
+
+class _Attention(nn.Module):
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self._heads = heads
+        self.qkv = nn.Linear(width, 3 * width)
+        self.proj = nn.Linear(width, width)
+
+    def forward(self, x: Tensor, rotary: Rotary) -> Tensor:
+        query, key, value = (_by_head(part, self._heads) for part in self.qkv(x).chunk(3, dim=-1))
+        return self.proj(_attend(rotary.turned(query), rotary.turned(key), value))
+
+
+class _CrossAttention(nn.Module):
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self._heads = heads
+        self.projq, self.projk, self.projv = (nn.Linear(width, width) for _ in range(3))
+        self.proj = nn.Linear(width, width)
+
+    def forward(self, x: Tensor, other: Tensor, rotary: Rotary, rotary_other: Rotary) -> Tensor:
+        query = _by_head(self.projq(x), self._heads)
+        key, value = _by_head(self.projk(other), self._heads), _by_head(self.projv(other), self._heads)
+        return self.proj(_attend(rotary.turned(query), rotary_other.turned(key), value))
+
+
+class _Mlp(nn.Module):
+    def __init__(self, width: int, hidden: int, out: int) -> None:
+        super().__init__()
+        self.fc1 = nn.Linear(width, hidden)
+        self.fc2 = nn.Linear(hidden, out)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.fc2(functional.gelu(self.fc1(x)))
+
+
+class _EncoderBlock(nn.Module):
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.norm1, self.norm2 = _norm(width), _norm(width)
+        self.attn = _Attention(width, heads)
+        self.mlp = _Mlp(width, 4 * width, width)
+
+    def forward(self, x: Tensor, rotary: Rotary) -> Tensor:
+        x = x + self.attn(self.norm1(x), rotary)
+        return x + self.mlp(self.norm2(x))
+
+
+class _DecoderBlock(nn.Module):
+    def __init__(self, width: int, heads: int) -> None:
+        super().__init__()
+        self.norm1, self.norm2, self.norm3, self.norm_y = (_norm(width) for _ in range(4))
+        self.attn = _Attention(width, heads)
+        self.cross_attn = _CrossAttention(width, heads)
+        self.mlp = _Mlp(width, 4 * width, width)
+
+    def forward(self, x: Tensor, other: Tensor, rotary: Rotary, rotary_other: Rotary) -> Tensor:
+        x = x + self.attn(self.norm1(x), rotary)
+        x = x + self.cross_attn(self.norm2(x), self.norm_y(other), rotary, rotary_other)
+        return x + self.mlp(self.norm3(x))
+
+
+class _Head(nn.Module):
+    """Points and confidence from a dense prediction transformer, descriptors from an MLP on each patch."""
+
+    def __init__(self, size: Size) -> None:
+        super().__init__()
+        self._patch, self._descriptor = size.patch, size.descriptor
+        self.dpt = DensePrediction(size.encoder_width, size.decoder_width, size.decoder_depth, channels=4)
+        width = size.encoder_width + size.decoder_width
+        self.head_local_features = _Mlp(width, 4 * width, (size.descriptor + 1) * size.patch**2)
+
+    def forward(self, layers: list[Tensor], height: int, width: int) -> Prediction:
+        rows, columns = height // self._patch, width // self._patch
+        dense = self.dpt(layers, rows, columns)
+        local = self.head_local_features(torch.cat([layers[0], layers[-1]], dim=-1))
+        local = functional.pixel_shuffle(local.T.unflatten(1, (rows, columns)), self._patch)
+        return Prediction(
+            points=_exponential_points(dense[:3].permute(1, 2, 0)),
+            confidence=1.0 + dense[3].exp(),
+            descriptors=functional.normalize(local[: self._descriptor].permute(1, 2, 0), dim=-1),
+            descriptor_confidence=local[self._descriptor].exp(),
+        )
+
+
+def _exponential_points(raw: Tensor) -> Tensor:
+    """(H, W, 3) points in the direction of `raw` (H, W, 3), at distance exp(|raw|) - 1."""
+    length = raw.norm(dim=-1, keepdim=True)
+    return raw / length.clamp_min(1e-8) * torch.expm1(length)
+
+
+def _norm(width: int) -> nn.LayerNorm:
+    return nn.LayerNorm(width, eps=1e-6)
+
+
+def _by_head(x: Tensor, heads: int) -> Tensor:
+    """(heads, N, D) from (N, heads * D)."""
+    return x.unflatten(-1, (heads, -1)).transpose(0, 1)
+
+
+def _attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
+    """(N, heads * D) softmax attention of (heads, N, D) queries to (heads, M, D) keys and values."""
+    attended = functional.scaled_dot_product_attention(query[None], key[None], value[None])[0]
+    return attended.transpose(0, 1).flatten(1)
