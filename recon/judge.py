@@ -28,10 +28,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_link_agreement: float = 0.85  # of fewer that alone hold two groups together; two places reach 0.6
     blurred_px: float = 0.7  # residual of blurred images; right above it only with nearly full agreement
     blurred_agreement: float = 0.95
-    max_rotation_sigma_deg: float = 0.6  # right up to 0.29, wrong from 0.33
-    max_centre_sigma_rel: float = 0.03  # right up to 0.012, wrong from 0.015
+    max_rotation_sigma_deg: float = 1.5  # right up to 1.1, wrong from 3.6
+    max_centre_sigma_rel: float = 0.025  # right up to 0.018, wrong from 0.047
     min_confirmed: int = 5  # points of a camera that two others see too; right from 8, wrong up to 8
-    max_focal_sigma: float = 0.045  # of log focal; right up to 0.02, 56 % wrong at 0.060
+    max_focal_sigma: float = 0.08  # of log focal; right up to 0.073, wrong from 0.13
 
 
 def judge(graph: ViewGraph, registration: Registration | None, config: Config) -> Verdict:

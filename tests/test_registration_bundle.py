@@ -156,7 +156,8 @@ def test_the_order_of_observations_does_not_matter():
 
 
 def test_covariance_is_the_spread_of_the_estimates():
-    config = bundle.Config(robust_px=50.0)  # nearly squares, for which the covariance is exact
+    # Nearly squares, for which the covariance is exact.
+    config = bundle.Config(robust_px=50.0, noise_px=NOISE_PX)
     estimates = [bundle.adjust(problem(seed=seed), PRIOR, config) for seed in range(60)]
     predicted = bundle.covariance(estimates[0], PRIOR, config)
     true = problem()

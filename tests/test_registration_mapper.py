@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from recon.geometry import align_cameras
-from recon.registration import focal, mapper, placement, tracks, two_view
+from recon.registration import focal, mapper, placement, tracks, triangulation, two_view
+from recon.registration.survey import Lens, View
 from recon.registration.two_view import TwoView
 
 FOCAL = 900.0
@@ -73,8 +74,8 @@ def compared(taken: Photographed, share_wrong: float = 0.2) -> dict[tuple[int, i
 
 
 def built(taken: Photographed, pairs: dict[tuple[int, int], TwoView], focals: tuple[float, ...]) -> mapper.Map:
-    views = [mapper.View(points, 0, max(SIZE)) for points in taken.pixels]
-    found = mapper.build_map(views, [mapper.Lens(focals, 0.3)], pairs, mapper.Config())
+    views = [View(points, 0, max(SIZE)) for points in taken.pixels]
+    found = mapper.build_map(views, [Lens(focals, 0.3)], pairs, mapper.Config())
     assert found is not None
     return found
 
@@ -162,8 +163,8 @@ def test_cameras_are_found_whatever_the_first_focal_length(taken, pairs, focals)
 
 
 def test_what_is_known_of_a_lens_stays(taken, pairs):
-    views = [mapper.View(points, 0, max(SIZE)) for points in taken.pixels]
-    found = mapper.build_map(views, [mapper.Lens((FOCAL,), 0.0)], pairs, mapper.Config())
+    views = [View(points, 0, max(SIZE)) for points in taken.pixels]
+    found = mapper.build_map(views, [Lens((FOCAL,), 0.0)], pairs, mapper.Config())
     assert found is not None
     assert np.exp(found.problem.log_focals[0]) == pytest.approx(FOCAL, rel=1e-12)
     assert found.problem.radials[0] == 0.0 and np.abs(found.problem.shifts).max() == 0.0
@@ -175,8 +176,8 @@ def test_a_pair_that_shows_a_double_does_not_bend_the_map(taken, pairs):
     lying = compared(elsewhere)[0, 4]
     points = [np.concatenate([own, other]) for own, other in zip(taken.pixels, elsewhere.pixels, strict=True)]
     spoiled = {**pairs, (0, 4): replace(lying, matches=lying.matches + len(taken.pixels[0]))}
-    views = [mapper.View(of_view, 0, max(SIZE)) for of_view in points]
-    found = mapper.build_map(views, [mapper.Lens((FOCAL,), 0.3)], spoiled, mapper.Config())
+    views = [View(of_view, 0, max(SIZE)) for of_view in points]
+    found = mapper.build_map(views, [Lens((FOCAL,), 0.3)], spoiled, mapper.Config())
     assert found is not None
     rotation_deg, centre = errors(taken, found)
     assert rotation_deg < 0.3 and centre < 0.02
@@ -208,8 +209,8 @@ def test_sampson_errors_are_the_noise_and_infinite_behind(taken, pairs):
 
 
 def test_no_pair_gives_no_map(taken):
-    views = [mapper.View(points, 0, max(SIZE)) for points in taken.pixels]
-    assert mapper.build_map(views, [mapper.Lens((FOCAL,), 0.3)], {}, mapper.Config()) is None
+    views = [View(points, 0, max(SIZE)) for points in taken.pixels]
+    assert mapper.build_map(views, [Lens((FOCAL,), 0.3)], {}, mapper.Config()) is None
 
 
 def test_tracks_join_matches_and_drop_what_contradicts_itself():
@@ -237,11 +238,11 @@ def test_triangulated_points_are_where_they_were(taken):
     camera, track = np.tile(np.arange(5), 2), np.repeat(np.arange(2), 5)
     in_camera = np.einsum("oij,oj->oi", taken.rotations[camera], world[track]) + taken.translations[camera]
     rays = in_camera[:, :2] / in_camera[:, 2:]
-    points = tracks.triangulate(state_matrices, rays, camera, track, num_tracks=3)
+    points = triangulation.triangulate(state_matrices, rays, camera, track, num_tracks=3)
     np.testing.assert_allclose(points[:2], world, atol=1e-9)
     assert np.isnan(points[2]).all()
     centres = -np.einsum("cji,cj->ci", taken.rotations, taken.translations)
-    widest = tracks.largest_angles(centres, points[:2], camera, track)
+    widest = triangulation.largest_angles(centres, points[:2], camera, track)
     first, last = centres[0] - world[0], centres[4] - world[0]
     expected = np.degrees(np.arccos(first @ last / np.linalg.norm(first) / np.linalg.norm(last)))
     assert widest[0] == pytest.approx(expected, abs=1e-6)

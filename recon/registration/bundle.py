@@ -37,6 +37,7 @@ class Problem:
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robust_px: float = 1.0  # scale of the Cauchy loss, pixels
+    noise_px: float = 1.0  # standard deviation that an observation counts with against the priors, pixels
     max_iterations: int = 40
     tolerance: float = 1e-5  # relative decrease of the cost at which it stops
 
@@ -90,12 +91,18 @@ def adjust(problem: Problem, prior: FocalPrior, config: Config, fixed_camera: in
 class Covariance:
     """What the observations leave open, relative to the fixed camera and with the scale of the scene as it is."""
 
-    cameras: Array  # (C, 6, 6) of rotation vector (radians) and translation, world to camera
+    joint: Array  # (6 C, 6 C) of the cameras' rotation vectors (radians) and translations, world to camera
     log_focals: Array  # (G,) variances
+
+    @property
+    def cameras(self) -> Array:
+        """(C, 6, 6) the blocks of the single cameras."""
+        count = len(self.joint) // 6
+        return np.stack([self.joint[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] for c in range(count)])
 
 
 def covariance(problem: Problem, prior: FocalPrior, config: Config, fixed_camera: int = 0) -> Covariance:
-    """Inverse of the normal equations at the minimum, times the variance of the residuals."""
+    """Inverse of the normal equations at the minimum, times the variance `config.noise_px ** 2` of an observation."""
     problem = _by_point(problem)
     native, _arrays = _native(problem, prior, config, fixed_camera)
     count, num_lenses = len(problem.rotations), len(problem.log_focals)
@@ -108,9 +115,6 @@ def covariance(problem: Problem, prior: FocalPrior, config: Config, fixed_camera
     seen = np.bincount(problem.camera_of, minlength=count) > 0
     free[: 6 * count] &= np.repeat(seen, 6)
     (kept,) = np.nonzero(free)
-    errors = np.minimum(reprojection_errors(problem), 10.0)
-    freedom = max(1, 2 * len(errors) - len(kept) - 3 * len(problem.points))
-    variance = float((errors**2 / (1.0 + errors**2 / config.robust_px**2)).sum()) / freedom
     # Parameters differ in unit: they are scaled to equal curvature. The scale of the scene is free; it is held.
     unit = 1.0 / np.sqrt(np.maximum(np.diag(information)[kept], 1e-30))
     free_scale = _growth_of_scene(problem, fixed_camera)[kept] / unit
@@ -119,9 +123,9 @@ def covariance(problem: Problem, prior: FocalPrior, config: Config, fixed_camera
     values, vectors = np.linalg.eigh(information[np.ix_(kept, kept)] * unit[:, None] * unit + len(kept) * held)
     inverse = (vectors / np.maximum(values, 1e-14)) @ vectors.T - held / len(kept)
     full = np.zeros_like(information)
-    full[np.ix_(kept, kept)] = inverse * unit[:, None] * unit * variance
+    full[np.ix_(kept, kept)] = inverse * unit[:, None] * unit * config.noise_px**2
     return Covariance(
-        cameras=np.stack([full[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] for c in range(count)]),
+        joint=full[: 6 * count, : 6 * count],
         log_focals=np.diag(full)[6 * count :: 4],
     )
 
@@ -182,7 +186,12 @@ def _native(
     lenses = (problem.log_focals, problem.radials, problem.shifts)
     parameters = (problem.rotations, problem.translations, *lenses, problem.points)
     indices = (problem.lens_of_camera, problem.camera_of, first)
-    observed = (problem.pixels, prior.log_focals, prior.sigmas, prior.radial_sigmas, prior.shift_sigmas)
+    sigmas = (
+        prior.sigmas / config.noise_px,
+        prior.radial_sigmas / config.noise_px,
+        prior.shift_sigmas / config.noise_px,
+    )
+    observed = (problem.pixels, prior.log_focals, *sigmas)
     arrays: list[npt.NDArray[np.generic]] = [
         *(np.ascontiguousarray(values, dtype=np.float64) for values in parameters),
         *(np.ascontiguousarray(values, dtype=np.int32) for values in indices),

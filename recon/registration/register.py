@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from capture.frame import Frame
 from recon.keyframe import Features, Keyframe
-from recon.registration import bundle, features, focal, mapper, matching, two_view
+from recon.registration import bundle, features, focal, mapper, matching, refinement, two_view, uncertainty
+from recon.registration.survey import Lens, View
 from recon.registration.two_view import TwoView
 
 Array = npt.NDArray[np.float64]
@@ -38,8 +39,8 @@ class RegisteredCamera:
     focal: float  # pixels of the full-size image
     principal: Array  # (2,) pixels of the full-size image
     radial: float  # first radial distortion coefficient
-    rotation_sigma_deg: float
-    centre_sigma_rel: float  # relative to the spread of the centres
+    rotation_sigma_deg: float  # after the best similarity
+    centre_sigma_rel: float  # relative to the spread of the centres, after the best similarity
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +56,7 @@ class Registration:
     focal_sigma: float  # of the logarithm of the least certain focal length
     median_angle_deg: float
     rms_px: float  # of the observations, at 1024 px on the longer side
+    rival: float = 0.0  # matches that the best other set of cameras explained, over those that this one does
 
 
 Pairs = dict[tuple[int, int], TwoView]
@@ -98,14 +100,19 @@ def register(
     """
     groups, lenses = _lenses(keyframes, pairs, config)
     views = [
-        mapper.View(
+        View(
             points=keyframe.features.points - principal_point(keyframe.frame),
             lens=groups[i],
             longer_side=max(keyframe.frame.width, keyframe.frame.height),
         )
         for i, keyframe in enumerate(keyframes)
     ]
-    built = mapper.build_map(views, lenses, pairs, config.mapper)
+    of_refinement = config.mapper.finishing.refinement
+    pictures = [
+        refinement.picture(keyframe.frame.image, principal_point(keyframe.frame), of_refinement)
+        for keyframe in keyframes
+    ]
+    built = mapper.build_map(views, lenses, pairs, config.mapper, pictures)
     return _in_first_camera(built, keyframes) if built else None
 
 
@@ -118,7 +125,7 @@ def principal_point(frame: Frame) -> Array:
 
 def _lenses(
     keyframes: Sequence[Keyframe], pairs: Mapping[tuple[int, int], TwoView], config: Config
-) -> tuple[list[int], list[mapper.Lens]]:
+) -> tuple[list[int], list[Lens]]:
     """Frames of one size (turned or not) and one nominal focal length share a lens."""
     keys, groups = [], []
     for keyframe in keyframes:
@@ -134,11 +141,11 @@ def _lenses(
         given = keyframes[members[0]].frame.intrinsics
         if given is not None:
             known = given.source in ("given", "calibration")
-            lenses.append(mapper.Lens((given.fx,), 0.0 if known else config.exif_sigma))
+            lenses.append(Lens((given.fx,), 0.0 if known else config.exif_sigma))
             continue
         inside = [pair for key, pair in pairs.items() if key[0] in members and key[1] in members]
         ratios = focal.vote(inside, num_candidates=3)
-        lenses.append(mapper.Lens(tuple(ratio * longer_side for ratio in ratios), config.voted_sigma))
+        lenses.append(Lens(tuple(ratio * longer_side for ratio in ratios), config.voted_sigma))
     return groups, lenses
 
 
@@ -151,18 +158,13 @@ def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe]) -> Regist
     scale = 1.0 / max(float(np.median(depths)), 1e-9)
     rotation0, translation0 = state.rotations[order[0]], state.translations[order[0]]
     points = scale * (state.points @ rotation0.T + translation0)
-    centres = {i: -state.rotations[i].T @ state.translations[i] for i in order}
-    spread = np.sqrt(np.mean(np.sum((np.stack(list(centres.values())) - np.mean(list(centres.values()), 0)) ** 2, 1)))
+    rotation_sigmas, centre_sigmas = uncertainty.camera_sigmas(state, covariances, order)
     cameras = []
-    for i in order:
+    for place, i in enumerate(order):
         T_world_camera = np.eye(4)
         T_world_camera[:3, :3] = rotation0 @ state.rotations[i].T
-        T_world_camera[:3, 3] = scale * (rotation0 @ centres[i] + translation0)
+        T_world_camera[:3, 3] = scale * (translation0 - T_world_camera[:3, :3] @ state.translations[i])
         lens = state.lens_of_camera[i]
-        # The centre is -R^T t: its covariance follows from that of rotation and translation.
-        inverse = state.rotations[i].T
-        jacobian = np.hstack([-inverse @ bundle.cross_matrix(state.translations[i][None])[0], -inverse])
-        centre_covariance = jacobian @ covariances.cameras[i] @ jacobian.T
         cameras.append(
             RegisteredCamera(
                 index=i,
@@ -170,8 +172,8 @@ def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe]) -> Regist
                 focal=float(np.exp(state.log_focals[lens])),
                 principal=principal_point(keyframes[i].frame) + state.shifts[lens],
                 radial=float(state.radials[lens]),
-                rotation_sigma_deg=float(np.degrees(np.sqrt(np.trace(covariances.cameras[i][:3, :3])))),
-                centre_sigma_rel=float(np.sqrt(max(np.trace(centre_covariance), 0.0)) / max(spread, 1e-12)),
+                rotation_sigma_deg=float(rotation_sigmas[place]),
+                centre_sigma_rel=float(centre_sigmas[place]),
             )
         )
     principal = np.stack([principal_point(keyframe.frame) for keyframe in keyframes])
@@ -185,4 +187,5 @@ def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe]) -> Regist
         focal_sigma=float(np.sqrt(covariances.log_focals.max())),
         median_angle_deg=built.median_angle_deg,
         rms_px=built.rms_px,
+        rival=built.rival,
     )

@@ -65,31 +65,3 @@ def thin(tracks: Tracks, num_cameras: int, per_camera: int) -> Tracks:
     observed = chosen[tracks.track_of]
     _, track_of = np.unique(tracks.track_of[observed], return_inverse=True)
     return Tracks(tracks.camera_of[observed], track_of, tracks.pixels[observed], int(chosen.sum()))
-
-
-def triangulate(matrices: Array, rays: Array, camera_of: Index, track_of: Index, num_tracks: int) -> Array:
-    """(T, 3) points by the direct linear transform from `rays` (O, 2), normalised image coordinates.
-
-    `matrices` (C, 3, 4) are world to camera. A track with no observation, or one at infinity, is NaN.
-    """
-    rows = rays[:, :, None] * matrices[camera_of, 2][:, None, :] - matrices[camera_of, :2]
-    rows /= np.linalg.norm(rows, axis=2, keepdims=True)
-    normal = np.einsum("oki,okj->oij", rows, rows)
-    index = track_of[:, None, None] * 16 + np.arange(16).reshape(4, 4)
-    summed = np.bincount(index.ravel(), weights=normal.ravel(), minlength=num_tracks * 16).reshape(-1, 4, 4)
-    homogeneous = np.linalg.eigh(summed)[1][:, :, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        points = homogeneous[:, :3] / homogeneous[:, 3:]
-    observed = np.bincount(track_of, minlength=num_tracks) >= 2
-    return np.where((np.abs(homogeneous[:, 3:]) > 1e-12) & observed[:, None], points, np.nan)
-
-
-def largest_angles(centres: Array, points: Array, camera_of: Index, track_of: Index) -> Array:
-    """(T,) the widest angle, in degrees, between two rays that meet in each of `points` (T, 3)."""
-    directions = np.zeros((len(points), len(centres), 3))
-    towards = points[track_of] - centres[camera_of]
-    directions[track_of, camera_of] = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-    seen = np.zeros((len(points), len(centres)), bool)
-    seen[track_of, camera_of] = True
-    cosine = np.where(seen[:, :, None] & seen[:, None, :], directions @ directions.transpose(0, 2, 1), 1.0)
-    return np.degrees(np.arccos(np.clip(cosine.min(axis=(1, 2)), -1.0, 1.0)))

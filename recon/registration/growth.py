@@ -1,0 +1,149 @@
+"""A map that grows: a first pair, one view after the other, bundle adjustment after each."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from recon.registration import bundle, placement, survey, tracks, triangulation
+from recon.registration.survey import Growth, Survey
+
+Array = npt.NDArray[np.float64]
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    placement: placement.Config = placement.Config()
+    triangulation: triangulation.Config = triangulation.Config()
+    robust_px: float = 1.0  # scale of the robust loss, at 1024 px on the longer side
+    min_points: int = 15  # of a map
+    doubted_share: float = 0.6  # a view that explains less of its matches is placed anew
+    pair_focal_sigma: float = 0.03  # of log focal while there are two views, which say little about it
+
+
+def grow(of: Survey, focals: list[float], first: tuple[int, int], config: Config) -> Growth | None:
+    """A map from the pair `first` on, with every view that finds its place. `focals` (one a lens) are in pixels."""
+    growth = _begin(of, focals, first, config)
+    failed: set[int] = set()
+    while growth and len(growth.registered) + len(failed) < len(of.views):
+        view = _next_view(of, growth, failed)
+        placed = _place(of, growth, view, config)
+        if placed is None:
+            failed.add(view)
+            continue
+        growth = placed
+        failed.clear()  # A new view brings new points, from which others may now be found.
+    return _repair(of, growth, config) if growth else None
+
+
+def score(of: Survey, growth: Growth, zero_px: float) -> float:
+    """Matches of all pairs that the map explains, the exact ones more; those with errors above `zero_px` not at all."""
+    errors = survey.pair_errors(of, growth).values()
+    return sum(float(np.maximum(0.0, 1.0 - (of_pair / zero_px) ** 2).sum()) for of_pair in errors)
+
+
+def adjusted(
+    of: Survey,
+    growth: Growth,
+    of_tracks: tracks.Tracks,
+    loss: bundle.Config,
+    widen: float,
+    config: triangulation.Config,
+) -> Growth:
+    """Points made anew from the registered views (limits times `widen`), then everything adjusted."""
+    problem, track_of_point = triangulation.retriangulate(
+        growth.problem, of_tracks, growth.registered, of.scale, config, widen
+    )
+    if len(problem.points):
+        problem = bundle.adjust(problem, growth.prior, loss, growth.registered[0])
+    return replace(growth, problem=problem, track_of_point=track_of_point)
+
+
+def _quickly_adjusted(of: Survey, growth: Growth, widen: float, config: Config) -> Growth:
+    robust_px = config.robust_px * float(np.median(of.scale))
+    loss = bundle.Config(robust_px=robust_px, max_iterations=10, tolerance=1e-3)
+    return adjusted(of, growth, of.coarse, loss, widen, config.triangulation)
+
+
+def _begin(of: Survey, focals: list[float], first: tuple[int, int], config: Config) -> Growth | None:
+    count, num_lenses = len(of.views), len(of.lenses)
+    rotation, direction, num_inliers = placement.relative_pose(
+        of.pairs[first],
+        focals[of.views[first[0]].lens],
+        focals[of.views[first[1]].lens],
+        config.triangulation.max_error_px * float(of.scale[first[0]]),
+    )
+    if num_inliers < config.min_points:
+        return None
+    rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+    rotations[first[1]], translations[first[1]] = rotation, direction
+    problem = bundle.Problem(
+        rotations=rotations,
+        translations=translations,
+        lens_of_camera=np.array([view.lens for view in of.views]),
+        log_focals=np.log(focals),
+        radials=np.array([lens.radial for lens in of.lenses]),
+        shifts=np.zeros((num_lenses, 2)),
+        points=np.zeros((0, 3)),
+        camera_of=np.zeros(0, np.int64),
+        point_of=np.zeros(0, np.int64),
+        pixels=np.zeros((0, 2)),
+    )
+    prior = bundle.FocalPrior(
+        log_focals=np.log(focals),
+        sigmas=np.array([lens.sigma for lens in of.lenses]),
+        radial_sigmas=np.zeros(num_lenses),
+        shift_sigmas=np.zeros(num_lenses),
+    )
+    tight = replace(prior, sigmas=np.minimum(prior.sigmas, config.pair_focal_sigma))
+    start = Growth(first, problem, tight, np.zeros(0, np.int64))
+    grown = _quickly_adjusted(of, start, 4.0, config)
+    return replace(grown, prior=prior) if len(grown.problem.points) >= config.min_points else None
+
+
+def _next_view(of: Survey, growth: Growth, failed: set[int]) -> int:
+    """The view that observes most of the map's points."""
+    in_map = np.isin(of.coarse.track_of, growth.track_of_point)
+    counts = np.bincount(of.coarse.camera_of[in_map], minlength=len(of.views))
+    waiting = [view for view in range(len(of.views)) if view not in growth.registered and view not in failed]
+    return max(waiting, key=lambda view: (counts[view], -view))
+
+
+def _place(of: Survey, growth: Growth, view: int, config: Config) -> Growth | None:
+    """The map with `view`, or None when it finds no place."""
+    placed = placement.place(
+        growth.problem,
+        of.coarse,
+        growth.track_of_point,
+        view,
+        growth.registered,
+        of.pairs,
+        of.scale,
+        config.placement,
+    )
+    if placed is None:
+        return None
+    problem = placement.with_pose(growth.problem, view, placed.rotation, placed.translation)
+    larger = replace(growth, problem=problem, registered=(*growth.registered, view))
+    return _quickly_adjusted(of, larger, 3.0, config)
+
+
+def _repair(of: Survey, growth: Growth, config: Config) -> Growth:
+    """Views that explain little of their matches are taken out and placed anew, from the whole map."""
+    limit = config.triangulation.max_error_px
+    for view in growth.registered[1:]:
+        if len(growth.registered) < 4:
+            break
+        agreement = {key: share for key, share in survey.agreement(of, growth, limit).items() if view in key}
+        matched = sum(len(of.pairs[key].matches) for key in agreement)
+        explained = sum(share * len(of.pairs[key].matches) for key, share in agreement.items())
+        if explained >= config.doubted_share * matched:
+            continue
+        others = tuple(other for other in growth.registered if other != view)
+        without = _quickly_adjusted(of, replace(growth, registered=others), 2.0, config)
+        again = _place(of, without, view, config)
+        if again and score(of, again, limit) > 1.05 * score(of, growth, limit):
+            growth = again
+    return growth
