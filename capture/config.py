@@ -26,7 +26,7 @@ from capture.quality import Limits
 T = TypeVar("T")
 
 
-class ConfigError(Exception):
+class ConfigError(ValueError):
     """A configuration that cannot be used; the message names the key, what was expected and what came."""
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from recon.core import set_threads
 from recon.rasterize.native import RasterImages, raster_forward, raster_input
 from recon.snapshot import GaussianArrays
 
@@ -23,6 +24,11 @@ class Picture:
     depth: Array  # (H, W) expected z in the camera frame, 0 where alpha is 0
     normal: Array  # (H, W, 3) in the camera frame, facing the camera, weighted by alpha
     alpha: Array  # (H, W)
+
+
+def use_threads(threads: int) -> None:
+    """Bounds the processors that a picture takes. Raises ValueError below 1."""
+    set_threads(threads)
 
 
 def take_picture(

@@ -1,0 +1,87 @@
+"""`splatnode view`: a result, a scene file or a running node, in a window or as pictures."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import sys
+from pathlib import Path
+
+from capture.config import read_yaml, typed
+from capture.messaging.network import Network
+from recon.picture import use_threads
+from viewer.moment import Moment
+from viewer.pictures import keep_picture, write_movie, write_series
+from viewer.probe import Probe, open3d_installed, probe_window
+from viewer.session import Session
+from viewer.sources import Finished, Live, Source, load_result
+from viewer.state import State
+
+EXIT_GOOD, EXIT_UNAVAILABLE = 0, 69
+
+_NICENESS = 10  # the reconstruction is more important than the picture of it
+_NO_OPEN3D = (
+    "splatnode: the window needs Open3D, which is not installed. Run: pip install 'splatnode[viewer]'. "
+    "Pictures need nothing more: splatnode view ... --headless, or --export turntable.mp4"
+)
+
+
+def view(args: argparse.Namespace) -> int:
+    """Shows what `args.what` names. Raises what opening it raises."""
+    finished = _finished(args)
+    if args.export is not None and (finished is None or args.export.suffix.lower() != ".mp4"):
+        raise ValueError("--export needs a finished result and a file that ends with .mp4")
+    width, height = args.size
+    if args.export is not None and finished is not None:
+        print(write_movie(finished, args.export, width, height, args.pictures))
+        return EXIT_GOOD
+    window = None if args.headless else _window()
+    if window is None and not args.headless:
+        return EXIT_UNAVAILABLE
+    folder = args.out or (_beside(args.what) if finished is not None else Path("view"))
+    if window is not None and window.window:
+        source = _source(args, finished)
+        from viewer.window import show  # brings Open3D
+
+        show(Session(source, State()), open3d_may_draw=not window.software, screenshots=folder)
+    elif finished is not None:
+        print(write_series(finished, folder, width, height, args.pictures))
+    else:
+        source = _source(args, finished)
+        with contextlib.closing(source):
+            keep_picture(source, folder, width, height, stop=lambda: False, say=lambda line: print(line, flush=True))
+    return EXIT_GOOD
+
+
+def _finished(args: argparse.Namespace) -> Moment | None:
+    """The result that is named; None where it is a running node."""
+    if args.what is None or args.what.suffix.lower() in (".yaml", ".yml"):
+        return None
+    return load_result(args.what, args.photographs)
+
+
+def _window() -> Probe | None:
+    """What a window would be like here; None where what it needs is not installed. Says so where there is none."""
+    if not open3d_installed():
+        print(_NO_OPEN3D, file=sys.stderr)
+        return None
+    probe = probe_window()
+    if not probe.window:
+        print(f"splatnode: no window: {probe.detail}. Writing pictures instead, as with --headless", file=sys.stderr)
+    return probe
+
+
+def _source(args: argparse.Namespace, finished: Moment | None) -> Source:
+    """Beside a running node the viewer takes one thread, and only what the node leaves of the processors."""
+    if finished is not None:
+        return Finished(finished)
+    raw = read_yaml(args.what) if args.what is not None else {}
+    live = Live(typed(raw.get("network", {}), Network, "network"))
+    use_threads(1)
+    os.nice(_NICENESS)
+    return live
+
+
+def _beside(what: Path) -> Path:
+    return (what if what.is_dir() else what.parent) / "view"

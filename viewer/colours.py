@@ -1,0 +1,93 @@
+"""Colours of the Gaussians by what a person wants to know of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from recon.export.prepare import SH_C0
+from recon.snapshot import GaussianArrays
+from viewer.moment import Moment
+from viewer.state import Colouring
+from viewer.support import Support
+
+Array = npt.NDArray[np.float32]
+
+UNKNOWN = (0.35, 0.35, 0.35)
+_SUPPORT = np.array([UNKNOWN, (0.85, 0.2, 0.15), (0.95, 0.6, 0.1), (0.85, 0.85, 0.2), (0.2, 0.75, 0.3)], np.float32)
+_GOLDEN = 0.61803398875  # steps around the circle of hues that stay far apart, however many there are
+
+
+def coloured(moment: Moment, colouring: Colouring, support: Support) -> GaussianArrays:
+    """The Gaussians in the colours of `colouring`; what is unknown is grey."""
+    gaussians = moment.snapshot.gaussians
+    if colouring is Colouring.PHOTOGRAPH:
+        return gaussians
+    rgb = {
+        Colouring.DEPTH: _by_depth,
+        Colouring.NORMAL: _by_normal,
+        Colouring.SUPPORT: _by_support,
+        Colouring.SOURCE: _by_source,
+    }[colouring](moment, support)
+    return replace(gaussians, sh=((rgb[:, None] - 0.5) / SH_C0).astype(np.float32))
+
+
+def normals(gaussians: GaussianArrays, centre: npt.NDArray[np.float64]) -> Array:
+    """(N, 3) the direction in which each Gaussian is thinnest, on the side of `centre`."""
+    w, x, y, z = gaussians.quats.T
+    axes = np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1),
+            np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1),
+            np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1),
+        ],
+        1,
+    )  # (N, axis, 3)
+    normal = axes[np.arange(len(gaussians)), gaussians.scales.argmin(1)]
+    away = ((gaussians.means - centre) * normal).sum(1) > 0
+    return np.where(away[:, None], -normal, normal).astype(np.float32)
+
+
+def source_colour(index: int) -> tuple[float, float, float]:
+    """RGB of the camera at `index`: as different from its neighbours' as can be."""
+    hue = round(180 * (index * _GOLDEN % 1.0)) % 180
+    ((red, green, blue),) = cv2.cvtColor(np.array([[[hue, 190, 235]]], np.uint8), cv2.COLOR_HSV2RGB)[0] / 255.0
+    return float(red), float(green), float(blue)
+
+
+def _middle(moment: Moment) -> npt.NDArray[np.float64]:
+    centres = [camera.T_world_camera[:3, 3] for camera in moment.snapshot.cameras]
+    return np.mean(centres, axis=0) if centres else np.zeros(3)
+
+
+def _by_depth(moment: Moment, _support: Support) -> Array:
+    """By the distance from the middle of the cameras: inverse, because that is what images resolve."""
+    means = moment.snapshot.gaussians.means
+    if not len(means):
+        return np.zeros((0, 3), np.float32)
+    nearness = 1.0 / np.maximum(np.linalg.norm(means - _middle(moment), axis=1), 1e-6)
+    low, high = np.percentile(nearness, [2, 98])
+    levels = np.rint(255 * np.clip((nearness - low) / max(high - low, 1e-9), 0, 1)).astype(np.uint8)
+    return cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1].astype(np.float32) / 255
+
+
+def _by_normal(moment: Moment, _support: Support) -> Array:
+    return 0.5 + 0.5 * normals(moment.snapshot.gaussians, _middle(moment)) * np.array([1, -1, -1], np.float32)
+
+
+def _by_support(_moment: Moment, support: Support) -> Array:
+    return _SUPPORT[np.minimum(support.views, len(_SUPPORT) - 1)]
+
+
+def _by_source(moment: Moment, support: Support) -> Array:
+    """By the frame that started a Gaussian. A file does not keep it: there, by the camera that sees it largest."""
+    snapshot = moment.snapshot
+    palette = np.array([*(source_colour(index) for index in range(len(snapshot.cameras))), UNKNOWN], np.float32)
+    if not len(snapshot.gaussians) or not (snapshot.gaussians.source_frame >= 0).any():
+        return palette[support.best]
+    index_of = {camera.frame_id: index for index, camera in enumerate(snapshot.cameras)}
+    frames, inverse = np.unique(snapshot.gaussians.source_frame, return_inverse=True)
+    return palette[np.array([index_of.get(int(frame), -1) for frame in frames])][inverse]

@@ -1,0 +1,143 @@
+"""The panel beside the picture: words and switches."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Callable
+from dataclasses import replace
+
+from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
+
+from viewer import words
+from viewer.session import Session
+from viewer.state import (
+    POINT_SIZES,
+    Colouring,
+    Engine,
+    State,
+    go_to_camera,
+    go_to_moment,
+    help_lines,
+    moment_index,
+)
+
+_LINE = 44  # characters
+_FREE = "free viewpoint"
+_SWITCHES = (
+    ("gaussians", "Gaussians"),
+    ("as_points", "as points"),
+    ("cameras", "cameras"),
+    ("photographs", "photographs"),
+    ("path", "path"),
+    ("tracked", "tracked camera"),
+    ("advice", "next view"),
+)
+
+
+class Panel:
+    """Its widgets follow the state; what the person does to them becomes another state."""
+
+    def __init__(self, window: gui.Window, change: Callable[[State], None], command: Callable[[str], None]) -> None:
+        em = window.theme.font_size
+        self._window, self._change = window, change
+        self._session: Session | None = None
+        self.root = gui.ScrollableVert(round(0.3 * em), gui.Margins(round(0.5 * em)))
+        self._labels: dict[str, gui.Label] = {}
+        for name in ("help", "verdict", "advice", "counts"):
+            self._add_label(name)
+        self._time = self._slider(
+            gui.Slider.INT, lambda state, history, value: go_to_moment(state, history, int(value))
+        )
+        self._add_label("time")
+        buttons = gui.Horiz(round(0.3 * em))
+        for text, key in (("Pause", "space"), ("Follow", "f"), ("Whole", "r"), ("Save", "s"), ("Help", "h")):
+            button = gui.Button(text)
+            button.horizontal_padding_em, button.vertical_padding_em = 0.4, 0.1
+            button.set_on_clicked(lambda key=key: command(key))
+            buttons.add_child(button)
+        self.root.add_child(buttons)
+        self._switches = {field: self._switch(field, text) for field, text in _SWITCHES}
+        self._add_label("point size", "point size")
+        self._points = self._slider(gui.Slider.INT, lambda state, _, value: replace(state, point_size=int(value)))
+        self._points.set_limits(*POINT_SIZES)
+        self._colouring = self._choice(
+            [c.value for c in Colouring], lambda s, i, _: replace(s, colouring=list(Colouring)[i])
+        )
+        self._engine = self._choice([e.value for e in Engine], lambda s, i, _: replace(s, engine=list(Engine)[i]))
+        self._cameras = self._choice([_FREE], lambda s, i, name: go_to_camera(s, name if i else None))
+        self._names: tuple[str, ...] = ()
+        self._add_label("blend", "photograph over the render")
+        self._blend = self._slider(gui.Slider.DOUBLE, lambda state, _, value: replace(state, blend=float(value)))
+        self._blend.set_limits(0.0, 1.0)
+        self._add_label("dropped")
+
+    def show(self, session: Session, seconds: float | None, notice: str) -> None:
+        """Everything as it is now; `seconds` is what a picture takes, None where that is not known."""
+        self._session = session
+        state, moment, analysis = session.state, session.moment, session.analysis()
+        age = session.source.age_s
+        feed = words.feed_line(age, bool(moment and moment.snapshot.final))
+        rate = [f"{1 / seconds:.0f} pictures/s ({1000 * seconds:.0f} ms each)"] if seconds else []
+        self._set("help", help_lines() if state.help else ["h: help"])
+        if moment is None:
+            self._set("verdict", [feed])
+            return
+        self._set("verdict", words.verdict_lines(moment))
+        self._set("advice", ["Next view: " + words.advice_line(analysis.advice if analysis else None, moment)])
+        self._set("counts", [*words.count_lines(moment), *rate, feed + (", paused" if state.paused else "")])
+        self._set("time", [words.time_line(state, session.history), *([notice] if notice else [])])
+        self._set("dropped", words.dropped_lines(moment))
+        self._time.set_limits(0, max(len(session.history) - 1, 1))
+        self._time.int_value = moment_index(state, session.history)
+        for field, switch in self._switches.items():
+            switch.checked = getattr(state, field)
+        self._points.int_value = state.point_size
+        self._colouring.selected_index = list(Colouring).index(state.colouring)
+        self._engine.selected_index = list(Engine).index(state.engine)
+        self._show_cameras(tuple(camera.name for camera in moment.snapshot.cameras), state.camera)
+        self._blend.double_value = state.blend
+
+    def _show_cameras(self, names: tuple[str, ...], chosen: str | None) -> None:
+        if names != self._names:
+            self._cameras.clear_items()
+            for name in (_FREE, *names):
+                self._cameras.add_item(name)
+            self._names = names
+        self._cameras.selected_index = 1 + names.index(chosen) if chosen in names else 0
+
+    def _set(self, name: str, lines: list[str]) -> None:
+        text = "\n".join(textwrap.fill(line, _LINE) for line in lines)
+        label = self._labels[name]
+        if label.text != text:
+            label.text = text
+            self._window.set_needs_layout()
+
+    def _add_label(self, name: str, text: str = "") -> None:
+        self._labels[name] = gui.Label(text)
+        self.root.add_child(self._labels[name])
+
+    def _switch(self, field: str, text: str) -> gui.Checkbox:
+        switch = gui.Checkbox(text)
+        switch.set_on_checked(
+            lambda checked: self._session and self._change(replace(self._session.state, **{field: checked}))
+        )
+        self.root.add_child(switch)
+        return switch
+
+    def _slider(self, kind, changed: Callable) -> gui.Slider:
+        slider = gui.Slider(kind)
+        slider.set_on_value_changed(
+            lambda value: self._session and self._change(changed(self._session.state, self._session.history, value))
+        )
+        self.root.add_child(slider)
+        return slider
+
+    def _choice(self, items: list[str], changed: Callable) -> gui.Combobox:
+        box = gui.Combobox()
+        for item in items:
+            box.add_item(item)
+        box.set_on_selection_changed(
+            lambda text, index: self._session and self._change(changed(self._session.state, index, text))
+        )
+        self.root.add_child(box)
+        return box

@@ -1,0 +1,111 @@
+"""Pictures without a window: a PNG series, an MP4 turntable, and a picture that is kept up to date."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from recon.export import write_file, write_files
+from viewer import words
+from viewer.analysis import Analysis, analyse
+from viewer.moment import Moment
+from viewer.paint import blended, caption, paint
+from viewer.shapes import Shapes, shapes
+from viewer.sources import Source
+from viewer.state import State
+from viewer.viewpoint import Viewpoint, at_camera, overview, swing
+
+Image = npt.NDArray[np.uint8]
+
+FRAMES_PER_S = 25
+_LIVE = "live.png"
+_WAIT_S = 0.1
+
+
+def write_series(moment: Moment, folder: Path, width: int, height: int, frames: int) -> Path:
+    """overview.png with all there is to say, a picture from each camera beside its photograph, and a turntable.
+
+    Raises ResultWriteError where they cannot be written.
+    """
+    files = {"overview.png": _png(overview_picture(analyse(moment), width, height))}
+    view = overview(moment)
+    for camera in moment.snapshot.cameras:
+        here = at_camera(view, camera)
+        image = paint(moment.snapshot.gaussians, Shapes((), ()), here, State(), width, height)
+        photograph = moment.snapshot.images.get(camera.name)
+        if photograph is not None:
+            image = np.hstack([blended(image, photograph, camera, here.K(width, height), 1.0), image])
+        files[f"camera_{camera.frame_id:03d}.png"] = _png(image)
+    for number, image in enumerate(turntable(moment, width, height, frames)):
+        files[f"turntable_{number:03d}.png"] = _png(image)
+    write_files(folder, files)
+    return folder
+
+
+def write_movie(moment: Moment, path: Path, width: int, height: int, frames: int) -> Path:
+    """The turntable as an MP4. Raises ResultWriteError; RuntimeError where this OpenCV cannot write MP4."""
+    size = width - width % 2, height - height % 2  # the encoding has half the resolution in colour
+    with tempfile.TemporaryDirectory() as folder:
+        draft = Path(folder) / "turntable.mp4"
+        writer = cv2.VideoWriter(str(draft), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_S, size)
+        if not writer.isOpened():
+            raise RuntimeError("this OpenCV cannot write MP4; use --headless for a PNG series")
+        for image in turntable(moment, *size, frames):
+            writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        writer.release()
+        write_file(path, draft.read_bytes())
+    return path
+
+
+def turntable(moment: Moment, width: int, height: int, frames: int) -> Iterator[Image]:
+    """The Gaussians alone, from a closed tour around them."""
+    for view in swing(moment, frames):
+        yield paint(moment.snapshot.gaussians, Shapes((), ()), view, State(), width, height)
+
+
+def overview_picture(analysis: Analysis, width: int, height: int) -> Image:
+    """The whole scene with cameras, photographs, path and advice, and below it what the panel of a window says."""
+    moment, state = analysis.moment, State()
+    view: Viewpoint = overview(moment)
+    image = paint(moment.snapshot.gaussians, shapes(moment, state, analysis.advice), view, state, width, height)
+    said = [*words.verdict_lines(moment), f"Next view: {words.advice_line(analysis.advice, moment)}"]
+    said += [*words.count_lines(moment), *words.dropped_lines(moment)]
+    return caption(image, said)
+
+
+def keep_picture(
+    source: Source, folder: Path, width: int, height: int, stop: Callable[[], bool], say: Callable[[str], None]
+) -> None:
+    """Writes live.png anew for every moment that comes, the newest first, until `stop` or the end of the source.
+
+    A moment that comes while another one is painted replaces those that wait: nothing piles up.
+    """
+    for moment in _moments(source, stop):
+        started = time.perf_counter()
+        picture = overview_picture(analyse(moment), width, height)
+        write_file(folder / _LIVE, _png(picture))
+        line = words.verdict_lines(moment)[0]
+        say(f"{folder / _LIVE}: {line} ({time.perf_counter() - started:.1f} s)")
+        if moment.snapshot.final:
+            return
+
+
+def _moments(source: Source, stop: Callable[[], bool]) -> Iterable[Moment]:
+    while not stop():
+        moment = source.take()
+        if moment is not None:
+            yield moment
+        elif source.age_s is None:
+            return
+        else:
+            time.sleep(_WAIT_S)
+
+
+def _png(image: Image) -> bytes:
+    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()

@@ -1,0 +1,78 @@
+"""Whether a window can be opened here, found out in a child process.
+
+Open3D ends the whole process, without an exception, where it finds no Vulkan driver, and opens a window that nobody can
+see where it finds no display. So a child tries first, and what becomes of it is the answer.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+
+TIMEOUT_S = 60.0
+_SOFTWARE = ("llvmpipe", "lavapipe", "swiftshader", "software")
+
+_TRIAL = """
+from open3d.visualization import gui, rendering
+app = gui.Application.instance
+app.initialize()
+window = app.create_window("splatnode", 64, 64)
+widget = gui.SceneWidget()
+widget.scene = rendering.Open3DScene(window.renderer)
+window.add_child(widget)
+for _ in range(3):
+    app.run_one_tick()
+print("splatnode-window-opened", flush=True)
+import os
+os._exit(0)
+"""
+
+
+@dataclass(frozen=True)
+class Probe:
+    window: bool
+    software: bool  # the processor plays the graphics card: Open3D's splats take a second a picture
+    detail: str  # the device, or why there is no window and what to do
+
+
+def probe_window(command: tuple[str, ...] = (sys.executable, "-c", _TRIAL), timeout_s: float = TIMEOUT_S) -> Probe:
+    """Tries to open a window in a child process. It never raises for what it finds."""
+    try:
+        child = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=timeout_s)
+    except subprocess.TimeoutExpired:
+        return Probe(False, False, f"opening a window took more than {timeout_s:.0f} s")
+    output = child.stdout + child.stderr
+    if "headless mode" in output or "GLFW error" in output:  # it opens a window that nobody can see
+        return Probe(False, False, "there is no display ($DISPLAY or $WAYLAND_DISPLAY)")
+    if child.returncode != 0 or "splatnode-window-opened" not in output:
+        return Probe(False, False, _reason(output, child.returncode))
+    device = re.search(r"Selected physical device '([^']*)'", output)
+    name = device.group(1) if device else "an unnamed device"
+    return Probe(True, any(word in name.lower() for word in _SOFTWARE), name)
+
+
+def open3d_installed() -> bool:
+    return importlib.util.find_spec("open3d") is not None
+
+
+def _reason(output: str, code: int) -> str:
+    """Why the child failed, by what it said last."""
+    said = output.lower()
+    missing = re.search(r"ImportError: (lib\S+): cannot open shared object", output)
+    if missing:
+        return f"Open3D needs {missing.group(1)}, which this system lacks; install it with the system's package manager"
+    if "importerror" in said or "modulenotfounderror" in said:
+        return f"Open3D cannot be imported: {_last_line(output)}"
+    if "unable to open x11 display" in said:
+        return "there is no display ($DISPLAY or $WAYLAND_DISPLAY)"
+    if "vulkan" in said:
+        return "there is no Vulkan driver; on Debian and Ubuntu: apt-get install mesa-vulkan-drivers libvulkan1"
+    return f"Open3D could not open a window (exit status {code}): {_last_line(output)}"
+
+
+def _last_line(output: str) -> str:
+    lines = [line.strip() for line in output.splitlines() if line.strip()]
+    return lines[-1][:200] if lines else "it said nothing"

@@ -1,0 +1,170 @@
+"""What a viewer goes through, whatever shows it: moments come, keys are pressed, the viewpoint moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.snapshot import CameraEstimate, GaussianArrays
+from viewer.analysis import Analysis, Analyst
+from viewer.colours import coloured
+from viewer.moment import History, Moment, remembered
+from viewer.paint import blended, paint, project
+from viewer.shapes import Photograph, Shapes, live_camera, shapes
+from viewer.sources import Source
+from viewer.state import Colouring, State, go_to_camera, press, shown_moment
+from viewer.support import Support
+from viewer.viewpoint import Viewpoint, at_camera, overview, scene_pivot
+
+Image = npt.NDArray[np.uint8]
+
+_CLICK_RADIUS = 14  # pixels around a camera's centre that are the camera
+
+
+class Session:
+    """The history, the state and the viewpoint, and the pictures that follow from them. To be used in one thread."""
+
+    def __init__(self, source: Source, state: State) -> None:
+        self.source = source
+        self.state = state
+        self.history: History = ()
+        self._analyst = Analyst()
+        self._view: Viewpoint | None = None
+        self._touched = False  # whether the person has chosen a viewpoint
+        self._coloured: tuple[tuple[object, ...], GaussianArrays] | None = None
+
+    def close(self) -> None:
+        self._analyst.close()
+        self.source.close()
+
+    def receive(self) -> bool:
+        """Takes what the source has; whether that was something."""
+        moment = self.source.take()
+        if moment is None:
+            return False
+        elsewhere = bool(self.history) and self.history[-1].scene_id != moment.scene_id
+        self.history = remembered(self.history, moment)
+        if elsewhere:
+            self._touched = False
+        if not self._touched and (self._view is None or moment.snapshot.cameras):
+            self._view = overview(moment)
+        return True
+
+    @property
+    def moment(self) -> Moment | None:
+        return shown_moment(self.state, self.history)
+
+    def analysis(self) -> Analysis | None:
+        """The analysis of the shown moment; None while it is not ready."""
+        moment = self.moment
+        return None if moment is None else self._analyst.of(moment)
+
+    def press(self, key: str) -> None:
+        self.state = press(self.state, self.history, key)
+
+    def whole_scene(self) -> None:
+        """The viewpoint from which all of the scene is seen."""
+        self.state = replace(self.state, camera=None, follow=False)
+        self._touched = False
+        if self.moment is not None:
+            self._view = overview(self.moment)
+
+    def camera(self) -> CameraEstimate | None:
+        """The camera whose viewpoint is taken, followed or chosen; None for a free one."""
+        moment = self.moment
+        if moment is None:
+            return None
+        if self.state.follow:
+            return live_camera(moment)
+        return next((camera for camera in moment.snapshot.cameras if camera.name == self.state.camera), None)
+
+    def viewpoint(self) -> Viewpoint | None:
+        """Where the person looks from; None where nothing has come yet."""
+        camera = self.camera()
+        if self._view is None or camera is None:
+            return self._view
+        return at_camera(self._view, camera)
+
+    def move(self, view: Viewpoint) -> None:
+        """The person takes another viewpoint, and leaves the camera's if it was one."""
+        self.state = replace(self.state, camera=None, follow=False)
+        self._view, self._touched = view, True
+
+    def grasped(self) -> Viewpoint | None:
+        """The viewpoint to start a movement from: at a camera, the pivot lies as deep as the scene's middle."""
+        view, moment = self.viewpoint(), self.moment
+        if view is None or moment is None or self.camera() is None:
+            return view
+        depth = float((scene_pivot(moment) - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, 2])
+        return replace(view, distance=max(depth, 0.1))
+
+    def shapes(self) -> Shapes:
+        """What stands in the scene beside the Gaussians."""
+        moment, analysis, view = self.moment, self.analysis(), self.viewpoint()
+        if moment is None or view is None:
+            return Shapes((), ())
+        return shapes(moment, self.state, analysis.advice if analysis else None, view.T_world_camera[:3, 3])
+
+    def gaussians(self) -> GaussianArrays:
+        """The Gaussians of the shown moment in the colours that are asked for, as soon as those are known."""
+        moment, analysis = self.moment, self.analysis()
+        if moment is None:
+            return GaussianArrays.empty()
+        needs_support = self.state.colouring in (Colouring.SUPPORT, Colouring.SOURCE)
+        colouring = Colouring.PHOTOGRAPH if needs_support and analysis is None else self.state.colouring
+        key = (moment, colouring)
+        if self._coloured is None or self._coloured[0] != key:
+            support = analysis.support if analysis else Support(np.zeros((0, 0), np.float32))
+            self._coloured = key, coloured(moment, colouring, support)
+        return self._coloured[1]
+
+    def paint(self, width: int, height: int) -> Image | None:
+        """(height, width, 3) the picture by the project's own rasteriser; None where nothing has come yet."""
+        view = self.viewpoint()
+        if view is None:
+            return None
+        image = paint(self.gaussians(), self.shapes(), view, self.state, width, height)
+        camera, photograph = self.camera(), self.photograph()
+        if camera is None or photograph is None or self.state.blend == 0.0:
+            return image
+        return blended(image, photograph, camera, view.K(width, height), self.state.blend)
+
+    def photograph(self) -> Image | None:
+        """What the camera whose viewpoint is taken saw; None where there is none."""
+        moment, camera = self.moment, self.camera()
+        return moment.snapshot.images.get(camera.name) if moment and camera else None
+
+    def click(self, x: float, y: float, width: int, height: int) -> bool:
+        """Goes to the camera that is seen at a pixel of the window; whether there is one."""
+        name = self._camera_at(x, y, width, height)
+        if name is not None:
+            self.state = go_to_camera(self.state, name)
+        return name is not None
+
+    def _camera_at(self, x: float, y: float, width: int, height: int) -> str | None:
+        view, moment = self.viewpoint(), self.moment
+        if view is None or moment is None or not self.state.cameras:
+            return None
+        hits = [
+            (depth, photograph.name)
+            for photograph in self.shapes().photographs
+            if (depth := _depth_at(photograph, view, x, y, width, height)) is not None
+        ]
+        for camera in moment.snapshot.cameras:
+            ((column, row, depth),) = project(camera.T_world_camera[None, :3, 3], view, width, height)
+            if depth > 0 and camera.name != self.state.camera and np.hypot(column - x, row - y) < _CLICK_RADIUS:
+                hits.append((float(depth), camera.name))
+        return min(hits)[1] if hits else None
+
+
+def _depth_at(photograph: Photograph, view: Viewpoint, x: float, y: float, width: int, height: int) -> float | None:
+    """How far the photograph is where it is seen at the pixel; None where it is not."""
+    corners = project(photograph.corners, view, width, height)
+    if corners[:, 2].min() <= 0:
+        return None
+    edges = np.roll(corners[:, :2], -1, 0) - corners[:, :2]
+    to_pixel = np.array([x, y]) - corners[:, :2]
+    sides = edges[:, 0] * to_pixel[:, 1] - edges[:, 1] * to_pixel[:, 0]
+    return float(corners[:, 2].mean()) if (sides > 0).all() or (sides < 0).all() else None

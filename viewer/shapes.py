@@ -1,0 +1,126 @@
+"""What stands in the scene beside the Gaussians: frusta, photographs, the path, the tracked camera, the arrow."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.snapshot import CameraEstimate
+from viewer.advice import Advice
+from viewer.colours import source_colour
+from viewer.moment import Moment
+from viewer.state import State
+
+Array = npt.NDArray[np.float64]
+Colour = tuple[float, float, float]
+
+PATH_COLOUR: Colour = (0.95, 0.95, 0.95)
+TRACKED_COLOUR: Colour = (0.2, 1.0, 0.3)
+ADVICE_COLOUR: Colour = (1.0, 0.85, 0.1)
+_FRUSTUM = 0.12  # depth of a frustum in parts of the scene's depth, which is 1
+_AT_THE_EYE = 2.0  # times the depth of a frustum
+_ROOM = 0.5  # of the distance to the nearest other camera: frusta do not run into each other
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    ends: Array  # (M, 2, 3) world
+    colour: Colour
+    width: int  # pixels
+
+
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """An image on its camera's frustum."""
+
+    name: str
+    corners: Array  # (4, 3) world: top left, top right, bottom right, bottom left
+    image: npt.NDArray[np.uint8]  # (h, w, 3) RGB
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    lines: tuple[Lines, ...]
+    photographs: tuple[Photograph, ...]
+
+
+def shapes(moment: Moment, state: State, advice: Advice | None, eye: Array | None = None) -> Shapes:
+    """All shapes that `state` shows. A camera right at the `eye` (3,) has none: it would fill the window."""
+    snapshot = moment.snapshot
+    depth = frustum_depth(snapshot.cameras)
+    others = [
+        (index, camera)
+        for index, camera in enumerate(snapshot.cameras)
+        if eye is None or np.linalg.norm(camera.T_world_camera[:3, 3] - eye) > _AT_THE_EYE * depth
+    ]
+    lines, photographs = [], []
+    if state.path and len(snapshot.cameras) > 1:
+        lines.append(Lines(path(snapshot.cameras), PATH_COLOUR, 1))
+    if state.cameras:
+        for index, camera in others:
+            corners = image_corners(camera, camera.T_world_camera, depth)
+            lines.append(Lines(frustum(camera.T_world_camera, corners), source_colour(index), 2))
+            image = snapshot.images.get(camera.name)
+            if state.photographs and image is not None:
+                photographs.append(Photograph(camera.name, corners, image))
+    live = moment.tracked
+    if state.tracked and live is not None and not state.follow:
+        corners = image_corners(live, live.T_world_camera, 1.2 * depth)
+        lines.append(Lines(frustum(live.T_world_camera, corners), TRACKED_COLOUR, 3))
+    if state.advice and advice is not None and advice.arrow is not None and advice.target is not None:
+        lines.append(Lines(arrow(*advice.arrow, advice.target), ADVICE_COLOUR, 3))
+    return Shapes(tuple(lines), tuple(photographs))
+
+
+def live_camera(moment: Moment) -> CameraEstimate | None:
+    """The camera to follow: the tracked one, or else the one whose frame came last; None where there is none."""
+    if moment.tracked is not None:
+        return moment.tracked
+    return max(moment.snapshot.cameras, key=lambda camera: camera.frame_id, default=None)
+
+
+def frustum_depth(cameras: tuple[CameraEstimate, ...]) -> float:
+    """How deep frusta are drawn: visible from afar, but no deeper than half the way to the next camera."""
+    centres = np.array([camera.T_world_camera[:3, 3] for camera in cameras])
+    if len(centres) < 2:
+        return _FRUSTUM
+    distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
+    nearest = np.median(distances[~np.eye(len(centres), dtype=bool)].reshape(len(centres), -1).min(1))
+    return float(np.clip(_ROOM * nearest, 0.03 * _FRUSTUM, _FRUSTUM))
+
+
+def image_corners(lens: CameraEstimate, T_world_camera: Array, depth: float) -> Array:
+    """(4, 3) world positions of the image's corners on the plane `depth` ahead of the camera."""
+    pixels = np.array([[0, 0], [lens.width, 0], [lens.width, lens.height], [0, lens.height]], np.float64)
+    rays = np.column_stack([(pixels - lens.K[:2, 2]) / lens.K[[0, 1], [0, 1]], np.ones(4)])
+    return depth * rays @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+
+
+def frustum(T_world_camera: Array, corners: Array) -> Array:
+    """(10, 2, 3) a pyramid from the camera's centre to the corners, and a roof that tells which side is up."""
+    centre = np.broadcast_to(T_world_camera[:3, 3], (4, 3))
+    height = corners[0] - corners[3]
+    top = (corners[0] + corners[1]) / 2.0 + 0.15 * height
+    roof = np.stack([np.stack([corners[0], top]), np.stack([corners[1], top])])
+    edges = np.stack([np.stack([centre, corners], 1), np.stack([corners, np.roll(corners, -1, 0)], 1)])
+    return np.concatenate([*edges, roof])
+
+
+def path(cameras: tuple[CameraEstimate, ...]) -> Array:
+    """(C - 1, 2, 3) from camera to camera in the order of their frames."""
+    ordered = sorted(cameras, key=lambda camera: camera.frame_id)
+    centres = np.array([camera.T_world_camera[:3, 3] for camera in ordered])
+    return np.stack([centres[:-1], centres[1:]], 1)
+
+
+def arrow(start: Array, end: Array, target: Array) -> Array:
+    """(6, 2, 3) an arrow from `start` to `end` with a head of four lines, and a short ray from there to `target`."""
+    length = float(np.linalg.norm(end - start))
+    along = (end - start) / max(length, 1e-12)
+    sight = (target - end) / max(float(np.linalg.norm(target - end)), 1e-12)
+    side = np.cross(along, sight)
+    side /= max(float(np.linalg.norm(side)), 1e-12)
+    barbs = [end - 0.3 * length * along + 0.15 * length * spread for spread in (side, -side, sight, -sight)]
+    return np.array([[start, end], *([end, barb] for barb in barbs), [end, end + length * sight]])

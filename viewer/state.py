@@ -1,0 +1,185 @@
+"""What the viewer shows and how: a value that keys and buttons turn into another value."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from viewer.moment import History, Moment
+
+POINT_SIZES = (1, 12)  # pixels
+BLEND_STEP = 0.25
+
+
+class Engine(enum.Enum):
+    """Who draws the Gaussians: the project's own rasteriser on the processor, or Open3D through Vulkan."""
+
+    CORE = "splatnode's own rasteriser"
+    OPEN3D = "Open3D's splat shader"
+
+
+class Colouring(enum.Enum):
+    PHOTOGRAPH = "as photographed"
+    DEPTH = "depth (red is near)"
+    NORMAL = "normal"
+    SUPPORT = "supporting views (red: one, green: four or more)"
+    SOURCE = "source frame"
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    engine: Engine = Engine.CORE
+    as_points: bool = False
+    point_size: int = 3  # pixels
+    colouring: Colouring = Colouring.PHOTOGRAPH
+    gaussians: bool = True
+    cameras: bool = True
+    photographs: bool = True
+    path: bool = True
+    tracked: bool = True
+    advice: bool = True
+    help: bool = False
+    paused: bool = False
+    follow: bool = False  # the viewpoint is that of the live camera
+    camera: str | None = None  # the viewpoint is that of this camera
+    blend: float = 0.0  # how much of its photograph lies over the render there, 0 to 1
+    held: Moment | None = None  # a moment of the past; None: the newest
+
+
+Change = Callable[[State, History], State]
+
+
+@dataclass(frozen=True)
+class Binding:
+    key: str  # a character, or the name of a key
+    help: str
+    change: Change
+
+
+def shown_moment(state: State, history: History) -> Moment | None:
+    """The moment to show, None where nothing has come yet."""
+    if state.held is not None:
+        return state.held
+    return history[-1] if history else None
+
+
+def press(state: State, history: History, key: str) -> State:
+    """The state after a key; keys that mean nothing leave it as it is."""
+    for binding in BINDINGS:
+        if binding.key == key:
+            return binding.change(state, history)
+    return state
+
+
+def go_to_camera(state: State, name: str | None) -> State:
+    """The viewpoint of the camera called `name`; None leaves the cameras."""
+    return replace(state, camera=name, follow=False)
+
+
+def go_to_moment(state: State, history: History, index: int) -> State:
+    """The moment at `index` of the history; the last one means the newest, also when newer ones come."""
+    if not history or (index >= len(history) - 1 and not state.paused):
+        return replace(state, held=None)
+    return replace(state, held=history[min(max(index, 0), len(history) - 1)])
+
+
+def moment_index(state: State, history: History) -> int:
+    """Where the shown moment is on the time axis. One that was thinned out is where it would be."""
+    if state.held is None:
+        return max(len(history) - 1, 0)
+    later = [index for index, moment in enumerate(history) if moment.received_s >= state.held.received_s]
+    return later[0] if later else max(len(history) - 1, 0)
+
+
+def _toggle(field: str) -> Change:
+    return lambda state, _history: replace(state, **{field: not getattr(state, field)})
+
+
+def _pause(state: State, history: History) -> State:
+    """Stops at what is shown; goes on with the newest."""
+    if state.paused:
+        return replace(state, paused=False, held=None)
+    return replace(state, paused=True, held=shown_moment(state, history))
+
+
+def _follow(state: State, _history: History) -> State:
+    return replace(state, follow=not state.follow, camera=None)
+
+
+def _engine(state: State, _history: History) -> State:
+    return replace(state, engine=Engine.OPEN3D if state.engine is Engine.CORE else Engine.CORE)
+
+
+def _colouring(state: State, _history: History) -> State:
+    order = list(Colouring)
+    return replace(state, colouring=order[(order.index(state.colouring) + 1) % len(order)])
+
+
+def _resize(step: int) -> Change:
+    smallest, largest = POINT_SIZES
+    return lambda state, _history: replace(state, point_size=min(max(state.point_size + step, smallest), largest))
+
+
+def _blend(step: float) -> Change:
+    return lambda state, _history: replace(state, blend=min(max(state.blend + step, 0.0), 1.0))
+
+
+def _camera(step: int) -> Change:
+    def change(state: State, history: History) -> State:
+        moment = shown_moment(state, history)
+        names = [camera.name for camera in moment.snapshot.cameras] if moment else []
+        if not names:
+            return state
+        if state.camera not in names:
+            return go_to_camera(state, names[0 if step > 0 else -1])
+        return go_to_camera(state, names[(names.index(state.camera) + step) % len(names)])
+
+    return change
+
+
+def _time(step: int) -> Change:
+    return lambda state, history: go_to_moment(state, history, moment_index(state, history) + step)
+
+
+def _leave(state: State, _history: History) -> State:
+    return replace(state, camera=None, follow=False, help=False)
+
+
+BINDINGS = (
+    Binding("h", "show or hide this help", _toggle("help")),
+    Binding("g", "Gaussians as Gaussians or as points", _toggle("as_points")),
+    Binding("e", "drawn by splatnode or by Open3D (where Vulkan is)", _engine),
+    Binding("c", "next colouring: photograph, depth, normal, support, source", _colouring),
+    Binding("[", "smaller points", _resize(-1)),
+    Binding("]", "larger points", _resize(1)),
+    Binding("1", "show or hide the Gaussians", _toggle("gaussians")),
+    Binding("2", "show or hide the cameras", _toggle("cameras")),
+    Binding("3", "show or hide the photographs on them", _toggle("photographs")),
+    Binding("4", "show or hide the path", _toggle("path")),
+    Binding("5", "show or hide the tracked camera", _toggle("tracked")),
+    Binding("6", "show or hide the advice for the next view", _toggle("advice")),
+    Binding("n", "go to the next camera", _camera(1)),
+    Binding("p", "go to the previous camera", _camera(-1)),
+    Binding(".", "more of its photograph over the render", _blend(BLEND_STEP)),
+    Binding(",", "less of it", _blend(-BLEND_STEP)),
+    Binding("f", "follow the live camera", _follow),
+    Binding("space", "pause: keep what is shown", _pause),
+    Binding("left", "back in time", _time(-1)),
+    Binding("right", "forward in time", _time(1)),
+    Binding("escape", "leave a camera, close the help", _leave),
+)
+
+COMMANDS = {"r": "look at the whole scene", "s": "save a screenshot", "q": "close the viewer"}
+
+MOUSE = (
+    ("left button", "orbit; a click on a camera goes there"),
+    ("right or middle button", "pan"),
+    ("wheel", "zoom"),
+)
+
+
+def help_lines() -> list[str]:
+    """What can be done, a line each."""
+    keys = [(binding.key, binding.help) for binding in BINDINGS]
+    return [f"{name}: {text}" for name, text in [*MOUSE, *keys, *COMMANDS.items()]]

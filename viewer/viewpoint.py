@@ -1,0 +1,173 @@
+"""Where the person looks from: orbit, pan, zoom, and the viewpoints that a scene suggests. Pure functions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.snapshot import CameraEstimate
+from viewer.moment import Moment
+
+Array = npt.NDArray[np.float64]
+
+_STEEPEST = math.radians(85.0)  # of a viewing direction, from the horizontal
+_NEAREST = 1e-3  # world units, of the pivot
+_LENS = np.array([[0.9, 0.0, 0.5], [0.0, 0.9, 0.375], [0.0, 0.0, 1.0]]), 1.0, 0.75  # where no camera suggests one
+
+
+@dataclass(frozen=True, eq=False)
+class Viewpoint:
+    """A camera that the person moves. The pivot is `distance` ahead of it; orbits go around it."""
+
+    T_world_camera: Array  # (4, 4)
+    distance: float
+    up: Array  # (3,) unit, the world's
+    lens: tuple[Array, float, float]  # K (3, 3), width, height: what has to fit into the window
+
+    @property
+    def pivot(self) -> Array:
+        return self.T_world_camera[:3, 3] + self.distance * self.T_world_camera[:3, 2]
+
+    def K(self, width: int, height: int) -> Array:
+        """(3, 3) for a window in which the lens's image lies in the middle, as large as it fits."""
+        K, lens_width, lens_height = self.lens
+        scale = min(width / lens_width, height / lens_height)
+        margin = np.array([width - scale * lens_width, height - scale * lens_height]) / 2.0
+        fitted = K.copy()
+        fitted[:2] *= scale
+        fitted[:2, 2] += margin
+        return fitted
+
+
+def look_at(centre: Array, target: Array, up: Array) -> Array:
+    """(4, 4) T_world_camera at `centre` that looks at `target`, with `up` pointing up in the image."""
+    forward = (target - centre) / max(float(np.linalg.norm(target - centre)), 1e-12)
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-9:  # straight up or down: any direction to the right will do
+        right = np.cross(forward, np.roll(up, 1))
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3] = np.column_stack([right, np.cross(forward, right), forward, centre])
+    return T
+
+
+def orbited(view: Viewpoint, right_rad: float, up_rad: float) -> Viewpoint:
+    """After a walk around the pivot: to the right around the world's up, then upwards, not over the pole."""
+    outwards = (view.T_world_camera[:3, 3] - view.pivot) / view.distance
+    elevation = math.asin(float(np.clip(outwards @ view.up, -1.0, 1.0)))
+    raised = float(np.clip(elevation + up_rad, -_STEEPEST, _STEEPEST)) if abs(elevation) < _STEEPEST else elevation
+    turned = _rotation(view.up, right_rad) @ outwards
+    flat = turned - (turned @ view.up) * view.up
+    flat /= max(float(np.linalg.norm(flat)), 1e-12)
+    direction = math.cos(raised) * flat + math.sin(raised) * view.up
+    return replace(view, T_world_camera=look_at(view.pivot + view.distance * direction, view.pivot, view.up))
+
+
+def panned(view: Viewpoint, right_px: float, down_px: float, focal_px: float) -> Viewpoint:
+    """After a drag of the scene by pixels: what is at the pivot's distance stays under the pointer."""
+    T = view.T_world_camera.copy()
+    T[:3, 3] -= view.distance / focal_px * (right_px * T[:3, 0] + down_px * T[:3, 1])
+    return replace(view, T_world_camera=T)
+
+
+def zoomed(view: Viewpoint, factor: float) -> Viewpoint:
+    """With the distance to the pivot multiplied by `factor`."""
+    distance = max(view.distance * factor, _NEAREST)
+    T = view.T_world_camera.copy()
+    T[:3, 3] = view.pivot - distance * T[:3, 2]
+    return replace(view, T_world_camera=T, distance=distance)
+
+
+def at_camera(view: Viewpoint, camera: CameraEstimate) -> Viewpoint:
+    """The viewpoint of an estimated camera, with its lens."""
+    lens = camera.K, float(camera.width), float(camera.height)
+    return replace(view, T_world_camera=camera.T_world_camera, lens=lens)
+
+
+def overview(moment: Moment) -> Viewpoint:
+    """From behind and above the cameras, at the middle of what they see."""
+    cameras = moment.snapshot.cameras
+    up, pivot = scene_up(cameras), scene_pivot(moment)
+    if not cameras:
+        spread = scene_spread(moment, pivot)
+        centre = pivot - np.array([0.0, 0.0, 2.5 * spread]) + 0.5 * spread * up
+        return Viewpoint(look_at(centre, pivot, up), float(np.linalg.norm(centre - pivot)), up, _LENS)
+    centres = np.array([camera.T_world_camera[:3, 3] for camera in cameras])
+    backwards = centres.mean(0) - pivot
+    middle = cameras[len(cameras) // 2]
+    lens = middle.K, float(middle.width), float(middle.height)
+    slope = np.array([middle.width, middle.height]) / (2.0 * middle.K[[0, 1], [0, 1]])
+    for factor in np.arange(1.3, 4.0, 0.15):  # as close as it can be with every camera in the picture
+        centre = pivot + factor * (backwards + 0.25 * float(np.linalg.norm(backwards)) * up)
+        view = Viewpoint(look_at(centre, pivot, up), float(np.linalg.norm(centre - pivot)), up, lens)
+        local = (centres - centre) @ view.T_world_camera[:3, :3]
+        if (np.abs(local[:, :2]) < 0.93 * slope * local[:, 2:]).all():
+            break
+    return view
+
+
+def scene_up(cameras: tuple[CameraEstimate, ...]) -> Array:
+    """(3,) people hold cameras upright: the mean of their upward axes; the first camera's where there are none."""
+    if not cameras:
+        return np.array([0.0, -1.0, 0.0])
+    total = np.sum([-camera.T_world_camera[:3, 1] for camera in cameras], axis=0)
+    length = float(np.linalg.norm(total))
+    return total / length if length > 1e-6 else -cameras[0].T_world_camera[:3, 1]
+
+
+def scene_pivot(moment: Moment) -> Array:
+    """(3,) the middle of what the cameras see: ahead of their middle, at the median depth of the Gaussians."""
+    cameras, means = moment.snapshot.cameras, moment.snapshot.gaussians.means
+    if not cameras:
+        return np.median(means, axis=0).astype(np.float64) if len(means) else np.array([0.0, 0.0, 1.0])
+    centre = np.mean([camera.T_world_camera[:3, 3] for camera in cameras], axis=0)
+    forward = np.sum([camera.T_world_camera[:3, 2] for camera in cameras], axis=0)
+    if np.linalg.norm(forward) < 0.3 * len(cameras):  # cameras all around: they look inwards or outwards
+        return np.median(means, axis=0).astype(np.float64) if len(means) else centre
+    forward /= np.linalg.norm(forward)
+    depths = (means - centre) @ forward
+    ahead = depths[depths > 0]
+    return centre + (float(np.median(ahead)) if len(ahead) else 1.0) * forward
+
+
+def scene_spread(moment: Moment, pivot: Array) -> float:
+    """The median distance of the Gaussians from the pivot; 1 where there are none."""
+    means = moment.snapshot.gaussians.means
+    return float(np.median(np.linalg.norm(means - pivot, axis=1))) or 1.0 if len(means) else 1.0
+
+
+def swing(moment: Moment, frames: int) -> list[Viewpoint]:
+    """A closed tour, `frames` long, around the pivot: an ellipse a little wider than where the cameras were.
+
+    A full circle would mostly show what no photograph shows.
+    """
+    start = overview(moment)
+    cameras = moment.snapshot.cameras
+    if len(cameras) < 2:
+        width, height, distance = math.radians(25.0), math.radians(8.0), start.distance
+    else:
+        offsets = np.array([camera.T_world_camera[:3, 3] for camera in cameras]) - start.pivot
+        distances = np.linalg.norm(offsets, axis=1)
+        level = offsets.mean(0) - (offsets.mean(0) @ start.up) * start.up
+        level /= max(float(np.linalg.norm(level)), 1e-12)
+        side = np.cross(start.up, level)
+        azimuths = np.arctan2(offsets @ side, offsets @ level)
+        elevations = np.arcsin(np.clip(offsets @ start.up / distances, -1.0, 1.0))
+        width = min(max(1.1 * float(np.ptp(azimuths)) / 2.0, math.radians(6.0)), math.radians(60.0))
+        height = min(max(1.1 * float(np.ptp(elevations)) / 2.0, math.radians(3.0)), math.radians(20.0))
+        distance = float(np.median(distances))
+        middle = (azimuths.max() + azimuths.min()) / 2.0, (elevations.max() + elevations.min()) / 2.0
+        direction = math.cos(middle[1]) * (math.cos(middle[0]) * level + math.sin(middle[0]) * side)
+        centre = start.pivot + distance * (direction + math.sin(middle[1]) * start.up)
+        start = replace(start, T_world_camera=look_at(centre, start.pivot, start.up), distance=distance)
+    angles = 2.0 * np.pi * np.arange(frames) / frames
+    return [orbited(start, width * math.sin(angle), height * math.cos(angle)) for angle in angles]
+
+
+def _rotation(axis: Array, angle: float) -> Array:
+    """(3, 3) rotation by Rodrigues' formula; `axis` is a unit vector."""
+    cross = np.cross(np.eye(3), axis)  # cross @ v is axis x v
+    return np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross

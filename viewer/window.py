@@ -1,0 +1,234 @@
+"""The window: a picture that is turned with the mouse, and a panel with words and switches.
+
+Everything runs in the main thread, as Open3D asks; what comes from elsewhere is looked for at each tick, and only the
+newest counts. Pictures by the project's own rasteriser go into an image widget, Open3D's into a scene widget; the
+scene widget is there in any case, because without one Open3D 0.20 keeps the memory of every image that it has shown.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import open3d as o3d  # pyright: ignore[reportMissingImports]
+from open3d.visualization import gui, rendering  # pyright: ignore[reportMissingImports]
+
+from recon.export import write_file
+from viewer.paint import BACKGROUND
+from viewer.panel import Panel
+from viewer.scene3d import Scene3D, image3d, look_from
+from viewer.session import Session
+from viewer.state import Engine
+from viewer.viewpoint import orbited, panned, zoomed
+
+Image = npt.NDArray[np.uint8]
+
+_TURN_PER_PIXEL = 0.006  # radians
+_ZOOM_PER_NOTCH = 0.88
+_CLICK_PX = 4  # a pointer that moves less between press and release clicks
+_SMOOTH_S = 0.06  # a picture that takes longer is painted at half the resolution while the pointer drags it
+_PANEL_EMS = 22  # the panel's width, in letter widths of the theme
+_KEYS = {
+    gui.KeyName.SPACE: "space",
+    gui.KeyName.ESCAPE: "escape",
+    gui.KeyName.LEFT: "left",
+    gui.KeyName.RIGHT: "right",
+}
+
+
+def show(session: Session, *, open3d_may_draw: bool, screenshots: Path, size: tuple[int, int] = (1280, 800)) -> None:
+    """Opens the window and returns when it is closed. Raises what went wrong while it was open.
+
+    `open3d_may_draw` is False where Vulkan is software; the key that asks for it works all the same.
+    """
+    # It would say, at each picture, which of the far shell's Gaussians are too wide for it.
+    o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
+    app = gui.Application.instance
+    app.initialize()
+    state = session.state
+    session.state = replace(state, engine=Engine.OPEN3D if open3d_may_draw else Engine.CORE)
+    window = _Window(app, session, screenshots, size)
+    try:
+        app.run()
+    finally:
+        session.close()
+    if window.error is not None:
+        raise window.error
+
+
+class _Window:
+    def __init__(self, app: gui.Application, session: Session, screenshots: Path, size: tuple[int, int]) -> None:
+        self.error: BaseException | None = None
+        self._app, self._session, self._screenshots = app, session, screenshots
+        self._window = app.create_window("splatnode", *size)
+        self._picture = gui.ImageWidget(image3d(np.full((8, 8, 3), BACKGROUND, np.uint8)))
+        self._scene_widget = gui.SceneWidget()
+        self._scene_widget.scene = rendering.Open3DScene(self._window.renderer)
+        self._scene = Scene3D(self._scene_widget.scene)
+        self._panel = Panel(self._window, self._guarded(self._change), self._guarded(self._command))
+        for widget in (self._picture, self._scene_widget, self._panel.root):
+            self._window.add_child(widget)
+        self._picture.set_on_mouse(self._guarded(self._mouse, gui.ImageWidget.EventCallbackResult.HANDLED))
+        self._scene_widget.set_on_mouse(self._guarded(self._mouse, gui.Widget.EventCallbackResult.CONSUMED))
+        self._window.set_on_layout(self._guarded(self._layout))
+        self._window.set_on_key(self._guarded(self._key, False))
+        self._window.set_on_tick_event(self._guarded(self._tick, False))
+        self._dirty = True
+        self._size = (1, 1)  # of the picture, pixels
+        self._pressed: tuple[float, float] | None = None  # where the pointer went down, None: it is up
+        self._pointer = (0.0, 0.0)
+        self._dragging = False
+        self._painted_s = 0.0  # how long the last full picture took
+        self._shown: tuple[object, ...] = ()  # what the scene widget shows
+        self._analysed: object = None
+        self._words_at = 0.0
+        self._notice = ""
+
+    def _guarded(self, function: Callable, otherwise: object = None) -> Callable:
+        """`function`, whose exception ends the run of the window and is raised where it was opened."""
+
+        def call(*arguments):
+            try:
+                return function(*arguments)
+            except BaseException as error:
+                self.error = self.error or error
+                self._app.quit()
+                return otherwise
+
+        return call
+
+    # ---- What happens by itself -----------------------------------------------------------------------------------
+
+    def _tick(self) -> bool:
+        """Looks for news and redraws where there are any."""
+        if self._session.receive():
+            self._dirty = True
+        analysis = self._session.analysis()
+        if analysis is not self._analysed:
+            self._analysed, self._dirty = analysis, True
+        if time.monotonic() - self._words_at > 0.5:
+            self._say()
+        if not self._dirty:
+            return False
+        self._dirty = False
+        self._draw()
+        self._say()
+        return True
+
+    def _draw(self) -> None:
+        session, (width, height) = self._session, self._size
+        view = session.viewpoint()
+        if view is None or width < 2 or height < 2:
+            return
+        blends = session.state.blend > 0 and session.photograph() is not None
+        own = session.state.engine is Engine.CORE or blends
+        if self._picture.visible != own or self._scene_widget.visible == own:
+            self._picture.visible, self._scene_widget.visible = own, not own
+            self._window.set_needs_layout()
+        started = time.perf_counter()
+        if own:
+            half = self._dragging and self._painted_s > _SMOOTH_S
+            image = session.paint(*((width // 2, height // 2) if half else (width, height)))
+            if image is not None:
+                self._picture.update_image(image3d(image))
+            if not half:
+                self._painted_s = time.perf_counter() - started
+            return
+        state = session.state
+        wanted = (session.gaussians(), state.gaussians, state.as_points, state.point_size)
+        if len(self._shown) != len(wanted) or any(a is not b for a, b in zip(self._shown, wanted, strict=True)):
+            self._scene.show_gaussians(session.gaussians(), state)
+            self._shown = wanted
+        self._scene.show_shapes(session.shapes())
+        look_from(self._scene_widget, view, width, height)
+        self._scene_widget.force_redraw()
+
+    def _say(self) -> None:
+        self._words_at = time.monotonic()
+        seconds = self._painted_s if self._session.state.engine is Engine.CORE else None
+        self._panel.show(self._session, seconds, self._notice)
+
+    def _layout(self, _context: object) -> None:
+        area = self._window.content_rect
+        panel = min(round(_PANEL_EMS * self._window.theme.font_size), area.width // 2)
+        frame = gui.Rect(area.x, area.y, area.width - panel, area.height)
+        self._picture.frame = self._scene_widget.frame = frame
+        self._panel.root.frame = gui.Rect(area.get_right() - panel, area.y, panel, area.height)
+        self._size, self._dirty = (frame.width, frame.height), True
+
+    # ---- What the person does -------------------------------------------------------------------------------------
+
+    def _change(self, state) -> None:
+        self._session.state = state
+        self._dirty = True
+
+    def _command(self, key: str) -> None:
+        if key == "r":
+            self._session.whole_scene()
+        elif key == "s":
+            self._screenshot()
+        elif key == "q":
+            self._window.close()
+        else:
+            self._session.press(key)
+        self._dirty = True
+
+    def _key(self, event: gui.KeyEvent) -> bool:
+        if event.type != gui.KeyEvent.Type.DOWN:
+            return False
+        key = _KEYS.get(event.key) or (chr(event.key) if 32 < event.key < 127 else "")
+        self._command(key)
+        return bool(key)
+
+    def _mouse(self, event: gui.MouseEvent):
+        """Orbits, pans, zooms, or goes to the camera that was clicked."""
+        frame = self._picture.frame
+        x, y = float(event.x - frame.x), float(event.y - frame.y)
+        if event.type == gui.MouseEvent.Type.BUTTON_DOWN:
+            self._pressed = self._pointer = (x, y)
+        elif event.type == gui.MouseEvent.Type.DRAG and self._pressed is not None:
+            self._drag(event, x, y)
+        elif event.type == gui.MouseEvent.Type.BUTTON_UP and self._pressed is not None:
+            if not self._dragging:
+                self._session.click(x, y, *self._size)
+            self._pressed, self._dragging, self._dirty = None, False, True
+        elif event.type == gui.MouseEvent.Type.WHEEL:
+            view = self._session.grasped()
+            if view is not None:
+                self._session.move(zoomed(view, _ZOOM_PER_NOTCH**event.wheel_dy))
+                self._dirty = True
+        return gui.Widget.EventCallbackResult.CONSUMED
+
+    def _drag(self, event: gui.MouseEvent, x: float, y: float) -> None:
+        start = self._pressed or (x, y)
+        if not self._dragging and max(abs(x - start[0]), abs(y - start[1])) < _CLICK_PX:
+            return
+        view = self._session.grasped()
+        right, down = x - self._pointer[0], y - self._pointer[1]
+        self._pointer, self._dragging, self._dirty = (x, y), True, True
+        if view is None:
+            return
+        if event.is_button_down(gui.MouseButton.LEFT):
+            self._session.move(orbited(view, -_TURN_PER_PIXEL * right, _TURN_PER_PIXEL * down))
+        else:
+            self._session.move(panned(view, right, down, float(view.K(*self._size)[0, 0])))
+
+    def _screenshot(self) -> None:
+        path = self._screenshots / time.strftime("splatnode_%Y%m%d_%H%M%S.png")
+        if self._picture.visible:
+            image = self._session.paint(*self._size)
+            if image is not None:
+                self._save(path, image)
+            return
+        scene = self._scene_widget.scene.scene
+        scene.render_to_image(self._guarded(lambda image: self._save(path, np.asarray(image))))
+
+    def _save(self, path: Path, image: Image) -> None:
+        _, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        write_file(path, png.tobytes())
+        self._notice = f"saved {path}"

@@ -1,0 +1,80 @@
+"""What the panel says, in plain words."""
+
+from __future__ import annotations
+
+from viewer.advice import Advice
+from viewer.moment import History, Moment
+from viewer.state import State, moment_index
+
+_STALE_S = 5.0  # a node that is at work is heard from more often
+_MOST_DROPPED = 6
+
+
+def verdict_lines(moment: Moment) -> list[str]:
+    """The verdict, what to do about it, and which frames it is about."""
+    verdict = moment.snapshot.verdict
+    lines = [f"{verdict.code.value}: {verdict.message}"]
+    if verdict.advice:
+        lines.append(f"What to do: {verdict.advice}")
+    if verdict.frames:
+        lines.append(f"About: {', '.join(verdict.frames)}")
+    return lines
+
+
+def count_lines(moment: Moment) -> list[str]:
+    """How much there is and how long it took."""
+    snapshot = moment.snapshot
+    cameras = len(snapshot.cameras)
+    lines = [f"{thousands(len(snapshot.gaussians))} Gaussians, {cameras} camera{'s' * (cameras != 1)}"]
+    stages = ", ".join(f"{name} {seconds:.1f}" for name, seconds in snapshot.seconds.items() if name != "total")
+    total = snapshot.seconds.get("total", sum(snapshot.seconds.values()))
+    if snapshot.seconds:
+        lines.append(f"{total:.1f} s" + (f" ({stages})" if stages else ""))
+    if snapshot.iterations:
+        lines.append(f"{thousands(snapshot.iterations)} iterations{', finished' if snapshot.final else ''}")
+    return lines
+
+
+def dropped_lines(moment: Moment) -> list[str]:
+    """The frames that were left out, the latest last, each with its reason."""
+    dropped = moment.snapshot.dropped
+    lines = [f"left out {frame.name}: {frame.reason}" for frame in dropped[-_MOST_DROPPED:]]
+    earlier = len(dropped) - len(lines)
+    return [f"{earlier} frames were left out before:"] * (earlier > 0) + lines
+
+
+def advice_line(advice: Advice | None, moment: Moment) -> str:
+    """The next view; where the verdict says what to do, that comes first."""
+    if not moment.snapshot.cameras or not moment.snapshot.verdict.publishable:
+        return moment.snapshot.verdict.advice or "Take photographs that overlap, with a step to the side."
+    return "looking for the best next view" if advice is None else advice.sentence
+
+
+def time_line(state: State, history: History) -> str:
+    """Where on the time axis the shown moment is."""
+    if not history:
+        return "nothing has come yet"
+    index, count = moment_index(state, history), len(history)
+    shown = state.held if state.held is not None else history[-1]
+    ago = history[-1].received_s - shown.received_s
+    newer = count - 1 - index
+    place = f"snapshot {index + 1} of {count}"
+    return f"{place}, {ago:.0f} s before the newest" if newer else f"{place}, the newest"
+
+
+def feed_line(age_s: float | None, final: bool) -> str:
+    """How the connection is; `age_s` is None for a result on disk, infinite before anything came."""
+    if age_s is None:
+        return "a finished result"
+    if age_s == float("inf"):
+        return "waiting for the node: nothing has come yet"
+    if final:
+        return "the node has finished"
+    if age_s > _STALE_S:
+        return f"STALE: nothing has come for {age_s:.0f} s"
+    return "live"
+
+
+def thousands(number: int) -> str:
+    """12345 as "12 345"."""
+    return f"{number:,}".replace(",", " ")
