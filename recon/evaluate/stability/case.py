@@ -1,0 +1,119 @@
+"""What a row of the matrix gives for one seed: photographs, what is true about them, and what is asked."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+from capture.frame import DroppedFrame, Frame
+from recon import optimize
+from recon.config import Config
+from recon.evaluate.stability.places import Photo, Stage
+from recon.evaluate.truth import TrueCamera
+from recon.snapshot import Snapshot
+from recon.verdict import Code
+
+Source = Callable[[], Iterable[Frame | DroppedFrame]]
+World = Mapping[str, TrueCamera]  # by the name of the frame
+
+# The verdict stands before the first step of the optimiser, so that few steps at a small size ask the same question.
+# They leave the cameras as they were judged: a handful of steps would move them without improving them.
+LIGHT = Config(
+    size=320,
+    preview=optimize.Config(iterations=2, checkpoints=(), half_resolution_share=1.0, refine_poses=False),
+    optimize=optimize.Config(iterations=6, checkpoints=(), half_resolution_share=1.0, refine_poses=False),
+)
+
+
+class Demand(enum.Enum):
+    ACCEPT = "accept"  # a refusal is a false refusal
+    REFUSE = "refuse"
+    EITHER = "either"  # nobody could tell in advance: a refusal is as good as a right answer
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What a row measures besides the verdict, and whether that is within the row's limits."""
+
+    values: Mapping[str, float]
+    held: bool
+
+
+Probe = Callable[[Snapshot, Config], Measured]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """`source`, `config` and `probe` are sent to another process, so they hold nothing but data and module functions.
+
+    `worlds` are the true cameras of frames that belong together: a published scene is right if all its cameras are of
+    one world and agree with it. Frames in no world may be in no scene.
+    """
+
+    note: str  # made by `described`
+    source: Source
+    demand: Demand
+    codes: frozenset[Code]  # verdicts that describe these frames
+    worlds: tuple[World, ...] = ()
+    config: Config = LIGHT
+    probe: Probe | None = None  # runs where splatnode has published a scene
+
+
+@dataclass(frozen=True)
+class Row:
+    """`number` is that of the matrix in the project's notes; several rows may share one."""
+
+    number: int
+    name: str
+    make: Callable[[Stage], Case]
+
+
+def row(number: int, name: str) -> Callable[[Callable[[Stage], Case]], Row]:
+    """Makes the decorated function a row of the matrix."""
+    return partial(Row, number, name)
+
+
+def frames(photos: Sequence[Photo]) -> tuple[Frame, ...]:
+    """What a reconstruction gets. Raises ValueError where two photographs have one name."""
+    names = [photo.name for photo in photos]
+    if len(set(names)) < len(names):
+        raise ValueError(f"photographs must have different names, got {', '.join(names)}")
+    return tuple(Frame(i, photo.name, i, photo.image, photo.intrinsics) for i, photo in enumerate(photos))
+
+
+def all_at_hand(photos: Sequence[Photo]) -> Source:
+    return partial(list, frames(photos))
+
+
+def one_by_one(photos: Sequence[Photo]) -> Source:
+    return partial(iter, frames(photos))
+
+
+def world(photos: Sequence[Photo]) -> World:
+    """The true cameras of `photos` as one world."""
+    return {photo.name: photo.camera for photo in photos if photo.camera is not None}
+
+
+def described(photos: Sequence[Photo], note: str) -> str:
+    """The note of a case: the places, the number of frames, and what was done to them."""
+    places = " and ".join(dict.fromkeys(photo.place for photo in photos if photo.place)) or "made up"
+    return f"{places}, {len(photos)} frames" + (f": {note}" if note else "")
+
+
+def accepted(photos: Sequence[Photo], note: str, *codes: Code, probe: Probe | None = None) -> Case:
+    """Photographs that are enough for a scene. Besides `codes`, OK is always fitting."""
+    fitting = frozenset((Code.OK, *codes))
+    return Case(described(photos, note), all_at_hand(photos), Demand.ACCEPT, fitting, (world(photos),), probe=probe)
+
+
+def refused(photos: Sequence[Photo], note: str, *codes: Code) -> Case:
+    """Photographs from which nothing can be told for certain, though what is published is compared with the truth."""
+    return Case(described(photos, note), all_at_hand(photos), Demand.REFUSE, frozenset(codes), (world(photos),))
+
+
+def either(photos: Sequence[Photo], note: str, *codes: Code) -> Case:
+    """Photographs that may or may not be enough."""
+    fitting = frozenset((Code.OK, Code.OK_PARTIAL, *codes))
+    return Case(described(photos, note), all_at_hand(photos), Demand.EITHER, fitting, (world(photos),))

@@ -1,0 +1,58 @@
+"""The verb `stability`."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import shlex
+import sys
+
+from recon.evaluate.stability.campaign import Plan, run_campaign
+from recon.evaluate.stability.matrix import chosen
+from recon.evaluate.stability.methods import by_name
+from recon.evaluate.stability.places import load_places
+from recon.evaluate.stability.summary import Rate, summarise
+
+logger = logging.getLogger(__name__)
+
+
+def stability(args: argparse.Namespace) -> int:
+    """Runs the matrix, writes stability.json and stability.png, and prints the rates."""
+    plan = Plan(
+        rows=chosen(args.rows),
+        seeds=tuple(range(args.seeds)),
+        methods=args.methods,
+        jobs=args.jobs,
+        timeout_s=args.timeout_s,
+    )
+    for method in plan.methods:
+        by_name(method)
+    command = shlex.join(["splatnode", *sys.argv[1:]])
+    trials = run_campaign(plan, load_places(args.scenes, args.out), args.out, command)
+    try:
+        from recon.evaluate.stability import chart
+    except ImportError:
+        logger.warning("no chart: matplotlib is not installed. Run: pip install 'splatnode[bench]'")
+    else:
+        chart.draw(args.out / "stability.json", args.out)
+    for trial in trials:
+        if trial["outcome"] in ("false_accept", "false_refuse", "failed"):
+            print(
+                f"{trial['outcome']}: row {trial['row']} {trial['name']}, seed {trial['seed']}, {trial['method']}: ",
+                end="",
+            )
+            print(f"{trial['verdict']}; {trial['note']}; {trial['message'].strip().splitlines()[-1]}")
+    for method in dict.fromkeys(trial["method"] for trial in trials):
+        summary = summarise(trials, method)
+        print(
+            f"{method}: {summary.trials} trials, false accepts {_told(summary.false_accept)}, "
+            f"false refusals {_told(summary.false_refuse)}, other codes {_told(summary.other_code)}"
+        )
+    print(f"results: {args.out}/ (stability.json, stability.png)")
+    return 0
+
+
+def _told(rate: Rate) -> str:
+    if rate.rate is None or rate.low is None or rate.high is None:
+        return "not tried"
+    return f"{rate.count}/{rate.of} = {rate.rate:.1%} ({rate.low:.1%} to {rate.high:.1%})"

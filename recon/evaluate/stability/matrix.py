@@ -1,0 +1,26 @@
+"""All rows: every `Row` that a family of them defines, by number. A new row is one function in one of the files."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from recon.evaluate.stability import cameras, degenerate, lenses, mixtures, photometric, streams
+from recon.evaluate.stability.case import Row
+
+_FAMILIES = (cameras, degenerate, photometric, lenses, mixtures, streams)
+
+ROWS: tuple[Row, ...] = tuple(
+    sorted(
+        (found for family in _FAMILIES for found in vars(family).values() if isinstance(found, Row)),
+        key=lambda r: r.number,
+    )
+)
+
+
+def chosen(numbers: Collection[int]) -> tuple[Row, ...]:
+    """The rows with these numbers; all, where there are none. Raises ValueError for a number that no row has."""
+    known = {found.number for found in ROWS}
+    unknown = sorted(set(numbers) - known)
+    if unknown:
+        raise ValueError(f"no row {', '.join(map(str, unknown))}; there are {min(known)} to {max(known)}")
+    return tuple(found for found in ROWS if not numbers or found.number in numbers)

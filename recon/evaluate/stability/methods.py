@@ -1,0 +1,34 @@
+"""What goes through the matrix: splatnode by its public entry point, and stock reconstructions beside it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+
+from capture.frame import DroppedFrame, Frame
+from recon.config import Config
+from recon.pipeline import reconstruct
+from recon.snapshot import Snapshot
+
+Method = Callable[[Iterable[Frame | DroppedFrame], Config], Snapshot]
+
+NAMES = ("splatnode", "colmap", "glomap")
+
+
+def splatnode(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:
+    """The last snapshot."""
+    (last,) = deque(reconstruct(frames, config), maxlen=1)
+    return last
+
+
+def by_name(name: str) -> Method:
+    """Raises ValueError for a method that there is not, or that needs a package that is not installed."""
+    if name == "splatnode":
+        return splatnode
+    if name not in NAMES:
+        raise ValueError(f"no method {name!r}; there are: {', '.join(NAMES)}")
+    try:
+        from recon.evaluate import rivals
+    except ImportError as error:
+        raise ValueError(f"method {name!r} needs pycolmap. Run: pip install 'splatnode[bench]'") from error
+    return rivals.colmap if name == "colmap" else rivals.glomap

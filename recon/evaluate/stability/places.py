@@ -1,0 +1,194 @@
+"""Where the photographs of the trials come from: recorded scenes with true cameras, or the built-in place."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from capture.cameras import synthetic
+from capture.frame import Intrinsics
+from recon.evaluate.alignment import angles_deg
+from recon.evaluate.demo import write_capture
+from recon.evaluate.truth import EvaluationScene, TrueCamera, load_scene
+
+Image = npt.NDArray[np.uint8]
+
+NEIGHBOUR_DEG = 12.0  # between neighbours of a set, as people take photographs
+OVERLAP_DEG = 20.0  # beyond, photographs may share too little: a refusal would be no mistake
+_LONGEST_STRIDE = 4
+
+_BUILT_IN_SEEDS = (0, 1, 2, 3)
+_BUILT_IN_VIEWS = 12
+_STILL_PX = 1e-6  # of the focal length: centres this close together are one
+_ALONG = 0.9  # share of the motion that is along the view
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    name: str
+    image: Image  # (H, W, 3) RGB
+    camera: TrueCamera | None  # of `image`; None: it belongs nowhere
+    place: str = ""  # that it shows, for people
+    intrinsics: Intrinsics | None = None  # what the reconstruction is told
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A scene whose photographs `names`, in the order of capture, have true cameras."""
+
+    scene: EvaluationScene
+    names: tuple[str, ...]
+
+    @property
+    def name(self) -> str:
+        return self.scene.name
+
+    @property
+    def Ts_world_camera(self) -> npt.NDArray[np.float64]:  # (M, 4, 4)
+        return np.stack([self.scene.cameras[name].T_world_camera for name in self.names])
+
+    def photo(self, index: int) -> Photo:
+        name = self.names[index]
+        return Photo(name, self.scene.image(name), self.scene.cameras[name], self.name)
+
+    def photos(self, indices: Sequence[int]) -> list[Photo]:
+        return [self.photo(index) for index in indices]
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """`walked`: the camera moved to the side; `forward`: mostly along its view; `turned`: it stood on the spot."""
+
+    walked: tuple[Place, ...]
+    forward: tuple[Place, ...] = ()
+    turned: tuple[Place, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """What a row may draw from. Seeds take turns through the places, so that each row sees as many as it can."""
+
+    places: Places
+    row_name: str
+    seed: int
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """Fresh at every call, the same for the same row and seed."""
+        return np.random.default_rng([self.seed, zlib.crc32(self.row_name.encode())])
+
+    def place(self, turn: int = 0) -> Place:
+        """The place of this seed; `turn` 1, 2 ... gives other ones, where there are more."""
+        walked = self.places.walked
+        return walked[(self.seed + turn + zlib.crc32(self.row_name.encode())) % len(walked)]
+
+    def window(self, count: int, turn: int = 0, step_deg: float = NEIGHBOUR_DEG) -> tuple[Place, list[int]]:
+        """A place, and positions of `count` photographs there that overlap well; other `turn`s give other places.
+
+        They are neighbours as far apart as `step_deg` allows, so that the camera has moved; where none are as close,
+        neighbours within `OVERLAP_DEG`. Places without any are passed over. Raises ValueError where all are.
+        """
+        fitting = []
+        for skipped in range(len(self.places.walked)):
+            place = self.place(skipped)
+            starts, stride = neighbours(place.Ts_world_camera, count, step_deg)
+            if starts:
+                fitting.append((place, starts, stride))
+        if not fitting:
+            raise ValueError(
+                f"no place has {count} photographs whose views are {OVERLAP_DEG:g} degrees apart or closer"
+            )
+        place, starts, stride = fitting[turn % len(fitting)]
+        start = int(self.rng.choice(starts))
+        return place, [start + stride * i for i in range(count)]
+
+    def photos(self, count: int, turn: int = 0, step_deg: float = NEIGHBOUR_DEG) -> list[Photo]:
+        """The photographs of `window`."""
+        place, indices = self.window(count, turn, step_deg)
+        return place.photos(indices)
+
+
+def neighbours(Ts_world_camera: npt.NDArray[np.float64], count: int, step_deg: float) -> tuple[list[int], int]:
+    """Where sets of `count` cameras may start, and the stride between them: the longest that keeps to `step_deg`."""
+    for stride, limit in [*((stride, step_deg) for stride in range(_LONGEST_STRIDE, 0, -1)), (1, OVERLAP_DEG)]:
+        starts = [
+            start
+            for start in range(len(Ts_world_camera) - stride * (count - 1))
+            if _overlap(Ts_world_camera[start : start + stride * count : stride], Ts_world_camera, limit)
+        ]
+        if starts:
+            return starts, stride
+    return [], 1
+
+
+def _overlap(chosen: npt.NDArray[np.float64], everyone: npt.NDArray[np.float64], limit_deg: float) -> bool:
+    """Whether each camera sees what the next one sees: it turned by less than `limit_deg` and stepped a usual step."""
+    usual = float(np.median(np.linalg.norm(np.diff(everyone[:, :3, 3], axis=0), axis=1)))
+    steps = np.linalg.norm(np.diff(chosen[:, :3, 3], axis=0), axis=1)
+    turns = angles_deg(chosen[:-1, :3, :3], chosen[1:, :3, :3])
+    return bool((turns <= limit_deg).all() and (steps >= 0.5 * usual).all() and (steps <= 5.0 * usual).all())
+
+
+def renamed(photos: Sequence[Photo], mark: str) -> list[Photo]:
+    """The photographs under names of their own, for sets in which names would meet twice."""
+    return [replace(photo, name=f"{mark}_{photo.name}") for photo in photos]
+
+
+def load_places(scenes: Sequence[Path], out: Path) -> Places:
+    """The scenes in their folders, sorted by how their camera moved; without any, the built-in place in `out`/places.
+
+    Raises ValueError where fewer than two scenes have a camera that moved to the side: there would be no mixtures.
+    """
+    loaded = [_recorded(folder) for folder in scenes] or [built_in(out, seed) for seed in _BUILT_IN_SEEDS]
+    kinds = {"walked": [], "forward": [], "turned": []}
+    for place in loaded:
+        kinds[motion(place.Ts_world_camera)].append(place)
+    if len(kinds["walked"]) < 2:
+        raise ValueError(
+            f"at least two scenes must have a camera that moved to the side, {len(kinds['walked'])} of {len(loaded)} "
+            "have; give more scenes, or none to use the built-in place"
+        )
+    return Places(**{kind: tuple(places) for kind, places in kinds.items()})
+
+
+def motion(Ts_world_camera: npt.NDArray[np.float64]) -> str:
+    """How cameras (M, 4, 4) in the order of capture moved: the name of a field of `Places`."""
+    centres = Ts_world_camera[:, :3, 3]
+    steps = np.diff(centres, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    if lengths.max(initial=0.0) <= _STILL_PX * (1.0 + float(np.abs(centres).max(initial=0.0))):
+        return "turned"
+    along = np.abs((steps * Ts_world_camera[:-1, :3, 2]).sum(1))
+    return "forward" if along.sum() > _ALONG * lengths.sum() else "walked"
+
+
+def far_apart(place: Place, count: int, least_deg: float, rng: np.random.Generator) -> list[int] | None:
+    """Positions of `count` photographs whose views differ by `least_deg` each; None where there are not as many."""
+    rotations = place.Ts_world_camera[:, :3, :3]
+    chosen: list[int] = []
+    for index in rng.permutation(len(rotations)):
+        if all(angles_deg(rotations[index], rotations[other]) >= least_deg for other in chosen):
+            chosen.append(int(index))
+    return sorted(chosen[:count]) if len(chosen) >= count else None
+
+
+def built_in(out: Path, seed: int) -> Place:
+    """The built-in place, written to `out`/places unless it is there."""
+    folder = out / "places" / f"built_in_{seed}"
+    config = synthetic.Config(views=_BUILT_IN_VIEWS, seed=seed)
+    if not (folder / "cameras.json").exists():
+        write_capture(folder, config)
+    return Place(load_scene(folder), tuple(synthetic.frame_name(i) for i in range(config.views)))
+
+
+def _recorded(folder: Path) -> Place:
+    scene = load_scene(folder)
+    names = tuple(name for name in scene.paths if name in scene.cameras)
+    if len(names) < 6:
+        raise ValueError(f"{folder} must have at least 6 photographs with true cameras, has {len(names)}")
+    return Place(scene, names)

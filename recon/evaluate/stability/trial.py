@@ -1,0 +1,158 @@
+"""One trial: a case and a method in a process of its own, so that a crash, a hang or its memory are its own."""
+
+from __future__ import annotations
+
+import dataclasses
+import multiprocessing
+import os
+import pickle
+import tempfile
+import time
+import traceback
+from collections.abc import Mapping
+from dataclasses import dataclass
+from multiprocessing.context import ForkServerContext
+from pathlib import Path
+
+from recon.evaluate.stability.case import Case, Measured
+from recon.evaluate.stability.methods import by_name
+from recon.evaluate.stability.outcome import Outcome, compare, outcome
+from recon.export.staged import write_file
+from recon.report import peak_rss_mb
+from recon.snapshot import CameraEstimate
+from recon.verdict import Verdict
+
+FAILED = "FAILED"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trial:
+    """One line of stability.json. What was not measured is None."""
+
+    row: int
+    name: str
+    seed: int
+    method: str
+    note: str
+    demand: str  # accept, refuse or either
+    expected: tuple[str, ...]  # codes that describe the frames
+    verdict: str  # a code; FAILED where there was no answer
+    published: bool
+    right: bool  # the answer as a whole: see outcome.Outcome
+    outcome: str
+    seconds: float | None = None  # wall time from the first frame to the last snapshot
+    processor_seconds: float | None = None
+    peak_rss_mb: float | None = None
+    num_cameras: int = 0  # that were published
+    num_gaussians: int | None = None
+    rotation_error_deg: float | None = None
+    centre_error_pct: float | None = None
+    measured: Mapping[str, float] | None = None  # by the row's probe
+    held: bool | None = None  # whether that was within the row's limits
+    message: str = ""  # the verdict's sentence, or the error
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """What the other process leaves."""
+
+    verdict: Verdict
+    cameras: tuple[CameraEstimate, ...]
+    num_gaussians: int
+    seconds: float
+    processor_seconds: float
+    peak_rss_mb: float | None
+    measured: Measured | None
+
+
+def run_trial(case: Case, row: int, name: str, seed: int, method: str, timeout_s: float) -> Trial:
+    answer = _answer(case, method, timeout_s)
+    head = {
+        "row": row,
+        "name": name,
+        "seed": seed,
+        "method": method,
+        "note": case.note,
+        "demand": case.demand.value,
+        "expected": tuple(sorted(code.value for code in case.codes)),
+    }
+    if isinstance(answer, str):
+        failed = Outcome.FAILED
+        return Trial(**head, verdict=FAILED, published=False, right=failed.right, outcome=failed.value, message=answer)
+    verdict = answer.verdict
+    score = compare(answer.cameras, case.worlds) if verdict.publishable else None
+    found = outcome(case.demand, verdict.publishable, score is not None and score.right, verdict.code in case.codes)
+    return Trial(
+        **head,
+        verdict=verdict.code.value,
+        published=verdict.publishable,
+        right=found.right,
+        outcome=found.value,
+        seconds=answer.seconds,
+        processor_seconds=answer.processor_seconds,
+        peak_rss_mb=answer.peak_rss_mb,
+        num_cameras=len(answer.cameras),
+        num_gaussians=answer.num_gaussians,
+        rotation_error_deg=score.rotation_error_deg if score else None,
+        centre_error_pct=score.centre_error_pct if score else None,
+        measured=answer.measured.values if answer.measured else None,
+        held=answer.measured.held if answer.measured else None,
+        message=verdict.message,
+    )
+
+
+def _answer(case: Case, method: str, timeout_s: float) -> Answer | str:
+    """The answer, or why there is none."""
+    with tempfile.TemporaryDirectory(prefix="splatnode-stability-") as folder:
+        path = Path(folder) / "answer"
+        job = dataclasses.replace(case, worlds=())  # the truth stays here
+        process = _context().Process(target=_work, args=(job, method, path))
+        process.start()
+        try:
+            process.join(timeout_s)
+            hangs = process.is_alive()
+        finally:
+            if process.is_alive():
+                process.kill()
+                process.join()
+        if hangs:
+            return f"stopped after {timeout_s:g} s"
+        if not path.exists():
+            return f"the process ended with code {process.exitcode}; -9 mostly means that the memory was used up"
+        return pickle.loads(path.read_bytes())
+
+
+def _context() -> ForkServerContext:
+    """Processes that find everything imported: half of a short trial would be the import of torch."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    return context
+
+
+def _work(case: Case, method: str, path: Path) -> None:
+    """The other process, in a session of its own: who interrupts a campaign must not make a trial fail."""
+    os.setsid()
+    try:
+        answer: Answer | str = _answer_here(case, method)
+    except Exception:
+        answer = traceback.format_exc()
+    write_file(path, pickle.dumps(answer))
+
+
+def _answer_here(case: Case, method: str) -> Answer:
+    reconstruct = by_name(method)
+    started, worked = time.perf_counter(), time.process_time()
+    snapshot = reconstruct(case.source(), case.config)
+    seconds, processor_seconds = time.perf_counter() - started, time.process_time() - worked
+    peak = peak_rss_mb()
+    publishable = snapshot.verdict.publishable
+    probed = case.probe is not None and method == "splatnode" and publishable
+    return Answer(
+        verdict=snapshot.verdict,
+        cameras=snapshot.cameras if publishable else (),
+        num_gaussians=len(snapshot.gaussians),
+        seconds=seconds,
+        processor_seconds=processor_seconds,
+        peak_rss_mb=peak,
+        measured=case.probe(snapshot, case.config) if case.probe is not None and probed else None,
+    )
