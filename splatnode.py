@@ -152,6 +152,7 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--budget-s", type=_seconds, metavar="S", help="stop refining after this many seconds")
     parser.add_argument("--max-gaussians", type=_positive, metavar="N")
     parser.add_argument("--seed", type=_natural, metavar="N")
+    parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
     chosen = parser.add_mutually_exclusive_group()
     chosen.add_argument("--views", type=_positive, metavar="N", help="use N frames, evenly spread")
     chosen.add_argument("--frames", type=_names, metavar="A,B,C", help="use these frames, by name")

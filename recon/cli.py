@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import shlex
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import msgspec
@@ -15,6 +16,7 @@ import numpy as np
 from capture.cameras import folder, synthetic
 from capture.config import merged, read_yaml, typed
 from capture.frame import DroppedFrame, Frame
+from recon.audience import viewer
 from recon.config import Config, preset
 from recon.evaluate.bench import Plan, run_bench
 from recon.evaluate.demo import write_capture
@@ -30,22 +32,39 @@ from recon.report import build_report, peak_rss_mb
 from recon.snapshot import Snapshot
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
+LOOK_EVERY = 50  # iterations between the snapshots that a viewer is shown
 
 
 def replay(args: argparse.Namespace) -> int:
     """Reconstructs a folder of photographs."""
     frames = folder.stream(folder.Config(folder=args.folder, names=_chosen(args)))
-    snapshot = run(frames, _config(args))
-    report = finish(snapshot, args.out, seed=_config(args).seed, preset_name=args.preset or "balanced")
-    _tell(snapshot, args.out, report, as_json=args.json)
+    config = _config(args)
+    with viewer(args.out / "view") if args.view else contextlib.nullcontext(_shown_to_nobody) as show:
+        snapshot = run(frames, with_looks(config, LOOK_EVERY) if args.view else config, show)
+        report = finish(snapshot, args.out, seed=config.seed, preset_name=args.preset or "balanced")
+        _tell(snapshot, args.out, report, as_json=args.json)
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
 
 
-def run(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:
-    """The final snapshot; progress goes to the terminal, if there is one."""
+def _shown_to_nobody(snapshot: Snapshot) -> None:
+    """What is done with a snapshot where nobody watches."""
+
+
+def with_looks(config: Config, every: int) -> Config:
+    """The same reconstruction, with a snapshot to look at `every` so many iterations."""
+    optimising = config.optimize
+    looks = sorted({*optimising.checkpoints, *range(every, optimising.iterations, every)})
+    return msgspec.structs.replace(config, optimize=msgspec.structs.replace(optimising, checkpoints=tuple(looks)))
+
+
+def run(
+    frames: Iterable[Frame | DroppedFrame], config: Config, show: Callable[[Snapshot], None] = _shown_to_nobody
+) -> Snapshot:
+    """The final snapshot; progress goes to the terminal, if there is one, and every snapshot to `show`."""
     snapshot = None
     for snapshot in reconstruct(list(frames), config):
         _progress(snapshot)
+        show(snapshot)
     if snapshot is None:
         raise AssertionError("reconstruct always yields a last snapshot")
     return snapshot

@@ -1,0 +1,58 @@
+"""A viewer beside a run: it sees the newest snapshot, and nobody waits for it while the run goes on."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import pytest
+
+import recon.audience
+from recon.audience import viewer
+from recon.cli import LOOK_EVERY, with_looks
+from recon.config import preset
+from tests.test_viewer_cli import snapshot
+
+SLEEPER = (sys.executable, "-c", "import time; time.sleep(60)")
+
+
+def test_the_viewer_gets_the_last_snapshot(tmp_path, capfd, monkeypatch):
+    monkeypatch.chdir(Path(recon.audience.__file__).parent.parent)
+    command = (sys.executable, "-m", "splatnode", "view", "--headless", "--size", "64x48")
+    with viewer(tmp_path, command) as show:
+        for sequence in range(20):
+            show(replace(snapshot(), sequence=sequence, final=sequence == 19))
+    assert (tmp_path / "live.png").is_file()
+    assert "live.png: OK: All is well." in capfd.readouterr().out
+
+
+def test_showing_waits_for_nobody_and_a_failed_run_ends_the_viewer(tmp_path, monkeypatch):
+    started = []
+
+    def remember(*args, **options):
+        started.append(popen(*args, **options))
+        return started[-1]
+
+    popen = subprocess.Popen
+    monkeypatch.setattr(recon.audience.subprocess, "Popen", remember)
+    shown = snapshot()
+    with pytest.raises(RuntimeError, match="the run failed"), viewer(tmp_path, SLEEPER) as show:
+        begin = time.perf_counter()
+        for _ in range(10_000):
+            show(shown)
+        assert time.perf_counter() - begin < 1.0
+        raise RuntimeError("the run failed")
+    assert started[0].returncode is not None
+
+
+def test_looks_change_nothing_but_the_looks():
+    config = preset("balanced")
+    looked = with_looks(config, LOOK_EVERY)
+    assert set(looked.optimize.checkpoints) >= {*config.optimize.checkpoints, LOOK_EVERY, 2 * LOOK_EVERY}
+    assert all(0 < look < config.optimize.iterations for look in looked.optimize.checkpoints)
+    same = msgspec.structs.replace(looked.optimize, checkpoints=config.optimize.checkpoints)
+    assert msgspec.structs.replace(looked, optimize=same) == config
