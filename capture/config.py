@@ -20,7 +20,10 @@ from typing import Any, ClassVar, TypeVar
 import msgspec
 import yaml
 
+from capture import preview, reader, selection
 from capture.frame import DroppedFrame, Frame
+from capture.messaging import spool
+from capture.messaging.network import Network
 from capture.quality import Limits
 
 T = TypeVar("T")
@@ -50,10 +53,20 @@ class Camera(Plugin):
 class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     camera: Camera
     quality: Limits = Limits()
+    selection: selection.Config = selection.Config()
+    reader: reader.Config = reader.Config()
+    preview: preview.Config = preview.Config()
+    spool: spool.Config = spool.Config()
+    network: Network = Network()
 
 
 def open_stream(camera: Camera) -> Iterator[Frame | DroppedFrame]:
     return camera.module.stream(camera.config)
+
+
+def is_live(camera: Camera) -> bool:
+    """Whether it goes on when nobody reads: then the newest frames are wanted, and of a recording all."""
+    return getattr(camera.module, "LIVE", False)
 
 
 def load_config(path: Path, schema: type[T], flags: Sequence[str] = ()) -> T:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -47,6 +47,7 @@ class Frame:
     stamp_ns: int  # monotonic time of exposure
     image: npt.NDArray[np.uint8]  # (H, W, 3) RGB
     intrinsics: Intrinsics | None  # None: nothing is known about this camera
+    encoded: bytes | None = field(default=None, repr=False)  # the JPEG or PNG that `image` was decoded from, if any
 
     def __post_init__(self) -> None:
         if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:

@@ -1,16 +1,19 @@
-"""A folder of photographs as a camera."""
+"""A folder of photographs as a camera; one that `splatnode record` made gives back the frames that were seen."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 
+from capture import recording
 from capture.frame import DroppedFrame, Frame, Intrinsics
 from capture.image_file import UnusableImage, decode_image
+from capture.pace import Pace, paced
 
 DECODED_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 # Photographs that cannot be decoded here: they are named, so that nobody wonders where they went.
@@ -22,9 +25,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     names: tuple[str, ...] = ()  # the files to take, with or without suffix; none: all
     intrinsics: Intrinsics | None = None  # of all images of its aspect ratio, instead of what their EXIF tells
     max_pixels: int = 100_000_000  # larger images are left out
-    frames_per_second: Annotated[float, msgspec.Meta(gt=0)] = (
-        10.0  # of the stamps only; reading is as fast as the consumer
-    )
+    frames_per_second: Annotated[float, msgspec.Meta(gt=0)] = 10.0  # of the stamps, unless they were recorded
+    pace: Pace = "fastest"
+    loops: Annotated[int, msgspec.Meta(ge=1)] = 1  # times that it is shown, each with names of its own
 
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
@@ -33,8 +36,34 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     Of a capture's other files, none is read: cameras that happen to lie beside the images stay unknown.
     Raises FileNotFoundError or ValueError, with what to do, where there is nothing to stream.
     """
+    if recording.is_recording(config.folder):
+        recorded = recording.read(config.folder)
+        return paced(_looped(lambda: recorded.frames(config.names, config.max_pixels), config.loops), config.pace)
     paths = chosen_images(config.folder, config.names)  # before the first frame, so that mistakes show at once
-    return _frames(paths, config)
+    return paced(_looped(lambda: _frames(paths, config), config.loops), config.pace)
+
+
+def _looped(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: int) -> Iterator[Frame | DroppedFrame]:
+    """The frames `loops` times; stamps and ids go on, and names tell from the second time on which one it is."""
+    first_id = first_ns = 0
+    for loop in range(loops):
+        last, step = None, round(1e8)
+        for item in once():
+            prefix = f"loop{loop}_" if loop else ""
+            if isinstance(item, Frame):
+                step = item.stamp_ns - last.stamp_ns if last else step
+                last = item
+                yield replace(
+                    item,
+                    frame_id=first_id + item.frame_id,
+                    name=prefix + item.name,
+                    stamp_ns=first_ns + item.stamp_ns,
+                )
+            else:
+                yield replace(item, name=prefix + item.name)
+        if last is None:
+            return
+        first_id, first_ns = first_id + last.frame_id + 1, first_ns + last.stamp_ns + step
 
 
 def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]:
@@ -44,7 +73,8 @@ def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]
             yield DroppedFrame(path.name, f"{path.suffix.lower()} files cannot be read; convert it to JPEG or PNG")
             continue
         try:
-            image, intrinsics = decode_image(path.read_bytes(), config.max_pixels)
+            data = path.read_bytes()
+            image, intrinsics = decode_image(data, config.max_pixels)
         except UnusableImage as error:
             yield DroppedFrame(path.name, str(error))
         except OSError as error:
@@ -53,7 +83,8 @@ def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]
             height, width = image.shape[:2]
             if config.intrinsics is not None and _same_aspect(config.intrinsics, width, height):
                 intrinsics = config.intrinsics.resized(width, height)
-            yield Frame(frame_id, path.name, round(frame_id / config.frames_per_second * 1e9), image, intrinsics)
+            stamp_ns = round(frame_id / config.frames_per_second * 1e9)
+            yield Frame(frame_id, path.name, stamp_ns, image, intrinsics, encoded=data)
             frame_id += 1
 
 

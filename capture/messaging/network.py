@@ -70,7 +70,7 @@ class NotAllowed(PermissionError):
 class Endpoint:
     """Sockets with all that they need; closes everything it opened. Subclasses say what is spoken.
 
-    One that offers a service holds its lock until the last socket is gone: libzmq removes an ipc path only then.
+    One that offers a service holds its lock until the last socket is gone, so that it removes no other's ipc path.
     """
 
     def __init__(self, network: Network, offers: Service | None = None) -> None:
@@ -105,7 +105,9 @@ class Endpoint:
                 socket.zap_domain = _ZAP_DOMAIN.encode()
             address = _address(self.network, service)
             if address.startswith("ipc://"):  # the lock is ours: what lies there is a dead process's
-                Path(address.removeprefix("ipc://")).unlink(missing_ok=True)
+                path = Path(address.removeprefix("ipc://"))
+                path.unlink(missing_ok=True)
+                self._resources.callback(path.unlink, missing_ok=True)
             try:
                 socket.bind(address)
             except zmq.ZMQError as error:

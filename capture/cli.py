@@ -1,0 +1,120 @@
+"""The verbs of the command line that concern cameras and messages."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import math
+import pkgutil
+from collections.abc import Iterator
+from importlib import import_module
+
+from capture import cameras, daemon
+from capture.config import CaptureConfig, is_live, load_config, open_stream, read_yaml, typed
+from capture.frame import DroppedFrame, Frame
+from capture.logs import use_structured_lines
+from capture.messaging import keys as key_files
+from capture.messaging.network import Network
+from capture.reader import Reader, State
+from capture.recording import Recorder
+from capture.status import heartbeats
+
+log = logging.getLogger(__name__)
+
+EXIT_GOOD, EXIT_SILENT = 0, 75
+
+
+def capture(args: argparse.Namespace) -> int:
+    """Runs the capture process."""
+    config = _config(args)
+    use_structured_lines()
+    daemon.capture(config)
+    return EXIT_GOOD
+
+
+def record(args: argparse.Namespace) -> int:
+    """Writes all that a camera gives into a folder, until it ends, the time is up, or the process is asked to stop."""
+    config = _config(args)
+    with Recorder(args.out) as recorder:
+        camera = config.camera
+        with Reader(lambda: open_stream(camera), is_live(camera), config.reader) as reader:
+            try:
+                for item in _until(reader, args.seconds):
+                    recorder.write(item)
+            finally:
+                late = f", {reader.skipped} came while the disk was busy and are missing" if reader.skipped else ""
+                print(f"{recorder.frames} frames in {args.out}{late}")
+    return EXIT_GOOD
+
+
+def _config(args: argparse.Namespace) -> CaptureConfig:
+    return load_config(args.config, CaptureConfig, [f"--{change}" for change in args.set])
+
+
+def _until(reader: Reader, seconds: float | None) -> Iterator[Frame | DroppedFrame]:
+    """The reader's items until its end, or for `seconds` after the first by their stamps."""
+    last_ns = math.inf
+    while not (reader.state is State.FINISHED and reader.empty):
+        item = reader.next(0.1)
+        if isinstance(item, Frame) and seconds is not None:
+            last_ns = min(last_ns, item.stamp_ns + seconds * 1e9)
+            if item.stamp_ns > last_ns:
+                return
+        if item is not None:
+            yield item
+
+
+def find(args: argparse.Namespace) -> int:
+    """Lists the cameras that are connected, in the words of a configuration."""
+    found = {}
+    for module in pkgutil.iter_modules(cameras.__path__):
+        source = import_module(f"capture.cameras.{module.name}")
+        if hasattr(source, "find"):
+            found[module.name] = source.find()
+    if args.json:
+        print(json.dumps(found, indent=1))
+        return EXIT_GOOD
+    for kind, devices in found.items():
+        for device in devices:
+            print(f"camera: {{kind: {kind}, device: {json.dumps(device['device'])}}}  # {device['description']}")
+    if not any(found.values()):
+        print("no camera is connected; folders and videos need none: see configs/replay.yaml")
+    return EXIT_GOOD
+
+
+def keys(args: argparse.Namespace) -> int:
+    """Makes this machine's keys, or says whom it lets in and whom it expects."""
+    if args.allow:
+        name, public = args.allow
+        key_files.allow(args.folder, name, public.encode())
+        print(f"{name} may connect")
+    elif args.server:
+        key_files.expect_server(args.folder, args.server.encode())
+        print("this machine connects to that server and to no other")
+    else:
+        print(key_files.create_keys(args.folder).decode())
+    return EXIT_GOOD
+
+
+def status(args: argparse.Namespace) -> int:
+    """Waits for a heartbeat of each process and prints what they say; 75 where one is silent."""
+    network = typed(read_yaml(args.config).get("network") or {}, Network, "network") if args.config else Network()
+    found = heartbeats(network)
+    if args.json:
+        print(json.dumps(found))
+    else:
+        for room, fields in found.items():
+            print("\n".join(_described(room, fields)))
+    return EXIT_GOOD if all(found.values()) else EXIT_SILENT
+
+
+def _described(room: str, fields: dict[str, object] | None) -> list[str]:
+    if fields is None:
+        return [f"{room}: silent; is splatnode {room} running, with the same network?"]
+    hidden = {"session", "sequence", "mono_ns", "type", "state"}
+    lines = [f"{room}: {fields.get('state', 'running')}"]
+    for key, value in fields.items():
+        if key not in hidden and value not in ("", None):
+            lines.append(f"  {key.replace('_', ' '):20}{f'{value:.1f}' if isinstance(value, float) else value}")
+    return lines

@@ -1,0 +1,176 @@
+"""The capture process: camera -> key frames, previews, heartbeats. Read `capture` for what happens to a frame."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from contextlib import ExitStack
+
+import cv2
+
+from capture.config import CaptureConfig, is_live, open_stream
+from capture.frame import DroppedFrame, Frame
+from capture.logs import event
+from capture.messaging.broadcast import Publisher
+from capture.messaging.keyframes import KeyframeServer
+from capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
+from capture.messaging.spool import Spool, SpoolFull
+from capture.messaging.wire import Numbering, WireError
+from capture.preview import encode_preview
+from capture.reader import Reader, State
+from capture.selection import Decision, Selector
+from capture.service_manager import ServiceManager
+from capture.status import HEARTBEAT_S, CaptureStatus, own_rss_mb
+
+log = logging.getLogger(__name__)
+
+TURN_S = 0.02  # the longest that a request waits for its answer
+
+
+def capture(config: CaptureConfig) -> None:
+    """Runs until the camera's end, when all its key frames are acknowledged; a live camera has none.
+
+    Raises CameraUnavailable, AlreadyRunning, NetworkError, OSError. SystemExit and KeyboardInterrupt end it cleanly.
+    """
+    cv2.setNumThreads(1)  # small images: threads would cost more than they give, and the processor is recon's
+    with ExitStack() as resources:
+        manager = ServiceManager()
+        server = resources.enter_context(KeyframeServer(config.network, Spool(config.spool)))
+        node = _Node(config, server, resources)
+        camera = config.camera
+        reader = resources.enter_context(Reader(lambda: open_stream(camera), is_live(camera), config.reader))
+        resources.callback(manager.stopping)
+        event(log, logging.INFO, "started", camera=camera.kind, waiting=server.queued)
+        while not (reader.state is State.FINISHED and reader.empty and server.queued == 0):
+            item = reader.next(TURN_S)
+            if isinstance(item, Frame):
+                if node.frames == 0:
+                    manager.ready()
+                node.take(item, reader.state)
+            elif isinstance(item, DroppedFrame):
+                node.drop(item)
+            server.serve(0)
+            node.beat(reader)
+            manager.alive(f"{reader.state.value}: {node.frames} frames, {node.key_frames} key frames")
+        event(log, logging.INFO, "finished", frames=node.frames, key_frames=node.key_frames)
+
+
+class _Node:
+    """What one session counts, and where it sends."""
+
+    def __init__(self, config: CaptureConfig, server: KeyframeServer, resources: ExitStack) -> None:
+        self.config = config
+        self.frames = self.key_frames = self.unusable = self.dropped = self.not_taken = 0
+        self.last_decision = ""
+        self._spool_full = ""
+        self._server = server
+        self._selector = Selector(config.selection, config.quality)
+        self._previews = resources.enter_context(Publisher(CAPTURE_PREVIEW, config.network))
+        self._heartbeats = resources.enter_context(Publisher(CAPTURE_STATUS, config.network))
+        self._preview_numbers = Numbering(server.numbering.session)
+        self._heartbeat_numbers = Numbering(server.numbering.session)
+        self._next_preview_ns = 0
+        self._started = self._next_beat = time.monotonic()
+        self._rate = _Rate()
+
+    def take(self, frame: Frame, state: State) -> None:
+        """A frame that the camera gave: as a key frame where it adds something, and as a preview in any case."""
+        self.frames += 1
+        self._rate.count()
+        decision = self._selector.decide(frame, waiting=self._server.queued)
+        self.unusable += decision.candidate and not decision.take
+        if decision.take:
+            self._offer(frame, decision)
+        if decision.candidate:
+            self.last_decision = f"{frame.name}: {'taken' if decision.take else 'not taken'}: {decision.reason}"
+        self._show(frame, decision, state)
+
+    def drop(self, dropped: DroppedFrame) -> None:
+        """A frame that the camera could not give: recon hears of it too."""
+        self.dropped += 1
+        event(log, logging.WARNING, "dropped", name=dropped.name, reason=dropped.reason)
+        self._deliver(dropped)
+
+    def beat(self, reader: Reader) -> None:
+        """A heartbeat, when it is due."""
+        if time.monotonic() < self._next_beat:
+            return
+        self._next_beat = time.monotonic() + HEARTBEAT_S
+        status = CaptureStatus(
+            **self._heartbeat_numbers.next(),
+            state=reader.state.value,
+            why=reader.why or self._spool_full,
+            camera=self.config.camera.kind,
+            pid=os.getpid(),
+            uptime_s=time.monotonic() - self._started,
+            frames=self.frames,
+            frames_per_second=self._rate.per_second(),
+            key_frames=self.key_frames,
+            unusable=self.unusable,
+            dropped=self.dropped,
+            skipped=reader.skipped,
+            not_taken=self.not_taken,
+            last_decision=self.last_decision,
+            waiting=self._server.queued,
+            waiting_mb=self._server.spool.size_bytes / 2**20,
+            acknowledged=self._server.acknowledged,
+            recon_connected=self._server.connected,
+            refused_messages=self._server.refused,
+            rss_mb=own_rss_mb(),
+        )
+        self._heartbeats.send(status)
+
+    def _offer(self, frame: Frame, decision: Decision) -> None:
+        if not self._deliver(frame):
+            self._selector.forget_last()
+            return
+        self.key_frames += 1
+        event(log, logging.INFO, "keyframe", name=frame.name, reason=decision.reason, waiting=self._server.queued)
+
+    def _deliver(self, item: Frame | DroppedFrame) -> bool:
+        """Into the spool. Where that is full it is said once, and again when there is room."""
+        try:
+            self._server.offer(item)
+        except (SpoolFull, WireError) as error:
+            self.not_taken += 1
+            if not self._spool_full:
+                event(log, logging.ERROR, "spool_full", why=error)
+            self._spool_full = str(error)
+            return False
+        if self._spool_full:
+            event(log, logging.INFO, "spool_has_room", not_taken=self.not_taken)
+            self._spool_full = ""
+        return True
+
+    def _show(self, frame: Frame, decision: Decision, state: State) -> None:
+        rate = self.config.preview.per_second
+        if rate == 0 or frame.stamp_ns < self._next_preview_ns:
+            return
+        self._next_preview_ns = frame.stamp_ns + round(0.9e9 / rate)  # cameras jitter: 30 a second of 30 are all
+        header, arrays = encode_preview(
+            frame,
+            self._preview_numbers,
+            self.config.preview,
+            state=state.value,
+            taken=decision.take,
+            reason=decision.reason,
+        )
+        self._previews.send(header, arrays)
+
+
+class _Rate:
+    """Events a second, over the last seconds."""
+
+    def __init__(self) -> None:
+        self._since = time.monotonic()
+        self._count = 0
+
+    def count(self) -> None:
+        self._count += 1
+
+    def per_second(self) -> float:
+        """Of the time since this was asked last."""
+        seconds, self._since = time.monotonic() - self._since, time.monotonic()
+        rate, self._count = self._count / max(seconds, 1e-6), 0
+        return rate

@@ -1,0 +1,165 @@
+"""A camera in its own thread: it is opened, read, and opened again after a loss, with growing pauses."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Annotated
+
+import msgspec
+
+from capture.frame import DroppedFrame, Frame
+from capture.unavailable import CameraUnavailable
+
+log = logging.getLogger(__name__)
+
+Seconds = Annotated[float, msgspec.Meta(gt=0)]
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    silence_s: Seconds = 5.0  # without a frame, a live camera counts as lost
+    first_pause_s: Seconds = 1.0  # before it is opened again; doubled at each failure
+    longest_pause_s: Seconds = 15.0
+    give_up_s: Seconds = 300.0  # then the process ends with 69, and the service manager decides
+
+
+class State(Enum):
+    STARTING = "starting"
+    STREAMING = "streaming"
+    DEGRADED = "degraded"  # the camera is lost, or silent
+    FINISHED = "finished"  # a recording's end
+
+
+@dataclass(frozen=True)
+class Failure:
+    """The camera cannot be used, and there is no use in trying again."""
+
+    error: Exception
+
+
+class Reader:
+    """Frames of one session, numbered through all losses. Close it, or use it as a context manager."""
+
+    def __init__(self, open_camera: Callable[[], Iterator[Frame | DroppedFrame]], live: bool, config: Config) -> None:
+        self.config = config
+        self.why = ""  # of a degraded state
+        self.skipped = 0  # frames of a live camera for which nobody had time
+        self._open_camera = open_camera
+        self._live = live
+        self._state = State.STARTING
+        self._last = time.monotonic()
+        self._stop = threading.Event()
+        self._items: queue.Queue[Frame | DroppedFrame | Failure] = queue.Queue(maxsize=2)
+        self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Reader:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Lets go of the camera. A driver that hangs is left behind: its thread ends with the process."""
+        self._stop.set()
+        self._thread.join(timeout=3)
+
+    @property
+    def state(self) -> State:
+        if self._state is State.STREAMING and self._live and self.silent_s > self.config.silence_s:
+            return State.DEGRADED
+        return self._state
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds since the last frame, or since the start."""
+        return time.monotonic() - self._last
+
+    @property
+    def empty(self) -> bool:
+        """Everything that the camera has given has been read."""
+        return self._items.empty()
+
+    def next(self, timeout_s: float) -> Frame | DroppedFrame | None:
+        """The next frame; None where none comes in time. Raises what ended the camera for good."""
+        try:
+            item = self._items.get(timeout=timeout_s)
+        except queue.Empty:
+            if self._live and self.silent_s > self.config.give_up_s:
+                raise CameraUnavailable(f"no frame for {self.silent_s:.0f} s") from None
+            return None
+        if isinstance(item, Failure):
+            raise item.error
+        return item
+
+    def _run(self) -> None:
+        try:
+            for item in self._frames():
+                self._hand_over(item)
+        except Exception as error:  # the thread's end is told to the reader, whatever it was
+            self._hand_over(Failure(error))
+        else:
+            self._state = State.FINISHED
+
+    def _frames(self) -> Iterator[Frame | DroppedFrame]:
+        """Goes through losses. Raises CameraUnavailable where the camera is not there at first, or for too long."""
+        count, pause, lost_at = 0, self.config.first_pause_s, None
+        while not self._stop.is_set():
+            try:
+                for item in self._numbered(count):
+                    count += isinstance(item, Frame)
+                    self._last, lost_at, pause = time.monotonic(), None, self.config.first_pause_s
+                    self._state, self.why = State.STREAMING, ""
+                    yield item
+                return
+            except CameraUnavailable as error:
+                lost_at = lost_at or time.monotonic()
+                if count == 0 or time.monotonic() - lost_at > self.config.give_up_s:
+                    raise
+                self._state, self.why = State.DEGRADED, str(error)
+                log.warning("camera lost: %s; opening it again in %.0f s", error, pause)
+                self._stop.wait(pause)
+                pause = min(2 * pause, self.config.longest_pause_s)
+
+    def _numbered(self, count: int) -> Iterator[Frame | DroppedFrame]:
+        """The camera's frames from one opening to its loss; a stamp that does not grow costs the frame."""
+        newest_ns = -1
+        stream = self._open_camera()
+        try:
+            for item in stream:
+                if self._stop.is_set():
+                    return
+                if isinstance(item, DroppedFrame):
+                    yield item
+                elif item.stamp_ns <= newest_ns:
+                    yield DroppedFrame(item.name, f"its time stamp is {newest_ns - item.stamp_ns} ns before the last")
+                else:
+                    newest_ns = item.stamp_ns
+                    yield replace(item, frame_id=count)
+                    count += 1
+        finally:
+            close = getattr(stream, "close", None)
+            if close is not None:
+                close()
+
+    def _hand_over(self, item: Frame | DroppedFrame | Failure) -> None:
+        """To the reader: of a live camera the newest, of a recording all."""
+        while not self._stop.is_set():
+            try:
+                self._items.put(item, timeout=0 if self._live else 0.1)
+                return
+            except queue.Full:
+                if self._live:
+                    self._drop_oldest()
+
+    def _drop_oldest(self) -> None:
+        try:
+            self._items.get_nowait()
+            self.skipped += 1
+        except queue.Empty:
+            return

@@ -1,0 +1,157 @@
+"""Frames on disk as they were seen: the same pixels, names, stamps and intrinsics come back.
+
+A recording is a folder with an image file a frame and `splatnode-frames.jsonl`, one line a frame in the order in which
+they came. A line is written after its image is whole, so that what a killed recorder leaves is a shorter recording.
+Images that came as JPEG or PNG files are kept byte for byte; others become PNG, which loses nothing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import msgspec
+
+from capture.durable import sync_folder
+from capture.frame import DroppedFrame, Frame, Intrinsics
+from capture.image_file import UnusableImage, decode_image
+
+log = logging.getLogger(__name__)
+
+INDEX = "splatnode-frames.jsonl"
+_JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+_SYNC_EVERY = 30  # frames; a power cut costs at most these
+
+
+class _Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="frame"):
+    name: str
+    stamp_ns: int
+    intrinsics: Intrinsics | None
+    file: str
+    sha256: str
+
+
+class _DroppedLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="dropped"):
+    name: str
+    reason: str
+
+
+class Recorder:
+    """Writes a recording into a new or empty folder. Close it, or use it as a context manager."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises ValueError where the folder holds anything, OSError where it cannot be written."""
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise ValueError(f"{folder} is not empty; give a new folder to record into")
+        self.folder = folder
+        self.frames = 0
+        self._index = (folder / INDEX).open("xb")
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        self._sync()
+        self._index.close()
+
+    def write(self, item: Frame | DroppedFrame) -> None:
+        """Raises OSError; the frames before it stay."""
+        if isinstance(item, DroppedFrame):
+            self._append(_DroppedLine(item.name, item.reason))
+            return
+        content = _file_of(item)
+        path = self.folder / f"{self.frames:06d}{'.jpg' if content.startswith(_JPEG) else '.png'}"
+        temporary = path.with_name(f".{path.name}.tmp")
+        try:
+            temporary.write_bytes(content)
+            temporary.replace(path)
+        except OSError:
+            temporary.unlink(missing_ok=True)
+            raise
+        digest = hashlib.sha256(content).hexdigest()
+        self._append(_Line(item.name, item.stamp_ns, item.intrinsics, path.name, digest))
+        self.frames += 1
+        if self.frames % _SYNC_EVERY == 0:
+            self._sync()
+
+    def _append(self, line: _Line | _DroppedLine) -> None:
+        self._index.write(msgspec.json.encode(line) + b"\n")
+        self._index.flush()
+
+    def _sync(self) -> None:
+        os.fsync(self._index.fileno())
+        sync_folder(self.folder)
+
+
+def _file_of(frame: Frame) -> bytes:
+    if frame.encoded is not None and frame.encoded.startswith((_JPEG, _PNG)):
+        return frame.encoded
+    bgr = cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)
+    written, png = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not written:
+        raise AssertionError("PNG takes every (H, W, 3) uint8 image")
+    return png.tobytes()
+
+
+@dataclass(frozen=True)
+class Recording:
+    folder: Path
+    lines: tuple[_Line | _DroppedLine, ...]
+
+    def frames(self, names: tuple[str, ...] = (), max_pixels: int = 1 << 40) -> Iterator[Frame | DroppedFrame]:
+        """The frames as they were seen, or those called `names`. Raises ValueError where one of these is missing."""
+        missing = [name for name in names if not any(name in (line.name, Path(line.name).stem) for line in self.lines)]
+        if missing:
+            raise ValueError(f"no frame named {', '.join(missing)} in the recording {str(self.folder)!r}")
+        frame_id = 0
+        for line in self.lines:
+            if names and line.name not in names and Path(line.name).stem not in names:
+                continue
+            item = self._item(line, frame_id, max_pixels)
+            frame_id += isinstance(item, Frame)
+            yield item
+
+    def _item(self, line: _Line | _DroppedLine, frame_id: int, max_pixels: int) -> Frame | DroppedFrame:
+        if isinstance(line, _DroppedLine):
+            return DroppedFrame(line.name, line.reason)
+        try:
+            content = (self.folder / line.file).read_bytes()
+            image, _ = decode_image(content, max_pixels)
+        except UnusableImage as error:
+            return DroppedFrame(line.name, str(error))
+        except OSError as error:
+            return DroppedFrame(line.name, f"cannot be read: {error.strerror}")
+        if hashlib.sha256(content).hexdigest() != line.sha256:
+            return DroppedFrame(line.name, f"{line.file} is not the file that was recorded")
+        return Frame(frame_id, line.name, line.stamp_ns, image, line.intrinsics, encoded=content)
+
+
+def is_recording(folder: Path) -> bool:
+    return (folder / INDEX).is_file()
+
+
+def read(folder: Path) -> Recording:
+    """Raises ValueError where the index is damaged other than at its end, where a recorder may have been killed."""
+    lines: list[_Line | _DroppedLine] = []
+    content = (folder / INDEX).read_bytes()
+    whole, _, _unfinished = content.rpartition(b"\n")
+    for number, text in enumerate(whole.splitlines(), start=1):
+        try:
+            line = msgspec.json.decode(text, type=_Line | _DroppedLine)
+        except msgspec.DecodeError as error:
+            raise ValueError(f"{folder / INDEX}, line {number}: {error}") from error
+        if isinstance(line, _Line) and Path(line.file).name != line.file:
+            raise ValueError(f"{folder / INDEX}, line {number}: {line.file!r} is not a file of this folder")
+        lines.append(line)
+    if not lines:
+        raise ValueError(f"the recording {str(folder)!r} is empty")
+    return Recording(folder, tuple(lines))

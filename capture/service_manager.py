@@ -1,0 +1,39 @@
+"""systemd's notification protocol (sd_notify(3)): ready, alive, stopping. Without systemd nothing happens."""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+
+
+class ServiceManager:
+    """Tells systemd how the process is; `alive` has to be called while it works, and limits its own rate."""
+
+    def __init__(self) -> None:
+        self._address = os.environ.get("NOTIFY_SOCKET", "")
+        timeout_s = int(os.environ.get("WATCHDOG_USEC", "0")) / 1e6
+        self._every_s = timeout_s / 4 if timeout_s else 1.0
+        self._next = 0.0
+
+    def ready(self) -> None:
+        self._notify("READY=1")
+
+    def alive(self, status: str) -> None:
+        """`status` is shown by systemctl status."""
+        if time.monotonic() >= self._next:
+            self._next = time.monotonic() + self._every_s
+            self._notify(f"WATCHDOG=1\nSTATUS={status}")
+
+    def stopping(self) -> None:
+        self._notify("STOPPING=1")
+
+    def _notify(self, message: str) -> None:
+        if not self._address:
+            return
+        address = f"\0{self._address[1:]}" if self._address.startswith("@") else self._address
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as link:
+            try:
+                link.sendto(message.encode(), address)
+            except OSError:
+                self._address = ""  # a manager that does not listen is none

@@ -1,0 +1,67 @@
+"""How the processes are: heartbeats, and `splatnode status`, which waits for one of each."""
+
+from __future__ import annotations
+
+import os
+import time
+from typing import Any
+
+from capture.messaging.broadcast import Subscriber
+from capture.messaging.network import Network
+from capture.messaging.services import CAPTURE_STATUS, RECON_STATUS, Service
+from capture.messaging.wire import Header
+
+HEARTBEAT_S = 1.0
+WAIT_S = 2.0
+
+
+class CaptureStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Capture's heartbeat."""
+
+    state: str  # starting, streaming, degraded, finished
+    why: str  # of a degraded state; or that the spool is full
+    camera: str  # its kind
+    pid: int
+    uptime_s: float
+    frames: int
+    frames_per_second: float
+    key_frames: int
+    unusable: int  # frames that would have added something and were blurred, badly exposed, or copies
+    dropped: int  # frames that the camera could not give
+    skipped: int  # frames for which there was no time
+    not_taken: int  # key frames that found no room in the spool
+    last_decision: str
+    waiting: int  # key frames that recon has not acknowledged
+    waiting_mb: float
+    acknowledged: int
+    recon_connected: bool
+    refused_messages: int
+    rss_mb: float
+
+
+def own_rss_mb() -> float:
+    """Memory of this process now."""
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+class _Listener(Subscriber):
+    """Hears a heartbeat of any process: its fields are shown and not used, so that no room need be imported."""
+
+    def __init__(self, service: Service, network: Network) -> None:
+        super().__init__(service, network, dict[str, Any])
+
+    def _count(self, header: dict[str, Any]) -> None:
+        """One heartbeat is enough, so that losses do not matter."""
+
+
+def heartbeats(network: Network, wait_s: float = WAIT_S) -> dict[str, dict[str, Any] | None]:
+    """The next heartbeat of each process by its room's name; None for one that is silent. Raises NotAllowed."""
+    with _Listener(CAPTURE_STATUS, network) as capture, _Listener(RECON_STATUS, network) as recon:
+        deadline = time.monotonic() + wait_s
+        found: dict[str, dict[str, Any] | None] = {"capture": None, "recon": None}
+        while time.monotonic() < deadline and None in found.values():
+            for room, subscriber in (("capture", capture), ("recon", recon)):
+                if found[room] is None and (message := subscriber.latest(0.05)) is not None:
+                    found[room] = message.header
+        return found
