@@ -8,6 +8,8 @@ import os
 import sys
 from pathlib import Path
 
+import cv2
+
 from capture.config import read_yaml, typed
 from capture.messaging.network import Network
 from recon.picture import use_threads
@@ -20,7 +22,7 @@ from viewer.state import State
 
 EXIT_GOOD, EXIT_UNAVAILABLE = 0, 69
 
-_NICENESS = 10  # the reconstruction is more important than the picture of it
+_NICENESS = 5  # the reconstruction is more important than the picture of it
 _NO_OPEN3D = (
     "splatnode: the window needs Open3D, which is not installed. Run: pip install 'splatnode[viewer]'. "
     "Pictures need nothing more: splatnode view ... --headless, or --export turntable.mp4"
@@ -44,11 +46,13 @@ def view(args: argparse.Namespace) -> int:
         source = _source(args, finished)
         from viewer.window import show  # brings Open3D
 
-        show(Session(source, State()), open3d_may_draw=not window.software, screenshots=folder)
+        background = (lambda: None) if finished is not None else _give_way
+        show(Session(source, State()), open3d_may_draw=not window.software, screenshots=folder, opened=background)
     elif finished is not None:
         print(write_series(finished, folder, width, height, args.pictures))
     else:
         source = _source(args, finished)
+        _give_way()
         with contextlib.closing(source):
             keep_picture(source, folder, width, height, stop=lambda: False, say=lambda line: print(line, flush=True))
     return EXIT_GOOD
@@ -73,14 +77,20 @@ def _window() -> Probe | None:
 
 
 def _source(args: argparse.Namespace, finished: Moment | None) -> Source:
-    """Beside a running node the viewer takes one thread, and only what the node leaves of the processors."""
     if finished is not None:
         return Finished(finished)
     raw = read_yaml(args.what) if args.what is not None else {}
-    live = Live(typed(raw.get("network", {}), Network, "network"))
+    return Live(typed(raw.get("network", {}), Network, "network"))
+
+
+def _give_way() -> None:
+    """Beside a running node the viewer takes one thread, and steps back where the node wants the processors.
+
+    Not before it is open: starting costs the node little, and the person should not wait for it.
+    """
     use_threads(1)
+    cv2.setNumThreads(1)
     os.nice(_NICENESS)
-    return live
 
 
 def _beside(what: Path) -> Path:

@@ -6,7 +6,7 @@ It needs neither a display nor a graphics driver, and it is what the viewer show
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -65,9 +65,13 @@ def paint_gaussians(
     picture = take_picture(
         gaussians, T_world_camera.astype(np.float64), K.astype(np.float64), width, height, channels=("rgb", "depth")
     )
-    veil = (1.0 - picture.alpha)[..., None] * np.array(BACKGROUND, np.float32)
-    image = np.ascontiguousarray(np.clip(255.0 * picture.rgb + veil, 0, 255), np.uint8)
-    return Canvas(image, np.where(picture.alpha > 0.5, picture.depth, np.inf).astype(np.float32))
+    planes = [  # 255 * rgb + (1 - alpha) * background, rounded and clipped
+        cv2.addWeighted(picture.rgb[..., channel], 255.0, picture.alpha, -level, level, dtype=cv2.CV_8U)
+        for channel, level in enumerate(BACKGROUND)
+    ]
+    return Canvas(
+        np.asarray(cv2.merge(planes), np.uint8), np.where(picture.alpha > 0.5, picture.depth, np.inf).astype(np.float32)
+    )
 
 
 def blended(image: Image, photograph: Image, camera: CameraEstimate, K: Array, weight: float) -> Image:
@@ -112,8 +116,8 @@ def _paint_points(canvas: Canvas, gaussians: GaussianArrays, T_camera_world: Arr
     points = gaussians.means @ T_camera_world[:3, :3].astype(np.float32).T + T_camera_world[:3, 3].astype(np.float32)
     ahead = np.flatnonzero(points[:, 2] > _NEAR)
     z = points[ahead, 2]
-    columns = np.floor(points[ahead, 0] / z * K[0, 0] + K[0, 2] - size / 2 + 0.5)
-    rows = np.floor(points[ahead, 1] / z * K[1, 1] + K[1, 2] - size / 2 + 0.5)
+    focal, corner = K[[0, 1], [0, 1]].astype(np.float32), (K[:2, 2] - size / 2 + 0.5).astype(np.float32)
+    columns, rows = np.floor(points[ahead, :2] / z[:, None] * focal + corner).T
     seen = (columns > -size) & (columns < width) & (rows > -size) & (rows < height)
     order = np.flatnonzero(seen)[np.argsort(-z[seen], kind="stable")]
     columns, rows, z = columns[order].astype(np.int64), rows[order].astype(np.int64), z[order]
@@ -123,9 +127,11 @@ def _paint_points(canvas: Canvas, gaussians: GaussianArrays, T_camera_world: Arr
     wide[rows + size, columns + size] = np.arange(len(order), dtype=np.float32)
     squares = cv2.dilate(wide, np.ones((size, size), np.uint8), anchor=(size - 1, size - 1))
     owner = squares[size : size + height, size : size + width].astype(np.int32)
-    hit = owner >= 0
-    canvas.image[hit] = base_rgb(gaussians)[ahead[order]][owner[hit]]
-    canvas.depth[hit] = z[owner[hit]]
+    # -1, where nobody owns a pixel, is the last row: the background.
+    colours = np.zeros((len(order) + 1, 4), np.uint8)  # four bytes are one number, which is gathered at once
+    colours[:-1, :3], colours[-1, :3] = base_rgb(replace(gaussians, sh=gaussians.sh[ahead[order]])), BACKGROUND
+    canvas.image[:] = colours.view(np.uint32)[:, 0].take(owner)[..., None].view(np.uint8)[..., :3]
+    canvas.depth[:] = np.append(z, np.float32(np.inf)).take(owner)
 
 
 def _paint_photograph(canvas: Canvas, photograph: Photograph, T_camera_world: Array, K: Array) -> None:
@@ -148,10 +154,10 @@ def _paint_photograph(canvas: Canvas, photograph: Photograph, T_camera_world: Ar
     warped = cv2.warpPerspective(image, homography, size, flags=cv2.INTER_LINEAR)
     inside = cv2.warpPerspective(np.full((image_height, image_width), 255, np.uint8), homography, size) > 127
     box = np.s_[low[1] : high[1], low[0] : high[0]]
-    depth = _plane_depth(corners, K, low, size)
-    shown = inside & (depth <= _BEHIND * canvas.depth[box])
-    canvas.image[box][shown] = warped[shown]
-    canvas.depth[box][shown] = depth[shown]
+    nearness = _plane_nearness(corners, K, low, size)
+    shown = inside & (_BEHIND * canvas.depth[box] * nearness >= 1.0)
+    np.copyto(canvas.image[box], warped, where=shown[..., None])
+    np.divide(1.0, nearness, out=canvas.depth[box], where=shown)
 
 
 def _shrunk(image: Image, size: npt.NDArray[np.int_]) -> Image:
@@ -163,15 +169,16 @@ def _shrunk(image: Image, size: npt.NDArray[np.int_]) -> Image:
     return np.asarray(cv2.resize(image, smaller, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _plane_depth(corners: Array, K: Array, low: npt.NDArray[np.int_], size: tuple[int, int]) -> Array:
-    """(h, w) z of the plane through `corners` (camera frame) at the box's pixels; infinite where it is edge-on."""
+def _plane_nearness(
+    corners: Array, K: Array, low: npt.NDArray[np.int_], size: tuple[int, int]
+) -> npt.NDArray[np.float32]:
+    """(h, w) 1 / z, at the pixels of the box, of the plane through `corners` (camera frame): affine in the pixel."""
     normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
-    columns, rows = np.meshgrid(low[0] + np.arange(size[0]) + 0.5, low[1] + np.arange(size[1]) + 0.5)
-    rays = np.stack([(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones_like(columns)], -1)
-    along = rays @ normal
-    with np.errstate(divide="ignore"):
-        depth = (corners[0] @ normal) / along
-    return np.where(depth > 0, depth, np.inf)
+    height = corners[0] @ normal  # over the eye; 0 where the plane is seen edge-on, and then it covers no pixel
+    columns = (low[0] + np.arange(size[0]) + 0.5 - K[0, 2]) / K[0, 0]
+    rows = (low[1] + np.arange(size[1]) + 0.5 - K[1, 2]) / K[1, 1]
+    sums = (rows * normal[1] + normal[2])[:, None] + (columns * normal[0])[None]
+    return (sums / (height if abs(height) > 1e-12 else np.inf)).astype(np.float32)
 
 
 def _paint_lines(canvas: Canvas, lines: Lines, T_camera_world: Array, K: Array) -> None:

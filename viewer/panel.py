@@ -79,6 +79,11 @@ class Panel:
         feed = words.feed_line(age, bool(moment and moment.snapshot.final))
         rate = [f"{1 / seconds:.0f} pictures/s ({1000 * seconds:.0f} ms each)"] if seconds else []
         self._set("help", help_lines() if state.help else ["h: help"])
+        for field, switch in self._switches.items():
+            switch.checked = getattr(state, field)
+        self._points.int_value = state.point_size
+        self._colouring.selected_index = list(Colouring).index(state.colouring)
+        self._engine.selected_index = list(Engine).index(state.engine)
         if moment is None:
             self._set("verdict", [feed])
             return
@@ -89,11 +94,6 @@ class Panel:
         self._set("dropped", words.dropped_lines(moment))
         self._time.set_limits(0, max(len(session.history) - 1, 1))
         self._time.int_value = moment_index(state, session.history)
-        for field, switch in self._switches.items():
-            switch.checked = getattr(state, field)
-        self._points.int_value = state.point_size
-        self._colouring.selected_index = list(Colouring).index(state.colouring)
-        self._engine.selected_index = list(Engine).index(state.engine)
         self._show_cameras(tuple(camera.name for camera in moment.snapshot.cameras), state.camera)
         self._blend.double_value = state.blend
 

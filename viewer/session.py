@@ -31,6 +31,7 @@ class Session:
         self.state = state
         self.history: History = ()
         self._analyst = Analyst()
+        self._analysis: Analysis | None = None
         self._view: Viewpoint | None = None
         self._touched = False  # whether the person has chosen a viewpoint
         self._coloured: tuple[tuple[object, ...], GaussianArrays] | None = None
@@ -57,9 +58,19 @@ class Session:
         return shown_moment(self.state, self.history)
 
     def analysis(self) -> Analysis | None:
-        """The analysis of the shown moment; None while it is not ready."""
+        """The analysis of the shown moment, or of one with the same cameras; None while there is none."""
         moment = self.moment
-        return None if moment is None else self._analyst.of(moment)
+        if moment is None:
+            return None
+        known = self._analysis
+        usable = known is not None and _same_cameras(known.moment, moment)
+        if usable and not self._needs_support():
+            return known  # what is advised depends on the cameras: the same ones need no second look
+        self._analysis = self._analyst.of(moment) or (known if usable else None)
+        return self._analysis
+
+    def _needs_support(self) -> bool:
+        return self.state.colouring in (Colouring.SUPPORT, Colouring.SOURCE)
 
     def press(self, key: str) -> None:
         self.state = press(self.state, self.history, key)
@@ -112,11 +123,11 @@ class Session:
         moment, analysis = self.moment, self.analysis()
         if moment is None:
             return GaussianArrays.empty()
-        needs_support = self.state.colouring in (Colouring.SUPPORT, Colouring.SOURCE)
-        colouring = Colouring.PHOTOGRAPH if needs_support and analysis is None else self.state.colouring
+        ready = analysis is not None and analysis.moment is moment
+        colouring = Colouring.PHOTOGRAPH if self._needs_support() and not ready else self.state.colouring
         key = (moment, colouring)
         if self._coloured is None or self._coloured[0] != key:
-            support = analysis.support if analysis else Support(np.zeros((0, 0), np.float32))
+            support = analysis.support if analysis and ready else Support(np.zeros((0, 0), np.float32))
             self._coloured = key, coloured(moment, colouring, support)
         return self._coloured[1]
 
@@ -157,6 +168,11 @@ class Session:
             if depth > 0 and camera.name != self.state.camera and np.hypot(column - x, row - y) < _CLICK_RADIUS:
                 hits.append((float(depth), camera.name))
         return min(hits)[1] if hits else None
+
+
+def _same_cameras(one: Moment, other: Moment) -> bool:
+    names = [[camera.name for camera in moment.snapshot.cameras] for moment in (one, other)]
+    return names[0] == names[1] and one.scene_id == other.scene_id
 
 
 def _depth_at(photograph: Photograph, view: Viewpoint, x: float, y: float, width: int, height: int) -> float | None:

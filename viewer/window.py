@@ -41,8 +41,15 @@ _KEYS = {
 }
 
 
-def show(session: Session, *, open3d_may_draw: bool, screenshots: Path, size: tuple[int, int] = (1280, 800)) -> None:
-    """Opens the window and returns when it is closed. Raises what went wrong while it was open.
+def show(
+    session: Session,
+    *,
+    open3d_may_draw: bool,
+    screenshots: Path,
+    opened: Callable[[], None] = lambda: None,
+    size: tuple[int, int] = (1280, 800),
+) -> None:
+    """Opens the window, calls `opened`, and returns when it is closed. Raises what went wrong while it was open.
 
     `open3d_may_draw` is False where Vulkan is software; the key that asks for it works all the same.
     """
@@ -54,6 +61,7 @@ def show(session: Session, *, open3d_may_draw: bool, screenshots: Path, size: tu
     session.state = replace(state, engine=Engine.OPEN3D if open3d_may_draw else Engine.CORE)
     window = _Window(app, session, screenshots, size)
     try:
+        opened()
         app.run()
     finally:
         session.close()
