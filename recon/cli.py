@@ -24,11 +24,9 @@ from recon.evaluate.methods import by_preset
 from recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
 from recon.evaluate.splits import Split
 from recon.evaluate.truth import load_scene
-from recon.export import write_result
 from recon.pipeline import reconstruct
-from recon.preview import contact_sheet
 from recon.rasterize.cpu import rasterize
-from recon.report import build_report, peak_rss_mb
+from recon.result import finish
 from recon.snapshot import Snapshot
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
@@ -68,14 +66,6 @@ def run(
     if snapshot is None:
         raise AssertionError("reconstruct always yields a last snapshot")
     return snapshot
-
-
-def finish(snapshot: Snapshot, out: Path, *, seed: int, preset_name: str, **extra: object) -> dict[str, object]:
-    """Writes the result folder and returns its report."""
-    report = build_report(snapshot, seed=seed, preset=preset_name, peak_rss_mb=peak_rss_mb()) | extra
-    preview = contact_sheet(snapshot) if snapshot.verdict.publishable else None
-    write_result(snapshot, out, report, preview=preview)
-    return report
 
 
 def demo(args: argparse.Namespace) -> int:

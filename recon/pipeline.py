@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import msgspec
@@ -17,12 +17,13 @@ from capture.frame import DroppedFrame, Frame
 from recon import growth, optimize
 from recon.config import Config
 from recon.judge import judge
-from recon.keyframe import Keyframe, modelled_image
+from recon.keyframe import Features, Keyframe, modelled_image
 from recon.priors import classical
 from recon.priors.pointmap import Pointmap
 from recon.priors.prior import Prior
 from recon.registration import features
 from recon.registration.register import Registration
+from recon.registration.two_view import TwoView
 from recon.scene import Scene, begin
 from recon.snapshot import GaussianArrays, Snapshot
 from recon.verdict import Verdict
@@ -30,6 +31,8 @@ from recon.view_graph import ViewGraph
 
 log = logging.getLogger(__name__)
 
+Judged = tuple[Registration | None, Verdict]
+REMEMBERED_VERDICTS = 3  # a keyframe may be tried, and taken back
 FITS = 0.02  # of the scene's depth: a scene grows while a new estimate moves its cameras by less
 
 
@@ -63,9 +66,9 @@ def reconstruct(frames: Iterable[Frame | DroppedFrame], config: Config) -> Itera
     yield work.snapshot(final=True)
 
 
-def prepare(frame: Frame, config: Config) -> Keyframe:
-    """The frame with its features and its image at modelled size. It depends on no other frame."""
-    found = features.extract(frame.image, config.prior.registration.features)
+def prepare(frame: Frame, config: Config, found: Features | None = None) -> Keyframe:
+    """The frame with its image at modelled size and its features, unless they are known. No other frame is needed."""
+    found = found or features.extract(frame.image, config.prior.registration.features)
     return Keyframe(frame, modelled_image(frame.image, config.size), found)
 
 
@@ -96,7 +99,7 @@ class Reconstruction:
         self.scene: Scene | None = None  # what is shown
         self.sequence = 0
         self._prior: Prior = classical.load(msgspec.structs.replace(config.prior, seed=config.seed))
-        self._judged: tuple[Registration | None, Verdict] | None = None  # of the keyframes as they are
+        self._judged: dict[tuple[str, ...], Judged] = {}  # by keyframes: as they are, and as they were
         self._pointmaps: dict[str, Pointmap] = {}  # by keyframe, as they were last computed
 
     @property
@@ -122,7 +125,6 @@ class Reconstruction:
     def add(self, keyframe: Keyframe) -> None:
         """Adds a frame that was prepared elsewhere to the view graph."""
         self.graph.add(keyframe)
-        self._judged = None
         newest = len(self.graph.keyframes) - 1
         overlapping = sum(newest in pair for pair in self.graph.pairs)
         num_features = len(keyframe.features.points)
@@ -132,19 +134,27 @@ class Reconstruction:
     def retract(self, names: Collection[str]) -> None:
         """Forgets keyframes and what the scene has from them alone. What is shown waits for the next estimate."""
         self.graph = self.graph.without(names)
-        self._judged = self.begun = None
+        self.begun = None
         self._pointmaps = {name: pointmap for name, pointmap in self._pointmaps.items() if name not in names}
         if self.scene is not None:
             self.scene = growth.without(self.scene, names) if len(self.scene.views) > len(names) else None
 
-    def judge(self) -> tuple[Registration | None, Verdict]:
-        """Cameras of the keyframes and the verdict on them; at once where no keyframe came since the last time."""
+    def restore(self, keyframes: Sequence[Keyframe], pairs: Mapping[tuple[str, str], TwoView]) -> None:
+        """Takes over keyframes whose pairs, by their names, are known from an earlier process."""
+        self.graph.keyframes[:] = keyframes
+        place = {keyframe.name: index for index, keyframe in enumerate(keyframes)}
+        self.graph.pairs = {(place[i], place[j]): pair for (i, j), pair in pairs.items() if i in place and j in place}
+
+    def judge(self) -> Judged:
+        """Cameras of the keyframes and the verdict on them; at once for keyframes that were judged a moment ago."""
         self.clock.lap("wait")
-        if self._judged is None:
+        names = tuple(self.names)
+        if names not in self._judged:
             registration = self._prior.register(self.graph)
-            self._judged = registration, judge(self.graph, registration, self.config.judge)
+            judged = registration, judge(self.graph, registration, self.config.judge)
+            self._judged = dict([*self._judged.items(), (names, judged)][-REMEMBERED_VERDICTS:])
         self.clock.lap("poses")
-        return self._judged
+        return self._judged[names]
 
     def work_in(self) -> None:
         """Shows a scene of all keyframes as soon as possible: grown from the one that is shown, else begun."""

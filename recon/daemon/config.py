@@ -1,0 +1,28 @@
+"""What can be configured in the recon daemon, with defaults and units."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+
+from capture.messaging.network import Network
+from recon.config import Config as Reconstruction
+from recon.daemon.tracking import Config as Tracking
+
+Positive = Annotated[int, msgspec.Meta(ge=1)]
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    network: Network = Network()
+    reconstruction: Reconstruction = Reconstruction()
+    tracking: Tracking = Tracking()  # of the live camera against a finished scene
+    # None: $STATE_DIRECTORY, else $XDG_STATE_HOME/splatnode, else ~/.local/state/splatnode
+    checkpoint: Path | None = None
+    out: Path = Path("out")  # each place becomes a folder in it
+    max_views: Annotated[int, msgspec.Meta(ge=4)] = 30  # beyond, those that others show too are given up
+    max_gaussians: Positive = 300_000
+    settle_s: Annotated[float, msgspec.Meta(ge=0)] = 1.5  # without a key frame, until the scene is made afresh
+    lost_after: Annotated[int, msgspec.Meta(ge=3)] = 3  # key frames in a row that do not fit: a new place
+    status_every_s: Annotated[float, msgspec.Meta(gt=0)] = 1.0

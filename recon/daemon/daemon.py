@@ -1,0 +1,209 @@
+"""`splatnode recon CONFIG`: the process. Its sockets are in this file, in the main thread; the work is in others.
+
+intake    capture.keyframes -> checkpoint, acknowledged -> inbox
+worker    inbox -> scenes, saved and exported
+watcher   capture.preview -> has the camera moved?
+main      recon.scene, recon.status, recon.control; the service manager; signals
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import logging
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import msgspec
+
+from capture.config import load_config
+from capture.logs import event, use_structured_lines
+from capture.messaging.broadcast import Publisher
+from capture.messaging.commands import CommandServer
+from capture.messaging.services import RECON_CONTROL, RECON_SCENE, RECON_STATUS
+from capture.messaging.state import StateServer
+from capture.messaging.wire import Numbering
+from capture.service_manager import ServiceManager
+from capture.status import own_rss_mb
+from recon.daemon.config import Config
+from recon.daemon.control import Answer, Retract
+from recon.daemon.inbox import Inbox, LeftOut
+from recon.daemon.intake import Intake
+from recon.daemon.scene_message import to_message
+from recon.daemon.status import ReconStatus, State
+from recon.daemon.store import Store, default_directory
+from recon.daemon.watcher import Watcher
+from recon.daemon.worker import Shown, Worker
+
+log = logging.getLogger(__name__)
+
+SERVE_S = 0.05  # between looks at what the threads have made
+END_S = 20.0  # for the threads to end; an export takes seconds
+
+
+def recon(args: argparse.Namespace) -> int:
+    """Runs until SIGTERM or SIGINT; 0 then."""
+    use_structured_lines()
+    config = load_config(args.config, Config) if args.config else Config()
+    if args.checkpoint:
+        config = msgspec.structs.replace(config, checkpoint=args.checkpoint)
+    if args.out:
+        config = msgspec.structs.replace(config, out=args.out)
+    stopping = threading.Event()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: stopping.set())
+    with Daemon(config, stopping) as daemon:
+        daemon.run()
+    return 0
+
+
+class Daemon:
+    def __init__(self, config: Config, stopping: threading.Event) -> None:
+        """Raises AlreadyRunning, CheckpointError, NetworkError, OSError."""
+        self._config, self._stopping = config, stopping
+        self._resources = contextlib.ExitStack()
+        with self._closing_on_error():
+            network = config.network
+            self._scenes = self._resources.enter_context(StateServer(RECON_SCENE, network))
+            self._heartbeat = self._resources.enter_context(Publisher(RECON_STATUS, network))
+            self._commands = self._resources.enter_context(CommandServer(RECON_CONTROL, network, Retract))
+            self._store = Store(config.checkpoint or default_directory())
+            self._resources.callback(self._store.close)
+            remove_leftovers(config.out)
+        self._inbox = Inbox()
+        self._newest = _Newest()
+        self._intake = Intake(network, config.reconstruction, self._store, self._inbox, stopping)
+        self._worker = Worker(config, self._store, self._inbox, self._newest.put, stopping)
+        self._watcher = Watcher(network, config.tracking, lambda: self._worker.finished, stopping)
+        self._numbering = Numbering()
+        self._started_s = time.monotonic()
+        self._shown: Shown | None = None
+        self._errors: list[BaseException] = []
+
+    def __enter__(self) -> Daemon:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._resources.close()
+
+    def run(self) -> None:
+        """Until the daemon is told to stop. Raises what ended one of its threads."""
+        manager = ServiceManager()
+        threads = [self._thread(each.run) for each in (self._intake, self._worker, self._watcher)]
+        manager.ready()
+        event(log, logging.INFO, "ready", checkpoint=self._store.directory, out=self._config.out)
+        next_status_s = 0.0
+        try:
+            while not self._stopping.is_set():
+                self._scenes.serve(SERVE_S)
+                self._commands.serve(0, self._answer)
+                self._publish()
+                if time.monotonic() >= next_status_s:
+                    next_status_s = time.monotonic() + self._config.status_every_s
+                    status = self._status()
+                    self._heartbeat.send(status)
+                    manager.alive(f"{status.state.value}, {status.keyframes} key frames, {status.verdict}")
+        finally:
+            self._stopping.set()
+            manager.stopping()
+            self._end(threads)
+        if self._errors:
+            raise self._errors[0]
+        event(log, logging.INFO, "stopped")
+
+    def _thread(self, run: Callable[[], None]) -> threading.Thread:
+        def guarded() -> None:
+            try:
+                run()
+            except BaseException as error:
+                self._errors.append(error)
+                self._stopping.set()
+
+        thread = threading.Thread(target=guarded, name=type(run).__name__, daemon=True)
+        thread.start()
+        return thread
+
+    def _end(self, threads: list[threading.Thread]) -> None:
+        """Waits for what must be whole: an export, a frame on its way to the disk."""
+        deadline = time.monotonic() + END_S
+        for thread in threads:
+            thread.join(max(0.0, deadline - time.monotonic()))
+        if any(thread.is_alive() for thread in threads):
+            log.error("a thread did not end within %d s; what it was writing is left out whole", END_S)
+
+    def _publish(self) -> None:
+        shown = self._newest.take()
+        if shown is None:
+            return
+        self._shown = shown
+        tracked = self._watcher.tracked()
+        header, arrays = to_message(shown.snapshot, shown.scene_id, self._numbering.next(), tracked)
+        self._scenes.publish(header, arrays)
+
+    def _answer(self, command: Retract) -> Answer:
+        if command.name not in self._store.names:
+            return Answer(False, f"no key frame {command.name!r}; there are: {', '.join(sorted(self._store.names))}")
+        self._store.forget(command.name, "retracted")
+        self._inbox.put(LeftOut(command.name), self._stopping)
+        event(log, logging.INFO, "retracted", frame=command.name)
+        return Answer(True, f"{command.name} is forgotten; the scene is made anew without it")
+
+    def _status(self) -> ReconStatus:
+        snapshot = self._shown.snapshot if self._shown else None
+        intake, worker, motion = self._intake, self._worker, self._watcher.motion
+        return ReconStatus(
+            **self._numbering.next(),
+            state=State.FULL if intake.problem else worker.state,
+            uptime_s=time.monotonic() - self._started_s,
+            scene_id=self._store.scene_id,
+            keyframe=intake.newest,
+            queue=len(self._inbox),
+            keyframes=len(snapshot.cameras) if snapshot else 0,
+            num_gaussians=len(snapshot.gaussians) if snapshot else 0,
+            iterations=snapshot.iterations if snapshot else 0,
+            final=bool(snapshot and snapshot.final),
+            verdict=snapshot.verdict.code.value if snapshot else "",
+            message=snapshot.verdict.message if snapshot else "",
+            keyframe_s=worker.keyframe_s,
+            refused=intake.refused + self._commands.refused + self._scenes.refused,
+            duplicates=intake.duplicates,
+            rss_mb=own_rss_mb(),
+            camera_moved=motion.moved if motion else None,
+            moved=str(motion) if motion and motion.moved else "",
+            problem=intake.problem or worker.problem,
+        )
+
+    @contextlib.contextmanager
+    def _closing_on_error(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self._resources.close()
+            raise
+
+
+class _Newest:
+    """The newest snapshot that has not been published."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._shown: Shown | None = None
+
+    def put(self, shown: Shown) -> None:
+        with self._lock:
+            self._shown = shown
+
+    def take(self) -> Shown | None:
+        with self._lock:
+            shown, self._shown = self._shown, None
+            return shown
+
+
+def remove_leftovers(out: Path) -> None:
+    """Temporary files of exports that a killed process had begun."""
+    for leftover in (*out.glob("scene-*/.*.tmp"), *out.glob("scene-*/colmap/.*.tmp")):
+        event(log, logging.INFO, "removed_leftover", file=leftover)
+        leftover.unlink(missing_ok=True)

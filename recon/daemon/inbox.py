@@ -1,0 +1,56 @@
+"""What waits for the worker: key frames with their features, and what became of others, in the order they came."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+from recon.keyframe import Keyframe
+
+CAPACITY = 32  # events in memory; further key frames wait with their sender
+
+
+@dataclass(frozen=True, eq=False)
+class Arrived:
+    """A key frame that the checkpoint holds."""
+
+    keyframe: Keyframe
+    at_s: float  # monotonic
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A frame that the checkpoint names as left out, or no longer holds."""
+
+    name: str
+
+
+Event = Arrived | LeftOut
+
+
+class Inbox:
+    def __init__(self) -> None:
+        self._events: deque[Event] = deque()
+        self._changed = threading.Condition()
+
+    def __len__(self) -> int:
+        return len(self._events)
+
+    def put(self, event: Event, stopping: threading.Event) -> None:
+        """Waits where the inbox is full, until there is room or the daemon stops."""
+        with self._changed:
+            while len(self._events) >= CAPACITY and not stopping.is_set():
+                self._changed.wait(0.1)
+            self._events.append(event)
+            self._changed.notify_all()
+
+    def get(self, timeout_s: float) -> list[Event]:
+        """The next event, and with a key frame those that follow it; none where none comes in time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._events, timeout_s)
+            events = [self._events.popleft()] if self._events else []
+            while events and self._events and all(isinstance(each, Arrived) for each in (events[0], self._events[0])):
+                events.append(self._events.popleft())
+            self._changed.notify_all()
+            return events

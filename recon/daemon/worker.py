@@ -1,0 +1,243 @@
+"""The thread that reconstructs: works key frames in as they come, and makes the scene as good as it gets in between."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import msgspec
+
+from capture.logs import event
+from recon.daemon import place, saved
+from recon.daemon.config import Config
+from recon.daemon.inbox import Arrived, Inbox, LeftOut
+from recon.daemon.status import State
+from recon.daemon.store import Store
+from recon.daemon.watcher import Finished
+from recon.keyframe import Keyframe
+from recon.pipeline import Reconstruction, prepare
+from recon.result import finish
+from recon.snapshot import Snapshot
+
+log = logging.getLogger(__name__)
+
+STEP = 10  # iterations between looks at the inbox
+IDLE_S = 0.5  # between looks at whether to stop
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What the world may see."""
+
+    snapshot: Snapshot
+    scene_id: str
+
+
+class _Abandoned(Exception):
+    """Something more urgent has come."""
+
+
+class Worker:
+    def __init__(
+        self,
+        config: Config,
+        store: Store,
+        inbox: Inbox,
+        publish: Callable[[Shown], None],
+        stopping: threading.Event,
+    ) -> None:
+        limit = min(config.max_gaussians, config.reconstruction.max_gaussians or config.max_gaussians)
+        self._recipe = msgspec.structs.replace(config.reconstruction, max_gaussians=limit, budget_s=None)
+        self._config, self._store, self._inbox, self._publish = config, store, inbox, publish
+        self._stopping = stopping
+        self._work = Reconstruction(self._recipe)
+        self._aside: list[Keyframe] = []  # the last ones in a row that did not fit
+        self._settled = True  # nothing can be made better before the next key frame
+        self.state = State.WAITING
+        self.problem = ""
+        self.keyframe_s: float | None = None
+        self.finished: Finished | None = None  # while no key frame waits
+
+    def run(self) -> None:
+        """Until the daemon stops; an export that has begun is finished."""
+        self._guarded(self._restore)
+        while not self._stopping.is_set():
+            events = self._inbox.get(IDLE_S if self._settled else self._config.settle_s)
+            arrived = [each for each in events if isinstance(each, Arrived)]
+            left_out = [each.name for each in events if isinstance(each, LeftOut)]
+            if arrived:
+                self._guarded(lambda arrived=arrived: self._take_in(arrived))
+            elif left_out:
+                self._guarded(lambda left_out=left_out: self._leave_out(left_out))
+            elif not self._settled:
+                self._guarded(self._settle)
+
+    def _guarded(self, step: Callable[[], None]) -> None:
+        """A step that fails is told and not repeated: what comes next may succeed, and a node runs for weeks."""
+        try:
+            step()
+        except _Abandoned:
+            pass
+        except Exception as error:
+            log.exception("a step of the reconstruction failed")
+            self.problem = f"{type(error).__name__}: {error}"
+            self._settled = True
+
+    def _restore(self) -> None:
+        """Goes on where an earlier process was."""
+        features, pairs, scene = {}, {}, None
+        try:
+            if (graph := self._store.load("graph", saved.GraphRecord)) is not None:
+                features, pairs = saved.graph_from(graph)
+            keyframes = {
+                stored.frame.name: prepare(stored.frame, self._recipe, features.get(stored.frame.name))
+                for stored in self._store.frames()
+            }
+            if (found := self._store.load("scene", saved.SceneRecord)) is not None:
+                scene = saved.scene_from(found, keyframes)
+                self._settled = found.header.final and scene is not None
+        except ValueError as error:
+            log.warning("the checkpoint's scene is made anew: %s", error)
+            keyframes = {stored.frame.name: prepare(stored.frame, self._recipe) for stored in self._store.frames()}
+        self._work.dropped = self._store.dropped
+        self._work.restore([keyframe for name, keyframe in keyframes.items() if name in features], pairs)
+        self._work.show(scene)
+        new = [keyframe for name, keyframe in keyframes.items() if name not in features]
+        if keyframes:
+            event(log, logging.INFO, "restored", scene=self._store.scene_id, keyframes=len(keyframes), new=len(new))
+        if new or (keyframes and scene is None):
+            self._take_in([Arrived(keyframe, time.monotonic()) for keyframe in new])
+        elif keyframes:
+            self.state = State.IDLE if self._settled else State.GROWING
+            self._show(final=self._settled)
+
+    def _take_in(self, arrived: Sequence[Arrived]) -> None:
+        """Key frames that have come, shown together."""
+        self.state, self.problem = State.GROWING, ""
+        self._settled, self.finished = False, None
+        for keyframe in self._tried([each.keyframe for each in arrived]):
+            event(log, logging.WARNING, "does_not_fit", frame=keyframe.name, scene=self._store.scene_id)
+        if len(self._aside) >= self._config.lost_after:
+            self._begin_place()
+        self._work.work_in()
+        self._bound_views()
+        snapshot = self._show()
+        if arrived:
+            self.keyframe_s = time.monotonic() - arrived[0].at_s
+        event(
+            log, logging.INFO, "keyframes", names=",".join(each.keyframe.name for each in arrived),
+            verdict=snapshot.verdict.code.value, gaussians=len(snapshot.gaussians), seconds=self.keyframe_s or 0.0,
+        )  # fmt: skip
+        self._save(final=False)
+
+    def _tried(self, keyframes: list[Keyframe]) -> list[Keyframe]:
+        """Adds keyframes to the view graph; returns those that do not fit, of which the last in a row are kept."""
+        try:
+            strangers = place.add(self._work, keyframes)
+        except Exception as error:  # one bad frame must not keep others out
+            if len(keyframes) > 1:
+                return [stranger for keyframe in keyframes for stranger in self._tried([keyframe])]
+            log.exception("%s cannot be worked in", keyframes[0].name)
+            self._forget(keyframes[0].name, f"cannot be worked in: {error}")
+            return []
+        for keyframe in keyframes:
+            if keyframe.name in strangers:
+                self._aside.append(keyframe)
+                continue
+            for stranger in self._aside:
+                if stranger.name not in self._work.names:
+                    self._forget(stranger.name, "it contradicts the scene")
+            self._aside = []
+        return [keyframe for keyframe in keyframes if keyframe.name in strangers]
+
+    def _begin_place(self) -> None:
+        """The scene that was is exported as it is, and another begins with the frames that did not belong to it."""
+        self.state = State.LOST
+        snapshot = self._show()
+        self._export(snapshot)
+        before = self._store.scene_id
+        self._store.begin_place(self._aside[0].frame.frame_id)
+        event(log, logging.WARNING, "another_place", before=before, now=self._store.scene_id)
+        self._work = Reconstruction(self._recipe)
+        for keyframe in self._aside:
+            self._work.add(keyframe)
+        self._aside = []
+
+    def _bound_views(self) -> None:
+        while len(self._work.names) > self._config.max_views:
+            name = place.most_redundant(self._work.graph)
+            event(log, logging.INFO, "given_up", frame=name)
+            self._forget(name, "given up for newer views that show the same")
+
+    def _leave_out(self, names: Sequence[str]) -> None:
+        """The checkpoint no longer has these frames; the scene forgets them, too."""
+        known = [name for name in names if name in self._work.names]
+        self._work.dropped = self._store.dropped
+        if known:
+            self._work.retract(known)
+            self._settled, self.finished, self.state = False, None, State.GROWING
+        self._show()
+        if known:
+            self._save(final=False)
+
+    def _forget(self, name: str, reason: str) -> None:
+        self._store.forget(name, reason)
+        if name in self._work.names:
+            self._work.retract([name])
+        self._work.dropped = self._store.dropped
+
+    def _settle(self) -> None:
+        """Makes the scene afresh from all key frames and refines it. Raises _Abandoned when something comes."""
+        self.state = State.REFINING
+        config = self._recipe.optimize
+        steps = msgspec.structs.replace(config, checkpoints=tuple(range(STEP, config.iterations, STEP)))
+        self._work.estimate(self._pause)
+        refined = None
+        for refined in self._work.refine(self._work.begun, steps):
+            self._pause()
+            if refined.iterations in config.checkpoints:
+                self._work.show(refined)
+                self._show()
+        self._settled = True
+        self._work.show(refined)
+        snapshot = self._show(final=refined is not None)
+        if refined is not None:
+            self._save(final=True)
+            self._export(snapshot)
+        self.state = State.WAITING if refined is None else State.LOST if self._aside else State.IDLE
+
+    def _pause(self) -> None:
+        if self._stopping.is_set() or len(self._inbox):
+            raise _Abandoned
+
+    def _show(self, final: bool = False) -> Snapshot:
+        snapshot = self._work.snapshot(final)
+        self._publish(Shown(snapshot, self._store.scene_id))
+        self.finished = Finished(snapshot, tuple(self._work.graph.keyframes)) if final else None
+        return snapshot
+
+    def _save(self, final: bool) -> None:
+        """What could be made anew from the key frames; a full disk costs time after a restart and nothing else."""
+        try:
+            self._store.save("graph", *saved.graph_message(self._work.graph))
+            if self._work.scene is not None:
+                self._store.save("scene", *saved.scene_message(self._work.scene, final))
+        except OSError as error:
+            self._complain(f"the scene cannot be kept ({error.strerror}): make room on the disk")
+
+    def _export(self, snapshot: Snapshot) -> None:
+        """The result folder, whole or not at all."""
+        folder = self._config.out / self._store.scene_id
+        try:
+            finish(snapshot, folder, seed=self._recipe.seed, preset_name="live")
+        except OSError as error:
+            self._complain(str(error))
+        else:
+            event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians))
+
+    def _complain(self, problem: str) -> None:
+        self.problem = problem
+        log.error("%s", problem)

@@ -1,0 +1,18 @@
+"""The result folder of a snapshot, with its report and a preview."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from recon.export import write_result
+from recon.preview import contact_sheet
+from recon.report import build_report, peak_rss_mb
+from recon.snapshot import Snapshot
+
+
+def finish(snapshot: Snapshot, out: Path, *, seed: int, preset_name: str, **extra: object) -> dict[str, object]:
+    """Writes the result folder and returns its report. Raises ResultWriteError, with what was there before intact."""
+    report = build_report(snapshot, seed=seed, preset=preset_name, peak_rss_mb=peak_rss_mb()) | extra
+    preview = contact_sheet(snapshot) if snapshot.verdict.publishable else None
+    write_result(snapshot, out, report, preview=preview)
+    return report

@@ -1,0 +1,168 @@
+"""The daemon as a whole, over its sockets: key frames in, a scene out, killed and gone on, a frame taken back."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from capture.messaging.commands import ask
+from capture.messaging.keyframes import KeyframeServer
+from capture.messaging.network import AlreadyRunning, Network
+from capture.messaging.services import RECON_CONTROL, RECON_SCENE
+from capture.messaging.spool import Config as SpoolConfig
+from capture.messaging.spool import Spool
+from capture.messaging.state import StateClient
+from capture.status import heartbeats
+from recon import optimize
+from recon.config import Config as Reconstruction
+from recon.daemon.config import Config
+from recon.daemon.control import Answer, Retract
+from recon.daemon.daemon import Daemon
+from recon.daemon.scene_message import LiveScene, SceneHeader, from_message
+from recon.daemon.tracking import Config as Tracking
+from recon.export import read_cameras
+from recon.verdict import Code
+from tests.synthetic import photographs, places
+
+QUICK = Reconstruction(
+    size=160,
+    preview=optimize.Config(iterations=2, half_resolution_share=1.0),
+    optimize=optimize.Config(iterations=20, checkpoints=(10,)),
+)
+PATIENCE_S = 120.0
+
+
+@pytest.fixture
+def config(tmp_path) -> Config:
+    (tmp_path / "run").mkdir(mode=0o700)
+    return Config(
+        network=Network(directory=tmp_path / "run"),
+        reconstruction=QUICK,
+        tracking=Tracking(every_s=0),
+        checkpoint=tmp_path / "checkpoint",
+        out=tmp_path / "out",
+        settle_s=0.2,
+        status_every_s=0.2,
+    )
+
+
+@contextmanager
+def running(config: Config) -> Iterator[None]:
+    """The daemon in a thread of its own, until the block ends."""
+    stopping, errors = threading.Event(), []
+
+    def run() -> None:
+        try:
+            with Daemon(config, stopping) as daemon:
+                daemon.run()
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stopping.set()
+        thread.join(PATIENCE_S)
+    assert not thread.is_alive() and not errors, errors
+
+
+class Peer:
+    """Capture and viewer at once: offers key frames and hears scenes."""
+
+    def __init__(self, config: Config, folder: Path) -> None:
+        self.server = KeyframeServer(config.network, Spool(SpoolConfig(directory=folder)))
+        self.client = StateClient(RECON_SCENE, config.network, SceneHeader)
+        self.heard: list[LiveScene] = []
+
+    def close(self) -> None:
+        self.server.close()
+        self.client.close()
+
+    def wait(self, until: Callable[[LiveScene], bool], what: str) -> LiveScene:
+        """The first scene from now on for which `until` holds."""
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline:
+            self.server.serve(0.01)
+            message = self.client.poll(0.02)
+            if message is not None:
+                self.heard.append(from_message(message))
+                if until(self.heard[-1]):
+                    return self.heard[-1]
+        raise AssertionError(
+            f"no scene with {what} in {PATIENCE_S} s; heard {[h.snapshot.verdict for h in self.heard]}"
+        )
+
+    def wait_for_acknowledgements(self) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while self.server.queued and time.monotonic() < deadline:
+            self.server.serve(0.02)
+        assert self.server.queued == 0
+
+
+@pytest.fixture
+def peer(config, tmp_path) -> Iterator[Peer]:
+    opened = Peer(config, tmp_path / "spool")
+    yield opened
+    opened.close()
+
+
+def finished(cameras: int) -> Callable[[LiveScene], bool]:
+    return lambda scene: scene.snapshot.final and len(scene.snapshot.cameras) == cameras
+
+
+def test_key_frames_become_a_scene_that_survives_the_process_and_forgets_what_it_must(config, peer):
+    frames = photographs()[:4]
+    with running(config):
+        for frame in frames[:3]:
+            peer.server.offer(frame)
+        first = peer.wait(lambda scene: len(scene.snapshot.cameras) == 3, "three cameras")
+        assert first.scene_id == "scene-0001" and first.snapshot.verdict.code == Code.OK
+        assert len(first.snapshot.gaussians) > 100
+        peer.server.offer(frames[3])
+        scene = peer.wait(finished(4), "four cameras, refined")
+        assert scene.snapshot.iterations == 20
+        peer.wait_for_acknowledgements()
+        with pytest.raises(AlreadyRunning):
+            Daemon(config, threading.Event())
+        assert heartbeats(config.network)["recon"]["keyframes"] == 4
+    exported = read_cameras(config.out / "scene-0001" / "cameras.json")
+    assert [camera.name for camera in exported] == [frame.name for frame in frames]
+
+    with running(config):
+        again = peer.wait(lambda scene: scene.session != first.session, "a new session")
+        assert again.snapshot.final and again.snapshot.iterations == 20
+        assert len(again.snapshot.gaussians) == len(scene.snapshot.gaussians)
+        answer = ask(RECON_CONTROL, config.network, Retract("nobody.png"), Answer)
+        assert not answer.done and frames[0].name in answer.message
+        assert ask(RECON_CONTROL, config.network, Retract(frames[3].name), Answer).done
+        less = peer.wait(finished(3), "three cameras, refined again")
+        assert [dropped.name for dropped in less.snapshot.dropped] == [frames[3].name]
+
+    with running(config):
+        peer.wait(lambda scene: scene.session not in (first.session, again.session), "a third session")
+        assert len(peer.heard[-1].snapshot.cameras) == 3
+        assert peer.heard[-1].snapshot.dropped == less.snapshot.dropped
+
+
+def test_another_place_begins_another_scene_and_the_old_one_is_exported(config, peer):
+    frames = places(seeds=(0, 1))
+    with running(replace(config, lost_after=3)):
+        for frame in frames[:3]:
+            peer.server.offer(frame)
+        peer.wait(lambda scene: len(scene.snapshot.cameras) == 3, "the first place")
+        for frame in frames[3:]:
+            peer.server.offer(frame)
+        other = peer.wait(lambda scene: scene.scene_id == "scene-0002", "another place")
+        assert {camera.name for camera in other.snapshot.cameras} <= {frame.name for frame in frames[3:]}
+        peer.wait_for_acknowledgements()
+    kept = read_cameras(config.out / "scene-0001" / "cameras.json")
+    assert {camera.name for camera in kept} == {frame.name for frame in frames[:3]}
+    assert len(list((config.checkpoint / "frames").glob("*.frame"))) == 3
