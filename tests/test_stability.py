@@ -302,6 +302,22 @@ def test_a_campaign_goes_on_where_it_was_stopped(tmp_path, places, monkeypatch):
         run_campaign(Plan(rows, (0,), ("splatnode",)), elsewhere, tmp_path, "command")
 
 
+def test_the_chart_has_a_cell_for_every_trial(tmp_path):
+    pytest.importorskip("matplotlib", reason="charts need matplotlib (pip install 'splatnode[bench]')")
+    from recon.evaluate.stability.chart import draw, figure_of
+
+    trials = [{**trial, "seed": number % 3, "verdict": f"CODE_{number}"} for number, trial in enumerate(TRIALS)]
+    figure = figure_of({"trials": trials, **report(trials)})
+    shown = [text.get_text() for axes in figure.axes for text in axes.texts]
+    assert {f"CODE_{number}" for number in range(len(trials))} <= {text.rstrip(" *") for text in shown}
+    assert "CODE_1 *" in shown, "a limit that was missed is marked"
+    (tmp_path / "stability.json").write_text(json.dumps({"trials": trials, **report(trials)}))
+    assert draw(tmp_path / "stability.json", tmp_path).stat().st_size > 10_000
+    (tmp_path / "stability.json").write_text(json.dumps({"trials": [], **report([])}))
+    with pytest.raises(ValueError, match="must have a trial to draw, it has none"):
+        draw(tmp_path / "stability.json", tmp_path)
+
+
 def test_command_line():
     parse = build_parser().parse_args
     args = parse(

@@ -5,7 +5,7 @@ Everything is at its defaults, except that frames of one size share a camera, as
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -18,27 +18,42 @@ from recon.config import Config
 from recon.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from recon.verdict import Code, Verdict
 
+Models = Mapping[int, pycolmap.Reconstruction]
+
 _MIN_CAMERAS = 3  # a model of two cameras counts as no answer, for every method
 
 
 def colmap(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:
     """Incremental mapping: the largest model."""
-    return _reconstructed(frames, config, pycolmap.incremental_mapping)
+    return _reconstructed(frames, config, _incremental)
 
 
 def glomap(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:
-    """Global mapping: the largest model."""
-    return _reconstructed(frames, config, pycolmap.global_mapping)
+    """Global mapping after a calibration of the view graph, as GLOMAP does it: the largest model."""
+    return _reconstructed(frames, config, _global)
 
 
-def _reconstructed(frames: Iterable[Frame | DroppedFrame], config: Config, mapping) -> Snapshot:
+def _incremental(folder: Path, seed: int) -> Models:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.random_seed = seed
+    return pycolmap.incremental_mapping(folder / "database.db", folder / "images", folder / "models", options)
+
+
+def _global(folder: Path, seed: int) -> Models:
+    options = pycolmap.GlobalPipelineOptions()
+    options.random_seed = seed
+    pycolmap.calibrate_view_graph(folder / "database.db")
+    return pycolmap.global_mapping(folder / "database.db", folder / "images", folder / "models", options)
+
+
+def _reconstructed(
+    frames: Iterable[Frame | DroppedFrame], config: Config, mapping: Callable[[Path, int], Models]
+) -> Snapshot:
     usable = [frame for frame in frames if isinstance(frame, Frame)]
     with TemporaryDirectory(prefix="splatnode-rival-") as name:
         folder = Path(name)
         _prepare(folder, usable, config.seed)
-        models: Mapping[int, pycolmap.Reconstruction] = {}
-        if len(usable) > 1:
-            models = mapping(folder / "database.db", folder / "images", folder / "models")
+        models = mapping(folder, config.seed) if len(usable) > 1 else {}
         model = max(models.values(), key=lambda m: m.num_reg_images(), default=None)
         cameras = _cameras(model, usable) if model is not None else ()
     return _snapshot(cameras, usable)
@@ -46,6 +61,7 @@ def _reconstructed(frames: Iterable[Frame | DroppedFrame], config: Config, mappi
 
 def _prepare(folder: Path, frames: list[Frame], seed: int) -> None:
     """Images by size, features, and matches of all pairs, in `folder`/database.db."""
+    pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # it reports every step
     pycolmap.set_random_seed(seed)
     (folder / "models").mkdir()
     groups: dict[str, list[int]] = {}

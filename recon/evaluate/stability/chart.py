@@ -58,7 +58,7 @@ def figure_of(content: Mapping) -> Figure:
     rows = list(dict.fromkeys((trial["row"], trial["name"]) for trial in trials))
     seeds = sorted({trial["seed"] for trial in trials})
     width = _NAMES + len(summaries) * max(_CELL * len(seeds) + 0.2, 4.4)
-    height = 1.0 + _TABLE + _LINE * (len(rows) + 2) + 0.5
+    height = 1.0 + _TABLE + _LINE * (len(rows) + 2) + 0.7
     figure = Figure(figsize=(width, height), dpi=150)
     share = (width - _NAMES - 0.1) / len(summaries) / width
     for number, summary in enumerate(summaries):
@@ -66,13 +66,13 @@ def figure_of(content: Mapping) -> Figure:
         mine = [trial for trial in trials if trial["method"] == summary["method"]]
         top = 1.0 - (0.75 + _TABLE) / height
         _table(figure.add_axes((left, top, share - 0.1 / width, (_TABLE - 0.65) / height)), summary)
-        strip = figure.add_axes((left, 0.45 / height, share - 0.1 / width, _LINE * len(rows) / height))
+        strip = figure.add_axes((left, 0.65 / height, share - 0.1 / width, _LINE * len(rows) / height))
         _strip(strip, mine, rows, seeds, with_names=number == 0)
     figure.text(
         0.1 / width, 1.0 - 0.28 / height, "How often the answer is wrong: the stability matrix", color=_INK, fontsize=12
     )
     handles = [Patch(color=_COLOURS[found], label=told.replace("\n", " ")) for found, told in _TOLD.items()]
-    figure.legend(handles=handles, loc="lower left", ncols=len(handles), frameon=False, fontsize=7.5)
+    figure.legend(handles=handles, loc="lower left", ncols=3 if width < 10 else 6, frameon=False, fontsize=7.5)
     return figure
 
 
