@@ -26,6 +26,7 @@ from recon.registration.register import Registration
 from recon.registration.two_view import TwoView
 from recon.scene import Scene, begin
 from recon.snapshot import GaussianArrays, Snapshot
+from recon.undistort import undistorted
 from recon.verdict import Verdict
 from recon.view_graph import ViewGraph
 
@@ -67,7 +68,11 @@ def reconstruct(frames: Iterable[Frame | DroppedFrame], config: Config) -> Itera
 
 
 def prepare(frame: Frame, config: Config, found: Features | None = None) -> Keyframe:
-    """The frame with its image at modelled size and its features, unless they are known. No other frame is needed."""
+    """The frame without distortion, with its image at modelled size and its features, unless these are known.
+
+    No other frame is needed. Raises ValueError where the given intrinsics cannot be used.
+    """
+    frame = undistorted(frame)
     found = found or features.extract(frame.image, config.prior.registration.features)
     return Keyframe(frame, modelled_image(frame.image, config.size), found)
 
