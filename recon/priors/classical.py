@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -28,11 +29,25 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     far_margin: float = 8.0
 
 
-class ClassicalPrior:
-    """Cameras by `recon.registration`, depth by `recon.priors.stereo`."""
+class DepthMaps(Protocol):
+    """`stereo.depth_maps`, or another way to the same."""
 
-    def __init__(self, config: Config) -> None:
-        self._config = config
+    def __call__(
+        self,
+        views: Sequence[stereo.View],
+        config: stereo.Config,
+        *,
+        seed: int = ...,
+        sparse: Sequence[stereo.Sparse | None] | None = ...,
+        pause: Callable[[], None] = ...,
+    ) -> list[DepthMap]: ...
+
+
+class ClassicalPrior:
+    """Cameras by `recon.registration`, depth by `recon.priors.stereo` or what takes its place."""
+
+    def __init__(self, config: Config, depth_maps: DepthMaps = stereo.depth_maps) -> None:
+        self._config, self._depth_maps = config, depth_maps
 
     def register(self, graph: ViewGraph) -> Registration | None:
         if not graph.pairs:
@@ -43,7 +58,7 @@ class ClassicalPrior:
         self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
     ) -> tuple[Pointmap, ...]:
         views, sparse = self._views(graph, registration)
-        maps = stereo.depth_maps(views, self._config.stereo, seed=self._config.seed, sparse=sparse, pause=pause)
+        maps = self._depth_maps(views, self._config.stereo, seed=self._config.seed, sparse=sparse, pause=pause)
         return tuple(map(_pointmap, _keyframes(graph, registration), views, maps))
 
     def further_pointmaps(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,8 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.keyframe import modelled_image
+from recon.priors.classical import DepthMaps
 from recon.priors.fusion import DepthMap
+from recon.priors.patchmatchnet import WEIGHTS, load_network
+from recon.priors.patchmatchnet.stereo import NetworkStereo
 from recon.priors.stereo import Config, Sparse, View, depth_maps, depth_range
+from recon.weights import find
 
 Float64 = npt.NDArray[np.float64]
 LONGER_SIDE = 512  # of the images that stereo works on
@@ -223,7 +228,15 @@ def _share(masks: list[npt.NDArray[np.bool_]], among: list[npt.NDArray[np.bool_]
     return float(sum((m & a).sum() for m, a in zip(masks, among, strict=True)) / sum(a.sum() for a in among))
 
 
-def run(case: Case, config: Config, *, seed: int = 0, pose_error_deg: float = 0.0, seeded: float = 0.0) -> tuple:
+def run(
+    case: Case,
+    config: Config,
+    *,
+    seed: int = 0,
+    pose_error_deg: float = 0.0,
+    seeded: float = 0.0,
+    method: DepthMaps = depth_maps,
+) -> tuple:
     """(depth maps, measurements). `seeded` is the share of reference points given as sparse points."""
     generator = np.random.default_rng(seed)
     views = [perturbed(view, pose_error_deg, generator) for view in case.views] if pose_error_deg else case.views
@@ -232,9 +245,16 @@ def run(case: Case, config: Config, *, seed: int = 0, pose_error_deg: float = 0.
         chosen = [generator.random(len(depths)) < seeded for depths in case.depths]
         sparse = [Sparse(p[c], d[c]) for p, d, c in zip(case.points, case.depths, chosen, strict=True)]
     wall, processor = time.perf_counter(), time.process_time()
-    maps = depth_maps(views, config, seed=seed, sparse=sparse)
+    maps = method(views, config, seed=seed, sparse=sparse)
     seconds = {"wall": time.perf_counter() - wall, "cpu": time.process_time() - processor}
     return maps, {"seconds": seconds, **measure(case, maps)}
+
+
+def _patchmatchnet() -> DepthMaps:
+    return NetworkStereo(load_network(find(WEIGHTS))).depth_maps
+
+
+METHODS: dict[str, Callable[[], DepthMaps]] = {"classical": lambda: depth_maps, "patchmatchnet": _patchmatchnet}
 
 
 def main() -> None:
@@ -245,6 +265,7 @@ def main() -> None:
     parser.add_argument("--pose-error-deg", type=float, default=0.0, help="turn every camera by this much")
     parser.add_argument("--seeded", type=float, default=0.0, help="share of reference points given as sparse points")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--method", choices=METHODS, default="classical")
     parser.add_argument("--out", type=Path, help="JSON file to write")
     arguments = parser.parse_args()
     splits = json.loads((arguments.shared / "scenes" / "splits.json").read_text())
@@ -253,9 +274,15 @@ def main() -> None:
         names = splits[name][arguments.split]
         case = make_case(arguments.shared / "scenes" / name, names, sorted({*names, *splits[name]["test"]}))
         _, row = run(
-            case, Config(), seed=arguments.seed, pose_error_deg=arguments.pose_error_deg, seeded=arguments.seeded
+            case,
+            Config(),
+            seed=arguments.seed,
+            pose_error_deg=arguments.pose_error_deg,
+            seeded=arguments.seeded,
+            method=METHODS[arguments.method](),
         )
-        rows.append({"scene": name, "split": arguments.split, "pose_error_deg": arguments.pose_error_deg, **row})
+        asked = {"split": arguments.split, "method": arguments.method, "pose_error_deg": arguments.pose_error_deg}
+        rows.append({"scene": name, **asked, **row})
         print(json.dumps(rows[-1]))
     if arguments.out:
         arguments.out.write_text(json.dumps({"rows": rows}, indent=1))
