@@ -184,7 +184,7 @@ def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe]) -> Regist
         observed_point=state.point_of,
         observed_pixels=state.pixels + principal[state.camera_of],
         agreement=built.agreement,
-        focal_sigma=float(np.sqrt(covariances.log_focals.max())),
+        focal_sigma=float(np.sqrt(covariances.log_focals[state.lens_of_camera[order]].max())),
         median_angle_deg=built.median_angle_deg,
         rms_px=built.rms_px,
         rival=built.rival,
