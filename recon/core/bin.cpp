@@ -45,6 +45,7 @@ int bin(Raster& raster) {
         slots += here;
     }
     raster.entries.resize(entries);
+    raster.tile_splats.resize(entries + kLanes);  // read a whole register of splats at a time
     raster.block_bits.resize(words);
 
     run_parallel(chunks, [&](int chunk, int) {

@@ -51,16 +51,15 @@ void blend_block(const Raster& raster, TileOrigin origin, int block, const TileS
 
 template <int Channels>
 void blend_tile(Raster& raster, int tile, const RasterImages& images) {
-    thread_local Buffer<TileSplat> splats;
-    splats.resize(raster.num_entries(tile) + kPadding);
     sort_entries(raster, tile);
-    load_splats(raster, tile, splats.data());
+    load_splats(raster, tile);
     find_blocks(raster, tile);
     const TileOrigin origin = tile_origin(raster, tile);
+    const TileSplat* splats = raster.tile_splats.data() + raster.first_entries[tile];
     const uint32_t num_words = raster.num_words(tile);
     uint64_t* words = raster.block_bits.data() + raster.first_words[tile];
     for (int block = 0; block < kBlocks; ++block)
-        blend_block<Channels>(raster, origin, block, splats.data(), words + block * num_words, num_words, images);
+        blend_block<Channels>(raster, origin, block, splats, words + block * num_words, num_words, images);
 }
 
 struct BlendTiles {

@@ -15,6 +15,8 @@ constexpr int kMoments = 6;
 constexpr int kColumns = 16;  // of a row of sums: moments in even places, features in odd ones
 constexpr int kPairFloats = 2 * kLanes;
 constexpr int kSumsInFlight = 8;  // registers
+constexpr int kPadding = 16;      // sums beyond a tile's splats, for whole registers
+constexpr int kRowsAhead = 2 * kBlockHeight;  // of the images, between asking memory for them and using them
 
 // Sums over the pixels of a tile, of v times a monomial and of the weight times a feature's gradient.
 struct alignas(64) Sums {
@@ -22,8 +24,7 @@ struct alignas(64) Sums {
 };
 
 struct Scratch {
-    Buffer<TileSplat> splats;
-    Buffer<Sums> sums;          // one per splat, then padding, whose splats nothing sees
+    Buffer<Sums> sums;          // one per splat, then padding
     Buffer<uint32_t> places;     // of a block's splats
     Buffer<float> pairs;        // (splats of a block, 2, lanes)
 };
@@ -83,17 +84,19 @@ uint32_t repeat_blending(const TileSplat* splats, const uint64_t* words, uint32_
 // Neither a division by 1 - alpha nor a difference of sums: both would lose digits behind opaque splats.
 template <int Channels>
 void differentiate(const TileSplat* splats, const uint32_t* places, uint32_t count,
-                   const PixelGradients<Channels>& gradients, float* pairs) {
+                   const PixelGradients<Channels>& pixel_gradients, float* pairs) {
     using F = Features<Channels>;
+    const PixelGradients<Channels> gradients = pixel_gradients;  // in registers: `pairs` might overlap the original
     Vec behind{};
     for (uint32_t i = count; i-- > 0;) {
         const TileSplat& splat = splats[places[i]];
         float* pair = pairs + i * kPairFloats;
         const Vec alpha = load(pair), weight = load(pair + kLanes);
         Vec value = gradients.alpha;
-        for (int c = 0; c < F::kCount; ++c) value += gradients.features[c] * splat.features[F::place(c)];
+        for (int c = 0; c < F::kCount; ++c)
+            value = multiply_add(gradients.features[c], core::splat(splat.features[F::place(c)]), value);
         const Vec difference = value - behind;
-        behind = behind * (1.0f - alpha) + value * alpha;
+        behind = multiply_add(alpha, difference, behind);
         const Vec v = keep(less(alpha, core::splat(kAlphaMax)), weight * difference);
         store_pairs(pair, v, weight);
     }
@@ -148,14 +151,14 @@ void differentiate_block(const Raster& raster, int tile, int block, const Raster
 
     const uint32_t num_words = raster.num_words(tile);
     const uint64_t* words = raster.block_bits.data() + raster.first_words[tile] + block * num_words;
+    const TileSplat* splats = raster.tile_splats.data() + raster.first_entries[tile];
     const Vec x = block_x(block), y = block_y(block);
     const Vec transmittance = initial_transmittance(raster.camera, origin, block);
     uint32_t* places = scratch.places.data();
     float* pairs = scratch.pairs.data();
-    const uint32_t count =
-        repeat_blending(scratch.splats.data(), words, num_words, x, y, transmittance, places, pairs);
+    const uint32_t count = repeat_blending(splats, words, num_words, x, y, transmittance, places, pairs);
     if (!count) return;
-    differentiate<Channels>(scratch.splats.data(), places, count, gradients, pairs);
+    differentiate<Channels>(splats, places, count, gradients, pairs);
     std::fill(places + count, places + count + kSumsInFlight, raster.num_entries(tile));
     std::fill(pairs + count * kPairFloats, pairs + (count + kSumsInFlight) * kPairFloats, 0.0f);
     alignas(64) float columns[kLanes][kColumns];
@@ -192,9 +195,9 @@ void store_gradients(const TileSplat* splats, const Sums* sums, SplatGradient* c
     store_transposed(out, slot_rows);
 }
 
-// The rows of a tile lie far apart in each plane, so the processor does not foresee them.
+// Asks for rows [begin, end) of a tile: they lie far apart in each plane, so the processor does not foresee them.
 template <int Channels>
-void prefetch_images(const Camera& camera, TileOrigin origin, const RasterImages& images,
+void prefetch_images(const Camera& camera, TileOrigin origin, int begin, int end, const RasterImages& images,
                      const RasterImages& gradients) {
     using F = Features<Channels>;
     const size_t plane_size = size_t(camera.width) * camera.height;
@@ -205,7 +208,7 @@ void prefetch_images(const Camera& camera, TileOrigin origin, const RasterImages
     if (F::kDepths)
         for (const float* plane : {gradients.depth, images.depth, images.alpha}) planes[count++] = plane;
     if (gradients.alpha) planes[count++] = gradients.alpha;
-    for (int y = origin.y; y < std::min(origin.y + kTile, camera.height); ++y)
+    for (int y = origin.y + begin; y < std::min(origin.y + end, camera.height); ++y)
         for (int i = 0; i < count; ++i)
             for (int x = origin.x; x < std::min(origin.x + kTile, camera.width); x += 16)
                 __builtin_prefetch(planes[i] + size_t(y) * camera.width + x);
@@ -217,21 +220,27 @@ void differentiate_tile(Raster& raster, int tile, const RasterImages& images, co
     const uint32_t count = raster.num_entries(tile);
     if (!count) return;
     const uint32_t padded = count + kPadding;
-    scratch.splats.resize(padded);
     scratch.sums.resize(padded);
     scratch.places.resize(padded);
     scratch.pairs.resize(size_t(padded) * kPairFloats);
-    prefetch_images<Channels>(raster.camera, tile_origin(raster, tile), images, gradients);
-    load_splats(raster, tile, scratch.splats.data());
+    const TileOrigin origin = tile_origin(raster, tile);
+    const TileSplat* splats = raster.tile_splats.data() + raster.first_entries[tile];
+    prefetch_images<Channels>(raster.camera, origin, 0, kRowsAhead, images, gradients);
+    for (uint32_t i = 0; i < count; ++i) __builtin_prefetch(splats + i);
     std::memset(scratch.sums.data(), 0, sizeof(Sums) * padded);
-    for (int block = 0; block < kBlocks; ++block)
-        differentiate_block<Channels>(raster, tile, block, images, gradients, scratch);
+    for (int row = 0; row < kBlocksDown; ++row) {
+        const int ahead = row * kBlockHeight + kRowsAhead;
+        if (ahead < kTile)
+            prefetch_images<Channels>(raster.camera, origin, ahead, ahead + kBlockHeight, images, gradients);
+        for (int column = 0; column < kBlocksAcross; ++column)
+            differentiate_block<Channels>(raster, tile, row * kBlocksAcross + column, images, gradients, scratch);
+    }
 
     for (uint32_t first = 0; first < count; first += kLanes) {
         SplatGradient unwanted, *slots[kLanes];
         for (uint32_t lane = 0; lane < kLanes; ++lane)
-            slots[lane] = first + lane < count ? &raster.slots[scratch.splats[first + lane].slot] : &unwanted;
-        store_gradients<Channels>(&scratch.splats[first], &scratch.sums[first], slots);
+            slots[lane] = first + lane < count ? &raster.slots[splats[first + lane].slot] : &unwanted;
+        store_gradients<Channels>(splats + first, &scratch.sums[first], slots);
     }
 }
 

@@ -17,9 +17,7 @@ double thread_seconds() {
 
 // Pixels of a tile's blocks that take part of a splat, summed over the splats.
 uint64_t count_pairs(const Raster& raster, int tile) {
-    thread_local Buffer<TileSplat> splats;
-    splats.resize(raster.num_entries(tile) + kPadding);
-    load_splats(raster, tile, splats.data());
+    const TileSplat* splats = raster.tile_splats.data() + raster.first_entries[tile];
     const TileOrigin origin = tile_origin(raster, tile);
     const uint32_t num_words = raster.num_words(tile);
     const uint64_t* words = raster.block_bits.data() + raster.first_words[tile];

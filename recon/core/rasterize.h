@@ -82,6 +82,16 @@ struct alignas(64) Splat {
     uint32_t slot_origin;  // its gradient from tile (x, y) is in slot slot_origin + y * slot_row + x
 };
 
+// A splat in the pixel coordinates of a tile, measured from the tile's centre:
+//   u = k0 * x + k1 * y + u0,  w = k2 * y + w0.
+struct alignas(64) TileSplat {
+    float k0, k1, u0, k2, w0, log2_opacity;
+    uint32_t slot;  // of its gradient from this tile
+    float unused;
+    float features[kFeatures];
+    float unused2;
+};
+
 // Tiles [x0, x1) x [y0, y1) that a splat may touch; empty for a Gaussian that is not seen.
 struct TileRect {
     uint16_t x0, x1, y0, y1;
@@ -112,6 +122,7 @@ struct Raster {
     Buffer<uint32_t> chunk_slots;   // (chunks) slots of a chunk, later where they start
     Buffer<uint32_t> first_entries;  // (tiles + 1)
     Buffer<uint64_t> entries;       // (E) depth and Gaussian of each splat of each tile, nearest first
+    Buffer<TileSplat> tile_splats;  // (E + kLanes) the splats of the entries
     Buffer<uint64_t> first_words;   // (tiles) where a tile's bits start
     Buffer<uint64_t> block_bits;    // (tiles, blocks, words) which of the tile's splats a block blends
     Buffer<SplatGradient> slots;    // (E) by Gaussian, then by the tiles of its rectangle, row by row

@@ -118,15 +118,26 @@ inline IntVec nearest_int(Vec value) {
 #endif
 }
 
+// a * b + c as one operation where the processor has it. Free to reorder sums, the compilers would make two of some.
+inline Vec multiply_add(Vec a, Vec b, Vec c) {
+#if CORE_LANES == 16
+    return (Vec)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c);
+#elif CORE_LANES == 8
+    return (Vec)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c);
+#else
+    return a * b + c;
+#endif
+}
+
 // 2^x to 2e-7 relative for x in [-126, 0]. Other x give rubbish, never a trap: mask them.
 inline Vec exp2_nonpositive(Vec x) {
     const IntVec exponent = nearest_int(x);
     const Vec fraction = x - __builtin_convertvector(exponent, Vec);
-    Vec power = fraction * 1.326472721e-3f + 9.671512813e-3f;
-    power = power * fraction + 5.550733745e-2f;
-    power = power * fraction + 2.402224208e-1f;
-    power = power * fraction + 6.931469776e-1f;
-    power = power * fraction + 1.0f;
+    // Three pairs of terms at once, then their sum: half as long a wait as term after term.
+    const Vec square = fraction * fraction;
+    const Vec low = fraction * 6.931469776e-1f + 1.0f, middle = fraction * 5.550733745e-2f + 2.402224208e-1f;
+    const Vec high = fraction * 1.326472721e-3f + 9.671512813e-3f;
+    const Vec power = (high * square + middle) * square + low;
     return (Vec)(((BitVec)exponent << 23) + (BitVec)power);
 }
 

@@ -37,10 +37,11 @@ void sort_entries(Raster& raster, int tile) {
     if (count > 1) sort_by_depth(raster.entries.data() + raster.first_entries[tile], count);
 }
 
-void load_splats(const Raster& raster, int tile, TileSplat* splats) {
-    constexpr uint32_t kAhead = 8;  // the splats are scattered over memory
+void load_splats(Raster& raster, int tile) {
+    constexpr uint32_t kAhead = 48;  // the splats are scattered over memory, whose answer takes that long
     const uint32_t count = raster.num_entries(tile);
     const uint64_t* entries = raster.entries.data() + raster.first_entries[tile];
+    TileSplat* splats = raster.tile_splats.data() + raster.first_entries[tile];
     const TileOrigin origin = tile_origin(raster, tile);
     const uint32_t tile_x = tile % raster.tiles_x, tile_y = tile / raster.tiles_x;
     for (uint32_t i = 0; i < count; ++i) {
@@ -57,9 +58,6 @@ void load_splats(const Raster& raster, int tile, TileSplat* splats) {
         here.slot = splat.slot_origin + tile_y * splat.slot_row + tile_x;
         std::memcpy(here.features, splat.features, sizeof here.features);
     }
-    TileSplat unseen = {};
-    unseen.log2_opacity = -126;
-    std::fill(splats + count, splats + count + kPadding, unseen);
 }
 
 void find_blocks(Raster& raster, int tile) {

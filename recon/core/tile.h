@@ -5,18 +5,6 @@
 
 namespace core {
 
-// A splat in the pixel coordinates of a tile, measured from the tile's centre:
-//   u = k0 * x + k1 * y + u0,  w = k2 * y + w0.
-struct alignas(64) TileSplat {
-    float k0, k1, u0, k2, w0, log2_opacity;
-    uint32_t slot;  // of its gradient from this tile
-    float unused;
-    float features[kFeatures];
-    float unused2;
-};
-
-constexpr int kPadding = 16;
-
 struct TileOrigin {
     int x, y;  // the top left pixel
     float centre_x() const { return float(x + kTile / 2); }
@@ -42,8 +30,8 @@ inline Vec block_y(int block) {
 // Sorts the tile's entries by depth, of equal ones by Gaussian.
 void sort_entries(Raster& raster, int tile);
 
-// The tile's splats in the order of its entries, and kPadding more that nothing sees.
-void load_splats(const Raster& raster, int tile, TileSplat* splats);
+// Fills in the tile's splats in the order of its entries.
+void load_splats(Raster& raster, int tile);
 
 // For each block the tile's splats whose ellipse alpha = 1/255 reaches a pixel centre of it, as bits.
 void find_blocks(Raster& raster, int tile);
@@ -56,15 +44,15 @@ struct Contribution {
 // Blends `splat` into the lanes at (x, y) that still let light through. `transmittance` becomes what is left; where it
 // is already too small it goes on falling, so that a splat waits for little of what the one before it computes.
 inline Contribution blend_splat(const TileSplat& splat_, Vec x, Vec y, Vec& transmittance) {
-    const Vec u = splat_.k0 * x + (splat_.k1 * y + splat_.u0);
-    const Vec w = splat_.k2 * y + splat_.w0;
-    const Vec log2_alpha = splat_.log2_opacity - u * u - w * w;
+    const Vec u = multiply_add(splat(splat_.k0), x, multiply_add(splat(splat_.k1), y, splat(splat_.u0)));
+    const Vec w = multiply_add(splat(splat_.k2), y, splat(splat_.w0));
+    const Vec log2_alpha = multiply_add(-u, u, multiply_add(-w, w, splat(splat_.log2_opacity)));
     const Mask visible = at_least(log2_alpha, splat(kLog2AlphaMin));
     const Mask open = at_least(transmittance, splat(kTransmittanceMin));
     const Vec alpha = keep(visible, minimum(exp2_nonpositive(log2_alpha), splat(kAlphaMax)));
-    const Vec weight = alpha * transmittance;
-    transmittance -= weight;
-    return {keep(open, alpha), keep(open, weight)};
+    const Vec weight = keep(open, alpha * transmittance);
+    transmittance = multiply_add(-alpha, transmittance, transmittance);
+    return {keep(open, alpha), weight};
 }
 
 // Lanes of a block whose pixel is inside the image let all light through, the others none.
