@@ -42,12 +42,13 @@ def capture(config: CaptureConfig) -> None:
         reader = resources.enter_context(Reader(lambda: open_stream(camera), is_live(camera), config.reader))
         resources.callback(manager.stopping)
         event(log, logging.INFO, "started", camera=camera.kind, waiting=server.queued)
+        if not is_live(camera):
+            manager.ready()  # its first frame may be long in coming; a live camera's proves that it is there
         while not (reader.state is State.FINISHED and reader.empty and server.queued == 0):
             item = reader.next(TURN_S)
             if isinstance(item, Frame):
-                if node.frames == 0:
-                    manager.ready()
                 node.take(item, reader.state)
+                manager.ready()
             elif isinstance(item, DroppedFrame):
                 node.drop(item)
             server.serve(0)

@@ -15,9 +15,13 @@ class ServiceManager:
         timeout_s = int(os.environ.get("WATCHDOG_USEC", "0")) / 1e6
         self._every_s = timeout_s / 4 if timeout_s else 1.0
         self._next = 0.0
+        self._is_ready = False
 
     def ready(self) -> None:
-        self._notify("READY=1")
+        """May be called again and again; the first time counts."""
+        if not self._is_ready:
+            self._is_ready = True
+            self._notify("READY=1")
 
     def alive(self, status: str) -> None:
         """`status` is shown by systemctl status."""

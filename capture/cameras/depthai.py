@@ -1,0 +1,161 @@
+"""The colour stream of a Luxonis OAK camera, through DepthAI v3."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import logging
+import os
+import time
+from collections.abc import Callable, Iterator
+from datetime import timedelta
+from types import ModuleType
+from typing import Annotated, Any
+
+import cv2
+import msgspec
+import numpy as np
+
+from capture.frame import Frame, Intrinsics
+from capture.logs import event
+from capture.unavailable import CameraUnavailable
+
+log = logging.getLogger(__name__)
+
+LIVE = True
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    device: str = ""  # id, IP address or USB port, as `splatnode find` prints it; "": the only one
+    width: Annotated[int, msgspec.Meta(ge=1)] = 1280
+    height: Annotated[int, msgspec.Meta(ge=1)] = 720
+    frames_per_second: Annotated[float, msgspec.Meta(gt=0)] = 10.0
+    undistort: bool = True  # on the camera; otherwise its distortion goes with the intrinsics
+    lock: bool = True  # exposure and white balance, once the camera has chosen them
+    settle_s: Annotated[float, msgspec.Meta(ge=0)] = 1.5  # in which it chooses; these frames are not given
+    exposure_us: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] | None = None  # instead of what it chooses
+    iso: Annotated[int, msgspec.Meta(ge=100, le=1600)] = 400  # with exposure_us
+    focus: Annotated[int, msgspec.Meta(ge=0, le=255)] | None = None  # lens position; None: as it is at the start
+    silence_s: Annotated[float, msgspec.Meta(gt=0)] = 4.0  # without a frame, the camera counts as lost
+
+
+def stream(config: Config) -> Iterator[Frame]:
+    """Frames as they come, with the calibration that the camera carries. Raises CameraUnavailable, also when unplugged.
+
+    Whether there is a camera is asked first: opening one that is not there takes 11 seconds to fail.
+    """
+    dai = _depthai()
+    info = _chosen(dai, config.device)
+    try:
+        with dai.Device(info) as device, dai.Pipeline(device) as pipeline:
+            camera = pipeline.create(dai.node.Camera).build(dai.CameraBoardSocket.CAM_A)
+            output = camera.requestOutput(
+                (config.width, config.height),
+                dai.ImgFrame.Type.BGR888i,
+                dai.ImgResizeMode.CROP,
+                fps=config.frames_per_second,
+                enableUndistortion=config.undistort,
+            )
+            queue = output.createOutputQueue(maxSize=2, blocking=False)
+            controls = camera.inputControl.createInputQueue()
+            pipeline.start()
+            if config.focus is not None:
+                controls.send(_control(dai, focus=config.focus))
+            yield from read(dai, queue, config, hold=lambda: controls.send(holding(dai, config)))
+    except RuntimeError as error:
+        if isinstance(error, CameraUnavailable):
+            raise
+        raise CameraUnavailable(f"the camera {info.getDeviceId()} failed: {error}") from error
+
+
+def find() -> list[dict[str, str]]:
+    """The cameras that are connected; none where depthai is not installed."""
+    if importlib.util.find_spec("depthai") is None:
+        return []
+    return [
+        {"device": info.getDeviceId(), "description": f"{info.platform.name} at {info.name} ({info.state.name})"}
+        for info in _depthai().Device.getAllAvailableDevices()
+    ]
+
+
+def read(dai: ModuleType, queue: Any, config: Config, hold: Callable[[], None]) -> Iterator[Frame]:
+    """The frames of a running pipeline's `queue`; `hold` is called once the camera has settled."""
+    settled, held, frame_id = time.monotonic() + config.settle_s, not config.lock, 0
+    while True:
+        try:
+            message = queue.get(timedelta(seconds=config.silence_s))
+        except dai.MessageQueue.QueueException as error:
+            raise CameraUnavailable(f"the camera ended its stream: {error}") from error
+        if message is None:
+            raise CameraUnavailable(f"no frame for {config.silence_s:g} s; is the camera still plugged in?")
+        if not held and time.monotonic() < settled:
+            continue
+        if not held:
+            hold()
+            held = True
+            exposure_us = message.getExposureTime() / timedelta(microseconds=1)
+            event(log, logging.INFO, "locked", exposure_us=exposure_us, iso=message.getSensitivity())
+            continue  # it was exposed before
+        yield to_frame(message, frame_id)
+        frame_id += 1
+
+
+def to_frame(message: Any, frame_id: int) -> Frame:
+    """An ImgFrame as a Frame: its stamp is of the host's monotonic clock, synchronised by DepthAI."""
+    stamp_ns = message.getTimestamp() // timedelta(microseconds=1) * 1000
+    image = cv2.cvtColor(message.getCvFrame(), cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+    intrinsics = _intrinsics(message.getTransformation(), image.shape[1], image.shape[0])
+    return Frame(frame_id, f"{stamp_ns / 1e9:.6f}", stamp_ns, image, intrinsics)
+
+
+def holding(dai: ModuleType, config: Config) -> Any:
+    """The command that holds exposure and white balance where they are, or where the configuration says."""
+    control = dai.CameraControl()
+    if config.exposure_us is None:
+        control.setAutoExposureLock(True)
+    else:
+        control.setManualExposure(config.exposure_us, config.iso)
+    control.setAutoWhiteBalanceLock(True)
+    return control
+
+
+def _control(dai: ModuleType, focus: int) -> Any:
+    control = dai.CameraControl()
+    control.setManualFocus(focus)
+    return control
+
+
+def _intrinsics(transformation: Any, width: int, height: int) -> Intrinsics | None:
+    """For the very pixels that were delivered, cropped and scaled; None where the camera carries no calibration."""
+    K = np.array(transformation.getIntrinsicMatrix(), float)
+    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] < 0.1 * max(width, height):  # identity: none
+        return None
+    distortion = tuple(float(value) for value in transformation.getDistortionCoefficients())
+    if any(distortion) and "Perspective" not in str(transformation.getDistortionModel()):
+        return None  # a fisheye's coefficients mean something else; `undistort` has the camera take them out
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5  # OpenCV's origin is a pixel's centre
+    return Intrinsics(width, height, fx, fy, cx, cy, "calibration", distortion if any(distortion) else ())
+
+
+def _chosen(dai: ModuleType, device: str) -> Any:
+    found = dai.Device.getAllAvailableDevices()
+    if device and found:
+        for info in found:
+            if device in (info.getDeviceId(), info.name):
+                return info
+    elif len(found) == 1:
+        return found[0]
+    listed = ", ".join(f"{info.getDeviceId()} at {info.name}" for info in found)
+    if not found:
+        raise CameraUnavailable(
+            "no OAK camera is connected. Plug one in; if it is, install configs/udev/80-splatnode-oak.rules"
+        )
+    raise CameraUnavailable(f"camera.device must name one of: {listed}; got {device!r}")
+
+
+def _depthai() -> ModuleType:
+    os.environ.setdefault("DEPTHAI_LEVEL", "err")  # its warnings go to stdout
+    try:
+        return importlib.import_module("depthai")
+    except ImportError as error:
+        raise CameraUnavailable("OAK cameras need the package depthai. Run: pip install 'splatnode[oak]'") from error
