@@ -14,27 +14,31 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from capture.cameras import folder, synthetic
+from capture.frame import DroppedFrame, Frame
 from recon import core
 from recon.adam import Adam
+from recon.config import preset
 from recon.gaussians import SH_C0
 from recon.geometry import exp_se3, twist_gradient
 from recon.photometric import PhotometricLoss
+from recon.pipeline import reconstruct
 from recon.rasterize import cpu
 from recon.rasterize.reference import CHANNELS
 
 FLOPS_PER_PAIR = 117
 LRS = {"means": 1.6e-3, "quats": 1e-2, "log_scales": 1e-2, "logit_opacities": 5e-2, "sh": 1e-1, "twist": 1e-4}
 SIGMA_PX = {20_000: 3.0, 50_000: 2.0, 150_000: 1.5}  # of a Gaussian at 512 x 384, so that it overlaps its neighbours
-REAL_PHOTO = ("llff_fern", "images")
+REAL_SCENE = "fountain_p11"
+REAL_VIEWS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,32 +104,35 @@ def bumpy_surface(case: Case, seed: int = 0) -> Scene:
     return Scene(params, torch.eye(4), K, noise, lr_factor=1e-6)
 
 
-def photograph(shared: Path, gaussians: int) -> Scene:
-    """A photograph at 512 pixels, and Gaussians on its pixels' rays: the statistics of real colours and overlaps."""
-    folder = shared.joinpath("scenes", *REAL_PHOTO)
-    image = cv2.imread(str(sorted(folder.iterdir())[0]))
-    if image is None:
-        raise FileNotFoundError(f"no image could be read in {folder}")
-    scale = 512 / max(image.shape[:2])
-    image = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)[..., ::-1] / 255.0
-    height, width = image.shape[:2]
-    generator = np.random.default_rng(0)
-    rows, columns = generator.integers(height, size=gaussians), generator.integers(width, size=gaussians)
-    focal = 0.9 * width
-    rays = np.column_stack([(columns + 0.5 - width / 2) / focal, (rows + 0.5 - height / 2) / focal, np.ones(gaussians)])
-    depth = 4 + 0.2 * generator.normal(size=gaussians)
-    size = np.log(np.sqrt(width * height / gaussians) * depth / focal)
+def reconstruction(frames: Sequence[Frame | DroppedFrame]) -> Scene:
+    """What a preview makes of the frames, seen by their middle camera: real colours, sizes and overlaps."""
+    *_, final = reconstruct(frames, preset("preview"))
+    if not final.verdict.publishable:
+        raise RuntimeError(f"the frames to time on must give a scene, but: {final.verdict.message}")
+    gaussians, camera = final.gaussians, final.cameras[len(final.cameras) // 2]
+    opacities = gaussians.opacities.clip(1e-6, 1 - 1e-6)
     arrays = {
-        "means": depth[:, None] * rays,
-        "quats": generator.normal(size=(gaussians, 4)),
-        "log_scales": size[:, None].repeat(3, 1),
-        "logit_opacities": np.zeros(gaussians),
-        "sh": ((image[rows, columns] - 0.5) / SH_C0)[:, None],
+        "means": gaussians.means,
+        "quats": gaussians.quats,
+        "log_scales": np.log(gaussians.scales),
+        "logit_opacities": np.log(opacities / (1 - opacities)),
+        "sh": gaussians.sh,
         "twist": np.zeros((1, 6)),
     }
     params = {name: torch.tensor(array, dtype=torch.float32).requires_grad_() for name, array in arrays.items()}
-    K = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Scene(params, torch.eye(4), K, torch.tensor(image.copy(), dtype=torch.float32), lr_factor=1.0)
+    T_world_camera, K = (torch.tensor(array, dtype=torch.float32) for array in (camera.T_world_camera, camera.K))
+    target = torch.tensor(final.images[camera.name] / 255.0, dtype=torch.float32)
+    return Scene(params, T_world_camera, K, target, lr_factor=1e-6)
+
+
+def real_frames(shared: Path) -> tuple[str, list[Frame | DroppedFrame]]:
+    """Photographs of a real place where they are at hand, otherwise the built-in capture; and the name of which."""
+    images = shared / "scenes" / REAL_SCENE / "images"
+    if not images.is_dir():
+        return "synthetic", list(synthetic.stream(synthetic.Config(views=REAL_VIEWS)))
+    paths = folder.image_paths(images)
+    chosen = np.linspace(0, len(paths) - 1, REAL_VIEWS).astype(int)
+    return REAL_SCENE, list(folder.stream(folder.Config(images, names=tuple(paths[i].name for i in chosen))))
 
 
 class Iteration:
@@ -283,9 +290,9 @@ def main() -> None:
         "cases": {},
     }
     scenes = {case.name: (bumpy_surface(case), case.channels) for case in CASES}
-    if arguments.shared.joinpath("scenes", *REAL_PHOTO).is_dir():
-        scenes["photograph_50k_all"] = (photograph(arguments.shared, 50_000), CHANNELS)
-        scenes["photograph_50k_rgb"] = (photograph(arguments.shared, 50_000), ("rgb",))
+    name, frames = real_frames(arguments.shared)
+    real = reconstruction(frames)
+    scenes |= {f"{name}_all": (real, CHANNELS), f"{name}_rgb": (real, ("rgb",))}
     print(f"{core.instruction_sets()[0]}, {arguments.threads} threads, {peak / 1e9:.0f} GFLOP/s a core")
     for name, (scene, channels) in scenes.items():
         result = measure(scene, channels, peak, arguments.rounds)
