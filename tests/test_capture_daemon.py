@@ -95,7 +95,7 @@ def test_a_folder_from_its_first_frame_to_its_last_acknowledgement(tmp_path, pho
     ):
         preview = wait_for(lambda: previews.latest(0.1), 20)
         assert decode_preview(preview).shape == (240, 320, 3) and preview.header.state == "streaming"
-        status = wait_for(lambda: (beat := heartbeats.latest(0.1)) and beat.header.state == "finished" and beat.header)
+        status = wait_for(lambda: (it := heartbeats.latest(0.1)) and it.header.state == "finished" and it.header, 20)
         assert status.key_frames == 5 and status.frames == 6 and status.dropped == 1 and status.unusable == 1
         assert status.waiting == 6 and not status.recon_connected and 10 < status.rss_mb < 1000
     items = take_all(tmp_path, process)

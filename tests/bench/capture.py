@@ -1,0 +1,129 @@
+"""What the capture process costs besides decoding: `python -m tests.bench.capture --seconds 30 --out capture.json`.
+
+A walk past a wall is written as JPEGs of 1280 x 720 and shown at 30 frames a second; somebody reads the previews and
+acknowledges the key frames. The cost is processor time of the whole process, as the kernel counts it, less the time
+that decoding the same files takes in this process, in the same minute.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from capture.image_file import decode_image
+from capture.messaging.broadcast import Subscriber
+from capture.messaging.keyframes import KeyframeClient
+from capture.messaging.network import Network
+from capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
+from capture.preview import PreviewHeader
+from capture.status import CaptureStatus
+
+RATE, WIDTH, HEIGHT = 30, 1280, 720
+FRAMES = 120
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seconds", type=float, default=30.0)
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        photographs = write_walk(Path(folder, "walk"))
+        result = {"command": "python -m tests.bench.capture", "seconds": args.seconds, "frames_per_second": RATE}
+        result |= measure(Path(folder), photographs, args.seconds)
+    print(json.dumps(result, indent=1))
+    if args.out:
+        args.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+def write_walk(folder: Path) -> list[Path]:
+    """A camera that slides along a textured wall, there and back: new views every few frames, and sensor noise."""
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    layers = [rng.uniform(0, 80, (HEIGHT // cell, 2 * WIDTH // cell, 3)) for cell in (4, 12, 40)]
+    wall = sum(cv2.resize(layer, (2 * WIDTH, HEIGHT)) for layer in layers)
+    for index in range(FRAMES):
+        left = int(WIDTH / 2 * (1 - np.cos(2 * np.pi * index / FRAMES)))
+        noisy = wall[:, left : left + WIDTH] + rng.normal(0, 2, (HEIGHT, WIDTH, 1))
+        image = np.clip(noisy, 0, 255).astype(np.uint8)
+        cv2.imwrite(str(folder / f"{index:04d}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 90])
+    return sorted(folder.iterdir())
+
+
+def measure(folder: Path, photographs: list[Path], seconds: float) -> dict[str, object]:
+    config = folder / "capture.yaml"
+    config.write_text(
+        f"camera: {{kind: folder, folder: {photographs[0].parent}, frames_per_second: {RATE}, pace: recorded, "
+        "loops: 999}\n"
+        f"spool: {{directory: {folder / 'state'}}}\nnetwork: {{directory: {folder / 'run'}}}\n"
+    )
+    process = subprocess.Popen([sys.executable, "-m", "splatnode", "capture", str(config)], stderr=subprocess.DEVNULL)
+    try:
+        return observe(process.pid, Network(directory=folder / "run"), photographs, seconds)
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def observe(pid: int, network: Network, photographs: list[Path], seconds: float) -> dict[str, object]:
+    with (
+        KeyframeClient(network) as recon,
+        Subscriber(CAPTURE_PREVIEW, network, PreviewHeader) as previews,
+        Subscriber(CAPTURE_STATUS, network, CaptureStatus) as heartbeats,
+    ):
+        while previews.latest(1.0) is None:
+            pass
+        first = heartbeats.latest(5.0)
+        used, start, latencies, seen = processor_s(pid), time.monotonic(), [], 0
+        newest = first
+        while time.monotonic() - start < seconds:
+            if (preview := previews.latest(0.02)) is not None:
+                latencies.append((time.monotonic_ns() - preview.header.mono_ns) / 1e6)
+                seen += 1
+            if (received := recon.receive(0)) is not None:
+                recon.acknowledge(received)
+            newest = heartbeats.latest(0) or newest
+        used, wall = processor_s(pid) - used, time.monotonic() - start
+    if first is None or newest is None:
+        raise RuntimeError("capture has no heartbeat")
+    rate = (newest.header.frames - first.header.frames) / ((newest.header.mono_ns - first.header.mono_ns) / 1e9)
+    decoding = decoding_s(photographs) * rate
+    return {
+        "frames_per_second_reached": rate,
+        "key_frames": newest.header.key_frames,
+        "process_share_of_a_core": used / wall,
+        "decoding_share_of_a_core": decoding,
+        "besides_decoding": used / wall - decoding,
+        "preview_ms": {str(q): float(np.percentile(latencies, q)) for q in (50, 95, 99)},
+        "previews_seen_per_second": seen / wall,
+        "rss_mb": newest.header.rss_mb,
+        "load_average": os.getloadavg()[0],
+    }
+
+
+def processor_s(pid: int) -> float:
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def decoding_s(photographs: list[Path]) -> float:
+    """Median processor seconds to read and decode one of the files."""
+    spent = []
+    for path in photographs:
+        start = time.thread_time()
+        decode_image(path.read_bytes(), 1 << 30)
+        spent.append(time.thread_time() - start)
+    return float(np.median(spent))
+
+
+if __name__ == "__main__":
+    main()
