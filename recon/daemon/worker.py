@@ -118,12 +118,13 @@ class Worker:
         """Key frames that have come, shown together."""
         self.state, self.problem = State.GROWING, ""
         self._settled, self.finished = False, None
+        self._make_room(len(arrived))
         for keyframe in self._tried([each.keyframe for each in arrived]):
             event(log, logging.WARNING, "does_not_fit", frame=keyframe.name, scene=self._store.scene_id)
         if len(self._aside) >= self._config.lost_after:
             self._begin_place()
+        self.state = State.LOST if self._aside else State.GROWING
         self._work.work_in()
-        self._bound_views()
         snapshot = self._show()
         if arrived:
             self.keyframe_s = time.monotonic() - arrived[0].at_s
@@ -166,8 +167,11 @@ class Worker:
             self._work.add(keyframe)
         self._aside = []
 
-    def _bound_views(self) -> None:
-        while len(self._work.names) > self._config.max_views:
+    def _make_room(self, coming: int) -> None:
+        """Gives up views that can be spared, so that there are not more than configured."""
+        for _ in range(len(self._work.names) + coming - self._config.max_views):
+            if len(self._work.names) <= place.NEWEST:
+                return
             name = place.most_redundant(self._work.graph)
             event(log, logging.INFO, "given_up", frame=name)
             self._forget(name, "given up for newer views that show the same")
@@ -179,7 +183,7 @@ class Worker:
         if known:
             self._work.retract(known)
             self._settled, self.finished, self.state = False, None, State.GROWING
-        self._show()
+        self._show(final=self._settled and self._work.scene is not None)
         if known:
             self._save(final=False)
 
