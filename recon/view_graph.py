@@ -2,66 +2,108 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
+from typing import TypeVar
 
 from recon.keyframe import Keyframe
 from recon.registration import features, register
+from recon.registration.register import Compared
 from recon.registration.two_view import TwoView
+
+T = TypeVar("T")
 
 
 class ViewGraph:
-    """Grows by one keyframe at a time; each new one is compared with all before it."""
+    """Grows by one keyframe at a time. What its pairs say does not depend on the order in which keyframes came.
+
+    Each keyframe is compared with all others by their plain features. Where two hardly match, one of them has few firm
+    partners, and something hints at a common scene or firm pairs do not connect them, they are compared again with
+    squeezed features, which find each other from further to the side and cost twice as much again.
+    """
 
     def __init__(self, config: register.Config) -> None:
         self._config = config
         self.keyframes: list[Keyframe] = []
-        self.pairs: dict[tuple[int, int], TwoView] = {}
+        self.pairs: dict[tuple[int, int], TwoView] = {}  # verified, by position (i < j)
+        self._plain: dict[tuple[int, int], Compared] = {}  # the first frame is the first in order of content
+        self._squeezed: dict[tuple[int, int], Compared] = {}
 
     def add(self, keyframe: Keyframe) -> None:
-        """Takes in `keyframe` and verifies it against every other keyframe.
-
-        Where two frames share little and one of them has few firm partners, they are compared again with squeezed
-        features, which find each other from further to the side and cost as much again.
-        """
+        """Takes in `keyframe` and verifies it against every other keyframe."""
         new = len(self.keyframes)
         self.keyframes.append(keyframe)
         for index in range(new):
-            self._compare(index, new)
-        for index in range(new) if self._config.squeezes else ():
-            needed = min(self._num_firm(index), self._num_firm(new)) < self._config.enough_firm_pairs
-            if needed and not self._is_firm(index, new):
-                self._squeeze(index)
-                self._squeeze(new)
-                self._compare(index, new)
-
-    def _compare(self, first: int, second: int) -> None:
-        pair = register.compare(self.keyframes[first], self.keyframes[second], self._config)
-        if pair is not None:
-            self.pairs[first, second] = pair
-
-    def _is_firm(self, first: int, second: int) -> bool:
-        pair = self.pairs.get((first, second))
-        return pair is not None and len(pair.matches) >= self._config.firm_matches
-
-    def _num_firm(self, index: int) -> int:
-        return sum(self._is_firm(*pair) for pair in self.pairs if index in pair)
-
-    def _squeeze(self, index: int) -> None:
-        keyframe = self.keyframes[index]
-        widened = features.add_squeezed(
-            keyframe.features, keyframe.frame.image, self._config.squeezes, self._config.features
-        )
-        self.keyframes[index] = replace(keyframe, features=widened)
+            first, second = self._in_order(index, new)
+            self._plain[first, second] = register.compare(self.keyframes[first], self.keyframes[second], self._config)
+        self._settle()
 
     def without(self, names: Collection[str]) -> ViewGraph:
         """A view graph of the other keyframes, with what their pairs say."""
         kept = [index for index, keyframe in enumerate(self.keyframes) if keyframe.name not in names]
+        place = {index: position for position, index in enumerate(kept)}
+
+        def remaining(pairs: Mapping[tuple[int, int], T]) -> dict[tuple[int, int], T]:
+            return {(place[i], place[j]): what for (i, j), what in pairs.items() if i in place and j in place}
+
         rest = ViewGraph(self._config)
         rest.keyframes = [self.keyframes[index] for index in kept]
-        place = {index: position for position, index in enumerate(kept)}
-        rest.pairs = {(place[i], place[j]): pair for (i, j), pair in self.pairs.items() if i in place and j in place}
+        rest.pairs, rest._plain, rest._squeezed = (
+            remaining(self.pairs),
+            remaining(self._plain),
+            remaining(self._squeezed),
+        )
+        rest._settle()
         return rest
+
+    def _settle(self) -> None:
+        """Chooses for each compared pair what its plain or its squeezed features say.
+
+        Pairs that came from elsewhere, restored by a process that compared them, stay as they are.
+        """
+        wanted = self._wanted()
+        for pair, plain in self._plain.items():
+            if pair in wanted and pair not in self._squeezed:
+                self._squeezed[pair] = self._compare_squeezed(*pair)
+            found = (self._squeezed[pair].pair if pair in wanted else None) or plain.pair
+            first, second = pair
+            self.pairs.pop((min(pair), max(pair)), None)
+            if found is not None:
+                self.pairs[min(pair), max(pair)] = found if first < second else found.swapped()
+
+    def _wanted(self) -> set[tuple[int, int]]:
+        """The pairs for which squeezed features are worth their time, by what the plain ones say of all pairs."""
+        if not self._config.squeezes:
+            return set()
+        firm = {
+            pair
+            for pair, plain in self._plain.items()
+            if plain.pair is not None and len(plain.pair.matches) >= self._config.firm_matches
+        }
+        num_firm = [sum(index in pair for pair in firm) for index in range(len(self.keyframes))]
+        groups = connected(range(len(self.keyframes)), firm)
+        group_of = {index: number for number, group in enumerate(groups) for index in group}
+        return {
+            (i, j)
+            for (i, j), plain in self._plain.items()
+            if (i, j) not in firm
+            and (plain.log10_nfa < self._config.hint_log10_nfa or group_of[i] != group_of[j])
+            and min(num_firm[i], num_firm[j]) < self._config.enough_firm_pairs
+        }
+
+    def _compare_squeezed(self, first: int, second: int) -> Compared:
+        for index in (first, second):
+            keyframe = self.keyframes[index]
+            widened = features.add_squeezed(
+                keyframe.features, keyframe.frame.image, self._config.squeezes, self._config.features
+            )
+            self.keyframes[index] = replace(keyframe, features=widened)
+        keyframes = self.keyframes[first], self.keyframes[second]
+        return register.compare_squeezed(*keyframes, self._plain[first, second], self._config)
+
+    def _in_order(self, *indices: int) -> tuple[int, ...]:
+        """The keyframes' numbers in the order of their content."""
+        return tuple(sorted(indices, key=lambda index: register.place_in_order(self.keyframes[index])))
 
     def components(self) -> list[list[int]]:
         """Sets of keyframes that verified pairs connect, the largest first."""

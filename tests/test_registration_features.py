@@ -85,4 +85,6 @@ def test_frames_without_features_are_compared_without_a_pair():
     keyframes = [
         Keyframe(Frame(i, f"{i}.png", i, flat, None), flat, features.extract(flat, config.features)) for i in range(2)
     ]
-    assert register.compare(keyframes[0], keyframes[1], config) is None
+    plain = register.compare(keyframes[0], keyframes[1], config)
+    assert plain.pair is None and plain.log10_nfa == 0.0 and plain.matches.shape == (0, 2)
+    assert register.compare_squeezed(keyframes[0], keyframes[1], plain, config).pair is None

@@ -2,56 +2,147 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
-from recon.registration import register
+from recon.keyframe import Keyframe
+from recon.registration import features, register
+from recon.registration.register import Compared
 from recon.view_graph import ViewGraph
 from tests.synthetic import photographs, places, view_graph
 
+NO_MATCHES = np.zeros((0, 2), np.int64)
+
+
+@dataclass(frozen=True)
+class Verified:
+    """A pair as the view graph sees it: how many matches, of which frames in which order."""
+
+    matches: range
+    names: tuple[str, str]
+
+    def swapped(self) -> Verified:
+        return replace(self, names=self.names[::-1])
+
+
+def keyframe(name: str) -> SimpleNamespace:
+    """Frames of one initial letter match firmly, those of one letter but another case weakly, others not at all."""
+    frame = SimpleNamespace(image=None)
+    return SimpleNamespace(name=name, frame=frame, features=name)
+
 
 @pytest.fixture
-def compared(monkeypatch) -> list[tuple[str, str]]:
-    """The names of the pairs that were compared; those of one initial letter match."""
-    calls: list[tuple[str, str]] = []
+def compared(monkeypatch) -> list[tuple[str, ...]]:
+    """The names of the pairs that were compared, those by squeezed features after a third word."""
+    calls: list[tuple[str, ...]] = []
 
     def compare(first, second, config):
-        first, second = (getattr(keyframe, "name", keyframe) for keyframe in (first, second))
-        calls.append((first, second))
-        return f"{first}{second}" if first[0] == second[0] else None
+        calls.append((first.name, second.name))
+        hint = -2.0 if first.name[0].lower() == second.name[0].lower() else 0.0
+        firm = Verified(range(200), (first.name, second.name)) if first.name[0] == second.name[0] else None
+        return Compared(NO_MATCHES, firm, hint)
+
+    def compare_squeezed(first, second, plain, config):
+        calls.append((first.name, second.name, "squeezed"))
+        weak = Verified(range(30), (first.name, second.name)) if plain.log10_nfa < 0.0 else None
+        return Compared(NO_MATCHES, weak, -20.0 if weak else 0.0)
 
     monkeypatch.setattr(register, "compare", compare)
+    monkeypatch.setattr(register, "compare_squeezed", compare_squeezed)
+    monkeypatch.setattr(register, "place_in_order", lambda keyframe: keyframe.name)
+    monkeypatch.setattr(features, "add_squeezed", lambda found, *others: found)
+    monkeypatch.setattr("recon.view_graph.replace", lambda keyframe, **changes: keyframe)
     return calls
 
 
-def test_each_new_keyframe_is_compared_with_all_before_it(compared):
-    graph = ViewGraph(register.Config(squeezes=()))
-    for name in ("a1", "b1", "a2"):
-        graph.add(name)
-    assert compared == [("a1", "b1"), ("a1", "a2"), ("b1", "a2")]
-    assert graph.pairs == {(0, 2): "a1a2"}
-    assert graph.keyframes == ["a1", "b1", "a2"]
+def graph_of(*names: str) -> Any:
+    graph: Any = ViewGraph(register.Config())
+    for name in names:
+        graph.add(keyframe(name))
+    return graph
+
+
+def names_of(graph: Any) -> dict[tuple[str, str], tuple[str, str]]:
+    """By the frames' names, what each pair says its frames are."""
+    names = [keyframe.name for keyframe in graph.keyframes]
+    return {(names[i], names[j]): pair.names for (i, j), pair in graph.pairs.items()}
+
+
+def squeezed(calls: list[tuple[str, ...]]) -> set[tuple[str, ...]]:
+    return {call[:2] for call in calls if len(call) == 3}
+
+
+def test_every_pair_is_compared_once_and_each_says_what_its_own_frames_are(compared):
+    graph = graph_of("a2", "b1", "a1")
+    assert sorted(call for call in compared if len(call) == 2) == [("a1", "a2"), ("a1", "b1"), ("a2", "b1")]
+    assert set(graph.pairs) == {(0, 2)}
+    assert graph.pairs[0, 2].names == ("a2", "a1")
+
+
+def test_squeezed_features_find_what_the_plain_ones_hint_at(compared):
+    graph = graph_of("a1", "A1", "b1")
+    assert ("A1", "a1") in squeezed(compared)
+    assert names_of(graph) == {("a1", "A1"): ("a1", "A1")}
+
+
+def test_squeezed_features_are_not_tried_between_frames_that_firm_pairs_connect(compared, monkeypatch):
+    plain = register.compare
+
+    def chained(first, second, config):
+        apart = abs(int(first.name[1]) - int(second.name[1])) > 1
+        found = plain(first, second, config)
+        return Compared(NO_MATCHES, None, 0.0) if apart else found
+
+    monkeypatch.setattr(register, "compare", chained)
+    graph_of("a1", "a2", "a3", "a4")
+    # Until a2 and a3 are there, a1 and a4 could be two places.
+    assert ("a1", "a4") not in squeezed(compared)
+
+
+def test_frames_with_enough_firm_partners_need_no_squeezed_features(compared):
+    graph = graph_of(*(f"{letter}{number}" for number in range(5) for letter in "aA"))
+    found = names_of(graph)
+    assert {first[0] + second[0] for first, second in found} == {"aa", "AA"}
+    assert len(found) == 20
+
+
+def test_the_order_in_which_frames_come_does_not_matter(compared):
+    names = ("a1", "A1", "a2", "A2", "a3")
+    found = []
+    for order in itertools.permutations(names):
+        pairs = names_of(graph_of(*order))
+        assert all(key == value for key, value in pairs.items())
+        found.append({tuple(sorted(key)) for key in pairs})
+    assert all(pairs == found[0] for pairs in found)
 
 
 def test_components_are_the_largest_first(compared):
-    graph = ViewGraph(register.Config(squeezes=()))
-    assert graph.components() == []
-    for name in ("c1", "a1", "b1", "a2", "b2", "a3"):
-        graph.add(name)
-    assert graph.components() == [[1, 3, 5], [2, 4], [0]]
+    assert graph_of().components() == []
+    assert graph_of("c1", "a1", "b1", "a2", "b2", "a3").components() == [[1, 3, 5], [2, 4], [0]]
 
 
-def test_without_a_keyframe_the_pairs_of_the_others_stay_and_a_new_one_is_compared_with_them(compared):
-    graph = ViewGraph(register.Config(squeezes=()))
-    for name in ("a1", "a2", "b1", "a3"):
-        graph.add(SimpleNamespace(name=name))
+def test_without_a_keyframe_the_graph_is_that_of_the_others(compared):
+    graph = graph_of("a1", "a2", "b1", "A1", "a3")
     rest = graph.without({"a1", "b1"})
-    assert [keyframe.name for keyframe in rest.keyframes] == ["a2", "a3"]
-    assert rest.pairs == {(0, 1): "a2a3"}
-    rest.add(SimpleNamespace(name="a4"))
-    assert set(rest.pairs) == {(0, 1), (0, 2), (1, 2)}
-    assert len(graph.keyframes) == 4 and len(graph.pairs) == 3
+    assert [keyframe.name for keyframe in rest.keyframes] == ["a2", "A1", "a3"]
+    # a2 and a3 had two firm partners before; now they have one, and squeezed features are worth their time.
+    assert names_of(rest) == names_of(graph_of("a2", "A1", "a3"))
+    rest.add(keyframe("a4"))
+    assert ("a2", "a4") in names_of(rest)
+    assert len(graph.keyframes) == 5 and ("a1", "a2") in names_of(graph)
+
+
+def test_pairs_from_elsewhere_stay_when_a_keyframe_comes(compared):
+    graph: Any = ViewGraph(register.Config())
+    graph.keyframes[:] = [keyframe("a1"), keyframe("a2")]
+    graph.pairs = {(0, 1): "as it was"}
+    graph.add(keyframe("b1"))
+    assert graph.pairs == {(0, 1): "as it was"}
 
 
 @pytest.mark.parametrize("pairs", [[(0, 1), (1, 2), (2, 3)], [(2, 3), (0, 1), (1, 2)], [(0, 3), (2, 3), (1, 2)]])
@@ -67,3 +158,23 @@ def test_photographs_of_one_place_are_a_pair_and_those_of_two_are_not():
     graph = view_graph([*here, *there])
     assert set(graph.pairs) == {(0, 1)}
     assert len(graph.pairs[0, 1].matches) > 100 and not graph.pairs[0, 1].turned_only
+
+
+def test_cameras_do_not_depend_on_the_order_of_the_photographs():
+    frames = photographs()[1:4]
+    config = register.Config(features=features.Config(num_features=1500))
+    found = {}
+    for order in ((0, 1, 2), (2, 0, 1)):
+        graph = ViewGraph(config)
+        for index in order:
+            image = frames[index].image
+            graph.add(Keyframe(frames[index], image, features.extract(image, config.features)))
+        registration = register.register(graph.keyframes, graph.pairs, config)
+        assert registration is not None and len(registration.cameras) == 3
+        found[order] = {graph.keyframes[camera.index].name: camera for camera in registration.cameras}
+    relative = []
+    for cameras in found.values():
+        first, *others = (cameras[frame.name] for frame in frames)
+        relative.append([np.linalg.inv(first.T_world_camera) @ camera.T_world_camera for camera in others])
+        assert cameras[frames[0].name].focal == pytest.approx(found[0, 1, 2][frames[0].name].focal, rel=1e-12)
+    np.testing.assert_allclose(relative[0], relative[1], atol=1e-9)

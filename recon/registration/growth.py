@@ -19,6 +19,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     triangulation: triangulation.Config = triangulation.Config()
     robust_px: float = 1.0  # scale of the robust loss, at 1024 px on the longer side
     min_points: int = 15  # of a map
+    candidates: int = 3  # views that are tried as the next one
     doubted_share: float = 0.6  # a view that explains less of its matches is placed anew
     pair_focal_sigma: float = 0.03  # of log focal while there are two views, which say little about it
 
@@ -26,16 +27,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def grow(of: Survey, focals: list[float], first: tuple[int, int], config: Config) -> Growth | None:
     """A map from the pair `first` on, with every view that finds its place. `focals` (one a lens) are in pixels."""
     growth = _begin(of, focals, first, config)
-    failed: set[int] = set()
-    while growth and len(growth.registered) + len(failed) < len(of.views):
-        view = _next_view(of, growth, failed)
-        placed = _place(of, growth, view, config)
-        if placed is None:
-            failed.add(view)
-            continue
-        growth = placed
-        failed.clear()  # A new view brings new points, from which others may now be found.
-    return _repair(of, growth, config) if growth else None
+    return _repair(of, _extend(of, growth, config), config) if growth else None
 
 
 def score(of: Survey, growth: Growth, zero_px: float) -> float:
@@ -103,17 +95,39 @@ def _begin(of: Survey, focals: list[float], first: tuple[int, int], config: Conf
     return replace(grown, prior=prior) if len(grown.problem.points) >= config.min_points else None
 
 
-def _next_view(of: Survey, growth: Growth, failed: set[int]) -> int:
-    """The view that observes most of the map's points."""
+def _extend(of: Survey, growth: Growth, config: Config) -> Growth:
+    """The map with every further view that finds its place.
+
+    Of the views that observe most of the map, the one comes next whose matches agree best on where it stands: one that
+    repeated structures put in a wrong place contradicts some of its neighbours, and waits until more of them are there.
+    """
+    failed: set[int] = set()
+    while len(growth.registered) + len(failed) < len(of.views):
+        tried = _waiting(of, growth, failed)[: config.candidates]
+        placed = {view: _place(of, growth, view, config) for view in tried}
+        failed |= {view for view, placement_ in placed.items() if placement_ is None}
+        found = {view: placement_ for view, placement_ in placed.items() if placement_ is not None}
+        if not found:
+            continue
+        best = max(found, key=lambda view: (found[view].share, -view))
+        problem = placement.with_pose(growth.problem, best, found[best].rotation, found[best].translation)
+        larger = replace(growth, problem=problem, registered=(*growth.registered, best))
+        growth = _quickly_adjusted(of, larger, 3.0, config)
+        failed.clear()  # A new view brings new points, from which others may now be found.
+    return growth
+
+
+def _waiting(of: Survey, growth: Growth, failed: set[int]) -> list[int]:
+    """Views that may come next; those that observe most of the map's points first."""
     in_map = np.isin(of.coarse.track_of, growth.track_of_point)
     counts = np.bincount(of.coarse.camera_of[in_map], minlength=len(of.views))
     waiting = [view for view in range(len(of.views)) if view not in growth.registered and view not in failed]
-    return max(waiting, key=lambda view: (counts[view], -view))
+    return sorted(waiting, key=lambda view: (-counts[view], view))
 
 
-def _place(of: Survey, growth: Growth, view: int, config: Config) -> Growth | None:
-    """The map with `view`, or None when it finds no place."""
-    placed = placement.place(
+def _place(of: Survey, growth: Growth, view: int, config: Config) -> placement.Placement | None:
+    """Where `view` stands, or None when it finds no place."""
+    return placement.place(
         growth.problem,
         of.coarse,
         growth.track_of_point,
@@ -123,27 +137,34 @@ def _place(of: Survey, growth: Growth, view: int, config: Config) -> Growth | No
         of.scale,
         config.placement,
     )
-    if placed is None:
-        return None
-    problem = placement.with_pose(growth.problem, view, placed.rotation, placed.translation)
-    larger = replace(growth, problem=problem, registered=(*growth.registered, view))
-    return _quickly_adjusted(of, larger, 3.0, config)
 
 
 def _repair(of: Survey, growth: Growth, config: Config) -> Growth:
-    """Views that explain little of their matches are taken out and placed anew, from the whole map."""
-    limit = config.triangulation.max_error_px
-    for view in growth.registered[1:]:
-        if len(growth.registered) < 4:
-            break
-        agreement = {key: share for key, share in survey.agreement(of, growth, limit).items() if view in key}
-        matched = sum(len(of.pairs[key].matches) for key in agreement)
-        explained = sum(share * len(of.pairs[key].matches) for key, share in agreement.items())
-        if explained >= config.doubted_share * matched:
+    """Views that explain little of their matches are taken out and placed anew, as long as that explains more.
+
+    First all of them at once, because views that are wrong together hold each other; then one after the other.
+    """
+    doubted = _doubted(of, growth, config)
+    for group in [doubted, *([view] for view in doubted)]:
+        rest = tuple(view for view in growth.registered if view not in group)
+        if not group or len(rest) < 3:
             continue
-        others = tuple(other for other in growth.registered if other != view)
-        without = _quickly_adjusted(of, replace(growth, registered=others), 2.0, config)
-        again = _place(of, without, view, config)
-        if again and score(of, again, limit) > 1.05 * score(of, growth, limit):
+        without = _quickly_adjusted(of, replace(growth, registered=rest), 2.0, config)
+        if len(without.problem.points) < config.min_points:
+            continue
+        again = _extend(of, without, config)
+        limit = config.triangulation.max_error_px
+        if score(of, again, limit) > 1.05 * score(of, growth, limit):
             growth = again
     return growth
+
+
+def _doubted(of: Survey, growth: Growth, config: Config) -> list[int]:
+    """Views that explain less than a share of their matches, the worst first."""
+    agreement = survey.agreement(of, growth, config.triangulation.max_error_px)
+    shares = {}
+    for view in growth.registered:
+        mine = {key: share for key, share in agreement.items() if view in key}
+        matched = sum(len(of.pairs[key].matches) for key in mine)
+        shares[view] = sum(share * len(of.pairs[key].matches) for key, share in mine.items()) / max(1, matched)
+    return sorted((view for view in shares if shares[view] < config.doubted_share), key=lambda view: shares[view])

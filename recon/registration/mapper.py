@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -47,6 +47,25 @@ class Map:
     median_angle_deg: float  # of the points' widest rays
     rms_px: float  # at 1024 px on the longer side
     rival: float  # score of the best attempt that found other cameras over the score of this map; 0 without any
+
+    def renumbered(self, number: Sequence[int]) -> Map:
+        """The map of the same views, of which what was view i is now view `number[i]`."""
+        place, new = np.argsort(number), np.asarray(number)
+        problem = replace(
+            self.problem,
+            rotations=self.problem.rotations[place],
+            translations=self.problem.translations[place],
+            lens_of_camera=self.problem.lens_of_camera[place],
+            camera_of=new[self.problem.camera_of],
+        )
+        pairs = {(i, j): (min(new[i], new[j]), max(new[i], new[j])) for i, j in self.agreement}
+        agreement = {(int(i), int(j)): self.agreement[old] for old, (i, j) in pairs.items()}
+        return replace(
+            self,
+            views=tuple(int(new[view]) for view in self.views),
+            problem=problem,
+            agreement=dict(sorted(agreement.items())),
+        )
 
 
 def build_map(

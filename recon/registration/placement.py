@@ -38,6 +38,7 @@ class Placement:
     rotation: Array  # (3, 3) world to camera
     translation: Array  # (3,)
     support: float  # matches and points that agree
+    share: float  # of all that could
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +69,7 @@ def place(
     }
     limit = config.max_error_px * scale[view]
     focal = float(np.exp(state.log_focals[state.lens_of_camera[view]]))
+    available = max(1, len(known.tracks) + sum(len(pair.matches) for pair in neighbours.values()))
     best: Placement | None = None
     for rotation, translation in _proposals(state, all_tracks, known, view, neighbours, limit, config):
         error = reprojection_errors(known, rotation, translation, focal)
@@ -77,7 +79,7 @@ def place(
             errors = pair_errors(proposed, (min(view, other), max(view, other)), pair)
             support += float((errors < 2.0 * limit).sum())
         if best is None or support > best.support:
-            best = Placement(rotation, translation, support)
+            best = Placement(rotation, translation, support, support / available)
     return best
 
 

@@ -16,6 +16,7 @@ from recon.registration.survey import Lens, View
 from recon.registration.two_view import TwoView
 
 Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -25,7 +26,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     mapper: mapper.Config = mapper.Config()
     squeezes: tuple[float, ...] = (1.6,)  # of the image's width, for pairs that share little
     firm_matches: int = 150  # verified matches from which on a pair needs no squeezed features
-    enough_firm_pairs: int = 2  # of a frame, so that it needs no more
+    enough_firm_pairs: int = 4  # of a frame, so that it needs no more
+    # log10 of the false alarms of a pair's plain matches from which on squeezed ones are tried although firm pairs
+    # connect the frames already: of 40 such pairs that squeezed features verified, 39 were below, of others one in ten.
+    hint_log10_nfa: float = -1.0
     exif_sigma: float = 0.05  # of log focal: nominal focal lengths are rounded, and focusing changes them
     voted_sigma: float = 0.3  # of log focal when frames voted for it
 
@@ -59,36 +63,61 @@ class Registration:
     rival: float = 0.0  # matches that the best other set of cameras explained, over those that this one does
 
 
-Pairs = dict[tuple[int, int], TwoView]
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """What the features of two frames say."""
+
+    matches: Index  # (M, 2) points, most distinct first
+    pair: TwoView | None  # None where chance explains the matches
+    log10_nfa: float  # of the matches' agreement, whether it is enough or not: below 0 it is a hint
 
 
-def compare(keyframe1: Keyframe, keyframe2: Keyframe, config: Config) -> TwoView | None:
-    """Matches and verifies one pair of keyframes, by the squeezed features too where they have them."""
-    matches = _matches(keyframe1.features, keyframe2.features, config.matching)
+def compare(keyframe1: Keyframe, keyframe2: Keyframe, config: Config) -> Compared:
+    """Matches the features of the plain images of two keyframes and verifies the pair."""
+    found = _match(keyframe1.features, keyframe2.features, (1.0, 1.0), config.matching)
+    return _examine(keyframe1, keyframe2, found, config)
+
+
+def compare_squeezed(keyframe1: Keyframe, keyframe2: Keyframe, plain: Compared, config: Config) -> Compared:
+    """The same with what the squeezed features add to the matches of the `plain` ones.
+
+    One of the two images is always the plain one: a surface is seen from the side in one image, not in both. Every
+    point is in one match at most, in the most distinct.
+    """
+    from_the_side = {(1.0, squeeze) for squeeze in set(keyframe2.features.squeeze) - {1.0}}
+    from_the_side |= {(squeeze, 1.0) for squeeze in set(keyframe1.features.squeeze) - {1.0}}
+    found = [plain.matches]
+    found += [
+        _match(keyframe1.features, keyframe2.features, squeezes, config.matching) for squeezes in sorted(from_the_side)
+    ]
+    rank = np.concatenate([np.arange(len(matches)) / max(1, len(matches)) for matches in found])
+    merged = np.concatenate(found)[np.argsort(rank, kind="stable")]
+    for side in (0, 1):
+        _, first = np.unique(merged[:, side], return_index=True)
+        merged = merged[np.sort(first)]
+    return _examine(keyframe1, keyframe2, merged, config)
+
+
+def _match(features1: Features, features2: Features, squeezes: tuple[float, float], config: matching.Config) -> Index:
+    """(M, 2) indices of points that match by the descriptors of these squeezes, most distinct first."""
+    (chosen1,), (chosen2,) = (
+        np.nonzero(features.squeeze == squeeze)
+        for features, squeeze in zip((features1, features2), squeezes, strict=True)
+    )
+    match = matching.match(features1.descriptors[chosen1], features2.descriptors[chosen2], config)
+    return np.stack([features1.point_of[chosen1[match[:, 0]]], features2.point_of[chosen2[match[:, 1]]]], 1)
+
+
+def _examine(keyframe1: Keyframe, keyframe2: Keyframe, matches: Index, config: Config) -> Compared:
     points1 = keyframe1.features.points[matches[:, 0]] - principal_point(keyframe1.frame)
     points2 = keyframe2.features.points[matches[:, 1]] - principal_point(keyframe2.frame)
     size = (keyframe2.frame.width, keyframe2.frame.height)
-    return two_view.verify(points1, points2, matches, size, config.two_view)
+    return Compared(matches, *two_view.examine(points1, points2, matches, size, config.two_view))
 
 
-def _matches(features1: Features, features2: Features, config: matching.Config) -> npt.NDArray[np.int64]:
-    """(M, 2) indices of points, most distinct first; every point is in one match at most.
-
-    One of the two images is always the plain one: a surface is seen from the side in one image, not in both.
-    """
-    found, rank = [], []
-    from_the_side = {(1.0, squeeze) for squeeze in set(features2.squeeze)}
-    from_the_side |= {(squeeze, 1.0) for squeeze in set(features1.squeeze)}
-    for squeeze1, squeeze2 in sorted({(1.0, 1.0)} | from_the_side):
-        (chosen1,), (chosen2,) = np.nonzero(features1.squeeze == squeeze1), np.nonzero(features2.squeeze == squeeze2)
-        match = matching.match(features1.descriptors[chosen1], features2.descriptors[chosen2], config)
-        found.append(np.stack([features1.point_of[chosen1[match[:, 0]]], features2.point_of[chosen2[match[:, 1]]]], 1))
-        rank.append(np.arange(len(match)) / max(1, len(match)))
-    matches = np.concatenate(found)[np.argsort(np.concatenate(rank), kind="stable")]
-    for side in (0, 1):
-        _, first = np.unique(matches[:, side], return_index=True)
-        matches = matches[np.sort(first)]
-    return matches
+def place_in_order(keyframe: Keyframe) -> bytes:
+    """Sorts keyframes by what they show: with it, an answer does not depend on the order in which they came."""
+    return keyframe.features.points[:64].tobytes()
 
 
 def register(
@@ -96,8 +125,26 @@ def register(
 ) -> Registration | None:
     """Cameras of as many keyframes as hang together, or None when no two do.
 
-    `pairs` holds the verified pairs by position (i < j).
+    `pairs` holds the verified pairs by position (i < j). The answer is the same in whatever order the keyframes come.
     """
+    order = sorted(range(len(keyframes)), key=lambda index: place_in_order(keyframes[index]))
+    ordered = [keyframes[index] for index in order]
+    built = _build(ordered, _renumbered(pairs, np.argsort(order)), config)
+    return _in_first_camera(built.renumbered(order), keyframes) if built else None
+
+
+def _renumbered(pairs: Mapping[tuple[int, int], TwoView], place: Index) -> dict[tuple[int, int], TwoView]:
+    """The pairs, sorted, of keyframes of which number i is now number `place[i]`."""
+    renumbered = {}
+    for (i, j), pair in pairs.items():
+        first, second = int(place[i]), int(place[j])
+        renumbered[min(first, second), max(first, second)] = pair if first < second else pair.swapped()
+    return dict(sorted(renumbered.items()))
+
+
+def _build(
+    keyframes: Sequence[Keyframe], pairs: Mapping[tuple[int, int], TwoView], config: Config
+) -> mapper.Map | None:
     groups, lenses = _lenses(keyframes, pairs, config)
     views = [
         View(
@@ -112,8 +159,7 @@ def register(
         refinement.picture(keyframe.frame.image, principal_point(keyframe.frame), of_refinement)
         for keyframe in keyframes
     ]
-    built = mapper.build_map(views, lenses, pairs, config.mapper, pictures)
-    return _in_first_camera(built, keyframes) if built else None
+    return mapper.build_map(views, lenses, pairs, config.mapper, pictures)
 
 
 def principal_point(frame: Frame) -> Array:

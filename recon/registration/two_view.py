@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import msgspec
@@ -41,11 +41,25 @@ class TwoView:
         """Nothing in this pair needs the camera to have moved."""
         return self.num_rotation >= 0.9 * len(self.matches)
 
+    def swapped(self) -> TwoView:
+        """The same of the second frame and the first."""
+        return replace(self, matches=self.matches[:, ::-1], points1=self.points2, points2=self.points1)
+
 
 def verify(
     points1: Array, points2: Array, matches: npt.NDArray[np.int64], size: tuple[int, int], config: Config
 ) -> TwoView | None:
     """The pair's geometry, or None when chance explains the agreement of `points1` and `points2` (both (M, 2)).
+
+    As `examine`, of which it is the first answer.
+    """
+    return examine(points1, points2, matches, size, config)[0]
+
+
+def examine(
+    points1: Array, points2: Array, matches: npt.NDArray[np.int64], size: tuple[int, int], config: Config
+) -> tuple[TwoView | None, float]:
+    """What `verify` says, and log10 of the expected number of false alarms also where that is not enough.
 
     The most distinct matches come first. Pixels are relative to the principal points; `size` is the second image's
     (width, height). The test is a contrario (Moisan and Stival, 2004): the expected number of fundamental matrices,
@@ -54,21 +68,21 @@ def verify(
     longer_side = max(size)
     scale = longer_side / 1024.0
     if len(matches) < config.min_inliers:
-        return None
+        return None, 0.0
     threshold = config.epipolar_px * scale
     fundamental, mask = cv2.findFundamentalMat(points1, points2, _magsac(threshold))
     if fundamental is None or mask is None:
-        return None
+        return None, 0.0
     inlier = mask.ravel() > 0
     # An unrelated point falls into the band around its epipolar line with this probability.
     chance = min(1.0, 2.0 * threshold * float(np.hypot(*size)) / (size[0] * size[1]))
     log10_nfa = log10_number_of_false_alarms(len(matches), int(inlier.sum()), sample_size=7, chance=chance)
     if inlier.sum() < config.min_inliers or log10_nfa > config.max_log10_nfa:
-        return None
+        return None, log10_nfa
     points1, points2 = points1[inlier], points2[inlier]
     _, plane = cv2.findHomography(points1, points2, cv2.USAC_MAGSAC, config.homography_px * scale)
     rotation_inliers, rotation_focal = fit_rotation(points1, points2, config.homography_px * scale, longer_side)
-    return TwoView(
+    found = TwoView(
         matches=matches[inlier],
         points1=points1,
         points2=points2,
@@ -79,6 +93,7 @@ def verify(
         focal_ratio=_shared_focal(points1, points2, threshold) / longer_side,
         rotation_focal_ratio=rotation_focal / longer_side,
     )
+    return found, log10_nfa
 
 
 def _magsac(threshold: float) -> cv2.UsacParams:
