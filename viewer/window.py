@@ -7,6 +7,7 @@ scene widget is there in any case, because without one Open3D 0.20 keeps the mem
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -60,10 +61,14 @@ def show(
     state = session.state
     session.state = replace(state, engine=Engine.OPEN3D if open3d_may_draw else Engine.CORE)
     window = _Window(app, session, screenshots, size)
+    # A handler that raises would do so where Open3D calls Python, before anything there can catch it.
+    handlers = {number: signal.signal(number, window.stop) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
         opened()
         app.run()
     finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
         session.close()
     if window.error is not None:
         raise window.error
@@ -95,7 +100,12 @@ class _Window:
         self._shown: tuple[object, ...] = ()  # what the scene widget shows
         self._analysed: object = None
         self._words_at = 0.0
+        self._stopped_by = 0  # a signal
         self._notice = ""
+
+    def stop(self, number: int, _frame: object) -> None:
+        """The handler of a signal: closes the window at the next tick."""
+        self._stopped_by = number
 
     def _guarded(self, function: Callable, otherwise: object = None) -> Callable:
         """`function`, whose exception ends the run of the window and is raised where it was opened."""
@@ -105,7 +115,8 @@ class _Window:
                 return function(*arguments)
             except BaseException as error:
                 self.error = self.error or error
-                self._app.quit()
+                # Not from within: a window that goes while it is at work takes the process with it.
+                self._app.post_to_main_thread(self._window, self._app.quit)
                 return otherwise
 
         return call
@@ -114,6 +125,8 @@ class _Window:
 
     def _tick(self) -> bool:
         """Looks for news and redraws where there are any."""
+        if self._stopped_by:
+            raise KeyboardInterrupt if self._stopped_by == signal.SIGINT else SystemExit(0)
         if self._session.receive():
             self._dirty = True
         analysis = self._session.analysis()
