@@ -20,7 +20,7 @@ from recon.evaluate.stability.case import Case, Demand, Row
 from recon.evaluate.stability.matrix import ROWS, chosen
 from recon.evaluate.stability.methods import by_name
 from recon.evaluate.stability.outcome import Outcome, compare, outcome
-from recon.evaluate.stability.places import Place, Places, Stage, far_apart, load_places, motion, neighbours
+from recon.evaluate.stability.places import Place, Places, Stage, far_apart, load_places, motion, neighbours, parallel
 from recon.evaluate.stability.summary import rate, report, summarise
 from recon.evaluate.stability.trial import Trial, run_trial
 from recon.evaluate.truth import EvaluationScene, TrueCamera
@@ -203,6 +203,17 @@ def test_neighbours_are_as_far_apart_as_they_may_be():
     assert neighbours(np.stack([on_arc(30.0 * i) for i in range(5)]), 3, 12.0) == ([], 1)
 
 
+def test_parallel_views_do_not_turn():
+    def sideways(turn: float) -> np.ndarray:
+        Ts_world_camera = np.stack([on_arc(turn * i) for i in range(6)])
+        Ts_world_camera[:, :3, 3] = [[0.1 * i, 0.0, 0.0] for i in range(6)]
+        return Ts_world_camera
+
+    assert parallel(sideways(1.0), 3) == ([0, 1], 2), "at a stride of 4 they do not fit in"
+    assert neighbours(sideways(1.0), 3, 12.0) == ([], 1)
+    assert parallel(sideways(9.0), 3) == ([], 1) and neighbours(sideways(9.0), 3, 12.0)[0]
+
+
 def test_views_far_apart(places):
     rng = np.random.default_rng(0)
     found = far_apart(places.walked[0], 3, 11.9, rng)
@@ -225,14 +236,20 @@ def test_every_number_has_a_row_and_every_row_a_name_of_its_own():
         chosen((31,))
 
 
-@pytest.mark.parametrize("row", [row for row in ROWS if row.number not in (6, 24, 26, 27)], ids=lambda r: r.name)
+# Rows that photograph the built-in place at full size, or write large files, would take as long as all others.
+SLOW = {"tiny baseline", "forward motion", "clean, parallel views", "a huge file"}
+
+
+@pytest.mark.parametrize("row", [row for row in ROWS if row.name not in SLOW], ids=lambda r: r.name)
 def test_rows_make_the_same_case_again(row, places):
     first, again = (row.make(Stage(places, row.name, 1)) for _ in range(2))
-    frames, same = list(first.source()), list(again.source())
-    assert len(frames) > 0 and len({frame.name for frame in frames}) == len(frames)
-    for frame, twin in zip(frames, same, strict=True):
-        assert isinstance(frame, Frame) and isinstance(twin, Frame)
-        assert frame.name == twin.name and np.array_equal(frame.image, twin.image)
+    given, same = list(first.source()), list(again.source())
+    assert len(given) > 0 and len({frame.name for frame in given}) == len(given)
+    frames = [frame for frame in given if isinstance(frame, Frame)]
+    for frame, twin in zip(given, same, strict=True):
+        assert frame.name == twin.name and type(frame) is type(twin)
+        if isinstance(frame, Frame) and isinstance(twin, Frame):
+            assert np.array_equal(frame.image, twin.image)
     assert first.codes and first.note
     names = {frame.name for frame in frames}
     assert all(set(known) <= names for known in first.worlds)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from capture.cameras import synthetic
 from recon.evaluate.stability.case import Case, accepted, either, refused, row, world
-from recon.evaluate.stability.places import Photo, Stage, far_apart, renamed
+from recon.evaluate.stability.places import Photo, Stage, far_apart, parallel, renamed
 from recon.evaluate.stability.probes import same_cameras
 from recon.evaluate.truth import TrueCamera
 from recon.verdict import Code
@@ -23,6 +24,19 @@ def clean(stage: Stage) -> Case:
 @row(1, "clean, further apart")
 def clean_apart(stage: Stage) -> Case:
     return accepted(stage.photos(5, step_deg=20.0), "neighbours at up to 20 degrees")
+
+
+@row(1, "clean, parallel views")
+def parallel_views(stage: Stage) -> Case:
+    """Where they are weak, the focal length is a guess: a right scene is as good as a refusal."""
+    fitting = (Code.FOCAL_SUSPECT, Code.BASELINE_TOO_SMALL, Code.AMBIGUOUS)
+    for turn in range(len(stage.places.walked)):
+        place = stage.place(turn)
+        starts, stride = parallel(place.Ts_world_camera, 4)
+        if starts:
+            start = int(stage.rng.choice(starts))
+            return either(place.photos(range(start, start + 4 * stride, stride)), "views in one direction", *fitting)
+    return either(_walked(stage, [0.0, 0.15, 0.3, 0.45], axis=0), "15 cm further to the side each", *fitting)
 
 
 @row(2, "shuffled")
@@ -82,7 +96,7 @@ def tiny_baseline(stage: Stage) -> Case:
 def places_apart(stage: Stage) -> Case:
     count = min(5, len(stage.places.walked))
     chosen = [photo for turn in range(count) for photo in renamed(stage.photos(1, turn), str(turn))]
-    case = refused(chosen, "one of each", Code.NO_OVERLAP, Code.SPLIT, Code.TOO_FEW_VIEWS)
+    case = refused(chosen, "one of each", Code.NO_OVERLAP, Code.SPLIT, Code.TOO_FEW_VIEWS, Code.AMBIGUOUS)
     return replace(case, worlds=tuple(world([photo]) for photo in chosen))
 
 
@@ -110,14 +124,19 @@ def forward(stage: Stage) -> Case:
         place = stage.places.forward[stage.seed // 2 % len(stage.places.forward)]
         start = int(stage.rng.integers(max(1, len(place.names) - 5)))
         return either(place.photos(range(start, min(start + 5, len(place.names)))), "recorded", *fitting)
+    return either(_walked(stage, [0.0, 0.2, 0.4, 0.6, 0.8], axis=2), "20 cm further forward each", *fitting)
+
+
+def _walked(stage: Stage, distances: Sequence[float], axis: int) -> list[Photo]:
+    """The built-in place from a camera that moves by `distances` along its own `axis`, and does not turn."""
     config = synthetic.Config(views=8, seed=stage.seed % 2)
     start, K = synthetic.scene_cameras(config)[int(stage.rng.integers(2, 6))]
     photos = []
-    for number in range(5):
+    for number, distance in enumerate(distances):
         T_world_camera = start.copy()
-        T_world_camera[:3, 3] += 0.2 * number * start[:3, 2]
+        T_world_camera[:3, 3] += distance * start[:3, axis]
         photos.append(_photograph(config, T_world_camera, K, number))
-    return either(photos, "20 cm further forward each", *fitting)
+    return photos
 
 
 def _photograph(config: synthetic.Config, T_world_camera: np.ndarray, K: np.ndarray, number: int) -> Photo:

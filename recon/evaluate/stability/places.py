@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,11 @@ from recon.evaluate.demo import write_capture
 from recon.evaluate.truth import EvaluationScene, TrueCamera, load_scene
 
 Image = npt.NDArray[np.uint8]
+Poses = npt.NDArray[np.float64]  # (M, 4, 4) T_world_camera
 
 NEIGHBOUR_DEG = 12.0  # between neighbours of a set, as people take photographs
 OVERLAP_DEG = 20.0  # beyond, photographs may share too little: a refusal would be no mistake
+TELLING_DEG = 8.0  # below, a set's views are as good as parallel: its focal length trades against its depth
 _LONGEST_STRIDE = 4
 
 _BUILT_IN_SEEDS = (0, 1, 2, 3)
@@ -49,7 +52,7 @@ class Place:
         return self.scene.name
 
     @property
-    def Ts_world_camera(self) -> npt.NDArray[np.float64]:  # (M, 4, 4)
+    def Ts_world_camera(self) -> Poses:
         return np.stack([self.scene.cameras[name].T_world_camera for name in self.names])
 
     def photo(self, index: int) -> Photo:
@@ -113,25 +116,46 @@ class Stage:
         return place.photos(indices)
 
 
-def neighbours(Ts_world_camera: npt.NDArray[np.float64], count: int, step_deg: float) -> tuple[list[int], int]:
+def neighbours(Ts_world_camera: Poses, count: int, step_deg: float) -> tuple[list[int], int]:
     """Where sets of `count` cameras may start, and the stride between them: the longest that keeps to `step_deg`."""
-    for stride, limit in [*((stride, step_deg) for stride in range(_LONGEST_STRIDE, 0, -1)), (1, OVERLAP_DEG)]:
-        starts = [
-            start
-            for start in range(len(Ts_world_camera) - stride * (count - 1))
-            if _overlap(Ts_world_camera[start : start + stride * count : stride], Ts_world_camera, limit)
-        ]
+    starts, stride = _strided(Ts_world_camera, count, _LONGEST_STRIDE, partial(_overlap, step_deg))
+    return (starts, stride) if starts else _strided(Ts_world_camera, count, 1, partial(_overlap, OVERLAP_DEG))
+
+
+def parallel(Ts_world_camera: Poses, count: int) -> tuple[list[int], int]:
+    """The same for cameras that look in one direction, by which a focal length can hardly be told."""
+    return _strided(Ts_world_camera, count, _LONGEST_STRIDE, lambda chosen: _span_deg(chosen) < TELLING_DEG)
+
+
+def _strided(everyone: Poses, count: int, longest: int, fits: Callable[[Poses], bool]) -> tuple[list[int], int]:
+    """Where `count` cameras that fit and that stepped usual steps may start, at the longest stride that has any."""
+    usual = float(np.median(_steps(everyone)))
+    for stride in range(longest, 0, -1):
+        starts = []
+        for start in range(len(everyone) - stride * (count - 1)):
+            chosen = everyone[start : start + stride * count : stride]
+            steps = _steps(chosen)
+            if (steps >= 0.5 * usual).all() and (steps <= 5.0 * usual).all() and fits(chosen):
+                starts.append(start)
         if starts:
             return starts, stride
     return [], 1
 
 
-def _overlap(chosen: npt.NDArray[np.float64], everyone: npt.NDArray[np.float64], limit_deg: float) -> bool:
-    """Whether each camera sees what the next one sees: it turned by less than `limit_deg` and stepped a usual step."""
-    usual = float(np.median(np.linalg.norm(np.diff(everyone[:, :3, 3], axis=0), axis=1)))
-    steps = np.linalg.norm(np.diff(chosen[:, :3, 3], axis=0), axis=1)
+def _overlap(limit_deg: float, chosen: Poses) -> bool:
+    """Whether each camera sees what the next one sees, and three or more turn enough to tell their focal length."""
     turns = angles_deg(chosen[:-1, :3, :3], chosen[1:, :3, :3])
-    return bool((turns <= limit_deg).all() and (steps >= 0.5 * usual).all() and (steps <= 5.0 * usual).all())
+    return bool((turns <= limit_deg).all()) and (len(chosen) < 3 or _span_deg(chosen) >= TELLING_DEG)
+
+
+def _span_deg(chosen: Poses) -> float:
+    """The largest angle between the views of any two cameras."""
+    axes = chosen[:, :3, 2]
+    return float(np.degrees(np.arccos(np.clip((axes @ axes.T).min(), -1.0, 1.0))))
+
+
+def _steps(chosen: Poses) -> npt.NDArray[np.float64]:
+    return np.linalg.norm(np.diff(chosen[:, :3, 3], axis=0), axis=1)
 
 
 def renamed(photos: Sequence[Photo], mark: str) -> list[Photo]:
@@ -156,7 +180,7 @@ def load_places(scenes: Sequence[Path], out: Path) -> Places:
     return Places(**{kind: tuple(places) for kind, places in kinds.items()})
 
 
-def motion(Ts_world_camera: npt.NDArray[np.float64]) -> str:
+def motion(Ts_world_camera: Poses) -> str:
     """How cameras (M, 4, 4) in the order of capture moved: the name of a field of `Places`."""
     centres = Ts_world_camera[:, :3, 3]
     steps = np.diff(centres, axis=0)
