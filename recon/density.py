@@ -1,4 +1,9 @@
-"""Where Gaussians start: the paper's confidence-ranked down-sampling, then one Gaussian per cell of image detail."""
+"""Where Gaussians start: the paper's confidence-ranked down-sampling, then one Gaussian per piece of equal colour.
+
+A piece is as large as what it leaves unexplained allows (`recon.partition`): the same error everywhere is the best use
+of a number of Gaussians. What a Gaussian has to explain to be worth having is told in photographs of a fixed size, so
+that the number follows from what there is to see and not from how many pixels show it.
+"""
 
 from __future__ import annotations
 
@@ -11,30 +16,27 @@ import torch
 
 from recon.gaussians import SH_C0, Gaussians, concatenate
 from recon.geometry import quat_from_matrix
+from recon.partition import partition
 from recon.priors import reprojection
 from recon.priors.pointmap import Pointmap
 
 Mask = npt.NDArray[np.bool_]
+Array = npt.NDArray[np.float64]
+REFERENCE_PX = 512  # longer side of the photographs that the configuration's pixels are of
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth_tolerance: float = 0.02  # theta of equation 16, relative to the depth
     coarser: float = 1.5  # a point replaces a pixel only if its own pixel covers at most this many times the surface
     min_confidence: float = 0.05  # pixels below get no Gaussian
-    largest_cell_px: int = 16
-    smallest_cell_px: int = 2
-    colour_deviation: float = 0.035  # standard deviation of colour, in [0, 1], above which a cell is divided
-    depth_deviation: float = 0.02  # standard deviation of depth, relative to it, above which a cell is divided
-    footprint: float = 0.6  # standard deviation of a new Gaussian in units of its cell
-    thickness: float = 0.15  # standard deviation along the normal, in units of that across
-    opacity: float = 0.9
-
-    def __post_init__(self) -> None:
-        if self.smallest_cell_px < 1 or self.largest_cell_px not in _sizes(self):
-            raise ValueError(
-                "smallest_cell_px must be at least 1, and largest_cell_px that times a power of two, "
-                f"got {self.smallest_cell_px} and {self.largest_cell_px}"
-            )
+    largest_px: int = 64  # side of a square beyond which no piece reaches
+    smallest_px: float = 3.0  # area of a piece that is not divided
+    most_error: float = 0.045  # squared deviation of colours in [0, 1], summed over a piece's pixels and channels
+    depth_weight: float = 2.0  # a relative difference of depth counts as this many times the difference of colour
+    noise: float = 0.01  # standard deviation of colours in [0, 1] that is not worth a Gaussian
+    footprint: float = 1.2  # standard deviations of a new Gaussian in units of its piece's
+    thickness: float = 0.15  # standard deviation along the normal, in units of the smaller across
+    opacity: float = 0.5
 
 
 def redundant(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
@@ -59,96 +61,107 @@ def redundant(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
 def gaussians_from_pointmap(
     pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, config: Config
 ) -> Gaussians:
-    """One Gaussian per cell of a quadtree over the pixels `wanted` (h, w) of a keyframe's `image` (h, w, 3).
+    """One Gaussian for each piece of the pixels `wanted` (h, w) of a keyframe's `image` (h, w, 3).
 
-    A cell is divided while its colours or its depths vary, down to the smallest size; so plain surfaces take few large
-    Gaussians and detail takes many small ones. Each lies on its cell's surface, turned to its normal.
+    Each has its piece's mean colour, and lies on its surface with its position and extent there (moment matching).
     """
-    height, width = pointmap.depth.shape
-    size = config.largest_cell_px
-    pad = ((0, -height % size), (0, -width % size))
-    weight = np.pad((wanted & (pointmap.depth > 0)).astype(np.float32), pad)
-    rows, columns = np.indices(weight.shape, np.float32) + np.float32(0.5)
-    inverse_depth = np.where(pointmap.depth > 0, 1.0 / np.maximum(pointmap.depth, 1e-9), 0.0)
-    inverse_depth = np.pad(inverse_depth.astype(np.float32), pad)
-    colour = np.pad(image.astype(np.float32) / 255.0, (*pad, (0, 0)))
-    normal = np.pad(pointmap.normal.astype(np.float32), (*pad, (0, 0)))
-    values = np.concatenate(
-        [np.stack([columns, rows, inverse_depth, inverse_depth**2], -1), colour, colour**2, normal], -1
+    wanted = wanted & (pointmap.depth > 0)
+    labels, count = _pieces(pointmap, image, wanted, config)
+    piece = labels[wanted]
+    pixels = np.bincount(piece, minlength=count)
+    rows, columns = np.nonzero(wanted)
+    u, v = columns + 0.5, rows + 0.5
+
+    def mean(values: npt.NDArray) -> Array:
+        return np.bincount(piece, values, minlength=count) / pixels
+
+    centre = np.column_stack([mean(u), mean(v)])
+    inverse_depth = mean(1.0 / pointmap.depth[wanted])
+    colour = np.column_stack([mean(image[..., channel][wanted] / 255.0) for channel in range(3)])
+    normal = np.column_stack([mean(pointmap.normal[..., axis][wanted]) for axis in range(3)])
+    # A pixel is a square of variance 1/12, not a point.
+    uu, vv = (mean(x * x) - centre[:, i] ** 2 + 1 / 12 for i, x in enumerate((u, v)))
+    uv = mean(u * v) - centre[:, 0] * centre[:, 1]
+    spread = np.stack([np.stack([uu, uv], 1), np.stack([uv, vv], 1)], 1)
+    return _on_surface(pointmap, centre, spread, inverse_depth, normal, colour, config)
+
+
+def _pieces(
+    pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, config: Config
+) -> tuple[npt.NDArray[np.int32], int]:
+    """(h, w) the number of the piece that each wanted pixel belongs to, -1 elsewhere, and how many there are."""
+    scale = max(wanted.shape) / REFERENCE_PX
+    depth = np.log(np.maximum(pointmap.depth, 1e-9)) if wanted.any() else pointmap.depth
+    middle = np.float32(np.median(depth[wanted])) if wanted.any() else np.float32(0)
+    features = np.empty((*wanted.shape, 4), np.float32)
+    features[..., :3] = image / np.float32(255) - np.float32(0.5)
+    features[..., 3] = config.depth_weight * (depth - middle)
+    return partition(
+        features,
+        wanted,
+        tile_px=max(1, round(config.largest_px * scale)),
+        smallest_px=max(1, round(config.smallest_px * scale**2)),
+        most_error=config.most_error * scale**2,
+        noise=3 * config.noise**2,
     )
-    values = np.concatenate([values * weight[..., None], weight[..., None]], -1)
-    undecided = np.ones((weight.shape[0] // size, weight.shape[1] // size), bool)
-    cells, sizes = [], []
-    # Sums over the smallest cells; those over larger ones are sums of four.
-    pyramid = {config.smallest_cell_px: _block_sums(values.astype(np.float64), config.smallest_cell_px)}
-    for level in _sizes(config)[1:]:
-        pyramid[level] = _block_sums(pyramid[level // 2], 2)
-    while True:
-        blocks = pyramid[size]
-        count = blocks[..., -1]
-        mean = blocks / np.maximum(count, 1.0)[..., None]
-        deviation = np.sqrt(np.maximum(mean[..., 7:10] - mean[..., 4:7] ** 2, 0.0)).max(-1)
-        relative_depth = np.sqrt(np.maximum(mean[..., 3] - mean[..., 2] ** 2, 0.0)) / np.maximum(mean[..., 2], 1e-9)
-        partial = (count > 0) & (count < 0.75 * size * size)
-        divide = (deviation > config.colour_deviation) | (relative_depth > config.depth_deviation) | partial
-        leaf = undecided & (count > 0) & (~divide if size > config.smallest_cell_px else True)
-        cells.append(mean[leaf])
-        sizes.append(np.full(int(leaf.sum()), float(size)))
-        if size <= config.smallest_cell_px:
-            break
-        undecided = np.repeat(np.repeat(undecided & divide & (count > 0), 2, 0), 2, 1)
-        size //= 2
-    return _on_surface(pointmap, np.concatenate(cells), np.concatenate(sizes), config)
-
-
-def _sizes(config: Config) -> list[int]:
-    sizes = [config.smallest_cell_px]
-    while sizes[-1] < config.largest_cell_px:
-        sizes.append(2 * sizes[-1])
-    return sizes
-
-
-def _block_sums(values: npt.NDArray[np.float64], size: int) -> npt.NDArray[np.float64]:
-    """Sums over blocks of size x size of values (h, w, n)."""
-    height, width, channels = values.shape
-    return values.reshape(height // size, size, width // size, size, channels).sum((1, 3))
 
 
 def _on_surface(
-    pointmap: Pointmap, cells: npt.NDArray[np.float64], sizes: npt.NDArray[np.float64], config: Config
+    pointmap: Pointmap,
+    centre: Array,  # (N, 2) pixels
+    spread: Array,  # (N, 2, 2) covariance in the image, pixels squared
+    inverse_depth: Array,  # (N,)
+    normal: Array,  # (N, 3) camera frame, of any length
+    colour: Array,  # (N, 3) in [0, 1]
+    config: Config,
 ) -> Gaussians:
-    """Gaussians from cell means: columns u, v, inverse depth, its square, rgb, rgb squared, normal, count."""
+    """Gaussians in the tangent planes at these pixels, with the images' covariances carried there."""
     K, T_world_camera = pointmap.K, pointmap.T_world_camera
-    depth = 1.0 / np.maximum(cells[:, 2], 1e-9)
-    ray = np.column_stack([(cells[:, 0] - K[0, 2]) / K[0, 0], (cells[:, 1] - K[1, 2]) / K[1, 1], np.ones(len(cells))])
-    direction = ray / np.linalg.norm(ray, axis=1, keepdims=True)
-    normal = cells[:, 10:13]
-    length = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = np.where(length > 0.3, normal / np.maximum(length, 1e-9), -direction)
-    cosine = np.clip(-(normal * direction).sum(1), 0.25, 1.0)
-    # In the tangent plane: one axis across the line of sight, the other, foreshortened in the image, along it.
-    helper = np.where(np.abs(direction[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    slanted = np.cross(normal, direction)
-    across = np.where(np.linalg.norm(slanted, axis=1, keepdims=True) > 0.05, slanted, np.cross(normal, helper))
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    along = np.cross(across, normal)
-    rotation = T_world_camera[:3, :3] @ np.stack([along, across, normal], 2)
-    extent = config.footprint * sizes * depth / K[0, 0]
-    scales = np.column_stack([extent / cosine, extent, config.thickness * extent])
-    means = (ray * depth[:, None]) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
+    count = len(centre)
+    focal = np.array([K[0, 0], K[1, 1]])
+    ray = np.column_stack([(centre - K[:2, 2]) / focal, np.ones(count)])
+    mean = ray / np.maximum(inverse_depth, 1e-9)[:, None]
+    normal = _facing(normal, ray)
+    # On the plane n . X = d a pixel's point is ray * d / (n . ray); these are its derivatives by u and by v.
+    along_ray = (normal * ray).sum(1)
+    depth = (normal * mean).sum(1) / along_ray
+    steps = np.stack([np.eye(3)[axis] - ray * (normal[:, axis] / along_ray)[:, None] for axis in (0, 1)], 2)
+    steps = steps * (depth[:, None] / focal)[:, None, :]
+    first = steps[:, :, 0] / np.linalg.norm(steps[:, :, 0], axis=1, keepdims=True)
+    second = np.cross(normal, first)
+    in_plane = np.stack([first, second], 1) @ steps  # (N, 2, 2)
+    shape: Array = in_plane @ spread @ in_plane.transpose(0, 2, 1)
+    variances, axes = np.linalg.eigh(shape)
+    extents = config.footprint * np.sqrt(np.maximum(variances, 1e-18))
+    along: Array = first * axes[:, :1, 1] + second * axes[:, 1:, 1]
+    rotation: Array = T_world_camera[:3, :3] @ np.stack([along, np.cross(normal, along), normal], 2)
+    scales: Array = np.column_stack([extents[:, 1], extents[:, 0], config.thickness * extents[:, 0]])
 
-    def tensor(array: npt.NDArray[np.float64]) -> torch.Tensor:
+    def tensor(array: Array) -> torch.Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).float()
 
-    logit = float(np.log(config.opacity / (1 - config.opacity)))
     return Gaussians(
-        means=tensor(means),
+        means=tensor(mean @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]),
         quats=quat_from_matrix(tensor(rotation)),
         log_scales=tensor(np.log(scales)),
-        logit_opacities=torch.full((len(cells),), logit),
-        sh=tensor((cells[:, 4:7] - 0.5) / SH_C0)[:, None],
-        source_frame=torch.full((len(cells),), pointmap.frame_id, dtype=torch.int32),
+        logit_opacities=torch.full((count,), float(np.log(config.opacity / (1 - config.opacity)))),
+        sh=tensor((colour - 0.5) / SH_C0)[:, None],
+        source_frame=torch.full((count,), pointmap.frame_id, dtype=torch.int32),
     )
+
+
+def _facing(normal: Array, ray: Array, least_cosine: float = 0.25) -> Array:
+    """(N, 3) unit normals that face the camera; the line of sight's where there is none, and not far from edge-on.
+
+    A surface seen at a grazing angle is known badly: its Gaussians would be stretched out along the line of sight.
+    """
+    direction = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    unit = np.where(length > 0.3, normal / np.maximum(length, 1e-9), -direction)
+    cosine = -(unit * direction).sum(1, keepdims=True)
+    sideways = unit + cosine * direction
+    sideways *= np.sqrt(1 - least_cosine**2) / np.maximum(np.linalg.norm(sideways, axis=1, keepdims=True), 1e-9)
+    return np.where(cosine < least_cosine, sideways - least_cosine * direction, unit)
 
 
 def initial_gaussians(
@@ -159,31 +172,29 @@ def initial_gaussians(
 ) -> Gaussians:
     """The Gaussians of a scene that has not been optimised: every surface once, from its best view.
 
-    With `max_gaussians` cells are coarsened, everywhere alike, until there are at most that many.
+    With `max_gaussians` pieces are coarsened, everywhere alike, until there are at most that many.
     """
     wanted = [
         ~covered & (pointmap.confidence >= config.min_confidence)
         for pointmap, covered in zip(pointmaps, redundant(pointmaps, config), strict=True)
     ]
-    while True:
+    for _ in range(12):
         gaussians = concatenate(
             [gaussians_from_pointmap(*view, config) for view in zip(pointmaps, images, wanted, strict=True)]
         )
         if max_gaussians is None or len(gaussians) <= max_gaussians:
             return gaussians
-        if config.smallest_cell_px >= 64:
-            keep = torch.linspace(0, len(gaussians) - 1, max_gaussians).round().long()
-            return gaussians.subset(keep)
-        config = _coarser(config)
+        config = _coarser(config, len(gaussians) / max(max_gaussians, 1))
+    assert max_gaussians is not None  # else the first was returned
+    return gaussians.subset(torch.linspace(0, len(gaussians) - 1, max_gaussians).round().long())
 
 
-def _coarser(config: Config) -> Config:
-    """More deviation allowed in a cell; once that is beyond all contrast, larger cells."""
-    if config.colour_deviation < 0.25:
-        return msgspec.structs.replace(
-            config, colour_deviation=1.4 * config.colour_deviation, depth_deviation=1.4 * config.depth_deviation
-        )
-    smallest = 2 * config.smallest_cell_px
+def _coarser(config: Config, times: float) -> Config:
+    """For about `times` fewer pieces."""
+    times = max(times, 1.1)
     return msgspec.structs.replace(
-        config, smallest_cell_px=smallest, largest_cell_px=max(smallest, config.largest_cell_px)
+        config,
+        most_error=times**1.3 * config.most_error,
+        smallest_px=times * config.smallest_px,
+        largest_px=round(times**0.5 * config.largest_px),
     )

@@ -1,9 +1,10 @@
-"""Where Gaussians start: equations 14 to 17 worked out by hand, and a quadtree whose leaves can be counted."""
+"""Where Gaussians start: equations 14 to 17 worked out by hand, and pieces that can be counted and measured."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -97,30 +98,56 @@ def test_detail_is_not_given_up_for_a_point_seen_from_far_away(behind, covers):
     assert masks[1].any() == covers
 
 
-def test_a_plain_wall_takes_one_gaussian_a_largest_cell_and_a_checkerboard_one_a_smallest():
+def test_a_plain_wall_takes_one_gaussian_a_square_and_stripes_one_each():
+    # A photograph of 64 pixels stands for one of 512, so that 128 pixels there are 16 here.
     pointmap = plane_pointmap(np.eye(4), width=64, height=64)
-    assert len(gaussians_from_pointmap(pointmap, plain(64), everything(pointmap), Config())) == 4 * 4
-    assert len(gaussians_from_pointmap(pointmap, checkerboard(64, 2), everything(pointmap), Config())) == 32 * 32
-    half = np.concatenate([plain(64)[:, :32], checkerboard(64, 2)[:, 32:]], 1)
-    assert len(gaussians_from_pointmap(pointmap, half, everything(pointmap), Config())) == 2 * 4 + 16 * 32
+    config = Config(largest_px=128)
+    stripes = np.tile(np.repeat([0, 255], 4), 8)[None, :, None].repeat(64, 0).repeat(3, 2).astype(np.uint8)
+    assert len(gaussians_from_pointmap(pointmap, plain(64), everything(pointmap), config)) == 4 * 4
+    assert len(gaussians_from_pointmap(pointmap, stripes, everything(pointmap), config)) == 4 * 16
+    half = np.concatenate([plain(64)[:, :32], stripes[:, 32:]], 1)
+    assert len(gaussians_from_pointmap(pointmap, half, everything(pointmap), config)) == 2 * 4 + 4 * 8
 
 
-def test_depth_divides_cells_as_colour_does():
+def test_a_step_in_depth_divides_pieces_as_one_in_colour_does():
     pointmap = plane_pointmap(np.eye(4), width=64, height=64)
-    pointmap.depth[:, 32 + 8 :] = 3.0  # a step in the middle of a column of cells
-    gaussians = gaussians_from_pointmap(pointmap, plain(64), everything(pointmap), Config())
-    # 3 columns of 4 whole cells; in the fourth the step falls between cells of 8.
-    assert len(gaussians) == 3 * 4 + 4 * 4
-    assert set(np.unique(gaussians.means[:, 2].numpy().round(4))) == {2.0, 3.0}
+    pointmap.depth[:, 40:] = 3.0
+    gaussians = gaussians_from_pointmap(pointmap, plain(64), everything(pointmap), Config(largest_px=512))
+    assert len(gaussians) == 2
+    assert sorted(gaussians.means[:, 2].tolist()) == pytest.approx([2.0, 3.0], rel=1e-5)
 
 
-def test_images_that_cells_do_not_divide_are_covered_to_the_border():
-    pointmap = plane_pointmap(np.eye(4), width=37, height=21)
-    gaussians = gaussians_from_pointmap(pointmap, plain(37)[:21], everything(pointmap), Config())
-    u = gaussians.means[:, 0] / gaussians.means[:, 2] * pointmap.K[0, 0] + pointmap.K[0, 2]
-    assert u.min() > 0 and 35 < u.max() < 37
-    image = render(gaussians, pointmap)
-    assert image[2:-2, 2:-2].min() > 0.1
+def foliage(size: int) -> np.ndarray:
+    """Leaves of all sizes, each of one colour; the same picture at every size."""
+    random = np.random.default_rng(0)
+    image = np.zeros((512, 512, 3), np.uint8)
+    for _ in range(3000):
+        x, y, radius = *random.integers(0, 512, 2), random.integers(4, 16)
+        cv2.circle(image, (int(x), int(y)), int(radius), random.integers(0, 255, 3).tolist(), -1, cv2.LINE_AA)
+    return np.asarray(cv2.resize(image, (size, size), interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def count(image: np.ndarray) -> int:
+    pointmap = plane_pointmap(np.eye(4), width=image.shape[1], height=image.shape[0])
+    return len(gaussians_from_pointmap(pointmap, image, everything(pointmap), Config()))
+
+
+def test_the_number_follows_from_what_there_is_to_see():
+    leaves, half = foliage(512), foliage(512)
+    half[:, 256:] = 128
+    assert count(plain(512)) * 50 <= count(leaves)
+    assert 0.4 * count(leaves) < count(half) < 0.6 * count(leaves)
+
+
+def test_the_same_picture_of_twice_the_size_takes_about_as_many():
+    small, large = foliage(256), foliage(512)
+    assert count(large) == pytest.approx(count(np.repeat(np.repeat(small, 2, 0), 2, 1)), rel=0.2)
+
+
+def test_every_wanted_pixel_is_covered_up_to_the_border():
+    pointmap, config = plane_pointmap(np.eye(4), width=137, height=91), Config(footprint=1.8, opacity=0.95)
+    image = render(gaussians_from_pointmap(pointmap, plain(137)[:91], everything(pointmap), config), pointmap)
+    assert image[2:-2, 2:-2, 2].min() > 0.5 * 204 / 255 and image[8:-8, 8:-8, 2].min() > 0.75 * 204 / 255
 
 
 def test_gaussians_lie_on_a_slanted_plane_and_face_along_its_normal():
@@ -130,29 +157,53 @@ def test_gaussians_lie_on_a_slanted_plane_and_face_along_its_normal():
     gaussians = gaussians_from_pointmap(pointmap, checkerboard(64, 8)[:48], everything(pointmap), Config())
     assert len(gaussians) > 50
     np.testing.assert_allclose((gaussians.means.numpy() - (0, 0, 3)) @ NORMAL, 0, atol=1e-5)
-    np.testing.assert_allclose(normals(gaussians), np.tile(NORMAL, (len(gaussians), 1)), atol=1e-5)
+    # Those seen at the most grazing angles are turned a little towards the camera.
+    np.testing.assert_allclose(normals(gaussians), np.tile(NORMAL, (len(gaussians), 1)), atol=5e-3)
     assert set(gaussians.source_frame.tolist()) == {5}
 
 
-def test_size_colour_and_opacity_of_one_cell():
+def test_size_colour_and_opacity_of_one_piece():
     pointmap = plane_pointmap(np.eye(4), width=16, height=16)
-    config = Config(footprint=0.5, thickness=0.1, opacity=0.8)
+    config = Config(largest_px=512, footprint=1.5, thickness=0.1, opacity=0.8)
     gaussians = gaussians_from_pointmap(pointmap, plain(16), everything(pointmap), config)
-    extent = 0.5 * 16 * 2.0 / pointmap.K[0, 0]
+    extent = 1.5 * 16 / 12**0.5 * 2.0 / pointmap.K[0, 0]  # a square's standard deviation is its side over root 12
     torch.testing.assert_close(gaussians.scales, torch.tensor([[extent, extent, 0.1 * extent]], dtype=torch.float32))
     torch.testing.assert_close(gaussians.means, torch.tensor([[0.0, 0.0, 2.0]]), rtol=0, atol=1e-6)
     torch.testing.assert_close(gaussians.rgb, torch.tensor([[0.2, 0.4, 0.8]]))
     torch.testing.assert_close(gaussians.opacities, torch.tensor([0.8]))
 
 
+def test_a_gaussian_is_as_long_and_wide_as_its_piece_and_lies_along_it():
+    pointmap = plane_pointmap(np.eye(4), width=32, height=32)
+    rows, columns = np.indices((32, 32))
+    stripe = np.abs(rows - columns) < 3
+    image = np.where(stripe[..., None], 255, 0).repeat(3, 2).astype(np.uint8)
+    gaussians = gaussians_from_pointmap(pointmap, image, stripe, Config(largest_px=512))
+    assert len(gaussians) == 1
+    long, wide, _ = gaussians.scales[0].tolist()
+    v, u = np.nonzero(stripe)
+    expected = np.sqrt(np.linalg.eigvalsh(np.cov(u, v, bias=True) + np.eye(2) / 12))
+    assert long / wide == pytest.approx(expected[1] / expected[0], rel=1e-3)
+    axes = Rotation.from_quat(gaussians.quats.numpy()[:, [1, 2, 3, 0]]).as_matrix()[0]
+    assert abs(axes[:, 0] @ (0.5**0.5, 0.5**0.5, 0)) == pytest.approx(1, abs=1e-4)
+
+
 def test_foreshortened_gaussians_are_longer_along_the_line_of_sight():
     pointmap = plane_pointmap(np.eye(4), (0.6, 0.0, -0.8), (0, 0, 2), width=16, height=16)
-    config = Config(colour_deviation=1.0, depth_deviation=1.0)
+    config = Config(largest_px=512, most_error=1e6)
     gaussians = gaussians_from_pointmap(pointmap, plain(16), everything(pointmap), config)
     along, across, _ = gaussians.scales[0].tolist()
-    assert along / across == pytest.approx(1 / 0.8, rel=1e-3)
+    assert along / across == pytest.approx(1 / 0.8, rel=0.02)
     axes = Rotation.from_quat(gaussians.quats.numpy()[:, [1, 2, 3, 0]]).as_matrix()[0]
-    assert abs(axes[:, 0] @ (0.8, 0, 0.6)) == pytest.approx(1, abs=1e-5)
+    assert abs(axes[:, 0] @ (0.8, 0, 0.6)) == pytest.approx(1, abs=1e-3)
+
+
+def test_a_surface_seen_edge_on_is_not_stretched_out_without_end():
+    pointmap = plane_pointmap(np.eye(4), width=16, height=16)
+    pointmap = replace(pointmap, normal=np.tile(np.array([1.0, 0, 0], np.float32), (16, 16, 1)))
+    gaussians = gaussians_from_pointmap(pointmap, plain(16), everything(pointmap), Config(largest_px=512))
+    assert normals(gaussians)[0, 2] == pytest.approx(-0.25, abs=0.01)
+    assert 2 < float(gaussians.scales[0, 0] / gaussians.scales[0, 1]) < 5
 
 
 def test_a_single_wanted_pixel_becomes_a_gaussian_at_its_point():
@@ -161,8 +212,8 @@ def test_a_single_wanted_pixel_becomes_a_gaussian_at_its_point():
     wanted[20, 7] = True
     gaussians = gaussians_from_pointmap(pointmap, plain(32), wanted, Config())
     np.testing.assert_allclose(gaussians.means.numpy(), pointmap.points[20, 7][None], rtol=1e-5)
-    smallest = Config().footprint * Config().smallest_cell_px * pointmap.depth[20, 7] / pointmap.K[0, 0]
-    assert float(gaussians.scales[0, 1]) == pytest.approx(smallest, rel=1e-5)
+    smallest = Config().footprint / 12**0.5 * pointmap.depth[20, 7] / pointmap.K[0, 0]
+    assert float(gaussians.scales[0, 1]) == pytest.approx(smallest, rel=0.05)
 
 
 def test_nothing_wanted_gives_no_gaussians():
@@ -183,7 +234,8 @@ def test_the_gaussians_of_a_textured_plane_look_like_the_photograph():
     pointmap = plane_pointmap(np.eye(4), NORMAL, width=64, height=64)
     v, u = np.indices((64, 64)) / 63.0
     image = (255 * np.stack([u, v, 0.5 + 0.4 * np.sin(9 * u)], -1)).astype(np.uint8)
-    gaussians = gaussians_from_pointmap(pointmap, image, everything(pointmap), Config())
+    # Opaque and wide enough to leave no gaps, as the refinement makes them.
+    gaussians = gaussians_from_pointmap(pointmap, image, everything(pointmap), Config(footprint=1.8, opacity=0.95))
     error = render(gaussians, pointmap) - torch.from_numpy(image).float() / 255
     assert float(error[4:-4, 4:-4].abs().mean()) < 0.04
 
@@ -199,7 +251,7 @@ def test_what_two_views_see_starts_from_one_of_them():
 def test_doubtful_pixels_start_no_gaussian():
     pointmap = plane_pointmap(np.eye(4), width=32, height=32)
     pointmap.confidence[:, :16] = 0.04
-    gaussians = initial_gaussians([pointmap], [plain(32)], Config(min_confidence=0.05))
+    gaussians = initial_gaussians([pointmap], [plain(32)], Config(min_confidence=0.05, largest_px=256))
     assert len(gaussians) == 2 and gaussians.means[:, 0].min() > 0
 
 
@@ -208,18 +260,10 @@ def test_at_most_as_many_gaussians_as_are_allowed(most):
     noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3)).astype(np.uint8)
     pointmap = plane_pointmap(np.eye(4), width=64, height=64)
     free = initial_gaussians([pointmap], [noise], Config())
-    assert len(free) == 32 * 32
+    assert len(free) > 2000
     bounded = initial_gaussians([pointmap], [noise], Config(), max_gaussians=most)
     assert len(bounded) <= most
     assert len(bounded) >= min(most // 4, len(free))  # and not many fewer
-
-
-def test_cells_that_do_not_halve_into_the_smallest_are_refused():
-    with pytest.raises(ValueError, match="power of two, got 3 and 16"):
-        Config(smallest_cell_px=3)
-    with pytest.raises(ValueError, match="at least 1"):
-        Config(smallest_cell_px=0)
-    assert Config(smallest_cell_px=4, largest_cell_px=4).largest_cell_px == 4
 
 
 def render(gaussians: Gaussians, pointmap: Pointmap) -> torch.Tensor:

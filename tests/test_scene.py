@@ -39,9 +39,9 @@ def test_a_scene_begins_with_the_registered_cameras_and_a_gaussian_for_what_they
     ]
     assert float(scene.views[1].T_world_camera[0, 3]) == pytest.approx(0.3)
     sources = scene.gaussians.source_frame
-    # 16 x 12 cells of noise from the surer view; from the other what only it sees: 0.3 * 35.2 / 2 = 5.3 of 32 columns.
-    assert int((sources == 0).sum()) == 16 * 12
-    assert 2 * 12 <= int((sources == 1).sum()) <= 4 * 12
+    # Every pixel of noise from the surer view; from the other what only it sees: 0.3 * 35.2 / 2 = 5.3 of 32 columns.
+    assert int((sources == 0).sum()) == 32 * 24
+    assert 4 * 24 <= int((sources == 1).sum()) <= 6 * 24
     assert int((sources == background.SOURCE_FRAME).sum()) > 10
 
 
