@@ -35,7 +35,8 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sh: float = 2e-2
     translation: float = 2e-4
     rotation: float = 2e-4  # radians
-    final: float = 0.1  # all of them have fallen to this part at the end, exponentially
+    final: float = 0.1  # those of the Gaussians have fallen to this part at the end, exponentially
+    final_pose: float = 0.1  # and those of the cameras to this
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -119,7 +120,8 @@ class _Fit:
         """One iteration on view `index`; `progress` in [0, 1] sets resolution and step sizes."""
         half = progress < self._config.half_resolution_share
         target = self._targets[half][index]
-        decay = self._config.rates.final**progress
+        rates = self._config.rates
+        decay, pose_decay = rates.final**progress, rates.final_pose**progress
         refine_pose = self._config.refine_poses and index > 0
         T_world_camera = self._Ts_world_camera[index].requires_grad_(refine_pose)
         channels = self._terms.channels(progress) if self._terms else ("rgb",)
@@ -133,7 +135,7 @@ class _Fit:
         self._adam.step()
         self._adam.zero_grad()
         if refine_pose and T_world_camera.grad is not None:
-            self._move_camera(index, twist_gradient(T_world_camera.detach(), T_world_camera.grad), decay)
+            self._move_camera(index, twist_gradient(T_world_camera.detach(), T_world_camera.grad), pose_decay)
         self._iterations += 1
 
     def _render(self, T_world_camera: Tensor, K: Tensor, width: int, height: int, channels: Collection[str]) -> Render:

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recon import background, completion, density
+from recon import background, completion, density, pixelwise
 from recon.gaussians import Gaussians, concatenate
 from recon.priors.pointmap import Pointmap
 from recon.registration.register import RegisteredCamera
@@ -82,10 +82,13 @@ def begin(
     sampling: density.Config,
     shell: background.Config,
     max_gaussians: int | None = None,
+    by_pixel: pixelwise.Config | None = None,
 ) -> Scene:
-    """The scene that has not been optimised: cameras as registered, Gaussians from the point maps."""
+    """The scene that has not been optimised: cameras as registered, Gaussians from the point maps.
+
+    With `by_pixel` it has a Gaussian for each pixel that stereo knows, and neither completion nor a far shell.
+    """
     pictures = [images[pointmap.name] for pointmap in pointmaps]
-    completed = completion.complete(pointmaps, pictures, completing)
     views = tuple(
         View(
             name=pointmap.name,
@@ -99,6 +102,9 @@ def begin(
         )
         for pointmap, camera in zip(pointmaps, cameras, strict=True)
     )
+    if by_pixel is not None:
+        return Scene(views, pixelwise.pixelwise_gaussians(pointmaps, pictures, by_pixel, max_gaussians))
+    completed = completion.complete(pointmaps, pictures, completing)
     behind = background.background(pointmaps, pictures, shell, None if max_gaussians is None else max_gaussians // 10)
     left = None if max_gaussians is None else max_gaussians - len(behind)
     surfaces = density.initial_gaussians(completed, pictures, sampling, left)

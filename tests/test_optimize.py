@@ -266,3 +266,18 @@ def test_further_losses_count_on_training_views_and_pseudo_views(truth, monkeypa
 def test_a_term_without_a_point_map_names_the_view(truth):
     with pytest.raises(ValueError, match=r"0\.png has no point map"):
         last(truth, Config(iterations=1, regularise=regularise.Config(normal=regularise.Term(1.0))))
+
+
+def test_the_steps_of_cameras_fall_by_a_part_of_their_own(truth):
+    def moved(**final: float) -> tuple[float, float]:
+        fit = optimize._Fit(disturbed(truth), Config(rates=Rates(**final)), seed=0)
+        fit.step(1, progress=1.0)
+        scene = fit.scene()
+        camera = (scene.views[1].T_world_camera - truth.views[1].T_world_camera).abs().max()
+        return float((scene.gaussians.sh - disturbed(truth).gaussians.sh).abs().max()), float(camera)
+
+    gaussians, camera = moved()
+    slower_gaussians, same_camera = moved(final=0.01)
+    same_gaussians, slower_camera = moved(final_pose=0.01)
+    assert slower_gaussians == pytest.approx(0.1 * gaussians, rel=1e-3) and same_camera == camera
+    assert slower_camera == pytest.approx(0.1 * camera, rel=1e-2) and same_gaussians == gaussians

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon import background, completion, density
+from recon import background, completion, density, pixelwise
 from recon.registration.register import RegisteredCamera
 from recon.scene import Scene, begin
 from tests.synthetic import plane_pointmap
@@ -14,7 +14,7 @@ from tests.synthetic import plane_pointmap
 WIDTH, HEIGHT = 32, 24
 
 
-def begun(max_gaussians: int | None = None) -> Scene:
+def begun(max_gaussians: int | None = None, by_pixel: pixelwise.Config | None = None) -> Scene:
     """Two views of a wall of noise, one step apart."""
     step = np.eye(4)
     step[0, 3] = 0.3
@@ -28,7 +28,8 @@ def begun(max_gaussians: int | None = None) -> Scene:
         for i, pointmap in enumerate(pointmaps)
     )
     images = {pointmap.name: noise for pointmap in pointmaps}
-    return begin(pointmaps, images, cameras, completion.Config(), density.Config(), background.Config(), max_gaussians)
+    settings = completion.Config(), density.Config(), background.Config(), max_gaussians, by_pixel
+    return begin(pointmaps, images, cameras, *settings)
 
 
 def test_a_scene_begins_with_the_registered_cameras_and_a_gaussian_for_what_they_saw():
@@ -43,6 +44,14 @@ def test_a_scene_begins_with_the_registered_cameras_and_a_gaussian_for_what_they
     assert int((sources == 0).sum()) == 32 * 24
     assert 4 * 24 <= int((sources == 1).sum()) <= 6 * 24
     assert int((sources == background.SOURCE_FRAME).sum()) > 10
+
+
+@pytest.mark.parametrize("most", [None, 100])
+def test_by_pixel_a_scene_has_what_stereo_knows_and_nothing_else(most):
+    scene = begun(most, pixelwise.Config(opacity=0.1))
+    assert len(scene.views) == 2 and set(scene.gaussians.source_frame.tolist()) == {0, 1}
+    assert len(scene.gaussians) == most or len(scene.gaussians) > WIDTH * HEIGHT
+    torch.testing.assert_close(scene.gaussians.opacities, torch.full((len(scene.gaussians),), 0.1))
 
 
 @pytest.mark.parametrize("most", [150, 20])
