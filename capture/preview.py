@@ -9,13 +9,13 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from capture.frame import Frame
+from capture.frame import Frame, reduced
 from capture.messaging.wire import Header, Message, Numbering, WireError
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     per_second: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # 0: none
-    longer_side: Annotated[int, msgspec.Meta(ge=16, le=4096)] = 480
+    longer_side: Annotated[int, msgspec.Meta(ge=16, le=4096)] = 480  # at least; less than twice as many
     jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 75
 
 
@@ -32,9 +32,7 @@ class PreviewHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 def encode_preview(
     frame: Frame, numbering: Numbering, config: Config, *, state: str, taken: bool, reason: str
 ) -> tuple[PreviewHeader, list[npt.NDArray[np.uint8]]]:
-    scale = min(1.0, config.longer_side / max(frame.width, frame.height))
-    size = max(1, round(frame.width * scale)), max(1, round(frame.height * scale))
-    small = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA)
+    small = reduced(frame.image, config.longer_side)
     options = [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality]
     _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(small, cv2.COLOR_RGB2BGR), options)
     header = PreviewHeader(

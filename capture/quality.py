@@ -64,7 +64,7 @@ def blur_width(image: Image) -> float | None:
 def _edge_width(grey: npt.NDArray, step: tuple[int, int]) -> float | None:
     """Pixels along `step` (rows, columns)."""
     slope = _slope(grey, step)
-    strong = slope >= max(float(np.quantile(slope, 0.9)), EDGE_STEP)
+    strong = slope >= max(float(np.quantile(slope[::2, ::2], 0.9)), EDGE_STEP)  # a sample tells as much
     if strong.mean() < LEAST_EDGES:
         return None
     lost = np.maximum(slope - _slope(_box_mean(grey, step), step), 0)

@@ -15,14 +15,15 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from capture.frame import Frame
+from capture.frame import Frame, reduced
 from capture.quality import Limits, assess, novelty, why_redundant, why_unusable
 
-TRACKED_WIDTH = 320  # longer side of the images in which corners are followed
+TRACKED_SIDE = 320  # the longer side of the images in which corners are followed is at least this
 CORNERS = 100
 LEAST_CORNERS = 12  # fewer tell nothing
 ROUND_TRIP_PX = 1.0  # a corner that is followed there and back must come home
 REMEMBERED_VIEWS = 64  # of which a new one must not be a copy
+DIFFERENT_GIST = 0.3  # mean difference; copies have 0.05, and a look at the gist costs nothing
 
 Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
 Picture = npt.NDArray  # (h, w) or (h, w, 3) uint8
@@ -55,13 +56,22 @@ class Motion:
     parallax: float  # distance from the best homography, in longer sides
 
 
+@dataclass(frozen=True)
+class _View:
+    """A key frame as it is remembered."""
+
+    name: str
+    small: Picture
+    gist: Picture
+
+
 class Selector:
     """Remembers the key frames so far. Frames are given in the order of their stamps."""
 
     def __init__(self, config: Config, limits: Limits) -> None:
         self.config = config
         self.limits = limits
-        self._views: list[tuple[str, Picture]] = []  # names and small images, newest last
+        self._views: list[_View] = []  # newest last
         self._start: Picture | None = None  # the last key frame as it is followed, grey
         self._corners: Points = np.zeros((0, 1, 2), np.float32)
         self._now: Points = self._corners
@@ -73,7 +83,7 @@ class Selector:
         if frame.stamp_ns < self._next_ns and not self.config.every_frame:
             return Decision(False, "between two examinations", False)
         self._next_ns = frame.stamp_ns + round(1e9 / self.config.per_second)
-        small = _small(frame.image)
+        small = reduced(frame.image, TRACKED_SIDE)
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
         reason, adds = self._what_it_adds(grey, patience=1 + waiting / self.config.backlog)
         if not adds:
@@ -104,9 +114,12 @@ class Selector:
 
     def _fault(self, frame: Frame, small: Picture) -> str | None:
         """Why the frame cannot be used, or is one that was taken before."""
-        for name, view in reversed(self._views):
-            if view.shape == small.shape and why_redundant(novelty(small, view), self.limits):
-                return f"duplicate: it shows what {name} shows"
+        gist = _gist(small)
+        for view in reversed(self._views):
+            if np.abs(gist - view.gist).mean() > DIFFERENT_GIST or view.small.shape != small.shape:
+                continue
+            if why_redundant(novelty(small, view.small), self.limits):
+                return f"duplicate: it shows what {view.name} shows"
         quality = assess(frame.image)
         fault = why_unusable(quality, self.limits, self._sharpest_px)
         if quality.blur_px is not None:
@@ -114,7 +127,7 @@ class Selector:
         return fault
 
     def _remember(self, name: str, small: Picture, grey: Picture) -> None:
-        self._views = [*self._views[1 - REMEMBERED_VIEWS :], (name, small)]
+        self._views = [*self._views[1 - REMEMBERED_VIEWS :], _View(name, small, _gist(small))]
         self._start = grey
         found = cv2.goodFeaturesToTrack(grey, CORNERS, qualityLevel=0.01, minDistance=8)
         self._corners = self._now = np.zeros((0, 1, 2), np.float32) if found is None else found
@@ -164,7 +177,7 @@ def what_it_adds(motion: Motion, config: Config, patience: float = 1.0) -> tuple
     return f"adds too little since the last key frame: {values}", False
 
 
-def _small(image: Picture) -> Picture:
-    scale = min(1.0, TRACKED_WIDTH / max(image.shape[:2]))
-    size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+def _gist(small: Picture) -> Picture:
+    """(12, 16) grey levels of unit contrast."""
+    grey = cv2.cvtColor(cv2.resize(small, (16, 12), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY).astype(float)
+    return (grey - grey.mean()) / (grey.std() + 1)

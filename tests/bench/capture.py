@@ -28,7 +28,7 @@ from capture.preview import PreviewHeader
 from capture.status import CaptureStatus
 
 RATE, WIDTH, HEIGHT = 30, 1280, 720
-FRAMES = 120
+FRAMES = 240
 
 
 def main() -> None:
@@ -49,11 +49,11 @@ def write_walk(folder: Path) -> list[Path]:
     """A camera that slides along a textured wall, there and back: new views every few frames, and sensor noise."""
     folder.mkdir()
     rng = np.random.default_rng(0)
-    layers = [rng.uniform(0, 80, (HEIGHT // cell, 2 * WIDTH // cell, 3)) for cell in (4, 12, 40)]
-    wall = sum(cv2.resize(layer, (2 * WIDTH, HEIGHT)) for layer in layers)
+    layers = [rng.uniform(0, 80, (HEIGHT // cell, 2 * WIDTH // cell, 3)) for cell in (8, 24, 60)]
+    wall = np.sum([cv2.resize(layer, (2 * WIDTH, HEIGHT)) for layer in layers], axis=0)
     for index in range(FRAMES):
         left = int(WIDTH / 2 * (1 - np.cos(2 * np.pi * index / FRAMES)))
-        noisy = wall[:, left : left + WIDTH] + rng.normal(0, 2, (HEIGHT, WIDTH, 1))
+        noisy = wall[:, left : left + WIDTH] + rng.normal(0, 1, (HEIGHT, WIDTH, 1))
         image = np.clip(noisy, 0, 255).astype(np.uint8)
         cv2.imwrite(str(folder / f"{index:04d}.jpg"), image, [cv2.IMWRITE_JPEG_QUALITY, 90])
     return sorted(folder.iterdir())
@@ -99,10 +99,11 @@ def observe(pid: int, network: Network, photographs: list[Path], seconds: float)
     decoding = decoding_s(photographs) * rate
     return {
         "frames_per_second_reached": rate,
-        "key_frames": newest.header.key_frames,
+        "key_frames_per_second": (newest.header.key_frames - first.header.key_frames) / wall,
         "process_share_of_a_core": used / wall,
         "decoding_share_of_a_core": decoding,
         "besides_decoding": used / wall - decoding,
+        "photograph_kb": float(np.median([path.stat().st_size for path in photographs])) / 1000,
         "preview_ms": {str(q): float(np.percentile(latencies, q)) for q in (50, 95, 99)},
         "previews_seen_per_second": seen / wall,
         "rss_mb": newest.header.rss_mb,
