@@ -1,8 +1,8 @@
 """The scene as Open3D draws it: geometry by name, added and removed whole.
 
 Open3D ends the process when a cloud is updated with fewer points than it was added with, and ignores an update with
-more: nothing is ever updated here. Its unlit materials take colours for sRGB and show them as linear light, so they are
-encoded once more on the way.
+more: nothing is ever updated here. It takes images and the background for sRGB and shows them as linear light, so they
+are encoded once more on the way; colours of points and lines it shows as they are.
 """
 
 from __future__ import annotations
@@ -65,6 +65,7 @@ def image3d(image: npt.NDArray[np.uint8]) -> o3d.geometry.Image:
 
 
 def _splats(gaussians: GaussianArrays, _state: State) -> tuple[o3d.t.geometry.PointCloud, rendering.MaterialRecord]:
+    """Open3D 0.20 leaves out what covers more than 256 of its tiles, whatever its material says: the far shell."""
     cloud = o3d.t.geometry.PointCloud(_tensor(gaussians.means))
     cloud.point["f_dc"] = _tensor(gaussians.sh[:, 0])
     degree = round(gaussians.sh.shape[1] ** 0.5) - 1
@@ -76,7 +77,6 @@ def _splats(gaussians: GaussianArrays, _state: State) -> tuple[o3d.t.geometry.Po
     cloud.point["opacity"] = _tensor(np.log(opacities / (1.0 - opacities))[:, None])  # Open3D keeps the logit
     material = _material("gaussianSplat")
     material.gaussian_splat_sh_degree = degree
-    material.gaussian_splat_max_tiles_per_splat = 1 << 16  # Gaussians of the far shell are wide
     return cloud, material
 
 
@@ -93,7 +93,7 @@ def _lines(lines: Lines) -> tuple[o3d.geometry.LineSet, rendering.MaterialRecord
     geometry = o3d.geometry.LineSet(
         o3d.utility.Vector3dVector(ends), o3d.utility.Vector2iVector(np.arange(len(ends)).reshape(-1, 2))
     )
-    geometry.paint_uniform_color(_encoded(np.array(lines.colour)))
+    geometry.paint_uniform_color(np.array(lines.colour))
     material = _material("unlitLine")
     material.line_width = float(lines.width)
     return geometry, material
@@ -106,6 +106,7 @@ def _photograph(photograph: Photograph) -> tuple[o3d.geometry.TriangleMesh, rend
         o3d.utility.Vector3dVector(photograph.corners), o3d.utility.Vector3iVector(triangles)
     )
     corners = np.array([[0.0, 1.0], [1.0, 1.0], [1.0, 0.0], [0.0, 0.0]])  # v points up
+    mesh.vertex_colors = o3d.utility.Vector3dVector(np.ones((4, 3)))  # without them the image is half as bright
     mesh.triangle_uvs = o3d.utility.Vector2dVector(corners[triangles.ravel()])
     levels = np.rint(255 * _encoded(np.arange(256) / 255.0)).astype(np.uint8)
     material = _material("defaultUnlit")

@@ -167,7 +167,7 @@ BINDINGS = (
     Binding("space", "pause: keep what is shown", _pause),
     Binding("left", "back in time", _time(-1)),
     Binding("right", "forward in time", _time(1)),
-    Binding("escape", "leave a camera, close the help", _leave),
+    Binding("x", "leave a camera, close the help", _leave),
 )
 
 COMMANDS = {"r": "look at the whole scene", "s": "save a screenshot", "q": "close the viewer"}

@@ -36,7 +36,6 @@ _SMOOTH_S = 0.06  # a picture that takes longer is painted at half the resolutio
 _PANEL_EMS = 22  # the panel's width, in letter widths of the theme
 _KEYS = {
     gui.KeyName.SPACE: "space",
-    gui.KeyName.ESCAPE: "escape",
     gui.KeyName.LEFT: "left",
     gui.KeyName.RIGHT: "right",
 }
