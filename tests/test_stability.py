@@ -57,11 +57,11 @@ def estimated(*degrees: float, turn: float = 0.0) -> list[CameraEstimate]:
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory) -> Places:
-    """Two places of twelve photographs each, 6 degrees apart; pixels without a meaning."""
+    """Three places of twelve photographs each, 6 degrees apart; pixels without a meaning."""
     folder = tmp_path_factory.mktemp("places")
     rng = np.random.default_rng(0)
     made = []
-    for name in ("east", "west"):
+    for name in ("east", "south", "west"):
         names = tuple(f"{i:02d}.png" for i in range(12))
         for image_name in names:
             small = rng.integers(0, 256, (12, 16, 3), dtype=np.uint8)
@@ -203,6 +203,18 @@ def test_neighbours_are_as_far_apart_as_they_may_be():
     assert neighbours(np.stack([on_arc(30.0 * i) for i in range(5)]), 3, 12.0) == ([], 1)
 
 
+def test_seeds_take_turns_through_the_places(places):
+    stages = [Stage(places, "a row", seed) for seed in range(3)]
+    assert {stage.photos(3)[0].place for stage in stages} == {"east", "south", "west"}
+    for stage in stages:
+        here = stage.photos(3)
+        (elsewhere,) = stage.photos(1, here)
+        assert elsewhere.place != here[0].place
+        assert len({photo.place for photo in stage.one_of_each(5)}) == 3
+    with pytest.raises(ValueError, match="row 'a row' needs a place with 13 photographs"):
+        stages[0].photos(13)
+
+
 def test_parallel_views_do_not_turn():
     def sideways(turn: float) -> np.ndarray:
         Ts_world_camera = np.stack([on_arc(turn * i) for i in range(6)])
@@ -315,7 +327,7 @@ def test_a_campaign_goes_on_where_it_was_stopped(tmp_path, places, monkeypatch):
     assert [(t["row"], t["seed"]) for t in content["trials"]] == [(1, 0), (1, 1), (2, 0), (2, 1)]
     assert content["false_accept_rate"] == 0.0 and content["false_refuse_rate"] is None
     elsewhere = Places(places.walked[:1])
-    with pytest.raises(ValueError, match="is of the scenes east, west, now there are east"):
+    with pytest.raises(ValueError, match="is of the scenes east, south, west, now there are east"):
         run_campaign(Plan(rows, (0,), ("splatnode",)), elsewhere, tmp_path, "command")
 
 

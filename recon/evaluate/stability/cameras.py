@@ -30,8 +30,7 @@ def clean_apart(stage: Stage) -> Case:
 def parallel_views(stage: Stage) -> Case:
     """Where they are weak, the focal length is a guess: a right scene is as good as a refusal."""
     fitting = (Code.FOCAL_SUSPECT, Code.BASELINE_TOO_SMALL, Code.AMBIGUOUS)
-    for turn in range(len(stage.places.walked)):
-        place = stage.place(turn)
+    for place in stage.in_turn():
         starts, stride = parallel(place.Ts_world_camera, 4)
         if starts:
             start = int(stage.rng.choice(starts))
@@ -69,7 +68,7 @@ def single(stage: Stage) -> Case:
 
 @row(5, "two views")
 def two_views(stage: Stage) -> Case:
-    place = stage.place()
+    place = stage.in_turn()[0]
     gap = 1 if stage.seed % 2 else max(1, (len(place.names) - 1) // 3)
     start = int(stage.rng.integers(len(place.names) - gap))
     note = f"{gap} apart in the order of capture"
@@ -94,8 +93,7 @@ def tiny_baseline(stage: Stage) -> Case:
 
 @row(9, "places that share nothing")
 def places_apart(stage: Stage) -> Case:
-    count = min(5, len(stage.places.walked))
-    chosen = [photo for turn in range(count) for photo in renamed(stage.photos(1, turn), str(turn))]
+    chosen = stage.one_of_each(5)
     case = refused(chosen, "one of each", Code.NO_OVERLAP, Code.SPLIT, Code.TOO_FEW_VIEWS, Code.AMBIGUOUS)
     return replace(case, worlds=tuple(world([photo]) for photo in chosen))
 
@@ -103,15 +101,15 @@ def places_apart(stage: Stage) -> Case:
 @row(9, "views that share nothing")
 def views_apart(stage: Stage) -> Case:
     """The corners of an orbit, or where no place was walked around, the ends of two walks."""
-    for turn in range(len(stage.places.walked)):
-        place = stage.place(turn)
+    for place in stage.in_turn():
         apart = far_apart(place, 4, 60.0, stage.rng)
         if apart:
             note = "at least 60 degrees apart"
             # Photographs with a wide lens may share something all the same.
             fitting = (Code.NO_OVERLAP, Code.SPLIT, Code.AMBIGUOUS, Code.BASELINE_TOO_SMALL)
             return either(place.photos(apart), note, *fitting)
-    first, second = renamed(stage.photos(2), "a"), renamed(stage.photos(2, turn=1), "b")
+    first = renamed(stage.photos(2), "a")
+    second = renamed(stage.photos(2, first), "b")
     case = refused(first + second, "two of each", Code.NO_OVERLAP, Code.SPLIT)
     return replace(case, worlds=(world(first), world(second)))
 

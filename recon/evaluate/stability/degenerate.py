@@ -8,7 +8,7 @@ import numpy as np
 
 from recon.evaluate.stability.case import Case, refused, row
 from recon.evaluate.stability.pixels import patchwork, static_noise
-from recon.evaluate.stability.places import Photo, Stage, renamed
+from recon.evaluate.stability.places import Photo, Stage
 from recon.evaluate.stability.warps import poster_views, turned_crops
 from recon.verdict import Code
 
@@ -30,7 +30,7 @@ def recorded_rotation(stage: Stage) -> Case:
     """A camera on a tripod, where there is a recording of one; else turned crops of a photograph of the built-in."""
     turned = stage.places.turned
     if not turned:
-        (photo,) = stage.photos(1, turn=1)
+        (photo,) = stage.photos(1)
         crops = turned_crops(photo, np.linspace(-9.0, 9.0, 4), np.zeros(4))
         return refused(crops, "crops turned to the side", Code.NO_PARALLAX)
     place = turned[stage.seed % len(turned)]
@@ -49,8 +49,7 @@ def poster(stage: Stage) -> Case:
 @row(11, "every frame from elsewhere")
 def from_elsewhere(stage: Stage) -> Case:
     """Every frame is of a place that is not in the truth: whatever is published is wrong."""
-    count = min(4, len(stage.places.walked))
-    photos = [photo for turn in range(count) for photo in renamed(stage.photos(1, turn), str(turn))]
+    photos = stage.one_of_each(4)
     views = [
         replace(photo, image=np.ascontiguousarray(photo.image[:, :: (-1) ** number]), camera=None)
         for number, photo in enumerate(photos)
@@ -68,7 +67,7 @@ def pure_noise(stage: Stage) -> Case:
 @row(11, "patchwork")
 def patches(stage: Stage) -> Case:
     """Pieces of real photographs without an order: features everywhere, matches here and there, and no place."""
-    images = [photo.image for turn in range(2) for photo in stage.photos(2, turn)]
+    images = [photo.image for photo in stage.one_of_each(4)]
     rng = stage.rng
     frames = [Photo(f"patchwork_{i}.png", patchwork(images, 600, 800, 6, rng), None) for i in range(4)]
     return refused(frames, "36 pieces each of 4 photographs", *_NOTHING, Code.MOVING_SCENE)

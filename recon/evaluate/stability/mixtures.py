@@ -17,7 +17,8 @@ _AMBIGUOUS = (Code.AMBIGUOUS, Code.SPLIT, Code.OUTLIER_VIEW, Code.NO_OVERLAP, Co
 
 @row(10, "one outlier")
 def outlier(stage: Stage) -> Case:
-    here, elsewhere = stage.photos(4), renamed(stage.photos(1, turn=1), "elsewhere")
+    here = stage.photos(4)
+    elsewhere = renamed(stage.photos(1, here), "elsewhere")
     photos = here + elsewhere
     order = [photos[i] for i in stage.rng.permutation(len(photos))]
     case = accepted(order, "one of the second place", Code.OUTLIER_VIEW, Code.OK_PARTIAL)
@@ -26,7 +27,8 @@ def outlier(stage: Stage) -> Case:
 
 @row(10, "two places")
 def two_places(stage: Stage) -> Case:
-    here, there = renamed(stage.photos(4), "here"), renamed(stage.photos(3, turn=1), "there")
+    here = renamed(stage.photos(4), "here")
+    there = renamed(stage.photos(3, here), "there")
     case = either(here + there, "4 and 3", *_AMBIGUOUS)
     return replace(case, codes=case.codes - {Code.OK}, worlds=(world(here), world(there)))
 
@@ -82,15 +84,15 @@ def doubled(stage: Stage) -> Case:
 @row(14, "opposite sides")
 def opposite_sides(stage: Stage) -> Case:
     """Neighbours from two sides of one place, which share no surface but may share its style."""
-    for turn in range(len(stage.places.walked)):
-        place = stage.place(turn)
+    for place in stage.in_turn():
         apart = far_apart(place, 2, 75.0, stage.rng)
         if apart and len(place.names) >= 10:
             indices = sorted(
                 {min(max(middle + step, 0), len(place.names) - 1) for middle in apart for step in (-1, 0, 1)}
             )
             return either(place.photos(indices), "neighbours on two sides", *_AMBIGUOUS)
-    near, far = stage.photos(3), renamed(stage.photos(3, turn=1), "far")
+    near = stage.photos(3)
+    far = renamed(stage.photos(3, near), "far")
     case = either(near + far, "3 of each", *_AMBIGUOUS)
     return replace(case, codes=case.codes - {Code.OK}, worlds=(world(near), world(far)))
 
@@ -99,7 +101,7 @@ def opposite_sides(stage: Stage) -> Case:
 def picture_elsewhere(stage: Stage) -> Case:
     """A frame of another place in which a photograph of this one hangs on the wall."""
     here = stage.photos(4)
-    (wall,) = renamed(stage.photos(1, turn=1), "elsewhere")
+    (wall,) = renamed(stage.photos(1, here), "elsewhere")
     side = (0.4, 0.6)[stage.seed % 2]
     size = round(side * wall.image.shape[1]), round(side * wall.image.shape[0])
     picture = cv2.resize(here[1].image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
@@ -113,8 +115,9 @@ def picture_elsewhere(stage: Stage) -> Case:
 @row(14, "the same thing in two places")
 def same_thing(stage: Stage) -> Case:
     """A big poster that hangs in both places: all frames share it, and nothing else."""
-    here, there = renamed(stage.photos(3), "here"), renamed(stage.photos(3, turn=1), "there")
-    (poster,) = stage.photos(1, turn=2)
+    here = renamed(stage.photos(3), "here")
+    there = renamed(stage.photos(3, here), "there")
+    (poster,) = stage.photos(1, here + there)
     views = warps.poster_views(poster, np.linspace(-20.0, 20.0, 6), 1.0)
     photos = [_with_poster(photo, view) for photo, view in zip(here + there, views, strict=True)]
     case = either(photos, "one poster in all", *_AMBIGUOUS, Code.PLANAR_ONLY, Code.MOVING_SCENE)

@@ -97,7 +97,7 @@ def moving_object(stage: Stage) -> Case:
 def own_body(stage: Stage) -> Case:
     """The robot's bumper: the lowest rows of every frame are the same."""
     photos, share = stage.photos(4), (0.1, 0.2)[stage.seed % 2]
-    body = stage.photos(1, turn=1)[0].image
+    body = stage.photos(1, photos)[0].image
 
     def with_body(image: Image) -> Image:
         rows, width = round(share * image.shape[0]), min(image.shape[1], body.shape[1])
@@ -126,7 +126,7 @@ def _changed(photos: Sequence[Photo], change: Callable[[Image], Image]) -> list[
 def _with_passer_by(stage: Stage, photos: Sequence[Photo], share: float) -> list[Photo]:
     """An ellipse of another place's photograph, covering `share` of each frame, on a way of its own."""
     rng = stage.rng
-    cutout = stage.photos(1, turn=1)[0].image
+    cutout = stage.photos(1, photos)[0].image
     way = np.cumsum(rng.normal(scale=0.12, size=(len(photos), 2)), axis=0) + rng.uniform(0.3, 0.7, 2)
     result = []
     for photo, (across, down) in zip(photos, np.clip(way, 0.2, 0.8), strict=True):

@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,7 @@ from recon.evaluate.alignment import angles_deg
 from recon.evaluate.demo import write_capture
 from recon.evaluate.truth import EvaluationScene, TrueCamera, load_scene
 
+T = TypeVar("T")
 Image = npt.NDArray[np.uint8]
 Poses = npt.NDArray[np.float64]  # (M, 4, 4) T_world_camera
 
@@ -85,35 +87,52 @@ class Stage:
         """Fresh at every call, the same for the same row and seed."""
         return np.random.default_rng([self.seed, zlib.crc32(self.row_name.encode())])
 
-    def place(self, turn: int = 0) -> Place:
-        """The place of this seed; `turn` 1, 2 ... gives other ones, where there are more."""
-        walked = self.places.walked
-        return walked[(self.seed + turn + zlib.crc32(self.row_name.encode())) % len(walked)]
+    def in_turn(self) -> list[Place]:
+        """All places in which the camera moved to the side, that of this seed first."""
+        return _rotated(self.places.walked, self._turn)
 
-    def window(self, count: int, turn: int = 0, step_deg: float = NEIGHBOUR_DEG) -> tuple[Place, list[int]]:
-        """A place, and positions of `count` photographs there that overlap well; other `turn`s give other places.
+    def window(
+        self, count: int, apart_from: Sequence[Photo] = (), step_deg: float = NEIGHBOUR_DEG
+    ) -> tuple[Place, list[int]]:
+        """A place that none of the photographs `apart_from` shows, and positions of `count` that overlap well there.
 
         They are neighbours as far apart as `step_deg` allows, so that the camera has moved; where none are as close,
-        neighbours within `OVERLAP_DEG`. Places without any are passed over. Raises ValueError where all are.
+        neighbours within `OVERLAP_DEG`. Raises ValueError where no place has as many.
         """
-        fitting = []
-        for skipped in range(len(self.places.walked)):
-            place = self.place(skipped)
-            starts, stride = neighbours(place.Ts_world_camera, count, step_deg)
-            if starts:
-                fitting.append((place, starts, stride))
+        shown = {photo.place for photo in apart_from}
+        places = [place for place in self.places.walked if place.name not in shown]
+        found = [(place, *neighbours(place.Ts_world_camera, count, step_deg)) for place in places]
+        fitting = [(place, starts, stride) for place, starts, stride in found if starts]
         if not fitting:
             raise ValueError(
-                f"no place has {count} photographs whose views are {OVERLAP_DEG:g} degrees apart or closer"
+                f"row {self.row_name!r} needs a place with {count} photographs that follow each other at "
+                f"{OVERLAP_DEG:g} degrees or less, and turn {TELLING_DEG:g} degrees in all; give more scenes"
             )
-        place, starts, stride = fitting[turn % len(fitting)]
+        place, starts, stride = _rotated(fitting, self._turn)[0]
         start = int(self.rng.choice(starts))
         return place, [start + stride * i for i in range(count)]
 
-    def photos(self, count: int, turn: int = 0, step_deg: float = NEIGHBOUR_DEG) -> list[Photo]:
+    def photos(self, count: int, apart_from: Sequence[Photo] = (), step_deg: float = NEIGHBOUR_DEG) -> list[Photo]:
         """The photographs of `window`."""
-        place, indices = self.window(count, turn, step_deg)
+        place, indices = self.window(count, apart_from, step_deg)
         return place.photos(indices)
+
+    def one_of_each(self, most: int) -> list[Photo]:
+        """One photograph each of at most `most` places, under names of their own."""
+        chosen: list[Photo] = []
+        for number in range(min(most, len(self.places.walked))):
+            chosen += renamed(self.photos(1, chosen), str(number))
+        return chosen
+
+    @property
+    def _turn(self) -> int:
+        return self.seed + zlib.crc32(self.row_name.encode())
+
+
+def _rotated(items: Sequence[T], turn: int) -> list[T]:
+    """`items` from the one whose turn it is, round to the one before it."""
+    first = turn % len(items)
+    return [*items[first:], *items[:first]]
 
 
 def neighbours(Ts_world_camera: Poses, count: int, step_deg: float) -> tuple[list[int], int]:
@@ -166,15 +185,15 @@ def renamed(photos: Sequence[Photo], mark: str) -> list[Photo]:
 def load_places(scenes: Sequence[Path], out: Path) -> Places:
     """The scenes in their folders, sorted by how their camera moved; without any, the built-in place in `out`/places.
 
-    Raises ValueError where fewer than two scenes have a camera that moved to the side: there would be no mixtures.
+    Raises ValueError where fewer than three scenes have a camera that moved to the side: there would be no mixtures.
     """
     loaded = [_recorded(folder) for folder in scenes] or [built_in(out, seed) for seed in _BUILT_IN_SEEDS]
     kinds = {"walked": [], "forward": [], "turned": []}
     for place in loaded:
         kinds[motion(place.Ts_world_camera)].append(place)
-    if len(kinds["walked"]) < 2:
+    if len(kinds["walked"]) < 3:
         raise ValueError(
-            f"at least two scenes must have a camera that moved to the side, {len(kinds['walked'])} of {len(loaded)} "
+            f"at least three scenes must have a camera that moved to the side, {len(kinds['walked'])} of {len(loaded)} "
             "have; give more scenes, or none to use the built-in place"
         )
     return Places(**{kind: tuple(places) for kind, places in kinds.items()})
