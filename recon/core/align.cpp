@@ -101,7 +101,8 @@ bool invert(double (&matrix)[kModel][kModel], double (&inverse)[kModel][kModel])
     return true;
 }
 
-bool prepare(const Image& image, float x, float y, int radius, Reference& reference) {
+// Without `to_move`, only what a correlation takes.
+bool prepare(const Image& image, float x, float y, int radius, bool to_move, Reference& reference) {
     const int side = 2 * radius + 1, wide = side + 2;
     float around[(kMaxSide + 2) * (kMaxSide + 2)];
     for (int row = 0; row < wide; ++row)
@@ -133,6 +134,7 @@ bool prepare(const Image& image, float x, float y, int radius, Reference& refere
             const float slopes[kModel] = {gx * dx, gx * dy, gy * dx, gy * dy, gx, gy, reference.value[i], 1};
             for (int k = 0; k < kModel; ++k) reference.slopes[k][i] = slopes[k];
         }
+    if (!to_move) return true;
     double normal[kModel][kModel];
     for (int k = 0; k < kModel; ++k)
         for (int j = 0; j <= k; ++j) {
@@ -201,13 +203,14 @@ void align(const Images& images, const Patches& patches, int patch, Reference& r
         return Image{images.pixels[index], images.widths[index], images.heights[index]};
     };
     const float* from = patches.reference + 2 * patch;
-    if (!prepare(image(patches.reference_image[patch]), from[0], from[1], patches.radius, reference)) return;
+    const bool to_move = patches.max_iterations > 0;
+    if (!prepare(image(patches.reference_image[patch]), from[0], from[1], patches.radius, to_move, reference)) return;
     const Image target = image(patches.target_image[patch]);
     float *at = patches.target + 2 * patch, *affine = patches.affine + 4 * patch;
     Warp warp = {at[0], at[1], affine[0], affine[1], affine[2], affine[3]};
     float values[kMaxPixels];
     if (!fetch(target, reference, warp, values)) return;
-    bool converged = patches.max_iterations == 0;
+    bool converged = !to_move;
     for (int iteration = 0; iteration < patches.max_iterations && !converged; ++iteration) {
         float right[kModel] = {};
         for (int k = 0; k < kModel; ++k) {
@@ -231,7 +234,7 @@ void align(const Images& images, const Patches& patches, int patch, Reference& r
     at[0] = warp.x;
     at[1] = warp.y;
     patches.correlation[patch] = correlation;
-    patches.sigma[patch] = position_sigma(reference, warp, correlation);
+    if (to_move) patches.sigma[patch] = position_sigma(reference, warp, correlation);
 }
 
 }  // namespace
@@ -240,7 +243,8 @@ void align(const Images& images, const Patches& patches, int patch, Reference& r
 using namespace core;
 
 // Aligns each patch from its first guess; with no iterations, only its correlation is found. A patch that leaves an
-// image, shows nothing or does not converge has the correlation -1 and keeps its guess. 1 when the radius is too large.
+// image, shows nothing or does not converge has the correlation -1 and keeps its guess; sigma is infinite where nothing
+// was aligned. 1 when the radius is too large.
 CORE_API int core_align(const Images* images, const Patches* patches) {
     if (patches->radius < 1 || patches->radius > kMaxRadius) return 1;
     run_ranges(patches->count, kPatchesPerTask, [&](int begin, int end, int) {

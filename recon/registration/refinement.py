@@ -27,7 +27,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     alignment: alignment.Config = alignment.Config()
     longer_side: int = 1600  # pixels; larger images are shrunk
     blur_px: float = 0.7  # before the patches are compared: interpolation adds less to a smooth image
-    tilts_deg: tuple[float, ...] = (0.0, 35.0, 60.0)  # of the surface against the direction to the reference view
+    tilts_deg: tuple[float, ...] = (0.0, 50.0)  # of the surface against the direction to the reference view
     turns: int = 6  # directions into which a tilted surface is tried
     min_correlation: float = 0.8
     max_move_px: float = 3.0  # from where the point was expected, at 1024 px on the longer side
