@@ -10,12 +10,15 @@ import numpy as np
 import numpy.typing as npt
 
 from capture.frame import Frame, reduced
+from capture.image_file import UnusableImage, decode_image
 from capture.messaging.wire import Header, Message, Numbering, WireError
+
+_LARGEST_SIDE = 4096  # of what is decoded: a JPEG of a few bytes may ask for gigabytes
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     per_second: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # 0: none
-    longer_side: Annotated[int, msgspec.Meta(ge=16, le=4096)] = 480  # at least; less than twice as many
+    longer_side: Annotated[int, msgspec.Meta(ge=16, le=2048)] = 480  # at least; less than twice as many
     jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 75
 
 
@@ -45,7 +48,7 @@ def decode_preview(message: Message[PreviewHeader]) -> npt.NDArray[np.uint8]:
     """(H, W, 3) RGB. Raises WireError where the message holds no JPEG."""
     if len(message.arrays) != 1 or message.arrays[0].size == 0 or message.arrays[0].dtype != np.uint8:
         raise WireError("a preview has one JPEG")
-    image = cv2.imdecode(message.arrays[0].ravel(), cv2.IMREAD_COLOR)
-    if image is None:
-        raise WireError("a preview that is no JPEG")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+    try:
+        return decode_image(message.arrays[0].tobytes(), _LARGEST_SIDE**2)[0]
+    except UnusableImage as error:
+        raise WireError(f"a preview that cannot be shown: {error}") from error

@@ -1,0 +1,44 @@
+"""The configurations that come with the project can be read, and the services do what they say."""
+
+from __future__ import annotations
+
+import configparser
+
+import pytest
+
+import splatnode
+from capture.config import CaptureConfig, load_config, read_yaml
+from tests.conftest import ROOT
+
+CAMERAS = [path for path in sorted((ROOT / "configs").glob("*.yaml")) if "camera" in read_yaml(path)]
+SERVICES = sorted((ROOT / "configs" / "systemd").glob("*.service"))
+
+
+def test_there_is_one_for_each_way_to_begin():
+    assert {"oak.yaml", "remote.yaml", "replay.yaml", "webcam.yaml"} <= {path.name for path in CAMERAS}
+
+
+@pytest.mark.parametrize("path", CAMERAS, ids=lambda path: path.name)
+def test_configurations_can_be_read(path):
+    config = load_config(path, CaptureConfig)
+    assert config.camera.module.stream
+
+
+def test_the_commented_calibration_can_be_used(tmp_path):
+    text = (ROOT / "configs" / "webcam.yaml").read_text()
+    line = next(line for line in text.splitlines() if "# intrinsics:" in line)
+    path = tmp_path / "webcam.yaml"
+    path.write_text(text.replace(line, line.replace("# ", "", 1)))
+    assert load_config(path, CaptureConfig).camera.config.intrinsics.distortion == (0.1, -0.2, 0, 0, 0)
+
+
+@pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)
+def test_services_run_a_verb_under_a_watchdog(path):
+    unit = configparser.ConfigParser(interpolation=None)
+    unit.read(path)
+    service = unit["Service"]
+    program, verb, *_ = service["ExecStart"].split()
+    assert program.endswith("/splatnode") and verb in {verb.name for verb in splatnode.VERBS}
+    assert service["Type"] == "notify" and int(service["WatchdogSec"]) > 0
+    assert service["RuntimeDirectoryMode"] == "0700"  # or the sockets would be refused
+    assert service["Restart"] == "on-failure" and "2" in service["RestartPreventExitStatus"].split()
