@@ -27,6 +27,7 @@ assert not [name for name in sys.modules if name.startswith("torch.")]
         "recon.verdict",
         "recon.export",
         "recon.preview",
+        "recon.daemon.scene_message",
         "viewer",
     ],
 )

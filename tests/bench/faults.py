@@ -76,13 +76,17 @@ def expect(condition: object, otherwise: str) -> None:
         raise AssertionError(otherwise)
 
 
+def wait_for(condition: Callable[[], bool], what: str, patience_s: float = 120.0) -> None:
+    deadline = time.monotonic() + patience_s
+    while not condition():
+        expect(time.monotonic() < deadline, f"no {what} within {patience_s:.0f} s")
+        time.sleep(0.05)
+
+
 def expect_whole(node: Node, views: int = VIEWS) -> None:
     """All photographs in a finished scene, which is exported whole; nothing half written; a clean end."""
     expect_scene(node, views)
-    deadline = time.monotonic() + 30
-    while node.spooled() and time.monotonic() < deadline:
-        time.sleep(0.1)
-    expect(node.spooled() == 0, f"{node.spooled()} key frames were not acknowledged")
+    wait_for(lambda: node.spooled() == 0, "acknowledgement of all key frames", 30)
     expect(node.end("recon") == 0, "recon did not end with 0")
     expect_exports_whole(node)
     expect(not list(node.folder.rglob(".*.tmp")), f"half-written files: {list(node.folder.rglob('.*.tmp'))}")
@@ -143,6 +147,7 @@ def camera_lost(trial: Trial) -> None:
         node.start("capture")
         for index, path in enumerate(sorted(waiting.iterdir())):
             if index == 3:
+                wait_for(lambda: node.log("capture").count("event=keyframe") == 3, "three key frames")
                 gone = trial.images.rename(trial.folder / "gone")
                 trial.some_time(6.0)
                 gone.rename(trial.images)
@@ -172,10 +177,7 @@ def second_publisher(trial: Trial) -> None:
     with running(trial.node()) as node:
         for verb, sign in (("capture", "event=started"), ("recon", "event=ready")):
             node.start(verb)
-            deadline = time.monotonic() + 120
-            while sign not in node.log(verb):
-                expect(time.monotonic() < deadline, f"{verb} did not start")
-                time.sleep(0.1)
+            wait_for(lambda verb=verb, sign=sign: sign in node.log(verb), f"{verb} that runs")
             code = node.start(verb, name=f"second {verb}").wait(120)
             expect(code == 75, f"the second {verb} ended with {code}")
         expect_whole(node)
