@@ -28,6 +28,7 @@ Mask = npt.NDArray[np.bool_]
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_confidence: float = 0.12  # depths below are doubtful
+    least_confidence: float = 0.1  # and those below this tell less than their surroundings do
     like: float = 0.12  # difference of colour, in [0, 1], up to which a point explains a pixel
     object_px: int = 15  # least width of a region of other colour that is taken for a foreground object
     foreground: float = 0.4  # depth of an unknown foreground in units of the nearest known depth of its view
@@ -40,7 +41,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def complete(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Config) -> list[Pointmap]:
     """The point maps with their unknown pixels filled or, where that would contradict another view, empty."""
-    known = [_only(pointmap, pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
+    known = [only(pointmap, pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
     # Blurred, so that a pixel's noise and a point's being half a pixel beside it make no difference.
     calm = [np.asarray(cv2.GaussianBlur(image, (5, 5), 0), np.uint8) for image in images]
     completed = list(known)
@@ -55,8 +56,8 @@ def complete(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Con
         if not hole.any() or not (known[j].depth > 0).any():
             continue
         for guess in _guesses(pointmaps[j], known[j], images[j], falls, occluded, config):
-            guess = _only(guess, hole)
-            guess = _only(guess, ~_hides_known(guess, [known[i] for i in rest], config.in_front))
+            guess = only(guess, hole)
+            guess = only(guess, ~_hides_known(guess, [known[i] for i in rest], config.in_front))
             completed[j] = replace(
                 completed[j],
                 depth=completed[j].depth + guess.depth,
@@ -73,9 +74,9 @@ def _guesses(
     """What a hole may be filled with, the best first."""
     near, far = np.percentile(known.depth[known.depth > 0], [2.0, 100.0])
     yield doubtful
-    yield _only(_facing(known, smooth_depth(known, image, config)), ~falls)
-    yield _only(_facing(known, config.background * far), ~falls)
-    yield _only(_facing(known, config.foreground * near), occluded)
+    yield only(_facing(known, smooth_depth(known, image, config)), ~falls)
+    yield only(_facing(known, config.background * far), ~falls)
+    yield only(_facing(known, config.foreground * near), occluded)
 
 
 def smooth_depth(pointmap: Pointmap, image: Image, config: Config) -> Float32:
@@ -102,7 +103,8 @@ def smooth_depth(pointmap: Pointmap, image: Image, config: Config) -> Float32:
     return (1.0 / np.clip(smooth, 0.5 / known.max(), 2.0 / known.min())).astype(np.float32)
 
 
-def _only(pointmap: Pointmap, keep: Mask) -> Pointmap:
+def only(pointmap: Pointmap, keep: Mask) -> Pointmap:
+    """The point map with nothing known where `keep` (h, w) does not say so."""
     return replace(
         pointmap,
         depth=pointmap.depth * keep,

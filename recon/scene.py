@@ -104,8 +104,9 @@ def begin(
     )
     if by_pixel is not None:
         return Scene(views, pixelwise.pixelwise_gaussians(pointmaps, pictures, by_pixel, max_gaussians))
-    completed = completion.complete(pointmaps, pictures, completing)
-    behind = background.background(pointmaps, pictures, shell, None if max_gaussians is None else max_gaussians // 10)
+    telling = [completion.only(each, each.confidence >= completing.least_confidence) for each in pointmaps]
+    completed = completion.complete(telling, pictures, completing)
+    behind = background.background(telling, pictures, shell, None if max_gaussians is None else max_gaussians // 10)
     left = None if max_gaussians is None else max_gaussians - len(behind)
     surfaces = density.initial_gaussians(completed, pictures, sampling, left)
     return Scene(views, concatenate([surfaces, behind]))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from recon import background, completion, density, pixelwise
+from recon.priors.pointmap import Pointmap
 from recon.registration.register import RegisteredCamera
 from recon.scene import Scene, begin
 from tests.synthetic import plane_pointmap
@@ -21,6 +24,12 @@ def begun(max_gaussians: int | None = None, by_pixel: pixelwise.Config | None = 
     pointmaps = tuple(
         plane_pointmap(T, confidence=c, frame_id=i) for i, (T, c) in enumerate([(np.eye(4), 0.9), (step, 0.5)])
     )
+    return scene_of(pointmaps, max_gaussians, by_pixel)
+
+
+def scene_of(
+    pointmaps: tuple[Pointmap, ...], max_gaussians: int | None = None, by_pixel: pixelwise.Config | None = None
+) -> Scene:
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     principal = np.array([WIDTH / 2, HEIGHT / 2])
     cameras = tuple(
@@ -44,6 +53,15 @@ def test_a_scene_begins_with_the_registered_cameras_and_a_gaussian_for_what_they
     assert int((sources == 0).sum()) == 32 * 24
     assert 4 * 24 <= int((sources == 1).sum()) <= 6 * 24
     assert int((sources == background.SOURCE_FRAME).sum()) > 10
+
+
+def test_depths_that_stereo_does_not_believe_in_move_neither_surfaces_nor_the_shell():
+    sure = tuple(plane_pointmap(np.eye(4), confidence=c, frame_id=i) for i, c in enumerate((0.9, 0.8)))
+    doubtful = tuple(replace(pointmap, depth=pointmap.depth.copy()) for pointmap in sure)
+    for pointmap in (sure[1], doubtful[1]):
+        pointmap.confidence[:8] = 0.05
+    doubtful[1].depth[:8] = 50.0
+    assert torch.equal(scene_of(sure).gaussians.means, scene_of(doubtful).gaussians.means)
 
 
 @pytest.mark.parametrize("most", [None, 100])

@@ -36,9 +36,9 @@ class Confidence:
 class Config:
     max_error: float = 2.0  # forward-backward reprojection error of agreeing views, pixels
     max_relative_difference: float = 0.01  # of the depth of agreeing views
-    min_support: float = 0.3  # share of neighbours on the same plane that keeps a pixel which no other view confirms
-    min_borrowed_support: float = 0.5  # the same for a neighbour's plane that fills such a pixel
-    min_confidence: float = 0.1  # below, the depth is unknown
+    min_support: float = 0.12  # share of neighbours on the same plane that keeps a pixel which no other view confirms
+    min_borrowed_support: float = 0.2  # the same for a neighbour's plane that fills such a pixel
+    min_confidence: float = 0.03  # below, the depth is unknown
     confidence: Confidence = field(default_factory=Confidence)
 
 
