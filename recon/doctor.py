@@ -5,18 +5,25 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import os
 import platform
+import shutil
 import sys
 from dataclasses import asdict, dataclass
 from importlib import metadata
+from pathlib import Path
 
+from capture.cameras import v4l2
+from capture.messaging import spool
+from capture.messaging.network import Network, runtime_directory
 from recon import core
 from recon.core.compile import find_compiler
+
+_UDEV_RULES = Path("/etc/udev/rules.d")
 
 # Import name -> distribution.
 REQUIRED = {
     "cv2": "opencv-contrib-python-headless",
-    "msgpack": "msgpack",
     "msgspec": "msgspec",
     "numpy": "numpy",
     "poselib": "poselib",
@@ -62,6 +69,10 @@ def findings() -> list[Finding]:
         *(_required(module, distribution) for module, distribution in REQUIRED.items()),
         *(_optional(module, *about) for module, about in OPTIONAL.items()),
         *(_lpips(network) for network in ("alex", "vgg")),
+        _cameras(),
+        *_oak_rights(),
+        _network(),
+        _spool(),
     ]
 
 
@@ -98,6 +109,48 @@ def _optional(module: str, distribution: str, extra: str, purpose: str) -> Findi
     if importlib.util.find_spec(module):
         return Finding(module, "ok", _version(distribution))
     return Finding(module, "optional", f"not installed; for {purpose} (the extra named {extra} brings it)")
+
+
+def _cameras() -> Finding:
+    """Opens each, as capture would."""
+    found = v4l2.find()
+    if not found:
+        return Finding("cameras", "optional", "no webcam is connected; folders, recordings and videos need none")
+    listed = "; ".join(f"{camera['device']} {camera['description']}" for camera in found)
+    shut = any("cannot be opened" in camera["description"] for camera in found)
+    return Finding("cameras", "optional" if shut else "ok", listed + ("; join the group video" if shut else ""))
+
+
+def _oak_rights() -> list[Finding]:
+    """Whether an OAK camera may be opened by this user; of no interest without the package."""
+    if not importlib.util.find_spec("depthai"):
+        return []
+    rules = [path for path in _UDEV_RULES.glob("*.rules") if "03e7" in path.read_text(errors="replace")]
+    if rules or os.geteuid() == 0:
+        return [Finding("oak rights", "ok", str(rules[0]) if rules else "this user may open every device")]
+    advice = "no udev rule for OAK cameras; copy configs/udev/80-splatnode-oak.rules to /etc/udev/rules.d"
+    return [Finding("oak rights", "optional", advice)]
+
+
+def _network() -> Finding:
+    """Where the processes meet unless they are told otherwise."""
+    try:
+        return Finding("sockets", "ok", str(runtime_directory(Network())))
+    except OSError as error:
+        return Finding("sockets", "missing", f"capture, recon and view cannot meet: {error}")
+
+
+def _spool() -> Finding:
+    """Room for key frames that wait."""
+    config = spool.Config()
+    directory = spool.spool_directory(config)
+    there = next(folder for folder in (directory, *directory.parents) if folder.exists())
+    if not os.access(there, os.W_OK):
+        return Finding("spool", "missing", f"capture cannot keep key frames: {there} cannot be written to")
+    free_mb = shutil.disk_usage(there).free >> 20
+    state = "ok" if free_mb > config.max_mb else "optional"
+    detail = f"{directory}, {len(list(directory.glob('*.frame')))} key frames wait, {free_mb} MB free"
+    return Finding("spool", state, detail if state == "ok" else f"{detail}; {config.max_mb} MB may be needed")
 
 
 def _version(distribution: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import time
@@ -13,11 +14,11 @@ import pytest
 import zmq
 
 from capture.frame import DroppedFrame, Frame, Intrinsics
-from capture.messaging import spool as spool_module
+from capture.lock import Held
 from capture.messaging.keyframes import FrameHeader, KeyframeClient, KeyframeServer
 from capture.messaging.network import AlreadyRunning, Network, runtime_directory
 from capture.messaging.services import CAPTURE_KEYFRAMES
-from capture.messaging.spool import Config, Key, Spool, SpoolFull
+from capture.messaging.spool import Config, Key, Spool, SpoolFull, spool_directory
 from capture.messaging.wire import WireError, encode
 from tests.conftest import ROOT
 from tests.test_messaging_sockets import ipc, tcp
@@ -118,6 +119,7 @@ def test_a_restarted_capture_does_not_send_again_what_recon_holds(tmp_path):
 
 KILLED = """
 import os, pathlib, sys, numpy
+from capture.lock import Held
 from capture.frame import Frame
 from capture.messaging.keyframes import KeyframeServer
 from capture.messaging.network import Network
@@ -142,8 +144,12 @@ def test_what_was_offered_survives_a_kill(tmp_path):
 
 
 def test_one_process_offers_key_frames(tmp_path):
-    with KeyframeServer(ipc(tmp_path), open_spool(tmp_path)), pytest.raises(AlreadyRunning):
-        KeyframeServer(ipc(tmp_path), open_spool(tmp_path))
+    with KeyframeServer(ipc(tmp_path), open_spool(tmp_path)):
+        with pytest.raises(AlreadyRunning):
+            KeyframeServer(ipc(tmp_path), open_spool(tmp_path / "other"))
+        with pytest.raises(Held):
+            open_spool(tmp_path)
+    open_spool(tmp_path / "other").close()  # the one that came too late has let go of its spool
 
 
 def test_what_is_no_key_frame_is_refused(tmp_path):
@@ -221,6 +227,7 @@ def test_damaged_files_are_put_aside(tmp_path):
     paths[3].write_bytes(b"")
     (spool.directory / ".half.tmp").write_bytes(b"half")
     (spool.directory / "stranger.frame").write_bytes(b"?")
+    spool.close()
     again = open_spool(tmp_path)
     assert [key.sequence for key in again] == [1]
     assert [bytes(part) for part in again.get(KEY._replace(sequence=1))] == [b"content", b"of the message"]
@@ -240,7 +247,10 @@ def test_a_frame_that_the_disk_loses_does_not_block_the_others(tmp_path):
 def test_where_the_spool_is(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home"))
     monkeypatch.delenv("STATE_DIRECTORY", raising=False)
-    assert Spool(Config()).directory == tmp_path / "home" / "splatnode" / "spool"
+    assert spool_directory(Config()) == tmp_path / "home" / "splatnode" / "spool"
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "service"))
-    assert Spool(Config()).directory == Path(tmp_path, "service", "spool")
-    assert spool_module.Spool(Config()).size_bytes == 0
+    assert spool_directory(Config()) == Path(tmp_path, "service", "spool")
+    holder = Spool(Config())
+    with pytest.raises(Held, match=f"held by process {os.getpid()}"):
+        Spool(Config())
+    holder.close()

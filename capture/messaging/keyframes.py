@@ -13,6 +13,7 @@ because capture died before it could remove it, it is acknowledged again and not
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import time
@@ -94,8 +95,11 @@ class KeyframeServer(Endpoint):
     """Capture's end."""
 
     def __init__(self, network: Network, spool: Spool) -> None:
-        """Raises AlreadyRunning where another process offers key frames."""
-        super().__init__(network, offers=CAPTURE_KEYFRAMES)
+        """Takes the spool over and closes it. Raises AlreadyRunning where another process offers key frames."""
+        with contextlib.ExitStack() as taken:
+            taken.callback(spool.close)
+            super().__init__(network, offers=CAPTURE_KEYFRAMES)
+            self._resources.push(taken.pop_all())
         self.spool = spool
         self.numbering = Numbering()
         self.refused = 0  # malformed requests

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import logging
 import os
 import stat
@@ -22,6 +21,7 @@ import msgspec
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
+from capture.lock import Held, exclusive
 from capture.messaging import wire
 from capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
 from capture.messaging.services import Service
@@ -52,15 +52,12 @@ class NetworkError(PermissionError):
     """The network cannot be used as configured; the text says what to do."""
 
 
-class AlreadyRunning(RuntimeError):
+class AlreadyRunning(Held):
     """Another process offers this service."""
-
-    exit_code = 75
 
     def __init__(self, service: Service, pid: int | None) -> None:
         who = f"process {pid}" if pid else "another process"
-        super().__init__(f"{service.name} is offered by {who} already; stop it, or give another network.directory")
-        self.pid = pid
+        super().__init__(f"{service.name} is offered by {who} already; stop it, or give another network.directory", pid)
 
 
 class NotAllowed(PermissionError):
@@ -81,7 +78,7 @@ class Endpoint:
             self._keys = _curve_keys(network)
             self._links: list[_Link] = []
             if offers is not None:
-                self._resources.enter_context(_service_lock(runtime_directory(network), offers))
+                self._lock(offers)
             self._context = zmq.Context()
             self._resources.callback(self._context.term)
             if offers is not None and self._keys is not None:
@@ -95,6 +92,12 @@ class Endpoint:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _lock(self, service: Service) -> None:
+        try:
+            self._resources.enter_context(exclusive(runtime_directory(self.network) / f"{service.name}.lock"))
+        except Held as error:
+            raise AlreadyRunning(service, error.pid) from error
 
     def _bind(self, service: Service, kind: int, *, queue: int) -> zmq.Socket:
         """Raises AlreadyRunning, NetworkError, OSError."""
@@ -216,22 +219,6 @@ def _curve_keys(network: Network) -> Keys | None:
     if network.keys is None:
         raise NetworkError("network.tcp needs network.keys, or anybody could speak. Run: splatnode keys FOLDER")
     return read_keys(network.keys)
-
-
-@contextlib.contextmanager
-def _service_lock(directory: Path, service: Service) -> Iterator[None]:
-    """Held as long as this process offers the service; the kernel lets go of it when the process dies."""
-    with open(directory / f"{service.name}.lock", "a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            file.seek(0)
-            pid = file.read(32).strip()
-            raise AlreadyRunning(service, int(pid) if pid.isdecimal() else None) from error
-        file.truncate(0)
-        file.write(f"{os.getpid()}\n")
-        file.flush()
-        yield
 
 
 @contextlib.contextmanager

@@ -16,6 +16,7 @@ from typing import Annotated, NamedTuple
 
 import msgspec
 
+from capture.lock import exclusive
 from capture.messaging.message_file import read_message, size_in_file, write_message
 from capture.messaging.wire import Part
 
@@ -44,10 +45,12 @@ class Spool:
     """Survives its process: what was put in is there until it is removed. One process at a time uses a directory."""
 
     def __init__(self, config: Config) -> None:
-        """Takes over what lies in the directory; what is damaged is put aside. Raises OSError."""
+        """Takes over what lies in the directory; what is damaged is put aside. Raises OSError, Held."""
         self.config = config
-        self.directory = (config.directory or _default_directory()) / "spool"
+        self.directory = spool_directory(config)
         self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._resources = contextlib.ExitStack()
+        self._resources.enter_context(exclusive(self.directory.with_suffix(".lock")))
         self._files: dict[Key, Path] = {}  # oldest first
         self._bytes: dict[Key, int] = {}
         for leftover in self.directory.glob(".*.tmp"):
@@ -55,6 +58,10 @@ class Spool:
         for path in sorted(self.directory.glob("*.frame")):
             self._take_over(path)
         self._number = max((int(path.stem.split("-")[0]) for path in self._files.values()), default=-1) + 1
+
+    def close(self) -> None:
+        """Lets another process use the directory."""
+        self._resources.close()
 
     def __len__(self) -> int:
         return len(self._files)
@@ -120,6 +127,10 @@ class Spool:
                 path.rename(path.with_suffix(".damaged"))
         else:
             self._files[key], self._bytes[key] = path, path.stat().st_size
+
+
+def spool_directory(config: Config) -> Path:
+    return (config.directory or _default_directory()) / "spool"
 
 
 def _default_directory() -> Path:
