@@ -29,8 +29,15 @@ class Scene3D:
     def __init__(self, scene: rendering.Open3DScene) -> None:
         self._scene = scene
         self._shapes: set[str] = set()
-        scene.view.set_post_processing(False)  # tone mapping would wash the colours out
         scene.set_background([*_encoded(np.array(BACKGROUND) / 255.0), 1.0])
+
+    def set_drawing(self, drawing: bool) -> None:
+        """Whether the scene is what the person sees.
+
+        Tone mapping would wash the colours out. While it is off, Open3D 0.20 keeps the memory of every image that it
+        shows elsewhere in the window, so it is off only where it matters.
+        """
+        self._scene.view.set_post_processing(not drawing)
 
     def show_gaussians(self, gaussians: GaussianArrays, state: State) -> None:
         """The Gaussians, as Gaussians or as points, in place of those that were there."""

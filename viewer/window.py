@@ -81,6 +81,7 @@ class _Window:
         self._picture = gui.ImageWidget(image3d(np.full((8, 8, 3), BACKGROUND, np.uint8)))
         self._scene_widget = gui.SceneWidget()
         self._scene_widget.scene = rendering.Open3DScene(self._window.renderer)
+        self._scene_widget.visible = False  # before it is first drawn: later, the memory is kept all the same
         self._scene = Scene3D(self._scene_widget.scene)
         self._panel = Panel(self._window, self._guarded(self._change), self._guarded(self._command))
         for widget in (self._picture, self._scene_widget, self._panel.root):
@@ -149,7 +150,7 @@ class _Window:
         own = session.state.engine is Engine.CORE or blends
         if self._picture.visible != own or self._scene_widget.visible == own:
             self._picture.visible, self._scene_widget.visible = own, not own
-            self._window.set_needs_layout()
+            self._scene.set_drawing(not own)
         started = time.perf_counter()
         if own:
             half = self._dragging and self._painted_s > _SMOOTH_S
@@ -177,8 +178,10 @@ class _Window:
         area = self._window.content_rect
         panel = min(round(_PANEL_EMS * self._window.theme.font_size), area.width // 2)
         frame = gui.Rect(area.x, area.y, area.width - panel, area.height)
-        self._picture.frame = self._scene_widget.frame = frame
         self._panel.root.frame = gui.Rect(area.get_right() - panel, area.y, panel, area.height)
+        if (frame.width, frame.height) == self._size:  # the panel's words have changed, no more
+            return
+        self._picture.frame = self._scene_widget.frame = frame
         self._size, self._dirty = (frame.width, frame.height), True
 
     # ---- What the person does -------------------------------------------------------------------------------------

@@ -155,6 +155,7 @@ def agreement(result: Path) -> dict:
     width, height = cameras[0].width, cameras[0].height
     renderer = rendering.OffscreenRenderer(width, height)
     scene = Scene3D(renderer.scene)
+    scene.set_drawing(True)
     scene.show_gaussians(gaussians, State())
     renderer.scene.set_background([0.0, 0.0, 0.0, 1.0])
     rows = []
