@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import cv2
 import msgspec
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +32,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_confidence: float = 0.05  # pixels below get no Gaussian
     largest_px: int = 64  # side of a square beyond which no piece reaches
     smallest_px: float = 3.0  # area of a piece that is not divided
-    most_error: float = 0.045  # squared deviation of colours in [0, 1], summed over a piece's pixels and channels
+    most_error: float = 0.06  # squared deviation of colours in [0, 1], summed over a piece's pixels and channels
     depth_weight: float = 2.0  # a relative difference of depth counts as this many times the difference of colour
     noise: float = 0.01  # standard deviation of colours in [0, 1] that is not worth a Gaussian
     footprint: float = 1.2  # standard deviations of a new Gaussian in units of its piece's
@@ -65,8 +66,8 @@ def gaussians_from_pointmap(
 
     Each has its piece's mean colour, and lies on its surface with its position and extent there (moment matching).
     """
-    wanted = wanted & (pointmap.depth > 0)
-    labels, count = _pieces(pointmap, image, wanted, config)
+    labels, count = _pieces(pointmap, image, wanted & (pointmap.depth > 0), config)
+    wanted = labels >= 0
     piece = labels[wanted]
     pixels = np.bincount(piece, minlength=count)
     rows, columns = np.nonzero(wanted)
@@ -89,13 +90,36 @@ def gaussians_from_pointmap(
 def _pieces(
     pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, config: Config
 ) -> tuple[npt.NDArray[np.int32], int]:
-    """(h, w) the number of the piece that each wanted pixel belongs to, -1 elsewhere, and how many there are."""
+    """(h, w) the number of the piece that each pixel belongs to, -1 for unwanted ones, and how many there are.
+
+    Larger images are cut where they are at the reference's size: what only more pixels show is no reason for more
+    Gaussians.
+    """
     scale = max(wanted.shape) / REFERENCE_PX
-    depth = np.log(np.maximum(pointmap.depth, 1e-9)) if wanted.any() else pointmap.depth
-    middle = np.float32(np.median(depth[wanted])) if wanted.any() else np.float32(0)
+    if scale > 1:
+        height, width = wanted.shape
+        size = (max(1, round(width / scale)), max(1, round(height / scale)))
+        depth = np.asarray(cv2.resize(pointmap.depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
+        there = cv2.resize(wanted.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        colour = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        labels, _ = _cut(depth, colour, there, 1.0, config)
+        labels = np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), np.int32)
+        found, numbers = np.unique(labels[wanted], return_inverse=True)
+        labels = np.full(wanted.shape, -1, np.int32)
+        labels[wanted] = numbers - (1 if len(found) and found[0] < 0 else 0)
+        return labels, int(labels.max(initial=-1)) + 1
+    return _cut(pointmap.depth, image, wanted, scale, config)
+
+
+def _cut(
+    depth: npt.NDArray[np.float32], image: npt.NDArray[np.uint8], wanted: Mask, scale: float, config: Config
+) -> tuple[npt.NDArray[np.int32], int]:
+    """The pieces of an image at `scale` of the reference's size."""
+    log_depth = np.log(np.maximum(depth, 1e-9))
+    middle = np.float32(np.median(log_depth[wanted])) if wanted.any() else np.float32(0)
     features = np.empty((*wanted.shape, 4), np.float32)
     features[..., :3] = image / np.float32(255) - np.float32(0.5)
-    features[..., 3] = config.depth_weight * (depth - middle)
+    features[..., 3] = config.depth_weight * (log_depth - middle)
     return partition(
         features,
         wanted,

@@ -140,8 +140,20 @@ def test_the_number_follows_from_what_there_is_to_see():
 
 
 def test_the_same_picture_of_twice_the_size_takes_about_as_many():
-    small, large = foliage(256), foliage(512)
-    assert count(large) == pytest.approx(count(np.repeat(np.repeat(small, 2, 0), 2, 1)), rel=0.2)
+    image = foliage(512)
+    assert count(foliage(1024)) == pytest.approx(count(image), rel=0.1)
+    assert count(np.repeat(np.repeat(image, 2, 0), 2, 1)) == count(image)
+
+
+def test_a_large_photographs_gaussians_have_its_pixels_moments():
+    pointmap = plane_pointmap(np.eye(4), width=1024, height=768)
+    image = np.zeros((768, 1024, 3), np.uint8)
+    image[:, 513:] = 255  # within a pixel of the size at which pieces are cut
+    gaussians = gaussians_from_pointmap(pointmap, image, everything(pointmap), Config(largest_px=512))
+    left = gaussians.subset(gaussians.rgb[:, 0] < 0.1)
+    u = left.means[:, 0] / left.means[:, 2] * pointmap.K[0, 0] + pointmap.K[0, 2]
+    assert float(u.min()) == pytest.approx(256.5, abs=1)
+    assert 2 <= len(gaussians) <= 4
 
 
 def test_every_wanted_pixel_is_covered_up_to_the_border():
