@@ -18,8 +18,9 @@ class ViewGraph:
     """Grows by one keyframe at a time. What its pairs say does not depend on the order in which keyframes came.
 
     Each keyframe is compared with all others by their plain features. Where two hardly match, one of them has few firm
-    partners, and something hints at a common scene or firm pairs do not connect them, they are compared again with
-    squeezed features, which find each other from further to the side and cost twice as much again.
+    partners, and they may overlap all the same, they are compared again with squeezed features, which find each other
+    from further to the side and cost twice as much again. They may overlap when something in their matches hints at it,
+    when they have a firm partner in common, or when firm pairs do not connect them at all.
     """
 
     def __init__(self, config: register.Config) -> None:
@@ -80,15 +81,20 @@ class ViewGraph:
             for pair, plain in self._plain.items()
             if plain.pair is not None and len(plain.pair.matches) >= self._config.firm_matches
         }
-        num_firm = [sum(index in pair for pair in firm) for index in range(len(self.keyframes))]
-        groups = connected(range(len(self.keyframes)), firm)
-        group_of = {index: number for number, group in enumerate(groups) for index in group}
+        everyone = range(len(self.keyframes))
+        partners = [{i + j - index for i, j in firm if index in (i, j)} for index in everyone]
+        group_of = {index: number for number, group in enumerate(connected(everyone, firm)) for index in group}
+
+        def may_overlap(i: int, j: int) -> bool:
+            hinted = self._plain[i, j].log10_nfa < self._config.hint_log10_nfa
+            return hinted or group_of[i] != group_of[j] or not partners[i].isdisjoint(partners[j])
+
         return {
             (i, j)
-            for (i, j), plain in self._plain.items()
+            for i, j in self._plain
             if (i, j) not in firm
-            and (plain.log10_nfa < self._config.hint_log10_nfa or group_of[i] != group_of[j])
-            and min(num_firm[i], num_firm[j]) < self._config.enough_firm_pairs
+            and min(len(partners[i]), len(partners[j])) < self._config.enough_firm_pairs
+            and may_overlap(i, j)
         }
 
     def _compare_squeezed(self, first: int, second: int) -> Compared:

@@ -246,3 +246,15 @@ def test_triangulated_points_are_where_they_were(taken):
     first, last = centres[0] - world[0], centres[4] - world[0]
     expected = np.degrees(np.arccos(first @ last / np.linalg.norm(first) / np.linalg.norm(last)))
     assert widest[0] == pytest.approx(expected, abs=1e-6)
+
+
+def test_wrong_matches_do_not_hide_how_far_a_pair_moved():
+    """8 of 25 points are right: less than the share that must agree, unless those that fit no length are left out."""
+    generator = np.random.default_rng(4)
+    turned = generator.uniform([-1.0, -1.0, 4.0], [1.0, 1.0, 6.0], (25, 3))
+    direction = np.array([1.0, 0.0, 0.1]) / np.sqrt(1.01)
+    moved = turned + 0.7 * direction
+    rays = moved[:, :2] / moved[:, 2:]
+    rays[8:, 1] += generator.choice([-1.0, 1.0], 17) * generator.uniform(0.05, 0.3, 17)
+    assert placement._scale(turned, direction, rays, 0.002, min_points=5) == pytest.approx(0.7, rel=1e-6)
+    assert placement._scale(turned, direction, rays, 0.002, min_points=9) is None

@@ -204,19 +204,25 @@ def _proposals(
 
 
 def _scale(turned: Array, direction: Array, rays: Array, limit: float, min_points: int) -> float | None:
-    """The s for which most `turned + s * direction` (M, 3) project to `rays` (M, 2), or None when few agree."""
+    """The s for which most `turned + s * direction` (M, 3) project to `rays` (M, 2), or None when few agree.
+
+    Points that lie on their ray for no s at all are wrong matches and say nothing about it.
+    """
     rays3 = np.column_stack([rays, np.ones(len(rays))])
     across = _cross(rays3, direction)
     lengths = -(_cross(rays3, turned) * across).sum(1) / np.maximum((across**2).sum(1), 1e-12)
-    lengths = lengths[lengths > 0]
-    if len(lengths) == 0:
+
+    def agree(moved: Array) -> npt.NDArray[np.bool_]:
+        depth = moved[..., 2:]
+        error = np.linalg.norm(moved[..., :2] / np.maximum(depth, 1e-9) - rays, axis=-1)
+        return (error < 4.0 * limit) & (depth[..., 0] > 0)
+
+    possible = lengths[(lengths > 0) & agree(turned + lengths[:, None] * direction)]
+    if len(possible) == 0:
         return None
-    moved = turned[None] + lengths[:, None, None] * direction
-    depth = moved[..., 2:]
-    error = np.linalg.norm(moved[..., :2] / np.maximum(depth, 1e-9) - rays, axis=2)
-    agree = ((error < 4.0 * limit) & (depth[..., 0] > 0)).sum(1)
-    best = int(agree.argmax())
-    return float(lengths[best]) if agree[best] >= max(min_points, 0.4 * len(rays)) else None
+    counts = agree(turned[None] + possible[:, None, None] * direction).sum(1)
+    best = int(counts.argmax())
+    return float(possible[best]) if counts[best] >= max(min_points, 0.4 * len(possible)) else None
 
 
 def _cross(one: Array, other: Array) -> Array:
