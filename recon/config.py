@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import msgspec
 
-from recon import background, completion, density, judge, optimize
+from recon import background, completion, density, judge, optimize, screening
 from recon.priors import classical
+from recon.verification import verify
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     size: int = 512  # longer side of the modelled images, pixels
     seed: int = 0
     prior: classical.Config = classical.Config()
+    screening: screening.Config = screening.Config()
+    verification: verify.Config = verify.Config()
     judge: judge.Config = judge.Config()
     completion: completion.Config = completion.Config()
     density: density.Config = density.Config()

@@ -16,7 +16,7 @@ import msgspec
 from capture.frame import DroppedFrame, Frame
 from recon import growth, optimize
 from recon.config import Config
-from recon.judge import judge
+from recon.judge import hopeless, judge
 from recon.keyframe import Features, Keyframe, modelled_image
 from recon.priors import classical
 from recon.priors.pointmap import Pointmap
@@ -25,14 +25,19 @@ from recon.registration import features
 from recon.registration.register import Registration
 from recon.registration.two_view import TwoView
 from recon.scene import Scene, begin
+from recon.screening import Look, Rejected, look, screen
 from recon.snapshot import GaussianArrays, Snapshot
 from recon.undistort import undistorted
 from recon.verdict import Verdict
+from recon.verification.evidence import Evidence
+from recon.verification.likelihood import record
+from recon.verification.verify import verify
 from recon.view_graph import ViewGraph
 
 log = logging.getLogger(__name__)
 
 Judged = tuple[Registration | None, Verdict]
+Known = tuple[tuple[str, ...], int]  # keyframes, and how many frames were left out
 REMEMBERED_VERDICTS = 3  # a keyframe may be tried, and taken back
 FITS = 0.02  # of the scene's depth: a scene grows while a new estimate moves its cameras by less
 
@@ -100,11 +105,13 @@ class Reconstruction:
         self.clock = _Clock()
         self.graph = ViewGraph(config.prior.registration)
         self.dropped: list[DroppedFrame] = []
+        self.rejected: list[Rejected] = []  # those of `dropped` that the screening left out
         self.begun: Scene | None = None  # from the last estimate of all frames, not optimised
         self.scene: Scene | None = None  # what is shown
         self.sequence = 0
         self._prior: Prior = classical.load(msgspec.structs.replace(config.prior, seed=config.seed))
-        self._judged: dict[tuple[str, ...], Judged] = {}  # by keyframes: as they are, and as they were
+        self._looks: dict[str, Look] = {}  # of the frames that were taken
+        self._judged: dict[Known, tuple[Judged, Evidence | None]] = {}  # as the keyframes are, and as they were
         self._pointmaps: dict[str, Pointmap] = {}  # by keyframe, as they were last computed
 
     @property
@@ -121,11 +128,25 @@ class Reconstruction:
         self.dropped.append(frame)
 
     def take(self, frame: Frame) -> None:
-        """Adds a frame to the view graph. Time counts from the first one."""
-        if not self.graph.keyframes:
+        """Adds a frame to the view graph unless it says nothing new. Time counts from the first one.
+
+        A frame that turns out to be blurred beside a sharper one is left out again.
+        """
+        if not self._looks:
             self.clock = _Clock()
         self.clock.lap("wait")
-        self.add(prepare(frame, self.config))
+        self._looks[frame.name] = look(frame)
+        _, rejected = screen(list(self._looks.values()), self.config.screening)
+        self.rejected += rejected
+        for name, reason in ((each.name, each.reason) for each in rejected):
+            del self._looks[name]
+            self.drop(DroppedFrame(name, reason))
+        gone = {each.name for each in rejected} & set(self.names)
+        if gone:
+            self.retract(gone)
+        self.clock.lap("poses")
+        if frame.name in self._looks:
+            self.add(prepare(frame, self.config))
 
     def add(self, keyframe: Keyframe) -> None:
         """Adds a frame that was prepared elsewhere to the view graph."""
@@ -153,13 +174,21 @@ class Reconstruction:
     def judge(self) -> Judged:
         """Cameras of the keyframes and the verdict on them; at once for keyframes that were judged a moment ago."""
         self.clock.lap("wait")
-        names = tuple(self.names)
-        if names not in self._judged:
-            registration = self._prior.register(self.graph)
-            judged = registration, judge(self.graph, registration, self.config.judge)
-            self._judged = dict([*self._judged.items(), (names, judged)][-REMEMBERED_VERDICTS:])
+        known = tuple(self.names), len(self.rejected)
+        if known not in self._judged:
+            newest = known, self._verified()
+            self._judged = dict([*self._judged.items(), newest][-REMEMBERED_VERDICTS:])
         self.clock.lap("poses")
-        return self._judged[names]
+        return self._judged[known][0]
+
+    def _verified(self) -> tuple[Judged, Evidence | None]:
+        """A registration of the keyframes, judged by its evidence; none where it would be of no use."""
+        refusal = hopeless(self.graph, self.rejected, self.config.judge)
+        if refusal is not None:
+            return (None, refusal), None
+        registration = self._prior.register(self.graph)
+        evidence = verify(self.graph, registration, self.config.verification)
+        return (registration, judge(self.graph, registration, evidence, self.config.judge)), evidence
 
     def work_in(self) -> None:
         """Shows a scene of all keyframes as soon as possible: grown from the one that is shown, else begun."""
@@ -225,6 +254,7 @@ class Reconstruction:
     def snapshot(self, final: bool = False) -> Snapshot:
         self.sequence += 1
         _, verdict = self.judge()
+        evidence = self._judged[tuple(self.names), len(self.rejected)][1]
         scene = self.scene if verdict.publishable else None
         snapshot = Snapshot(
             sequence=self.sequence,
@@ -236,6 +266,7 @@ class Reconstruction:
             iterations=scene.iterations if scene else 0,
             seconds={**self.clock.seconds, "total": time.monotonic() - self.clock.started},
             final=final,
+            evidence=record(evidence) if evidence is not None else None,
         )
         log.info("snapshot %d: %s, %d Gaussians", self.sequence, verdict.code.value, len(snapshot.gaussians))
         return snapshot

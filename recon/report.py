@@ -36,6 +36,7 @@ def build_report(
             "frames": list(verdict.frames),
             "publishable": verdict.publishable,
         },
+        "evidence": snapshot.evidence,
         "seconds": {**stages, "total": seconds_total},
         "peak_rss_mb": peak_rss_mb,
         "num_gaussians": len(gaussians),

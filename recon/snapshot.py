@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -64,3 +65,4 @@ class Snapshot:
     iterations: int
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
     final: bool = False
+    evidence: Mapping[str, object] | None = None  # recon.verification.likelihood.record; None: nothing to verify

@@ -1,4 +1,4 @@
-"""Verdicts, each from a view graph and a registration made by hand."""
+"""Verdicts, each from a view graph, a registration and evidence made by hand."""
 
 from __future__ import annotations
 
@@ -7,20 +7,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from capture.frame import Frame
-from recon.judge import Config, judge
+from capture.frame import Frame, Intrinsics
+from recon.judge import Config, hopeless, judge
 from recon.keyframe import Features, Keyframe
 from recon.registration import register
 from recon.registration.register import RegisteredCamera, Registration
 from recon.registration.two_view import TwoView
+from recon.screening import Rejected
 from recon.verdict import Code, Verdict
+from recon.verification.cycles import Cycles
+from recon.verification.evidence import CameraEvidence, Evidence
+from recon.verification.joints import Joint
+from recon.verification.lens import Distortion, FreedLens
+from recon.verification.photometric import Score
+from recon.verification.stability import Spread
 from recon.view_graph import ViewGraph
 
 PLAIN, RICH = 20, 2000  # features
+FOUND, BY_CHANCE = Score(300, 0.8, 0.2), Score(300, 0.2, 0.2)
 
 
-def keyframe(index: int, num_features: int = RICH) -> Keyframe:
-    image = np.zeros((48, 64, 3), np.uint8)
+def keyframe(index: int, num_features: int = RICH, size: tuple[int, int] = (64, 48)) -> Keyframe:
+    image = np.zeros((size[1], size[0], 3), np.uint8)
     features = Features(
         points=np.zeros((num_features, 2)),
         descriptors=np.zeros((num_features, 128), np.uint8),
@@ -55,13 +63,8 @@ def all_pairs(num_frames: int, turned: tuple[tuple[int, int], ...] = ()) -> dict
     return {(i, j): pair(turned=(i, j) in turned) for j in range(num_frames) for i in range(j)}
 
 
-def registration(
-    indices: tuple[int, ...],
-    agreement: dict[tuple[int, int], float] | None = None,
-    median_angle_deg: float = 10.0,
-) -> Registration:
-    """Cameras a step apart on a line, known to 0.05 degrees and 0.5 % of their spread, that see the same points."""
-    num_points = 20
+def registration(indices: tuple[int, ...]) -> Registration:
+    """Cameras a step apart on a line. What the judge needs to know of them is in the evidence."""
     cameras = []
     for index in indices:
         T_world_camera = np.eye(4)
@@ -69,21 +72,52 @@ def registration(
         cameras.append(RegisteredCamera(index, T_world_camera, 64.0, np.array([32.0, 24.0]), 0.0, 0.05, 0.005))
     return Registration(
         cameras=tuple(cameras),
-        points=np.zeros((num_points, 3)),
-        observed_by=np.repeat(np.array(indices, np.int64), num_points),
-        observed_point=np.tile(np.arange(num_points), len(indices)),
-        observed_pixels=np.zeros((num_points * len(indices), 2)),
+        points=np.zeros((0, 3)),
+        observed_by=np.zeros(0, np.int64),
+        observed_point=np.zeros(0, np.int64),
+        observed_pixels=np.zeros((0, 2)),
+        agreement={},
         focal_sigma=0.01,
-        agreement=agreement or {(i, j): 1.0 for j in indices for i in indices if i < j},
-        median_angle_deg=median_angle_deg,
+        median_angle_deg=10.0,
         rms_px=0.3,
     )
 
 
-def refused(verdict: Verdict, code: Code) -> Verdict:
-    assert verdict.code == code and not verdict.publishable
-    assert verdict.message.endswith(".") and verdict.advice.endswith(".")
-    return verdict
+def camera(index: int, **what: object) -> CameraEvidence:
+    """A camera about which there is no doubt, but for `what`."""
+    return replace(CameraEvidence(f"{index}.png", 1.0, 200, 1.0, FOUND, 0.05, 0.005), **what)
+
+
+def evidence(
+    indices: tuple[int, ...], doubtful: dict[int, dict[str, object]] | None = None, **what: object
+) -> Evidence:
+    """Evidence for cameras about which there is no doubt, but for `doubtful` ones and `what` concerns all."""
+    good = Evidence(
+        cameras=tuple(camera(index, **(doubtful or {}).get(index, {})) for index in indices),
+        agreement=1.0,
+        joint=Joint(group=(indices[-1],), points=500, matches=200, explained=200.0, patches=FOUND),
+        spread=Spread(0.1, 0.005, 0.01),
+        mirrored_cost=10.0,
+        cycles=Cycles(1, 0.1, 0.1, 0.1),
+        median_angle_deg=10.0,
+        rms_px=0.3,
+        focal_sigma=0.01,
+        freed=(),
+        distortion=Distortion(0.0, 1.0),
+    )
+    return replace(good, **what)
+
+
+def verdict(count: int, doubtful: dict[int, dict[str, object]] | None = None, **what: object) -> Verdict:
+    """Of `count` frames that were all placed."""
+    indices = tuple(range(count))
+    return judge(graph(count, all_pairs(count)), registration(indices), evidence(indices, doubtful, **what), Config())
+
+
+def refused(given: Verdict | None, code: Code) -> Verdict:
+    assert given is not None and given.code == code and not given.publishable
+    assert given.message.endswith(".") and given.advice.endswith(".")
+    return given
 
 
 def names(*indices: int) -> tuple[str, ...]:
@@ -91,92 +125,174 @@ def names(*indices: int) -> tuple[str, ...]:
 
 
 def test_all_frames_placed_is_ok():
-    verdict = judge(graph(4, all_pairs(4)), registration((0, 1, 2, 3)), Config())
-    assert verdict.code == Code.OK and verdict.publishable and verdict.frames == () and verdict.advice == ""
+    given = verdict(4)
+    assert given.code == Code.OK and given.publishable and given.frames == () and given.advice == ""
 
 
 def test_frames_left_out_are_named():
     pairs = {key: value for key, value in all_pairs(5).items() if 3 not in key}
-    verdict = judge(graph(5, pairs), registration((0, 1, 2, 4)), Config())
-    assert verdict.code == Code.OUTLIER_VIEW and verdict.publishable
-    assert verdict.frames == names(3) and "3.png" in verdict.message
+    left = (0, 1, 2, 4)
+    given = judge(graph(5, pairs), registration(left), evidence(left), Config())
+    assert given.code == Code.OUTLIER_VIEW and given.publishable
+    assert given.frames == names(3) and "3.png" in given.message
+    given = judge(graph(5, all_pairs(5)), registration(left), evidence(left), Config())
+    assert given.code == Code.OK_PARTIAL and given.publishable
+    assert given.frames == names(3) and "3.png" in given.advice
 
 
-def test_frames_that_overlap_but_could_not_be_placed_are_named():
-    verdict = judge(graph(5, all_pairs(5)), registration((0, 1, 2, 4)), Config())
-    assert verdict.code == Code.OK_PARTIAL and verdict.publishable
-    assert verdict.frames == names(3) and "3.png" in verdict.advice
+def test_two_frames_of_somewhere_else_are_a_place():
+    pairs = {**all_pairs(3), (3, 4): pair()}
+    given = judge(graph(5, pairs), registration((0, 1, 2)), evidence((0, 1, 2)), Config())
+    assert given.code == Code.SPLIT and given.publishable and given.frames == names(3, 4)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_frames(count):
-    verdict = refused(judge(graph(count, all_pairs(count)), None, Config()), Code.TOO_FEW_VIEWS)
-    assert verdict.frames == names(*range(count)) and str(count) in verdict.message
+    given = refused(hopeless(graph(count, all_pairs(count)), (), Config()), Code.TOO_FEW_VIEWS)
+    assert given.frames == names(*range(count)) and str(count) in given.message
+
+
+@pytest.mark.parametrize(
+    ("kept", "codes", "expected"),
+    [
+        (1, [Code.STATIC_CAMERA] * 4, Code.STATIC_CAMERA),
+        (2, [Code.STATIC_CAMERA] * 4, Code.TOO_FEW_VIEWS),
+        (0, [Code.BLUR] * 3, Code.BLUR),
+        (2, [Code.BLUR] * 2, Code.BLUR),
+        (0, [Code.LOW_TEXTURE] * 3, Code.LOW_TEXTURE),
+        (1, [Code.BLUR], Code.TOO_FEW_VIEWS),
+    ],
+)
+def test_what_the_screening_left_out_is_the_reason(kept, codes, expected):
+    rejected = [Rejected(f"r{i}.png", code, "that is why") for i, code in enumerate(codes)]
+    given = refused(hopeless(graph(kept, all_pairs(kept)), rejected, Config()), expected)
+    assert "that is why" in given.message or expected in (Code.STATIC_CAMERA, Code.LOW_TEXTURE)
 
 
 def test_frames_without_texture():
-    verdict = refused(judge(graph(4, {}, plain=(0, 2, 3)), None, Config()), Code.LOW_TEXTURE)
-    assert verdict.frames == names(0, 2, 3)
+    given = refused(hopeless(graph(4, {}, plain=(0, 2, 3)), (), Config()), Code.LOW_TEXTURE)
+    assert given.frames == names(0, 2, 3)
 
 
 def test_rich_frames_that_do_not_overlap():
-    refused(judge(graph(4, {}, plain=(1,)), None, Config()), Code.NO_OVERLAP)
+    refused(hopeless(graph(4, {}, plain=(1,)), (), Config()), Code.NO_OVERLAP)
+
+
+def test_frames_that_stand_still_and_those_that_see_one_plane():
+    still = {key: replace(value, points2=value.points1 + 0.01) for key, value in all_pairs(3).items()}
+    refused(hopeless(graph(3, still), (), Config()), Code.STATIC_CAMERA)
+    flat = {key: replace(value, num_homography=195) for key, value in all_pairs(3).items()}
+    refused(hopeless(graph(3, flat), (), Config()), Code.PLANAR_ONLY)
+
+
+def test_a_camera_that_only_turned():
+    pairs = all_pairs(4, turned=((0, 1), (0, 2), (0, 3), (1, 2), (1, 3)))  # 5 of 6
+    given = refused(hopeless(graph(4, pairs), (), Config()), Code.NO_PARALLAX)
+    assert given.frames == names(0, 1, 2, 3) and "5 of 6" in given.message
+    assert hopeless(graph(4, all_pairs(4, turned=((0, 1), (2, 3)))), (), Config()) is None
 
 
 def test_only_two_frames_that_overlap():
-    verdict = refused(judge(graph(4, {(0, 1): pair()}), registration((0, 1)), Config()), Code.NO_OVERLAP)
-    assert "2 of 4" in verdict.message
+    given = refused(judge(graph(4, {(0, 1): pair()}), registration((0, 1)), None, Config()), Code.NO_OVERLAP)
+    assert "2 of 4" in given.message
 
 
 def test_frames_that_overlap_and_still_cannot_be_placed():
-    refused(judge(graph(4, all_pairs(4)), None, Config()), Code.NO_OVERLAP)
+    refused(judge(graph(4, all_pairs(4)), None, None, Config()), Code.NO_OVERLAP)
 
 
-def test_a_camera_that_only_turned_before_anything_is_said_about_its_places():
-    pairs = all_pairs(4, turned=((0, 1), (0, 2), (0, 3), (1, 2), (1, 3)))  # 5 of 6
-    for found in (None, registration((0, 1, 2, 3))):
-        verdict = refused(judge(graph(4, pairs), found, Config()), Code.NO_PARALLAX)
-        assert verdict.frames == names(0, 1, 2, 3) and "5 of 6" in verdict.message
+def test_frames_that_find_no_place_because_of_the_focal_length_that_was_given():
+    pairs = {key: replace(view, focal_ratio=1.4) for key, view in all_pairs(4).items()}
+    told = graph(4, pairs)
+    lens = Intrinsics(64, 48, 64.0, 64.0, 32.0, 24.0, "given")
+    told.keyframes = [replace(k, frame=replace(k.frame, intrinsics=lens)) for k in told.keyframes]
+    given = refused(judge(told, None, None, Config()), Code.FOCAL_SUSPECT)
+    assert "64 pixels" in given.message and "+40 %" in given.message
 
 
-def test_some_pairs_without_parallax_do_no_harm():
-    pairs = all_pairs(4, turned=((0, 1), (2, 3)))
-    assert judge(graph(4, pairs), registration((0, 1, 2, 3)), Config()).code == Code.OK
+def test_a_given_focal_length_that_the_frames_contradict_is_named_with_how_much():
+    given = refused(verdict(3, freed=(FreedLens(1000.0, 1430.0, 0.3),)), Code.FOCAL_SUSPECT)
+    assert "1000 pixels" in given.message and "1430" in given.message and "+43 %" in given.message
+    assert verdict(3, freed=(FreedLens(1000.0, 1010.0, 0.3),)).code == Code.OK  # well within a calibration
+    assert verdict(3, freed=(FreedLens(1000.0, 1100.0, 0.97),)).code == Code.OK  # nothing gained by it
+
+
+def test_a_lens_that_bends_the_picture():
+    given = refused(verdict(3, distortion=Distortion(0.1, 0.1)), Code.FOCAL_SUSPECT)
+    assert "10 %" in given.message and "coefficients" in given.advice
+    assert verdict(3, distortion=Distortion(0.01, 0.5)).code == Code.OK
 
 
 def test_views_too_close_together():
-    found = registration((0, 1, 2), median_angle_deg=0.8)
-    verdict = refused(judge(graph(3, all_pairs(3)), found, Config()), Code.BASELINE_TOO_SMALL)
-    assert "0.8" in verdict.message
+    given = refused(verdict(3, median_angle_deg=0.8), Code.BASELINE_TOO_SMALL)
+    assert "0.8 degrees" in given.message
+
+
+def test_uncertain_views_of_a_camera_that_hardly_moved_have_turned():
+    turning = graph(3, {key: replace(value, num_rotation=150) for key, value in all_pairs(3).items()})
+    seen = evidence((0, 1, 2), median_angle_deg=0.8)
+    refused(judge(turning, registration((0, 1, 2)), seen, Config()), Code.NO_PARALLAX)
+
+
+@pytest.mark.parametrize("what", [{"rotation_sigma_deg": 4.0}, {"centre_sigma_rel": 0.1}])
+def test_an_uncertain_camera(what):
+    refused(verdict(4, {2: what}), Code.BASELINE_TOO_SMALL)
+
+
+@pytest.mark.parametrize("spread", [Spread(8.0, 0.005, 0.01), Spread(0.1, 0.2, 0.01)])
+def test_an_answer_that_hangs_on_one_region_of_the_pictures(spread):
+    refused(verdict(4, spread=spread), Code.BASELINE_TOO_SMALL)
+
+
+def test_a_focal_length_that_is_not_known_well_enough():
+    refused(verdict(3, focal_sigma=0.2), Code.FOCAL_SUSPECT)
 
 
 def test_matches_that_contradict_each_other():
-    found = registration((0, 1, 2), agreement={(0, 1): 1.0, (0, 2): 0.9, (1, 2): 0.1})
-    verdict = refused(judge(graph(3, all_pairs(3)), found, Config()), Code.AMBIGUOUS)
-    assert set(names(1, 2)) <= set(verdict.frames)
+    given = refused(verdict(3, {2: {"agreement": 0.45}}, agreement=0.5), Code.AMBIGUOUS)
+    assert given.frames == names(2) and "50 %" in given.message
 
 
-@pytest.mark.parametrize("what", [{"rotation_sigma_deg": 2.0}, {"centre_sigma_rel": 0.2}])
-def test_an_uncertain_camera(what):
-    found = registration((0, 1, 2, 3))
-    cameras = tuple(replace(camera, **what) if camera.index == 2 else camera for camera in found.cameras)
-    verdict = refused(judge(graph(4, all_pairs(4)), replace(found, cameras=cameras), Config()), Code.BASELINE_TOO_SMALL)
-    assert verdict.frames == names(2)
+def test_a_frame_that_poses_as_another_is_told_by_its_pixels():
+    """Half of its matches agree; only of a frame that is where it seems to be, the pixels do too."""
+    given = refused(verdict(6, {4: {"agreement": 0.55, "patches": BY_CHANCE}}, agreement=0.84), Code.AMBIGUOUS)
+    assert given.frames == names(4)
+    assert verdict(6, {4: {"agreement": 0.55}}, agreement=0.84).code == Code.OK
+    assert verdict(6, {4: {"patches": BY_CHANCE}}).code == Code.OK  # seen from too far aside to be compared
+
+
+def test_a_camera_that_nothing_confirms():
+    given = refused(verdict(4, {3: {"confirmed": 0}, 1: {"confirmed": 6}}), Code.AMBIGUOUS)
+    assert given.frames == names(3)
+
+
+def test_an_answer_that_is_as_good_as_its_mirror_image():
+    given = refused(verdict(3, mirrored_cost=1.0), Code.AMBIGUOUS)
+    assert "mirror" in given.message
+
+
+def test_two_places_that_almost_no_point_joins():
+    joint = Joint(group=(3, 4), points=3, matches=180, explained=150.0, patches=BY_CHANCE)
+    given = refused(verdict(5, joint=joint), Code.SPLIT)
+    assert given.frames == names(3, 4)
+
+
+def test_frames_of_another_size_that_do_not_fit_are_named():
+    mixed = graph(4, all_pairs(4))
+    mixed.keyframes[1] = keyframe(1, size=(50, 40))
+    mixed.keyframes[2] = keyframe(2, size=(48, 64))  # the common size, turned
+    uncertain = evidence((0, 1, 2, 3), spread=Spread(0.1, 0.2, 0.01))
+    given = refused(judge(mixed, registration((0, 1, 2, 3)), uncertain, Config()), Code.MIXED_CAMERAS)
+    assert given.frames == names(1)
+
+
+def test_different_exposures_are_noted():
+    given = verdict(4, {2: {"gain": 0.6}})
+    assert given.code == Code.EXPOSURE_SHIFT and given.publishable
+    assert given.frames == names(2) and "1.7 times" in given.message
 
 
 def test_limits_come_from_the_configuration():
-    found = registration((0, 1, 2), median_angle_deg=0.8)
-    assert judge(graph(3, all_pairs(3)), found, Config(min_angle_deg=0.5)).code == Code.OK
-    refused(judge(graph(3, all_pairs(3)), registration((0, 1, 2)), Config(min_cameras=4)), Code.TOO_FEW_VIEWS)
-
-
-def groups_joined_by_chance() -> tuple[ViewGraph, Registration]:
-    """Two places of three views each: what joins them is few matches, half of which the cameras contradict."""
-    pairs = {key: pair(1800) for key in ((0, 1), (0, 2), (1, 2), (3, 4), (3, 5), (4, 5))}
-    joints = {(0, 3): pair(37), (2, 3): pair(46), (2, 4): pair(51)}
-    agreement = dict.fromkeys(pairs, 1.0) | {(0, 3): 0.46, (2, 3): 0.61, (2, 4): 0.71}
-    return graph(6, pairs | joints), registration((0, 1, 2, 3, 4, 5), agreement)
-
-
-def test_groups_of_views_that_only_contradicting_pairs_join_are_not_one_scene():
-    refused(judge(*groups_joined_by_chance(), Config()), Code.SPLIT)
+    seen = evidence((0, 1, 2), median_angle_deg=0.8)
+    assert judge(graph(3, all_pairs(3)), registration((0, 1, 2)), seen, Config(min_angle_deg=0.5)).code == Code.OK
+    refused(hopeless(graph(3, all_pairs(3)), (), Config(min_cameras=4)), Code.TOO_FEW_VIEWS)

@@ -13,11 +13,13 @@ import torch
 from capture.cameras import synthetic
 from recon.evaluate.alignment import camera_errors
 from recon.judge import Config as JudgeConfig
-from recon.judge import judge
+from recon.judge import hopeless, judge
 from recon.priors.depth_normals import normals_of_depth
 from recon.priors.mast3r.inference import ask, crop, prepared
 from recon.priors.mast3r.network import Encoded, Prediction
 from recon.priors.mast3r.prior import Config, Mast3rPrior, load
+from recon.verification.verify import Config as VerificationConfig
+from recon.verification.verify import verify
 from tests.synthetic import SMALL, photographs, places, view_graph
 
 VIEWS = 3
@@ -121,7 +123,9 @@ def test_what_a_lying_network_invents_is_refused(noise):
         frames = [replace(frame, image=rng.integers(0, 256, frame.image.shape, np.uint8)) for frame in frames]
     graph = view_graph(frames)
     registration = Mast3rPrior(Liar(), Config(longer_side=192)).register(graph)
-    assert not judge(graph, registration, JudgeConfig()).publishable
+    evidence = verify(graph, registration, VerificationConfig())
+    verdict = hopeless(graph, (), JudgeConfig()) or judge(graph, registration, evidence, JudgeConfig())
+    assert not verdict.publishable
 
 
 def test_crops_are_whole_patches_and_keep_the_middle():

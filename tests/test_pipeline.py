@@ -24,13 +24,14 @@ from recon.evaluate.protocol import mean_intrinsics
 from recon.evaluate.splits import load_split
 from recon.evaluate.truth import load_scene
 from recon.geometry import align_cameras
-from recon.judge import judge
+from recon.judge import hopeless, judge
 from recon.pipeline import reconstruct
 from recon.preview import render_rgb
 from recon.rasterize.cpu import rasterize
 from recon.registration import register
 from recon.snapshot import Snapshot
 from recon.verdict import Code, Verdict
+from recon.verification.verify import verify
 from recon.view_graph import ViewGraph
 from tests.synthetic import SMALL, photographs, places, pure_rotation, view_graph
 
@@ -260,7 +261,8 @@ def real(shared: Path, name: str, views: int | None = None, step: int = 1) -> tu
         np.array([np.diag([camera.focal, camera.focal, 1.0]) for camera, _ in pairs]).reshape(-1, 3, 3),
         np.array([truth.K for _, truth in pairs]).reshape(-1, 3, 3),
     )
-    return graph, measured, judge(graph, found, CONFIG.judge)
+    evidence = verify(graph, found, CONFIG.verification)
+    return graph, measured, hopeless(graph, (), CONFIG.judge) or judge(graph, found, evidence, CONFIG.judge)
 
 
 @pytest.mark.parametrize(

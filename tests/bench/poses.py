@@ -20,10 +20,11 @@ from recon.config import Config
 from recon.evaluate.alignment import camera_errors
 from recon.evaluate.splits import load_split
 from recon.evaluate.truth import EvaluationScene, load_scene
-from recon.judge import judge
+from recon.judge import hopeless, judge
 from recon.keyframe import Keyframe, modelled_image
 from recon.registration import features, register
 from recon.registration.register import Registration
+from recon.verification.verify import verify
 from recon.view_graph import ViewGraph
 
 RIGHT_ROTATION_DEG = 2.0
@@ -45,6 +46,7 @@ class Row:
     seconds_features: float
     seconds_matching: float
     seconds_mapping: float
+    seconds_verification: float
     seconds_processor: float
 
     @property
@@ -65,7 +67,9 @@ def measure(scene: EvaluationScene, names: tuple[str, ...], config: Config) -> R
     laps.append(time.perf_counter())
     registration = register.register(graph.keyframes, graph.pairs, registering) if graph.pairs else None
     laps.append(time.perf_counter())
-    verdict = judge(graph, registration, config.judge)
+    evidence = verify(graph, registration, config.verification)
+    laps.append(time.perf_counter())
+    verdict = hopeless(graph, (), config.judge) or judge(graph, registration, evidence, config.judge)
     seconds = np.diff(laps).tolist()
     errors = against_truth(scene, names, registration)
     return Row(
@@ -78,6 +82,7 @@ def measure(scene: EvaluationScene, names: tuple[str, ...], config: Config) -> R
         seconds_features=seconds[0],
         seconds_matching=seconds[1],
         seconds_mapping=seconds[2],
+        seconds_verification=seconds[3],
         seconds_processor=time.process_time() - processor,
     )
 

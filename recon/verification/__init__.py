@@ -1,0 +1,1 @@
+"""Verification: what speaks for and against a registration, before anything is published."""

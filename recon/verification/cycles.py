@@ -1,0 +1,94 @@
+"""Cycles: what the pairs say, each by itself, must come to nothing around every triangle of frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from recon.keyframe import Keyframe
+from recon.registration import placement
+from recon.registration.register import Registration
+from recon.registration.two_view import TwoView
+
+Array = npt.NDArray[np.float64]
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    min_matches: int = 40  # of a pair that is heard
+    partners: int = 3  # of each frame, those with most matches
+    max_matches: int = 400  # of a pair that are used; more make a relative pose no surer
+    max_error_px: float = 2.5  # of a match, at 1024 px on the longer side
+
+
+@dataclass(frozen=True)
+class Cycles:
+    """Triangles of pairs, each with a relative pose of its own (five points, known focal lengths)."""
+
+    triangles: int
+    rotation_deg: float  # median angle that is left after going round; 0 without a triangle
+    worst_rotation_deg: float
+    direction_deg: float  # median angle between the direction in which a pair sees its partner and the registration's
+
+
+def measure(
+    keyframes: Sequence[Keyframe],
+    registration: Registration,
+    pairs: Mapping[tuple[int, int], TwoView],
+    config: Config,
+) -> Cycles:
+    cameras = {camera.index: camera for camera in registration.cameras}
+    rotations: dict[tuple[int, int], Array] = {}
+    directions = []
+    for i, j in _heard(list(cameras), pairs, config):
+        scale = max(max(keyframes[k].frame.width, keyframes[k].frame.height) for k in (i, j)) / 1024.0
+        thinned = _thinned(pairs[i, j], config.max_matches)
+        limit = config.max_error_px * scale
+        rotation, direction, num_inliers = placement.relative_pose(thinned, cameras[i].focal, cameras[j].focal, limit)
+        if 2 * num_inliers < len(thinned.matches):
+            continue  # The pair has no rigid answer for these focal lengths; agreement says so too.
+        rotations[i, j] = rotation
+        T_second_first = np.linalg.inv(cameras[j].T_world_camera) @ cameras[i].T_world_camera
+        directions.append(_angle_between(direction, T_second_first[:3, 3]))
+    left = []
+    for i, j, k in combinations(sorted(cameras), 3):
+        if (i, j) in rotations and (j, k) in rotations and (i, k) in rotations:
+            around = rotations[i, k].T @ rotations[j, k] @ rotations[i, j]
+            left.append(float(np.degrees(np.arccos(np.clip((np.trace(around) - 1.0) / 2.0, -1.0, 1.0)))))
+    return Cycles(
+        triangles=len(left),
+        rotation_deg=float(np.median(left)) if left else 0.0,
+        worst_rotation_deg=max(left, default=0.0),
+        direction_deg=float(np.median(directions)) if directions else 0.0,
+    )
+
+
+def _heard(frames: Sequence[int], pairs: Mapping[tuple[int, int], TwoView], config: Config) -> list[tuple[int, int]]:
+    """Pairs of registered frames that are among the strongest of one of the two."""
+    strong = [
+        key
+        for key, pair in pairs.items()
+        if key[0] in frames and key[1] in frames and len(pair.matches) >= config.min_matches
+    ]
+    strong.sort(key=lambda key: (-len(pairs[key].matches), key))
+    heard: set[tuple[int, int]] = set()
+    for frame in frames:
+        heard.update([key for key in strong if frame in key][: config.partners])
+    return sorted(heard)
+
+
+def _thinned(pair: TwoView, count: int) -> TwoView:
+    """The pair with about `count` of its matches, spread evenly over their ranks."""
+    if len(pair.matches) <= count:
+        return pair
+    chosen = np.linspace(0, len(pair.matches) - 1, count).astype(int)
+    return replace(pair, matches=pair.matches[chosen], points1=pair.points1[chosen], points2=pair.points2[chosen])
+
+
+def _angle_between(one: Array, other: Array) -> float:
+    lengths = float(np.linalg.norm(one) * np.linalg.norm(other))
+    return float(np.degrees(np.arccos(np.clip(one @ other / max(lengths, 1e-12), -1.0, 1.0))))

@@ -1,0 +1,51 @@
+"""Evidence: numbers that speak for or against a registration, each from a source of its own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from recon.verification.cycles import Cycles
+from recon.verification.joints import Joint
+from recon.verification.lens import Distortion, FreedLens
+from recon.verification.photometric import Score
+from recon.verification.stability import Spread
+
+
+@dataclass(frozen=True)
+class CameraEvidence:
+    """What speaks for the pose of one camera."""
+
+    name: str
+    agreement: float  # share of its matches, in all verified pairs, that the poses explain
+    confirmed: int  # points of it that at least two other cameras see
+    gain: float  # of its exposure, over that of most cameras
+    patches: Score  # of it in the pictures that share most points with it
+    rotation_sigma_deg: float  # after the bundle adjustment
+    centre_sigma_rel: float  # relative to the spread of the centres
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Of a registration with at least three cameras."""
+
+    cameras: tuple[CameraEvidence, ...]
+    agreement: float  # share of all matches that the cameras explain
+    joint: Joint  # the weakest
+    spread: Spread  # how much the answer changes without parts of the pictures
+    mirrored_cost: float  # of the mirrored answer over that of this one
+    cycles: Cycles
+    median_angle_deg: float
+    rms_px: float
+    focal_sigma: float  # of the logarithm of the least certain focal length
+    freed: tuple[FreedLens, ...]  # lenses that were given
+    distortion: Distortion
+
+    @property
+    def rotation_deg(self) -> float:
+        """How wrong rotations may be: by the covariance, or by half of what leaving out regions changes."""
+        return max(0.5 * self.spread.rotation_deg, *(camera.rotation_sigma_deg for camera in self.cameras))
+
+    @property
+    def centre_rel(self) -> float:
+        """The same for the centres, relative to their spread."""
+        return max(0.5 * self.spread.centre_rel, *(camera.centre_sigma_rel for camera in self.cameras))

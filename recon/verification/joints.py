@@ -1,0 +1,75 @@
+"""The weakest joint: what holds the two parts together into which the cameras fall most easily."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.registration.register import Registration
+from recon.registration.two_view import TwoView
+from recon.verification import photometric
+from recon.view_graph import connected
+
+TRIED = 3  # pairs across the joint in which patches are looked for, those with most points in common
+
+
+@dataclass(frozen=True)
+class Joint:
+    """Two places that a few chance matches join are each right by themselves: only the joint tells."""
+
+    group: tuple[int, ...]  # frames of the smaller part
+    points: int  # that pairs of frames across the joint share, summed
+    matches: int  # of the verified pairs across it
+    explained: float  # of these, how many the poses explain
+    patches: photometric.Score  # across it
+
+
+def weakest(
+    registration: Registration,
+    pairs: Mapping[tuple[int, int], TwoView],
+    pictures: Mapping[int, photometric.Picture],
+    config: photometric.Config,
+) -> Joint:
+    """The joint that is left last when cameras are put together in the order of the points that they share."""
+    indices = [camera.index for camera in registration.cameras]
+    shared = shared_points(registration)
+    one, other = _two_parts(indices, shared)
+    across = sorted(((i, j) for i in one for j in other), key=lambda pair: (-shared[pair], pair))
+    scores = [
+        photometric.score(pictures[a], pictures[b], config) for i, j in across[:TRIED] for a, b in ((i, j), (j, i))
+    ]
+    verified = [key for i, j in across if (key := (min(i, j), max(i, j))) in registration.agreement]
+    return Joint(
+        group=tuple(sorted(min(one, other, key=len))),
+        points=int(sum(shared[pair] for pair in across)),
+        matches=sum(len(pairs[key].matches) for key in verified),
+        explained=sum(registration.agreement[key] * len(pairs[key].matches) for key in verified),
+        patches=photometric.pooled(scores, config),
+    )
+
+
+def shared_points(registration: Registration) -> npt.NDArray[np.int64]:
+    """(M, M) how many points each two frames both observe."""
+    size = max(camera.index for camera in registration.cameras) + 1
+    seen = np.zeros((size, len(registration.points)), np.int64)
+    seen[registration.observed_by, registration.observed_point] = 1
+    return seen @ seen.T
+
+
+def _two_parts(indices: list[int], shared: npt.NDArray[np.int64]) -> tuple[list[int], list[int]]:
+    """The frames without the last of the links that join all, strongest first: the larger part and the rest."""
+    links = sorted(
+        ((i, j) for place, i in enumerate(indices) for j in indices[:place]),
+        key=lambda pair: (-shared[pair], pair),
+    )
+    taken: list[tuple[int, int]] = []
+    for link in links:
+        parts = connected(indices, [*taken, link])
+        if len(parts) == 1:
+            break
+        taken.append(link)
+    first, *rest = connected(indices, taken)
+    return first, [index for part in rest for index in part]

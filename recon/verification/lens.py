@@ -1,0 +1,65 @@
+"""Given focal lengths doubted: what the pictures themselves say when the lens is set free."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from recon.keyframe import Keyframe
+from recon.registration import focal
+from recon.registration.two_view import TwoView
+from recon.verification import refit
+
+FREE_RADIAL = 0.3  # sigma of the radial coefficient
+STEPS = (0.0, 0.35, -0.35)  # of log focal, from which it is set free: a wrong one can be a local minimum
+
+
+@dataclass(frozen=True)
+class FreedLens:
+    """A lens whose focal length was given, after the same observations were adjusted with it free."""
+
+    given: float  # pixels of the full-size image
+    found: float
+    cost_ratio: float  # robust cost with the lens free over that with it as given
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """What the observations ask for when the first radial coefficient of all lenses is free, too."""
+
+    corner_shift: float  # by which a corner of the picture moves further, relative to its distance from the middle
+    cost_ratio: float  # robust cost with it free over that with it as registered
+
+
+def distortion(fit: refit.Fit) -> Distortion:
+    held = refit.adjusted(fit)
+    num_lenses = len(held.prior.sigmas)
+    free = refit.adjusted(replace(held, prior=replace(held.prior, radial_sigmas=np.full(num_lenses, FREE_RADIAL))))
+    corner = 0.6 * 1024.0 * np.array([held.scale[held.problem.lens_of_camera == g].max() for g in range(num_lenses)])
+    further = (free.problem.radials - held.problem.radials) * (corner / np.exp(free.problem.log_focals)) ** 2
+    return Distortion(float(np.abs(further).max()), float(free.cost / max(held.cost, 1e-12)))
+
+
+def freed(fit: refit.Fit) -> tuple[FreedLens, ...]:
+    """All lenses that the fit holds fixed, set free together. Empty where none is."""
+    fixed = fit.prior.sigmas == 0
+    if not fixed.any():
+        return ()
+    held = refit.adjusted(fit)
+    prior = replace(held.prior, sigmas=np.where(fixed, refit.FREE_SIGMA, held.prior.sigmas))
+    starts = [held.problem.log_focals + np.where(fixed, step, 0.0) for step in STEPS]
+    tried = [refit.adjusted(replace(held, prior=prior, problem=replace(held.problem, log_focals=s))) for s in starts]
+    free = min(tried, key=lambda candidate: candidate.cost)
+    ratio = free.cost / max(held.cost, 1e-12)
+    focals = np.exp(np.stack([held.problem.log_focals, free.problem.log_focals]))
+    return tuple(FreedLens(float(focals[0, g]), float(focals[1, g]), float(ratio)) for g in np.nonzero(fixed)[0])
+
+
+def voted_focal(keyframes: Sequence[Keyframe], pairs: Sequence[TwoView]) -> float | None:
+    """The focal length in pixels that the pairs vote for where all frames have the same size, else None."""
+    sides = {max(keyframe.frame.width, keyframe.frame.height) for keyframe in keyframes}
+    if len(sides) != 1 or not pairs:
+        return None
+    return focal.vote(pairs, num_candidates=1)[0] * sides.pop()

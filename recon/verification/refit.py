@@ -1,0 +1,150 @@
+"""A registration adjusted once more: from another start, from some of its points, or with a lens set free."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.geometry import align_cameras
+from recon.keyframe import Keyframe
+from recon.registration import bundle
+from recon.registration.register import Registration
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.int64]
+
+FREE_SIGMA = 0.3  # of log focal where nothing is known
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A bundle that holds C registered cameras, numbered in their order, with what is known of their lenses."""
+
+    problem: bundle.Problem
+    prior: bundle.FocalPrior
+    loss: bundle.Config
+    scale: Array  # (C,) longer side of each frame over 1024
+
+    @property
+    def Ts_world_camera(self) -> Array:
+        """(C, 4, 4)"""
+        return Ts_world_camera(self.problem)
+
+    @property
+    def cost(self) -> float:
+        """Robust cost of an observation, pixels squared."""
+        return bundle.robust_cost(self.problem, self.loss) / max(1, len(self.problem.pixels))
+
+
+def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_camera: int) -> Fit:
+    """The registration as a bundle of at most about `tracks_per_camera` tracks a camera, the longest first.
+
+    Cameras whose lens came out the same to the last digit share it. A given focal length is kept, a nominal one held
+    loosely, an unknown one almost free.
+    """
+    cameras = registration.cameras
+    position = np.full(len(keyframes), -1)
+    position[[camera.index for camera in cameras]] = np.arange(len(cameras))
+    camera_of = position[registration.observed_by]
+    chosen = _longest(camera_of, registration.observed_point, len(registration.points), tracks_per_camera)
+    observed = chosen[registration.observed_point]
+    lenses = [(camera.focal, camera.radial, *camera.principal) for camera in cameras]
+    unique = sorted(set(lenses))
+    lens_of_camera = np.array([unique.index(lens) for lens in lenses])
+    sigmas = np.zeros(len(unique))
+    for camera, lens in zip(cameras, lens_of_camera, strict=True):
+        given = keyframes[camera.index].frame.intrinsics
+        sigmas[lens] = FREE_SIGMA if given is None or given.source not in ("given", "calibration") else 0.0
+    principal = np.stack([camera.principal for camera in cameras])
+    Ts_camera_world: Array = np.linalg.inv(np.stack([camera.T_world_camera for camera in cameras])).astype(np.float64)
+    (kept,) = np.nonzero(chosen)
+    problem = bundle.Problem(
+        rotations=Ts_camera_world[:, :3, :3],
+        translations=Ts_camera_world[:, :3, 3],
+        lens_of_camera=lens_of_camera,
+        log_focals=np.log([lens[0] for lens in unique]),
+        radials=np.array([lens[1] for lens in unique]),
+        shifts=np.zeros((len(unique), 2)),
+        points=registration.points[kept],
+        camera_of=camera_of[observed],
+        point_of=np.searchsorted(kept, registration.observed_point[observed]),
+        pixels=(registration.observed_pixels - principal[camera_of])[observed],
+    )
+    scale = np.array([max(keyframes[c.index].frame.width, keyframes[c.index].frame.height) for c in cameras]) / 1024.0
+    prior = bundle.FocalPrior(problem.log_focals, sigmas, np.zeros(len(unique)), np.zeros((len(unique), 2))[:, 0])
+    errors = bundle.reprojection_errors(problem)
+    robust_px = float(np.clip(3.0 * np.median(errors), *(np.array([0.4, 1.5]) * np.median(scale))))
+    return Fit(problem, prior, bundle.Config(robust_px=robust_px), scale)
+
+
+def _longest(camera_of: Index, point_of: Index, num_points: int, per_camera: int) -> npt.NDArray[np.bool_]:
+    """(P,) the points that are among the `per_camera` most often seen of at least one camera; ties fall by chance."""
+    times_seen = np.bincount(point_of, minlength=num_points)
+    rank = np.empty(num_points, np.int64)
+    rank[np.lexsort((np.random.default_rng(0).permutation(num_points), -times_seen))] = np.arange(num_points)
+    chosen = np.zeros(num_points, bool)
+    for camera in np.unique(camera_of):
+        mine = point_of[camera_of == camera]
+        chosen[mine[np.argsort(rank[mine], kind="stable")[:per_camera]]] = True
+    return chosen
+
+
+def adjusted(start: Fit) -> Fit:
+    return replace(start, problem=bundle.adjust(start.problem, start.prior, start.loss))
+
+
+def without_points(start: Fit, left_out: npt.NDArray[np.bool_]) -> Fit:
+    """The same with the points `left_out` (P,) taken away."""
+    problem = start.problem
+    (kept,) = np.nonzero(~left_out)
+    observed = ~left_out[problem.point_of]
+    smaller = replace(
+        problem,
+        points=problem.points[kept],
+        camera_of=problem.camera_of[observed],
+        point_of=np.searchsorted(kept, problem.point_of[observed]),
+        pixels=problem.pixels[observed],
+    )
+    return replace(start, problem=smaller)
+
+
+def Ts_world_camera(problem: bundle.Problem) -> Array:
+    """(C, 4, 4) of a bundle's cameras."""
+    Ts = np.tile(np.eye(4), (len(problem.rotations), 1, 1))
+    Ts[:, :3, :3] = problem.rotations.transpose(0, 2, 1)
+    Ts[:, :3, 3] = -np.einsum("cji,cj->ci", problem.rotations, problem.translations)
+    return Ts
+
+
+@dataclass(frozen=True)
+class Shift:
+    """How far cameras have moved from one fit to another."""
+
+    rotation_deg: float  # the largest change of a relative rotation
+    centre_rel: float  # RMS change of the centres after the best similarity, relative to their spread
+    focal_rel: float  # the largest change of a focal length, of its logarithm
+
+
+LOST = Shift(180.0, 1e3, 10.0)
+
+
+def shift(before: Fit, after: Fit) -> Shift:
+    """`LOST` where one of them has come to nothing."""
+    Ts_before, Ts_after = before.Ts_world_camera, after.Ts_world_camera
+    if not (np.isfinite(Ts_before).all() and np.isfinite(Ts_after).all()):
+        return LOST
+    first, second = np.triu_indices(len(Ts_before), 1)
+    relative = [Ts[first, :3, :3].transpose(0, 2, 1) @ Ts[second, :3, :3] for Ts in (Ts_before, Ts_after)]
+    chord = np.linalg.norm(relative[0] - relative[1], axis=(1, 2)) / np.sqrt(8.0)
+    moved = align_cameras(Ts_after, Ts_before)
+    centres = moved.scale * Ts_after[:, :3, 3] @ moved.rotation.T + moved.translation
+    target = Ts_before[:, :3, 3]
+    spread = np.sqrt(((target - target.mean(0)) ** 2).sum(1).mean())
+    return Shift(
+        rotation_deg=float(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))).max()),
+        centre_rel=float(np.sqrt(((centres - target) ** 2).sum(1).mean()) / max(spread, 1e-12)),
+        focal_rel=float(np.abs(before.problem.log_focals - after.problem.log_focals).max()),
+    )

@@ -1,0 +1,45 @@
+"""The mirrored answer: seen from afar, a scene and its mirror image in depth look the same from mirrored cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from recon.registration import bundle
+from recon.verification import refit
+
+SAME_DEG, SAME_REL = 1.0, 0.03  # of rotations and centres: the mirrored start has found the way back
+NO_RIVAL = 100.0
+
+
+def mirrored_cost(fit: refit.Fit) -> float:
+    """How much worse the mirrored answer is than this one: the ratio of their costs, both adjusted; near 1 nothing
+    tells them apart, and 100 at most.
+
+    Under an affine camera, points mirrored in a plane that faces the camera and cameras turned the other way give the
+    same pictures (Necker's reversal; Shapiro et al. 1995). Perspective breaks the tie, if there is enough of it.
+    """
+    whole = refit.adjusted(fit)
+    other = refit.adjusted(replace(whole, problem=_mirrored(whole.problem)))
+    between = refit.shift(whole, other)
+    if not np.isfinite(other.cost) or (between.rotation_deg < SAME_DEG and between.centre_rel < SAME_REL):
+        return NO_RIVAL
+    return min(NO_RIVAL, other.cost / max(whole.cost, 1e-12))
+
+
+def _mirrored(problem: bundle.Problem) -> bundle.Problem:
+    """The problem with its points mirrored in the plane through their middle that faces the first camera."""
+    rotation0, translation0 = problem.rotations[0], problem.translations[0]
+    points = problem.points @ rotation0.T + translation0
+    rotations = problem.rotations @ rotation0.T
+    translations = problem.translations - rotations @ translation0
+    middle = np.median(points, axis=0)
+    mirror = np.diag([1.0, 1.0, -1.0])
+    turned = mirror @ rotations @ mirror
+    return replace(
+        problem,
+        rotations=turned,
+        translations=rotations @ middle + translations - turned @ middle,
+        points=(points - middle) @ mirror + middle,
+    )

@@ -1,0 +1,94 @@
+"""The verification of a registration: evidence from sources that the fit did not use, or used otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import cv2
+import msgspec
+import numpy as np
+
+from recon.registration.register import Registration
+from recon.verification import cycles, exposure, joints, lens, photometric, refit, reversal, stability
+from recon.verification.evidence import CameraEvidence, Evidence
+from recon.verification.photometric import Picture
+from recon.view_graph import ViewGraph
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    tracks_per_camera: int = 300  # with which answers are found again
+    photometric: photometric.Config = photometric.Config()
+    cycles: cycles.Config = cycles.Config()
+
+
+def verify(graph: ViewGraph, registration: Registration | None, config: Config) -> Evidence | None:
+    """Numbers for and against `registration`; None where it has fewer than three cameras, which confirm nothing."""
+    if registration is None or len(registration.cameras) < 3:
+        return None
+    fit = refit.fit(graph.keyframes, registration, config.tracks_per_camera)
+    views = pictures(graph, registration, config.photometric)
+    return Evidence(
+        cameras=_of_cameras(graph, registration, views, config),
+        agreement=_agreement(graph, registration, None),
+        joint=joints.weakest(registration, graph.pairs, views, config.photometric),
+        spread=stability.by_regions(fit),
+        mirrored_cost=reversal.mirrored_cost(fit),
+        cycles=cycles.measure(graph.keyframes, registration, graph.pairs, config.cycles),
+        median_angle_deg=registration.median_angle_deg,
+        rms_px=registration.rms_px,
+        focal_sigma=registration.focal_sigma,
+        freed=lens.freed(fit),
+        distortion=lens.distortion(fit),
+    )
+
+
+def _of_cameras(
+    graph: ViewGraph, registration: Registration, views: Mapping[int, Picture], config: Config
+) -> tuple[CameraEvidence, ...]:
+    times_seen = np.bincount(registration.observed_point, minlength=len(registration.points))
+    by_third = times_seen[registration.observed_point] >= 3
+    confirmed = np.bincount(registration.observed_by[by_third], minlength=len(graph.keyframes))
+    scales = {index: graph.keyframes[index].scale for index in views}
+    gains = exposure.gains({index: picture.grey for index, picture in views.items()}, registration, scales)
+    return tuple(
+        CameraEvidence(
+            name=graph.keyframes[camera.index].name,
+            agreement=_agreement(graph, registration, camera.index),
+            confirmed=int(confirmed[camera.index]),
+            gain=gains[camera.index],
+            patches=photometric.in_partners(camera.index, views, registration, config.photometric),
+            rotation_sigma_deg=camera.rotation_sigma_deg,
+            centre_sigma_rel=camera.centre_sigma_rel,
+        )
+        for camera in registration.cameras
+    )
+
+
+def _agreement(graph: ViewGraph, registration: Registration, index: int | None) -> float:
+    """The share of matches that the cameras explain, of all verified pairs or of those of one frame."""
+    pairs = {key: share for key, share in registration.agreement.items() if index is None or index in key}
+    matched = sum(len(graph.pairs[key].matches) for key in pairs)
+    return sum(share * len(graph.pairs[key].matches) for key, share in pairs.items()) / max(1, matched)
+
+
+def pictures(
+    graph: ViewGraph, registration: Registration, config: photometric.Config
+) -> dict[int, photometric.Picture]:
+    """The registered views at modelled size, by keyframe."""
+    views = {}
+    for camera in registration.cameras:
+        keyframe = graph.keyframes[camera.index]
+        scale = np.array(keyframe.scale)
+        (fx, fy), (cx, cy) = camera.focal * scale, camera.principal * scale
+        mine = registration.observed_by == camera.index
+        to_camera = np.linalg.inv(camera.T_world_camera)
+        points = registration.points[registration.observed_point[mine]]
+        views[camera.index] = photometric.picture(
+            cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY).astype(np.float32),
+            np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
+            camera.T_world_camera,
+            registration.observed_pixels[mine] * scale,
+            points @ to_camera[2, :3] + to_camera[2, 3],
+            config,
+        )
+    return views
