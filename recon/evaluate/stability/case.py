@@ -27,6 +27,9 @@ LIGHT = Config(
 )
 
 
+_WHOLE = (Code.OK, Code.EXPOSURE_SHIFT)  # a scene of all frames: recorded photographs differ in exposure too
+
+
 class Demand(enum.Enum):
     ACCEPT = "accept"  # a refusal is a false refusal
     REFUSE = "refuse"
@@ -103,8 +106,8 @@ def described(photos: Sequence[Photo], note: str) -> str:
 
 
 def accepted(photos: Sequence[Photo], note: str, *codes: Code, probe: Probe | None = None) -> Case:
-    """Photographs that are enough for a scene. Besides `codes`, OK is always fitting."""
-    fitting = frozenset((Code.OK, *codes))
+    """Photographs that are enough for a scene. Besides `codes`, OK is always fitting, and so is a change of light."""
+    fitting = frozenset((*_WHOLE, *codes))
     return Case(described(photos, note), all_at_hand(photos), Demand.ACCEPT, fitting, (world(photos),), probe=probe)
 
 
@@ -115,5 +118,5 @@ def refused(photos: Sequence[Photo], note: str, *codes: Code) -> Case:
 
 def either(photos: Sequence[Photo], note: str, *codes: Code) -> Case:
     """Photographs that may or may not be enough."""
-    fitting = frozenset((Code.OK, Code.OK_PARTIAL, *codes))
+    fitting = frozenset((*_WHOLE, Code.OK_PARTIAL, *codes))
     return Case(described(photos, note), all_at_hand(photos), Demand.EITHER, fitting, (world(photos),))

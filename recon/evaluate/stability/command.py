@@ -37,11 +37,9 @@ def stability(args: argparse.Namespace) -> int:
         chart.draw(args.out / "stability.json", args.out)
     for trial in trials:
         if trial["outcome"] in ("false_accept", "false_refuse", "failed"):
-            print(
-                f"{trial['outcome']}: row {trial['row']} {trial['name']}, seed {trial['seed']}, {trial['method']}: ",
-                end="",
-            )
-            print(f"{trial['verdict']}; {trial['note']}; {trial['message'].strip().splitlines()[-1]}")
+            which = f"row {trial['row']} {trial['name']}, seed {trial['seed']}, {trial['method']}"
+            reason = trial["message"].strip().splitlines()[-1]
+            print(f"{trial['outcome']}: {which}: {trial['verdict']}; {trial['note']}; {reason}")
     for method in dict.fromkeys(trial["method"] for trial in trials):
         summary = summarise(trials, method)
         print(

@@ -12,7 +12,14 @@ from recon.evaluate.stability.case import Case, accepted, either, refused, row, 
 from recon.evaluate.stability.places import Photo, Stage, far_apart, renamed
 from recon.verdict import Code
 
-_AMBIGUOUS = (Code.AMBIGUOUS, Code.SPLIT, Code.OUTLIER_VIEW, Code.NO_OVERLAP, Code.BASELINE_TOO_SMALL)
+_AMBIGUOUS = (
+    Code.AMBIGUOUS,
+    Code.SPLIT,
+    Code.OUTLIER_VIEW,
+    Code.NO_OVERLAP,
+    Code.BASELINE_TOO_SMALL,
+    Code.MIXED_CAMERAS,  # places are often photographed by cameras of their own
+)
 
 
 @row(10, "one outlier")

@@ -146,7 +146,7 @@ def _answer_here(case: Case, method: str) -> Answer:
     seconds, processor_seconds = time.perf_counter() - started, time.process_time() - worked
     peak = peak_rss_mb()
     publishable = snapshot.verdict.publishable
-    probed = case.probe is not None and method == "splatnode" and publishable
+    probe = case.probe if publishable and method == "splatnode" else None
     return Answer(
         verdict=snapshot.verdict,
         cameras=snapshot.cameras if publishable else (),
@@ -154,5 +154,5 @@ def _answer_here(case: Case, method: str) -> Answer:
         seconds=seconds,
         processor_seconds=processor_seconds,
         peak_rss_mb=peak,
-        measured=case.probe(snapshot, case.config) if case.probe is not None and probed else None,
+        measured=probe(snapshot, case.config) if probe is not None else None,
     )
