@@ -25,7 +25,7 @@ from capture.status import HEARTBEAT_S, CaptureStatus, own_rss_mb
 
 log = logging.getLogger(__name__)
 
-TURN_S = 0.02  # the longest that a request waits for its answer
+TURN_S = 0.05  # the longest that a request waits for its answer
 
 
 def capture(config: CaptureConfig) -> None:

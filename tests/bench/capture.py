@@ -28,7 +28,7 @@ from capture.preview import PreviewHeader
 from capture.status import CaptureStatus
 
 RATE, WIDTH, HEIGHT = 30, 1280, 720
-FRAMES = 240
+FRAMES = 480  # so that the wall goes by at an eighth of the picture a second
 
 
 def main() -> None:
