@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import itertools
+import os
+import subprocess
+import sys
 from datetime import timedelta
 from types import SimpleNamespace
 from typing import Any
@@ -15,6 +18,7 @@ from capture.cameras import depthai as oak
 from capture.cameras.depthai import Config, find, read, stream, to_frame
 from capture.frame import Intrinsics
 from capture.unavailable import CameraUnavailable
+from tests.conftest import ROOT
 
 PERSPECTIVE = "CameraModel.Perspective"
 LENS = [[800.0, 0, 639.5], [0, 801.0, 359.5], [0, 0, 1]]
@@ -180,6 +184,14 @@ def test_found_cameras_are_named_as_the_configuration_wants_them(monkeypatch):
     pytest.importorskip("depthai", reason="find() asks only where depthai is installed")
     use(monkeypatch, FakeDepthai(["first"]))
     assert find() == [{"device": "first", "description": "RVC2 at usb-first (UNBOOTED)"}]
+
+
+def test_the_real_library_is_asked_and_prints_nothing():
+    pytest.importorskip("depthai", reason="needs the extra oak")
+    program = "from capture.cameras import depthai; assert isinstance(depthai.find(), list)"
+    environment = {key: value for key, value in os.environ.items() if key != "DEPTHAI_LEVEL"}
+    result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, env=environment)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
 
 
 def test_depthais_own_replay(tmp_path, monkeypatch):

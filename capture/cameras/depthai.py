@@ -154,7 +154,7 @@ def _chosen(dai: ModuleType, device: str) -> Any:
 
 
 def _depthai() -> ModuleType:
-    os.environ.setdefault("DEPTHAI_LEVEL", "err")  # its warnings go to stdout
+    os.environ.setdefault("DEPTHAI_LEVEL", "error")  # its warnings go to stdout
     try:
         return importlib.import_module("depthai")
     except ImportError as error:
