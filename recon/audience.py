@@ -33,7 +33,7 @@ def viewer(pictures: Path, command: tuple[str, ...] = (sys.executable, "-m", "sp
         config = Path(folder, "node.yaml")
         config.write_text(f"network: {{directory: {folder}}}\n")
         with _Stage(Network(directory=Path(folder))) as stage:
-            child = subprocess.Popen([*command, str(config), "--out", str(pictures)])
+            child = subprocess.Popen([*command, str(config), "--until-final", "--out", str(pictures)])
             try:
                 yield stage.show
                 child.wait()

@@ -17,7 +17,7 @@ from recon.cli import LOOK_EVERY, with_looks
 from recon.config import preset
 from tests.test_viewer_cli import snapshot
 
-SLEEPER = (sys.executable, "-c", "import time; time.sleep(60)")
+SLEEPER = (sys.executable, "-c", "import time; time.sleep(60)", "--")
 
 
 def test_the_viewer_gets_the_last_snapshot(tmp_path, capfd, monkeypatch):

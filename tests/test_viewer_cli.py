@@ -211,7 +211,10 @@ def test_a_node_is_watched_without_a_display(node, tmp_path, monkeypatch, capsys
     config = tmp_path / "node.yaml"
     config.write_text(f"network: {{directory: {network.directory}}}\n")
     out = tmp_path / "pictures"
-    assert splatnode.main(["view", str(config), "--headless", "--size", "160x120", "--out", str(out)]) == 0
+    assert (
+        splatnode.main(["view", str(config), "--headless", "--until-final", "--size", "160x120", "--out", str(out)])
+        == 0
+    )
     assert (out / "live.png").is_file() and "live.png: OK: All is well." in capsys.readouterr().out
     assert given_up == [1, 1, 5]  # one thread, and only what the node leaves
 

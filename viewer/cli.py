@@ -54,8 +54,12 @@ def view(args: argparse.Namespace) -> int:
         source = _source(args, finished)
         _give_way()
         with contextlib.closing(source):
-            keep_picture(source, folder, width, height, stop=lambda: False, say=lambda line: print(line, flush=True))
+            keep_picture(source, folder, width, height, until_final=args.until_final, say=_say)
     return EXIT_GOOD
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)
 
 
 def _finished(args: argparse.Namespace) -> Moment | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -80,24 +80,24 @@ def overview_picture(analysis: Analysis, width: int, height: int) -> Image:
 
 
 def keep_picture(
-    source: Source, folder: Path, width: int, height: int, stop: Callable[[], bool], say: Callable[[str], None]
+    source: Source, folder: Path, width: int, height: int, *, until_final: bool, say: Callable[[str], None]
 ) -> None:
-    """Writes live.png anew for every moment that comes, the newest first, until `stop` or the end of the source.
+    """Writes live.png anew for every moment that comes, the newest first, for ever or until a snapshot is final.
 
     A moment that comes while another one is painted replaces those that wait: nothing piles up.
     """
-    for moment in _moments(source, stop):
+    for moment in _moments(source):
         started = time.perf_counter()
         picture = overview_picture(analyse(moment), width, height)
         write_file(folder / _LIVE, _png(picture))
         line = words.verdict_lines(moment)[0]
         say(f"{folder / _LIVE}: {line} ({time.perf_counter() - started:.1f} s)")
-        if moment.snapshot.final:
+        if until_final and moment.snapshot.final:
             return
 
 
-def _moments(source: Source, stop: Callable[[], bool]) -> Iterable[Moment]:
-    while not stop():
+def _moments(source: Source) -> Iterator[Moment]:
+    while True:
         moment = source.take()
         if moment is not None:
             yield moment

@@ -69,7 +69,7 @@ def feed_line(age_s: float | None, final: bool) -> str:
     if age_s == float("inf"):
         return "waiting for the node: nothing has come yet"
     if final:
-        return "the node has finished"
+        return "the scene is finished"
     if age_s > _STALE_S:
         return f"STALE: nothing has come for {age_s:.0f} s"
     return "live"
