@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
-from typing import TypeVar
+from typing import Protocol, TypeVar
+
+import numpy as np
+import numpy.typing as npt
 
 from recon.keyframe import Keyframe
 from recon.registration import features, register
@@ -14,17 +17,30 @@ from recon.registration.two_view import TwoView
 T = TypeVar("T")
 
 
+class Matcher(Protocol):
+    """Finds matches that the plain features do not, as a prior may."""
+
+    def with_points(self, keyframe: Keyframe) -> Keyframe:
+        """The keyframe with the points that `match` needs beside those it has, which keep their numbers."""
+        ...
+
+    def match(self, keyframe1: Keyframe, keyframe2: Keyframe) -> npt.NDArray[np.int64]:
+        """(M, 2) numbers of points that show the same, most distinct first. They are checked by their geometry."""
+        ...
+
+
 class ViewGraph:
     """Grows by one keyframe at a time. What its pairs say does not depend on the order in which keyframes came.
 
     Each keyframe is compared with all others by their plain features. Where two hardly match, one of them has few firm
     partners, and they may overlap all the same, they are compared again with squeezed features, which find each other
     from further to the side and cost twice as much again. They may overlap when something in their matches hints at it,
-    when they have a firm partner in common, or when firm pairs do not connect them at all.
+    when they have a firm partner in common, or when firm pairs do not connect them at all. What a prior's matcher finds
+    there is added to them.
     """
 
-    def __init__(self, config: register.Config) -> None:
-        self._config = config
+    def __init__(self, config: register.Config, matcher: Matcher | None = None) -> None:
+        self._config, self._matcher = config, matcher
         self.keyframes: list[Keyframe] = []
         self.pairs: dict[tuple[int, int], TwoView] = {}  # verified, by position (i < j)
         self._plain: dict[tuple[int, int], Compared] = {}  # the first frame is the first in order of content
@@ -47,7 +63,7 @@ class ViewGraph:
         def remaining(pairs: Mapping[tuple[int, int], T]) -> dict[tuple[int, int], T]:
             return {(place[i], place[j]): what for (i, j), what in pairs.items() if i in place and j in place}
 
-        rest = ViewGraph(self._config)
+        rest = ViewGraph(self._config, self._matcher)
         rest.keyframes = [self.keyframes[index] for index in kept]
         rest.pairs, rest._plain, rest._squeezed = (
             remaining(self.pairs),
@@ -105,7 +121,13 @@ class ViewGraph:
             )
             self.keyframes[index] = replace(keyframe, features=widened)
         keyframes = self.keyframes[first], self.keyframes[second]
-        return register.compare_squeezed(*keyframes, self._plain[first, second], self._config)
+        squeezed = register.compare_squeezed(*keyframes, self._plain[first, second], self._config)
+        if self._matcher is None:
+            return squeezed
+        for index in (first, second):
+            self.keyframes[index] = self._matcher.with_points(self.keyframes[index])
+        keyframes = self.keyframes[first], self.keyframes[second]
+        return register.compare_further(*keyframes, squeezed, self._matcher.match(*keyframes), self._config)
 
     def _in_order(self, *indices: int) -> tuple[int, ...]:
         """The keyframes' numbers in the order of their content."""

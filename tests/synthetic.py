@@ -20,7 +20,7 @@ from recon.gaussians import Gaussians
 from recon.keyframe import Keyframe, modelled_image
 from recon.priors.pointmap import Pointmap
 from recon.registration import features, register
-from recon.view_graph import ViewGraph
+from recon.view_graph import Matcher, ViewGraph
 
 SMALL = synthetic.Config(views=6, width=320, height=240)
 
@@ -108,10 +108,10 @@ def _eight_bit(image: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
-def view_graph(frames: Iterable[Frame]) -> ViewGraph:
+def view_graph(frames: Iterable[Frame], matcher: Matcher | None = None) -> ViewGraph:
     """The frames as keyframes, each compared with all before it."""
     config = register.Config()
-    graph = ViewGraph(config)
+    graph = ViewGraph(config, matcher)
     for frame in frames:
         found = features.extract(frame.image, config.features)
         graph.add(Keyframe(frame, modelled_image(frame.image, 320), found))

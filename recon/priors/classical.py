@@ -15,7 +15,7 @@ from recon.priors.fusion import DepthMap
 from recon.priors.pointmap import Pointmap
 from recon.registration import register
 from recon.registration.register import Registration
-from recon.view_graph import ViewGraph
+from recon.view_graph import Matcher, ViewGraph
 
 Array = npt.NDArray[np.float64]
 
@@ -46,8 +46,10 @@ class DepthMaps(Protocol):
 class ClassicalPrior:
     """Cameras by `recon.registration`, depth by `recon.priors.stereo` or what takes its place."""
 
-    def __init__(self, config: Config, depth_maps: DepthMaps = stereo.depth_maps) -> None:
-        self._config, self._depth_maps = config, depth_maps
+    def __init__(
+        self, config: Config, depth_maps: DepthMaps = stereo.depth_maps, matcher: Matcher | None = None
+    ) -> None:
+        self._config, self._depth_maps, self.matcher = config, depth_maps, matcher
 
     def register(self, graph: ViewGraph) -> Registration | None:
         if not graph.pairs:

@@ -7,7 +7,7 @@ from typing import Protocol
 
 from recon.priors.pointmap import Pointmap
 from recon.registration.register import Registration
-from recon.view_graph import ViewGraph
+from recon.view_graph import Matcher, ViewGraph
 
 
 class Prior(Protocol):
@@ -15,6 +15,11 @@ class Prior(Protocol):
 
     The two steps are apart because the verdict stands between them: refused cameras cost no dense points.
     """
+
+    @property
+    def matcher(self) -> Matcher | None:
+        """What the view graph shall ask where plain features find few matches."""
+        ...
 
     def register(self, graph: ViewGraph) -> Registration | None:
         """Cameras of the keyframes that hang together, with the evidence for them; None when no two do."""

@@ -90,12 +90,22 @@ def compare_squeezed(keyframe1: Keyframe, keyframe2: Keyframe, plain: Compared, 
     found += [
         _match(keyframe1.features, keyframe2.features, squeezes, config.matching) for squeezes in sorted(from_the_side)
     ]
+    return _examine(keyframe1, keyframe2, _merged(found), config)
+
+
+def compare_further(keyframe1: Keyframe, keyframe2: Keyframe, known: Compared, more: Index, config: Config) -> Compared:
+    """The same with `more` matches (M, 2) of the keyframes' points, most distinct first, beside the `known` ones."""
+    return _examine(keyframe1, keyframe2, _merged([known.matches, more]), config)
+
+
+def _merged(found: Sequence[Index]) -> Index:
+    """(M, 2) matches of several sets, the most distinct of each first; every point is in one match at most."""
     rank = np.concatenate([np.arange(len(matches)) / max(1, len(matches)) for matches in found])
     merged = np.concatenate(found)[np.argsort(rank, kind="stable")]
     for side in (0, 1):
         _, first = np.unique(merged[:, side], return_index=True)
         merged = merged[np.sort(first)]
-    return _examine(keyframe1, keyframe2, merged, config)
+    return merged
 
 
 def _match(features1: Features, features2: Features, squeezes: tuple[float, float], config: matching.Config) -> Index:

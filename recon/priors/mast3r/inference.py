@@ -13,6 +13,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from recon.keyframe import Keyframe
 from recon.priors.mast3r.alignment import PairPoints
 from recon.priors.mast3r.network import Encoded, Prediction
 
@@ -63,31 +64,41 @@ def prepared(image: Image, to: Crop) -> Tensor:
     return torch.from_numpy(cut).permute(2, 0, 1).float() / 127.5 - 1.0
 
 
-@dataclass(frozen=True, eq=False)
-class Answers:
-    """What the network says about a set of photographs."""
+class Asked:
+    """What the network has said about photographs and pairs of them, each asked about once."""
 
-    crops: tuple[Crop, ...]
-    pairs: dict[tuple[int, int], tuple[Prediction, Prediction]]  # by position (first, second)
+    def __init__(self, network: Network, longer_side: int) -> None:
+        self._network, self._longer_side = network, longer_side
+        self._encoded: dict[str, Encoded] = {}
+        self._pairs: dict[tuple[str, str], tuple[Prediction, Prediction]] = {}
 
-    def points(self) -> dict[tuple[int, int], PairPoints]:
-        return {
-            pair: PairPoints(
-                first.points.numpy(), first.confidence.numpy(), second.points.numpy(), second.confidence.numpy()
-            )
-            for pair, (first, second) in self.pairs.items()
-        }
+    def crop_of(self, keyframe: Keyframe) -> Crop:
+        return crop(keyframe.frame.width, keyframe.frame.height, self._longer_side)
 
+    @torch.inference_mode()
+    def pair(self, first: Keyframe, second: Keyframe) -> tuple[Prediction, Prediction]:
+        """What the ordered pair says about its first and its second photograph, in the first camera's frame."""
+        names = first.name, second.name
+        if names not in self._pairs:
+            self._pairs[names] = self._network.decode(self._encode(first), self._encode(second))
+        return self._pairs[names]
 
-@torch.inference_mode()
-def ask(network: Network, images: Sequence[Image], longer_side: int, max_neighbours: int) -> Answers:
-    """Every ordered pair of photographs at most `max_neighbours` places apart in the (circular) order they came in."""
-    crops = tuple(crop(image.shape[1], image.shape[0], longer_side) for image in images)
-    encoded = [network.encode(prepared(image, to)) for image, to in zip(images, crops, strict=True)]
-    count = len(images)
-    pairs = {
-        (i, j): network.decode(encoded[i], encoded[j])
-        for i, j in itertools.permutations(range(count), 2)
-        if min((i - j) % count, (j - i) % count) <= max_neighbours
-    }
-    return Answers(crops, pairs)
+    def points(self, keyframes: Sequence[Keyframe], max_neighbours: int) -> dict[tuple[int, int], PairPoints]:
+        """By position, all ordered pairs at most `max_neighbours` places apart in a circle. Others are forgotten."""
+        names = [keyframe.name for keyframe in keyframes]
+        self._pairs = {pair: what for pair, what in self._pairs.items() if pair[0] in names and pair[1] in names}
+        count = len(keyframes)
+        found = {}
+        for i, j in itertools.permutations(range(count), 2):
+            if min((i - j) % count, (j - i) % count) <= max_neighbours:
+                first, second = self.pair(keyframes[i], keyframes[j])
+                found[i, j] = PairPoints(
+                    first.points.numpy(), first.confidence.numpy(), second.points.numpy(), second.confidence.numpy()
+                )
+        return found
+
+    def _encode(self, keyframe: Keyframe) -> Encoded:
+        if keyframe.name not in self._encoded:
+            to = self.crop_of(keyframe)
+            self._encoded[keyframe.name] = self._network.encode(prepared(keyframe.frame.image, to))
+        return self._encoded[keyframe.name]

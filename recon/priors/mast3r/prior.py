@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -17,12 +18,11 @@ from recon.priors.classical import modelled_K
 from recon.priors.depth_normals import normals_of_depth
 from recon.priors.mast3r.alignment import AlignedView, align
 from recon.priors.mast3r.checkpoint import LICENCE, load_network
-from recon.priors.mast3r.inference import Answers, Crop, Network, ask
+from recon.priors.mast3r.inference import Asked, Crop, Network
 from recon.priors.mast3r.network import Prediction
 from recon.priors.pointmap import Pointmap
-from recon.registration import register, two_view
+from recon.registration import register
 from recon.registration.register import RegisteredCamera, Registration
-from recon.registration.two_view import TwoView
 from recon.view_graph import ViewGraph
 from recon.weights import find
 
@@ -40,43 +40,35 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Mast3rPrior:
-    """Matches by descriptors, cameras by `recon.registration` from them, depth by global alignment."""
+    """Matches by descriptors, cameras by `recon.registration` from them, depth by global alignment.
+
+    A match is one between two detected features, and counts only where a pair's epipolar geometry holds it: what the
+    network invents between unrelated photographs is not in agreement with any.
+    """
 
     licence = LICENCE
 
     def __init__(self, network: Network, config: Config) -> None:
-        self._network, self._config = network, config
-        self._asked: tuple[tuple[str, ...], Answers] | None = None
+        self._config = config
+        self._asked = Asked(network, config.longer_side)
+        self.matcher = DescriptorMatcher(self._asked)
 
     def register(self, graph: ViewGraph) -> Registration | None:
-        """Cameras from the classical matches and those that the network's descriptors add to them.
-
-        A match is one between two detected features, and counts only where a pair's epipolar geometry holds it: what
-        the network invents between unrelated images is not in agreement with any.
-        """
-        if len(graph.keyframes) < 2:
+        if not graph.pairs:
             return None
-        answers = self._answers(graph)
-        pairs = dict(graph.pairs)
-        for i, j in answers.pairs:
-            if i < j and (verified := _verified(graph.keyframes, answers, i, j, self._config.registration)):
-                known = pairs.get((i, j))
-                if known is None or len(known.matches) < len(verified.matches):
-                    pairs[i, j] = verified
-        if not pairs:
-            return None
-        return register.register(graph.keyframes, pairs, self._config.registration)
+        return register.register(graph.keyframes, graph.pairs, self._config.registration)
 
     def pointmaps(
         self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
     ) -> tuple[Pointmap, ...]:
         """The aligned depth maps, each brought to the scale of the registered points that its camera sees."""
-        answers = self._answers(graph)
-        views = align(answers.points())
+        keyframes = [graph.keyframes[camera.index] for camera in registration.cameras]
+        views = align(self._asked.points(keyframes, self._config.max_neighbours))
         pause()
+        crops = [self._asked.crop_of(keyframe) for keyframe in keyframes]
         return tuple(
-            _pointmap(graph, registration, camera, views[camera.index], answers.crops[camera.index])
-            for camera in registration.cameras
+            _pointmap(graph, registration, camera, view, to)
+            for camera, view, to in zip(registration.cameras, views, crops, strict=True)
         )
 
     def further_pointmaps(
@@ -84,13 +76,22 @@ class Mast3rPrior:
     ) -> tuple[Pointmap, ...]:
         return tuple(found for found in self.pointmaps(graph, registration) if found.name not in known)
 
-    def _answers(self, graph: ViewGraph) -> Answers:
-        names = tuple(keyframe.name for keyframe in graph.keyframes)
-        if self._asked is None or self._asked[0] != names:
-            images = [keyframe.frame.image for keyframe in graph.keyframes]
-            config = self._config
-            self._asked = names, ask(self._network, images, config.longer_side, config.max_neighbours)
-        return self._asked[1]
+
+@dataclass(frozen=True, eq=False)
+class DescriptorMatcher:
+    """A `recon.view_graph.Matcher` by the network's descriptors at the features that keyframes have."""
+
+    asked: Asked
+
+    def with_points(self, keyframe: Keyframe) -> Keyframe:
+        return keyframe
+
+    def match(self, keyframe1: Keyframe, keyframe2: Keyframe) -> npt.NDArray[np.int64]:
+        first, second = self.asked.pair(keyframe1, keyframe2)
+        found1, inside1 = _at_features(first, self.asked.crop_of(keyframe1), keyframe1)
+        found2, inside2 = _at_features(second, self.asked.crop_of(keyframe2), keyframe2)
+        matches = _mutual(found1, found2)
+        return np.stack([inside1[matches[:, 0]], inside2[matches[:, 1]]], 1)
 
 
 def load(config: Config) -> Mast3rPrior:
@@ -98,21 +99,6 @@ def load(config: Config) -> Mast3rPrior:
     network = load_network(config.weights or find(WEIGHTS))
     log.info("%s", LICENCE)
     return Mast3rPrior(network, config)
-
-
-def _verified(
-    keyframes: Sequence[Keyframe], answers: Answers, i: int, j: int, config: register.Config
-) -> TwoView | None:
-    """The pair's matches by descriptors, as far as one epipolar geometry holds them."""
-    first, second = answers.pairs[i, j]
-    found1, inside1 = _at_features(first, answers.crops[i], keyframes[i])
-    found2, inside2 = _at_features(second, answers.crops[j], keyframes[j])
-    matches = _mutual(found1, found2)
-    matches = np.stack([inside1[matches[:, 0]], inside2[matches[:, 1]]], 1)
-    points1 = keyframes[i].features.points[matches[:, 0]] - register.principal_point(keyframes[i].frame)
-    points2 = keyframes[j].features.points[matches[:, 1]] - register.principal_point(keyframes[j].frame)
-    size = (keyframes[j].frame.width, keyframes[j].frame.height)
-    return two_view.verify(points1, points2, matches, size, config.two_view)
 
 
 def _at_features(
