@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 
-from recon import background, completion, density, judge, optimize, screening
+from recon import background, completion, density, judge, optimize, pixelwise, screening
 from recon.priors import classical
 from recon.verification import verify
 
@@ -19,6 +19,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     completion: completion.Config = completion.Config()
     density: density.Config = density.Config()
     background: background.Config = background.Config()
+    pixelwise: pixelwise.Config | None = None  # in place of completion, density and background, for comparison
     preview: optimize.Config = optimize.Config(iterations=30, half_resolution_share=1.0)  # after each keyframe
     optimize: optimize.Config = optimize.Config()  # after the last one
     max_gaussians: int | None = None  # None: as many as the scene calls for

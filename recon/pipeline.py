@@ -233,6 +233,7 @@ class Reconstruction:
             config.density,
             config.background,
             config.max_gaussians,
+            config.pixelwise,
         )
         self._pointmaps = {pointmap.name: pointmap for pointmap in pointmaps}
         self.clock.lap("points")

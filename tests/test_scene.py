@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from capture.config import typed
 from recon import background, completion, density, pixelwise
+from recon.config import Config
 from recon.priors.pointmap import Pointmap
 from recon.registration.register import RegisteredCamera
 from recon.scene import Scene, begin
@@ -70,6 +72,12 @@ def test_by_pixel_a_scene_has_what_stereo_knows_and_nothing_else(most):
     assert len(scene.views) == 2 and set(scene.gaussians.source_frame.tolist()) == {0, 1}
     assert len(scene.gaussians) == most or len(scene.gaussians) > WIDTH * HEIGHT
     torch.testing.assert_close(scene.gaussians.opacities, torch.full((len(scene.gaussians),), 0.1))
+
+
+def test_a_gaussian_a_pixel_is_asked_for_by_naming_it_in_the_configuration():
+    assert Config().pixelwise is None
+    chosen = typed({"pixelwise": {"opacity": 0.2}}, Config).pixelwise
+    assert chosen is not None and chosen.opacity == 0.2
 
 
 @pytest.mark.parametrize("most", [150, 20])
