@@ -32,7 +32,7 @@ Image = npt.NDArray[np.uint8]
 _TURN_PER_PIXEL = 0.006  # radians
 _ZOOM_PER_NOTCH = 0.88
 _CLICK_PX = 4  # a pointer that moves less between press and release clicks
-_SMOOTH_S = 0.06  # a picture that takes longer is painted at half the resolution while the pointer drags it
+_SMOOTH_S = 0.04  # a picture that takes longer is painted at half the resolution while the pointer drags it
 _PANEL_EMS = 22  # the panel's width, in letter widths of the theme
 _KEYS = {
     gui.KeyName.SPACE: "space",
