@@ -19,6 +19,7 @@ from recon.screening import Rejected
 from recon.verdict import Code, Verdict
 from recon.verification import lens
 from recon.verification.evidence import Evidence
+from recon.verification.lens import FreedLens
 from recon.verification.likelihood import Odds, weigh
 from recon.view_graph import ViewGraph
 
@@ -36,7 +37,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_angle_deg: float = 1.5  # median of the points' widest viewing angles
     max_focal_sigma: float = 0.1  # of log focal; right up to 0.073, wrong from 0.13
     focal_gain: float = 0.8  # a given lens is doubted when setting it free lowers the cost to this share
-    focal_change: float = 0.04  # and moves its focal length by more than this
+    focal_change: float = 0.04  # and moves its focal length by more than this, if it was calibrated,
+    nominal_change: float = 0.15  # a nominal one, when it ends as far off as this and the registration was held back
+    held_back: float = 0.03  # from it by as much as this
     corner_shift: float = 0.03  # further distortion, of the corners' distance, that is doubted at the same gain
     voted_change: float = 0.15  # a given focal length that leads nowhere is doubted when pairs vote for one so far off
     blurred_px: float = 5.0  # width of edges, at 640 px, that explains why frames do not fit
@@ -127,11 +130,7 @@ def _doubted_focal(graph: ViewGraph, config: Config) -> Verdict | None:
 
 def _refused(graph: ViewGraph, evidence: Evidence, odds: Odds, config: Config) -> Verdict | None:
     names = [camera.name for camera in evidence.cameras]
-    doubted = [
-        freed
-        for freed in evidence.freed
-        if freed.cost_ratio < config.focal_gain and abs(np.log(freed.found / freed.given)) > config.focal_change
-    ]
+    doubted = [freed for freed in evidence.freed if _contradicted(freed, config)]
     if doubted:
         return refusals.wrong_focal(names, doubted)
     distortion = evidence.distortion
@@ -139,6 +138,8 @@ def _refused(graph: ViewGraph, evidence: Evidence, odds: Odds, config: Config) -
         return refusals.distorted(names, distortion.corner_shift)
     if evidence.joint.points < config.min_joint_points:
         return refusals.apart([graph.keyframes[index].name for index in evidence.joint.group])
+    if evidence.loose:
+        return refusals.apart(evidence.loose)
     if evidence.median_angle_deg < config.min_angle_deg:
         return _too_close(graph, evidence)
     if odds.total < config.min_log_odds or odds.doubtful:
@@ -146,6 +147,13 @@ def _refused(graph: ViewGraph, evidence: Evidence, odds: Odds, config: Config) -
     if evidence.focal_sigma > config.max_focal_sigma:
         return refusals.uncertain_focal(names, evidence.focal_sigma)
     return None
+
+
+def _contradicted(freed: FreedLens, config: Config) -> bool:
+    off = abs(np.log(freed.found / freed.given))
+    if freed.trusted:
+        return off > config.focal_change and freed.cost_ratio < config.focal_gain
+    return off > config.nominal_change and abs(np.log(freed.found / freed.registered)) > config.held_back
 
 
 def _reason(graph: ViewGraph, evidence: Evidence, odds: Odds, config: Config) -> Verdict:
@@ -163,6 +171,8 @@ def _reason(graph: ViewGraph, evidence: Evidence, odds: Odds, config: Config) ->
         return refusals.blurred([name for name in names if widths[name] > config.blurred_px], max(widths.values()))
     if odds.total >= config.min_log_odds:
         return refusals.unconfirmed(odds.doubtful)
+    if odds.against == "plane":
+        return refusals.moving(names, evidence.agreement)
     if odds.against == "mirror":
         return refusals.mirrored(names)
     if odds.against == "agreement":

@@ -159,6 +159,16 @@ def unconfirmed(names: Names) -> Verdict:
     )
 
 
+def moving(names: Names, agreement: float) -> Verdict:
+    return Verdict(
+        Code.MOVING_SCENE,
+        f"One flat thing fits, and the rest does not fit with it ({100 * agreement:.0f} % of the matches): it may have "
+        "moved.",
+        "Wait until nothing moves in the picture, or keep what moves out of it.",
+        tuple(names),
+    )
+
+
 def mirrored(names: Names) -> Verdict:
     return Verdict(
         Code.AMBIGUOUS,

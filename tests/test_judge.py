@@ -96,6 +96,8 @@ def evidence(
         cameras=tuple(camera(index, **(doubtful or {}).get(index, {})) for index in indices),
         agreement=1.0,
         joint=Joint(group=(indices[-1],), points=500, matches=200, explained=200.0, patches=FOUND),
+        loose=(),
+        flatness=0.5,
         spread=Spread(0.1, 0.005, 0.01),
         mirrored_cost=10.0,
         cycles=Cycles(1, 0.1, 0.1, 0.1),
@@ -211,10 +213,17 @@ def test_frames_that_find_no_place_because_of_the_focal_length_that_was_given():
 
 
 def test_a_given_focal_length_that_the_frames_contradict_is_named_with_how_much():
-    given = refused(verdict(3, freed=(FreedLens(1000.0, 1430.0, 0.3),)), Code.FOCAL_SUSPECT)
+    given = refused(verdict(3, freed=(FreedLens(1000.0, True, 1000.0, 1430.0, 0.3),)), Code.FOCAL_SUSPECT)
     assert "1000 pixels" in given.message and "1430" in given.message and "+43 %" in given.message
-    assert verdict(3, freed=(FreedLens(1000.0, 1010.0, 0.3),)).code == Code.OK  # well within a calibration
-    assert verdict(3, freed=(FreedLens(1000.0, 1100.0, 0.97),)).code == Code.OK  # nothing gained by it
+    assert (
+        verdict(3, freed=(FreedLens(1000.0, True, 1000.0, 1010.0, 0.3),)).code == Code.OK
+    )  # well within a calibration
+    assert verdict(3, freed=(FreedLens(1000.0, True, 1000.0, 1100.0, 0.97),)).code == Code.OK  # nothing gained by it
+    assert (
+        verdict(3, freed=(FreedLens(1000.0, False, 1030.0, 1100.0, 0.9),)).code == Code.OK
+    )  # nominal ones are rounded
+    refused(verdict(3, freed=(FreedLens(1000.0, False, 1300.0, 1430.0, 0.9),)), Code.FOCAL_SUSPECT)
+    assert verdict(3, freed=(FreedLens(1000.0, False, 1420.0, 1430.0, 1.0),)).code == Code.OK  # put right already
 
 
 def test_a_lens_that_bends_the_picture():
@@ -275,6 +284,17 @@ def test_two_places_that_almost_no_point_joins():
     joint = Joint(group=(3, 4), points=3, matches=180, explained=150.0, patches=BY_CHANCE)
     given = refused(verdict(5, joint=joint), Code.SPLIT)
     assert given.frames == names(3, 4)
+
+
+def test_frames_that_only_contradicted_matches_join_to_the_others():
+    assert refused(verdict(5, loose=("4.png",)), Code.SPLIT).frames == names(4)
+
+
+def test_a_flat_thing_that_moves_is_not_taken_for_the_scene():
+    given = refused(verdict(4, flatness=1.0, agreement=0.85), Code.MOVING_SCENE)
+    assert "85 %" in given.message
+    assert verdict(4, flatness=1.0, agreement=0.99).code == Code.OK  # a wall, and nothing against it
+    assert verdict(4, flatness=0.97, agreement=0.85).code == Code.OK  # a facade in relief
 
 
 def test_frames_of_another_size_that_do_not_fit_are_named():

@@ -11,7 +11,7 @@ import pytest
 
 from recon.registration import register
 from recon.registration.register import Registration
-from recon.verification import joints, likelihood, photometric, verify
+from recon.verification import flatness, joints, likelihood, photometric, verify
 from recon.verification.evidence import Evidence
 from recon.view_graph import ViewGraph
 from tests.synthetic import photographs, view_graph
@@ -59,6 +59,7 @@ def test_a_right_answer_has_evidence_from_every_source():
     assert evidence.mirrored_cost > 3.0
     assert evidence.cycles.triangles >= 3 and evidence.cycles.rotation_deg < 2.0
     assert all(abs(camera.gain - 1.0) < 0.1 for camera in evidence.cameras)
+    assert evidence.loose == () and evidence.flatness < 0.95
     assert evidence.freed == () and evidence.distortion.corner_shift < 0.02
 
 
@@ -113,3 +114,19 @@ def test_points_shared_by_two_frames_are_counted():
     )
     shared = joints.shared_points(few)
     assert shared[0, 1] == 2 and shared[0, 2] == 1 and shared[0, 3] == 0
+
+
+def test_frames_that_pairs_contradict_are_loose():
+    graph, found = placed()
+    assert joints.loose(found, graph.pairs) == ()
+    doubted = {key: 0.4 if 3 in key else share for key, share in found.agreement.items()}
+    assert joints.loose(replace(found, agreement=doubted), graph.pairs) == (3,)
+
+
+def test_the_share_of_points_on_a_plane():
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([rng.uniform(-1, 1, (300, 2)), np.ones(300)])
+    assert flatness.share_on_plane(wall) == 1.0
+    relief = wall + (0.0, 0.0, 1.0) * rng.choice([0.0, 0.2], (300, 1), p=[0.7, 0.3])
+    assert flatness.share_on_plane(relief) == pytest.approx(0.7, abs=0.06)
+    assert flatness.share_on_plane(wall[:2]) == 0.0

@@ -41,12 +41,12 @@ def made_up(noise_px: float = 0.2, depth: float = 1.0, radial: float = 0.0, foca
         exact, pixels=pixels + rng.normal(0, noise_px, pixels.shape), log_focals=np.log([focal]), radials=np.zeros(1)
     )
     prior = bundle.FocalPrior(problem.log_focals, np.array([refit.FREE_SIGMA]), np.zeros(1), np.zeros(1))
-    return refit.Fit(problem, prior, bundle.Config(robust_px=1.0), np.ones(4))
+    return refit.Fit(problem, prior, bundle.Config(robust_px=1.0), np.ones(4), np.full(1, np.nan))
 
 
 def given(fit: refit.Fit) -> refit.Fit:
     """The fit with a focal length that is held as it is."""
-    return replace(fit, prior=replace(fit.prior, sigmas=np.zeros(1)))
+    return replace(fit, prior=replace(fit.prior, sigmas=np.zeros(1)), told=np.exp(fit.problem.log_focals))
 
 
 def test_nothing_moves_between_a_fit_and_itself():
@@ -116,12 +116,17 @@ def test_the_mirrored_scene_of_a_camera_far_away_cannot_be_told():
 @pytest.mark.parametrize("factor", [0.7, 1.0, 1.4])
 def test_a_given_focal_length_is_found_right_or_wrong(factor):
     (freed,) = lens.freed(given(made_up(focal=factor * FOCAL)))
-    assert freed.given == pytest.approx(factor * FOCAL)
+    assert freed.trusted and freed.given == pytest.approx(factor * FOCAL)
     assert freed.found == pytest.approx(FOCAL, rel=0.02)
     assert (freed.cost_ratio < 0.5) == (factor != 1.0)
 
 
-def test_no_lens_is_freed_that_was_not_given():
+def test_a_nominal_focal_length_is_doubted_too():
+    (freed,) = lens.freed(replace(made_up(focal=0.8 * FOCAL), told=np.array([0.8 * FOCAL])))
+    assert not freed.trusted and freed.found == pytest.approx(FOCAL, rel=0.02) and freed.cost_ratio < 0.5
+
+
+def test_no_lens_is_freed_that_did_not_come_with_the_frames():
     assert lens.freed(made_up()) == ()
 
 

@@ -31,13 +31,15 @@ class Evidence:
     cameras: tuple[CameraEvidence, ...]
     agreement: float  # share of all matches that the cameras explain
     joint: Joint  # the weakest
+    loose: tuple[str, ...]  # frames that only contradicted matches join to most of the others
+    flatness: float  # share of the points on one plane
     spread: Spread  # how much the answer changes without parts of the pictures
     mirrored_cost: float  # of the mirrored answer over that of this one
     cycles: Cycles
     median_angle_deg: float
     rms_px: float
     focal_sigma: float  # of the logarithm of the least certain focal length
-    freed: tuple[FreedLens, ...]  # lenses that were given
+    freed: tuple[FreedLens, ...]  # lenses that came with the frames
     distortion: Distortion
 
     @property

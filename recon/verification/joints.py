@@ -13,6 +13,8 @@ from recon.registration.two_view import TwoView
 from recon.verification import photometric
 from recon.view_graph import connected
 
+FITTING = 0.6  # share of a pair's matches that the poses explain, from which on the pair holds its frames together
+FEW = 20  # matches that hold nothing together
 TRIED = 3  # pairs across the joint in which patches are looked for, those with most points in common
 
 
@@ -49,6 +51,21 @@ def weakest(
         explained=sum(registration.agreement[key] * len(pairs[key].matches) for key in verified),
         patches=photometric.pooled(scores, config),
     )
+
+
+def loose(registration: Registration, pairs: Mapping[tuple[int, int], TwoView]) -> tuple[int, ...]:
+    """Frames outside the largest group that fitting pairs hold together.
+
+    Frames that pose as others, as mirror images of a symmetric place do, fit well with each other, and with the rest
+    only where the place repeats.
+    """
+    fitting = [
+        key
+        for key, share in registration.agreement.items()
+        if share >= FITTING and share * len(pairs[key].matches) >= FEW
+    ]
+    _, *rest = connected([camera.index for camera in registration.cameras], fitting)
+    return tuple(sorted(index for part in rest for index in part))
 
 
 def shared_points(registration: Registration) -> npt.NDArray[np.int64]:

@@ -18,11 +18,13 @@ STEPS = (0.0, 0.35, -0.35)  # of log focal, from which it is set free: a wrong o
 
 @dataclass(frozen=True)
 class FreedLens:
-    """A lens whose focal length was given, after the same observations were adjusted with it free."""
+    """A lens whose focal length came with the frames, after the same observations were adjusted with it free."""
 
     given: float  # pixels of the full-size image
+    trusted: bool  # a calibration; else nominal, as from EXIF
+    registered: float  # where the registration left it: a nominal one may move a little
     found: float
-    cost_ratio: float  # robust cost with the lens free over that with it as given
+    cost_ratio: float  # robust cost with the lens free over that with it as it was registered
 
 
 @dataclass(frozen=True)
@@ -43,18 +45,21 @@ def distortion(fit: refit.Fit) -> Distortion:
 
 
 def freed(fit: refit.Fit) -> tuple[FreedLens, ...]:
-    """All lenses that the fit holds fixed, set free together. Empty where none is."""
-    fixed = fit.prior.sigmas == 0
-    if not fixed.any():
+    """All lenses that came with the frames, set free together. Empty where none did."""
+    told = np.isfinite(fit.told)
+    if not told.any():
         return ()
-    held = refit.adjusted(fit)
-    prior = replace(held.prior, sigmas=np.where(fixed, refit.FREE_SIGMA, held.prior.sigmas))
-    starts = [held.problem.log_focals + np.where(fixed, step, 0.0) for step in STEPS]
+    held = refit.adjusted(replace(fit, prior=replace(fit.prior, sigmas=np.where(told, 0.0, fit.prior.sigmas))))
+    prior = replace(held.prior, sigmas=np.where(told, refit.FREE_SIGMA, held.prior.sigmas))
+    starts = [held.problem.log_focals + np.where(told, step, 0.0) for step in STEPS]
     tried = [refit.adjusted(replace(held, prior=prior, problem=replace(held.problem, log_focals=s))) for s in starts]
     free = min(tried, key=lambda candidate: candidate.cost)
-    ratio = free.cost / max(held.cost, 1e-12)
-    focals = np.exp(np.stack([held.problem.log_focals, free.problem.log_focals]))
-    return tuple(FreedLens(float(focals[0, g]), float(focals[1, g]), float(ratio)) for g in np.nonzero(fixed)[0])
+    ratio = float(free.cost / max(held.cost, 1e-12))
+    registered, found = np.exp(held.problem.log_focals), np.exp(free.problem.log_focals)
+    return tuple(
+        FreedLens(float(fit.told[g]), bool(fit.prior.sigmas[g] == 0), float(registered[g]), float(found[g]), ratio)
+        for g in np.nonzero(told)[0]
+    )
 
 
 def voted_focal(keyframes: Sequence[Keyframe], pairs: Sequence[TwoView]) -> float | None:

@@ -24,6 +24,7 @@ MOSTLY_EXPLAINED = 0.72  # of all matches
 SOME_PATCHES = 2.0  # found, in standard errors beyond chance
 FEW_CONFIRMED = 5.0  # points of a camera that two others see
 UNCERTAIN_DEG, UNCERTAIN_REL = 1.0, 0.0145  # errors to be expected of rotations and centres
+FLAT = 0.985  # share of the points on one plane; facades, and meadows from afar, reach 0.98
 MIRRORED = 1.3  # cost of the mirrored answer over that of this one
 
 
@@ -60,6 +61,8 @@ def weigh(evidence: Evidence) -> Odds:
         "agreement": _bounded(15.0 * (evidence.agreement - MOSTLY_EXPLAINED), -5.0, 0.3),
         "rotations": _bounded(3.0 * np.log(UNCERTAIN_DEG / max(evidence.rotation_deg, 1e-3)), -6.0, 0.3),
         "centres": _bounded(3.0 * np.log(UNCERTAIN_REL / max(evidence.centre_rel, 1e-4)), -6.0, 0.3),
+        "plane": -_bounded(40.0 * (1.0 - evidence.agreement), 0.0, 6.0)
+        * _bounded((evidence.flatness - FLAT) / 0.01, 0.0, 1.0),
         "mirror": _bounded(12.0 * np.log(evidence.mirrored_cost / MIRRORED), -4.0, 0.2),
     }
     return Odds(whole, {camera.name: CAMERA_PRIOR + _camera(camera) for camera in evidence.cameras})

@@ -27,6 +27,7 @@ class Fit:
     prior: bundle.FocalPrior
     loss: bundle.Config
     scale: Array  # (C,) longer side of each frame over 1024
+    told: Array  # (G,) focal length in pixels that came with the frames; NaN where none did
 
     @property
     def Ts_world_camera(self) -> Array:
@@ -42,8 +43,8 @@ class Fit:
 def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_camera: int) -> Fit:
     """The registration as a bundle of at most about `tracks_per_camera` tracks a camera, the longest first.
 
-    Cameras whose lens came out the same to the last digit share it. A given focal length is kept, a nominal one held
-    loosely, an unknown one almost free.
+    Cameras whose lens came out the same to the last digit share it. A given focal length is kept, others are almost
+    free.
     """
     cameras = registration.cameras
     position = np.full(len(keyframes), -1)
@@ -54,9 +55,10 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
     lenses = [(camera.focal, camera.radial, *camera.principal) for camera in cameras]
     unique = sorted(set(lenses))
     lens_of_camera = np.array([unique.index(lens) for lens in lenses])
-    sigmas = np.zeros(len(unique))
+    sigmas, told = np.zeros(len(unique)), np.full(len(unique), np.nan)
     for camera, lens in zip(cameras, lens_of_camera, strict=True):
         given = keyframes[camera.index].frame.intrinsics
+        told[lens] = np.nan if given is None else given.fx
         sigmas[lens] = FREE_SIGMA if given is None or given.source not in ("given", "calibration") else 0.0
     principal = np.stack([camera.principal for camera in cameras])
     Ts_camera_world: Array = np.linalg.inv(np.stack([camera.T_world_camera for camera in cameras])).astype(np.float64)
@@ -77,7 +79,7 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
     prior = bundle.FocalPrior(problem.log_focals, sigmas, np.zeros(len(unique)), np.zeros((len(unique), 2))[:, 0])
     errors = bundle.reprojection_errors(problem)
     robust_px = float(np.clip(3.0 * np.median(errors), *(np.array([0.4, 1.5]) * np.median(scale))))
-    return Fit(problem, prior, bundle.Config(robust_px=robust_px), scale)
+    return Fit(problem, prior, bundle.Config(robust_px=robust_px), scale, told)
 
 
 def _longest(camera_of: Index, point_of: Index, num_points: int, per_camera: int) -> npt.NDArray[np.bool_]:

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from recon.registration.register import Registration
-from recon.verification import cycles, exposure, joints, lens, photometric, refit, reversal, stability
+from recon.verification import cycles, exposure, flatness, joints, lens, photometric, refit, reversal, stability
 from recon.verification.evidence import CameraEvidence, Evidence
 from recon.verification.photometric import Picture
 from recon.view_graph import ViewGraph
@@ -31,6 +31,8 @@ def verify(graph: ViewGraph, registration: Registration | None, config: Config) 
         cameras=_of_cameras(graph, registration, views, config),
         agreement=_agreement(graph, registration, None),
         joint=joints.weakest(registration, graph.pairs, views, config.photometric),
+        loose=tuple(graph.keyframes[index].name for index in joints.loose(registration, graph.pairs)),
+        flatness=flatness.share_on_plane(registration.points),
         spread=stability.by_regions(fit),
         mirrored_cost=reversal.mirrored_cost(fit),
         cycles=cycles.measure(graph.keyframes, registration, graph.pairs, config.cycles),
