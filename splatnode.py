@@ -171,7 +171,11 @@ def _bench_arguments(parser: argparse.ArgumentParser) -> None:
         "--views", type=_counts, default=(3, 6, 12), metavar="N,N,N", help="training views (default: 3,6,12)"
     )
     parser.add_argument(
-        "--methods", type=_names, default=("balanced",), metavar="A,B,C", help="presets (default: balanced)"
+        "--methods",
+        type=_names,
+        default=("balanced",),
+        metavar="A,B,C",
+        help="presets, instantsplat-s, instantsplat-xl, paper (default: balanced)",
     )
     parser.add_argument("--checkpoints", type=_counts, default=(), metavar="N,N", help="iterations scored on the way")
     parser.add_argument("--seeds", type=_positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")

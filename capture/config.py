@@ -35,15 +35,26 @@ class ConfigError(ValueError):
 
 @dataclass(frozen=True)
 class Plugin:
-    """A module of `package`, chosen by `kind`, with its Config. A room subclasses it and names the package."""
+    """A module of `package`, chosen by `kind`, with its Config. A room subclasses it and names the package.
+
+    Modules of the package that lack what `needs` names are no plug-ins. `usual` is the kind where none is named.
+    """
 
     package: ClassVar[str]
+    needs: ClassVar[tuple[str, ...]] = ("Config",)
+    usual: ClassVar[str | None] = None
     kind: str
     config: Any  # the module's Config
 
     @property
     def module(self) -> ModuleType:
         return import_module(f"{self.package}.{self.kind}")
+
+    @classmethod
+    def kinds(cls) -> list[str]:
+        names = sorted(module.name for module in iter_modules(import_module(cls.package).__path__))
+        modules = {name: import_module(f"{cls.package}.{name}") for name in names}
+        return [name for name, module in modules.items() if all(hasattr(module, needed) for needed in cls.needs)]
 
 
 class Camera(Plugin):
@@ -147,11 +158,9 @@ def _checked(raw: Any, schema: Any, where: str) -> Any:
 
 
 def _plugin(raw: Mapping[str, Any], schema: type[Plugin], where: str) -> Plugin:
-    package = import_module(schema.package)
-    kinds = sorted(module.name for module in iter_modules(package.__path__))
-    kind = raw.get("kind")
-    if kind not in kinds:
-        raise ConfigError(f"{_join(where, 'kind')}: expected one of {', '.join(kinds)}, got {kind!r}")
+    kind = raw.get("kind", schema.usual)
+    if kind not in schema.kinds():
+        raise ConfigError(f"{_join(where, 'kind')}: expected one of {', '.join(schema.kinds())}, got {kind!r}")
     module = import_module(f"{schema.package}.{kind}")
     rest = {key: value for key, value in raw.items() if key != "kind"}
     return schema(kind, typed(rest, module.Config, where))

@@ -14,13 +14,13 @@ import msgspec
 import numpy as np
 
 from capture.cameras import folder, synthetic
-from capture.config import merged, read_yaml, typed
+from capture.config import read_yaml
 from capture.frame import DroppedFrame, Frame
 from recon.audience import viewer
-from recon.config import Config, preset
+from recon.config import Config, overlaid, preset
 from recon.evaluate.bench import Plan, run_bench
 from recon.evaluate.demo import write_capture
-from recon.evaluate.methods import by_preset
+from recon.evaluate.methods import by_name, method
 from recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
 from recon.evaluate.splits import Split
 from recon.evaluate.truth import load_scene
@@ -97,13 +97,13 @@ def held_out_quality(snapshot: Snapshot, capture: Path, split: Split) -> dict[st
 
 
 def bench(args: argparse.Namespace) -> int:
-    """Measures presets on scenes with true cameras."""
+    """Measures methods on scenes with true cameras."""
     plan = Plan(args.scenes, args.views, args.methods, tuple(range(args.seeds)), args.checkpoints)
-    for method in plan.methods:
-        preset(method)
+    for name in plan.methods:
+        method(name)
     rows = run_bench(
         plan,
-        by_preset,
+        by_name,
         args.out,
         rasterize=rasterize,
         networks=load_networks(args.weights_dir),
@@ -119,11 +119,11 @@ def bench(args: argparse.Namespace) -> int:
 
 def _config(args: argparse.Namespace) -> Config:
     """The preset, then the configuration file, then the flags: what comes later wins."""
-    if args.prior not in (None, "classical"):
-        raise ValueError(f"no prior {args.prior!r}; there is: classical")
     config = preset(args.preset or "balanced")
     if args.config is not None:
-        config = typed(merged(msgspec.to_builtins(config), read_yaml(args.config)), Config)
+        config = overlaid(config, read_yaml(args.config))
+    if args.prior is not None and args.prior != config.prior.kind:
+        config = overlaid(config, {"prior": {"kind": args.prior}})
     flags = {
         "size": args.size,
         "seed": args.seed,

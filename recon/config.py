@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import msgspec
 
+from capture.config import Plugin, merged, typed
 from recon import background, completion, density, judge, optimize, pixelwise, screening
 from recon.priors import classical
 from recon.verification import verify
 
 
+class PriorChoice(Plugin):
+    """What gives cameras and first points: a module of recon.priors."""
+
+    package = "recon.priors"
+    needs = ("Config", "load")
+    usual = "classical"
+
+
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     size: int = 512  # longer side of the modelled images, pixels
     seed: int = 0
-    prior: classical.Config = classical.Config()
+    prior: PriorChoice = PriorChoice("classical", classical.Config())
     screening: screening.Config = screening.Config()
     verification: verify.Config = verify.Config()
     judge: judge.Config = judge.Config()
@@ -39,3 +51,15 @@ def preset(name: str) -> Config:
     if name not in PRESETS:
         raise ValueError(f"no preset {name!r}; there are: {', '.join(PRESETS)}")
     return PRESETS[name]
+
+
+def overlaid(config: Config, changes: Mapping[str, Any]) -> Config:
+    """`config` with `changes` as a file gives them. Raises ConfigError.
+
+    Another kind of prior starts from its own defaults.
+    """
+    tree = msgspec.to_builtins(config)
+    kind, settings = tree["prior"]["kind"], tree["prior"]["config"]
+    same = changes.get("prior", {}).get("kind", kind) == kind
+    tree["prior"] = {"kind": kind, **settings} if same else {}
+    return typed(merged(tree, changes), Config)

@@ -18,7 +18,6 @@ from recon import growth, optimize
 from recon.config import Config
 from recon.judge import hopeless, judge
 from recon.keyframe import Features, Keyframe, modelled_image
-from recon.priors import classical
 from recon.priors.pointmap import Pointmap
 from recon.priors.prior import Prior
 from recon.registration import features
@@ -78,7 +77,7 @@ def prepare(frame: Frame, config: Config, found: Features | None = None) -> Keyf
     No other frame is needed. Raises ValueError where the given intrinsics cannot be used.
     """
     frame = undistorted(frame)
-    found = found or features.extract(frame.image, config.prior.registration.features)
+    found = found or features.extract(frame.image, config.prior.config.registration.features)
     return Keyframe(frame, modelled_image(frame.image, config.size), found)
 
 
@@ -103,13 +102,14 @@ class Reconstruction:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.clock = _Clock()
-        self.graph = ViewGraph(config.prior.registration)
+        settings = config.prior.config
+        self._prior: Prior = config.prior.module.load(msgspec.structs.replace(settings, seed=config.seed))
+        self.graph = ViewGraph(settings.registration, self._prior.matcher)
         self.dropped: list[DroppedFrame] = []
         self.rejected: list[Rejected] = []  # those of `dropped` that the screening left out
         self.begun: Scene | None = None  # from the last estimate of all frames, not optimised
         self.scene: Scene | None = None  # what is shown
         self.sequence = 0
-        self._prior: Prior = classical.load(msgspec.structs.replace(config.prior, seed=config.seed))
         self._looks: dict[str, Look] = {}  # of the frames that were taken
         self._judged: dict[Known, tuple[Judged, Evidence | None]] = {}  # as the keyframes are, and as they were
         self._pointmaps: dict[str, Pointmap] = {}  # by keyframe, as they were last computed

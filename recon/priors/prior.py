@@ -11,7 +11,7 @@ from recon.view_graph import Matcher, ViewGraph
 
 
 class Prior(Protocol):
-    """A loaded prior. A prior file has `Config` and `load(config)`.
+    """A loaded prior. A prior file has `Config`, with at least `registration` and `seed`, and `load(config)`.
 
     The two steps are apart because the verdict stands between them: refused cameras cost no dense points.
     """

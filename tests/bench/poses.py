@@ -57,7 +57,7 @@ class Row:
 def measure(scene: EvaluationScene, names: tuple[str, ...], config: Config) -> Row:
     """One set of photographs from pixels to a verdict."""
     frames = scene.frames(names)
-    registering = config.prior.registration
+    registering = config.prior.config.registration
     graph = ViewGraph(registering)
     processor, laps = time.process_time(), [time.perf_counter()]
     found = [features.extract(frame.image, registering.features) for frame in frames]
