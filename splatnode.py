@@ -175,7 +175,7 @@ def _bench_arguments(parser: argparse.ArgumentParser) -> None:
         type=_names,
         default=("balanced",),
         metavar="A,B,C",
-        help="presets, instantsplat-s, instantsplat-xl, paper (default: balanced)",
+        help="presets, instantsplat-s or -xl, paper",
     )
     parser.add_argument("--checkpoints", type=_counts, default=(), metavar="N,N", help="iterations scored on the way")
     parser.add_argument("--seeds", type=_positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from recon import optimize
+from recon import regularise
 from recon.config import PRESETS
 from recon.evaluate.methods import METHODS, method
 from recon.pipeline import reconstruct
-from tests.synthetic import SMALL, photographs
+from tests.synthetic import photographs
 
 
 def test_every_preset_is_a_method():
@@ -24,9 +24,7 @@ def test_the_papers_schedule_and_weights():
     assert weights == [0.25, 0.05, 0.01, 0.5]
     assert method("paper").optimize.iterations == 1000
     assert [term.at(0.1) > 0 for term in (terms.point_render, terms.depth)] == [True, False]
-    without = msgspec.structs.replace(
-        method("paper").optimize, regularise=method("instantsplat-xl").optimize.regularise
-    )
+    without = msgspec.structs.replace(method("paper").optimize, regularise=regularise.Config())
     assert without == method("instantsplat-xl").optimize
 
 
@@ -34,9 +32,5 @@ def test_they_start_from_a_gaussian_a_pixel_and_keep_them():
     few = msgspec.structs.replace(method("paper").optimize, iterations=30, checkpoints=())
     config = msgspec.structs.replace(method("paper"), size=160, optimize=few)
     last = list(reconstruct(list(photographs()[:3]), config))[-1]
-    ours = list(reconstruct(list(photographs()[:3]), msgspec.structs.replace(
-        method("fast"), size=160, optimize=optimize.Config(iterations=2, checkpoints=())
-    )))[-1]  # fmt: skip
     assert last.verdict.publishable and last.iterations == 30
-    assert len(last.gaussians) > 3 * len(ours.gaussians) and len(last.gaussians) > 0.5 * 160 * 120
-    assert SMALL.width >= 160
+    assert len(last.gaussians) > 160 * 120

@@ -15,8 +15,8 @@ from recon.config import PRESETS, Config
 from recon.pipeline import reconstruct
 from recon.snapshot import Snapshot
 
-# InstantSplat's released settings (2025): a Gaussian a pixel, nothing added or taken away; colours, scales and turns ten
-# times as fast as in 3DGS; steps that do not fall, but for the poses', which fall to a hundredth.
+# InstantSplat's released settings (2025): a Gaussian a pixel, nothing added or taken away; colours, scales and turns
+# ten times as fast as in 3DGS; steps that do not fall, but for the poses', which fall to a hundredth.
 _INSTANTSPLAT_RATES = optimize.Rates(
     means=1.6e-4,
     quats=1e-2,
