@@ -146,7 +146,7 @@ def time_pictures(result: Path, engine: Engine, as_points: bool) -> dict:
 
 def agreement(result: Path) -> dict:
     """Differences between the engines' pictures on black, in levels of 255, at the result's cameras."""
-    from open3d.visualization import rendering
+    from open3d.visualization import rendering  # pyright: ignore[reportMissingImports]
 
     from viewer.scene3d import Scene3D
 
