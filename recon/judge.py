@@ -193,7 +193,7 @@ def _too_close(graph: ViewGraph, evidence: Evidence) -> Verdict:
     angle = evidence.median_angle_deg
     return refusals.too_close(
         names,
-        f"The positions are uncertain by {100 * evidence.centre_rel:.0f} % of their distances, the directions by "
+        f"The positions are uncertain by {100 * evidence.centre_rel:.1f} % of their distances, the directions by "
         f"{evidence.rotation_deg:.1f} degrees; points are seen under {angle:.1f} degrees.",
     )
 

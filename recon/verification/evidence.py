@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from recon.verification.cycles import Cycles
 from recon.verification.joints import Joint
 from recon.verification.lens import Distortion, FreedLens
@@ -49,5 +51,5 @@ class Evidence:
 
     @property
     def centre_rel(self) -> float:
-        """The same for the centres, relative to their spread."""
-        return max(0.5 * self.spread.centre_rel, *(camera.centre_sigma_rel for camera in self.cameras))
+        """The same for the centres, relative to their spread; both together, for each misses what the other sees."""
+        return float(np.hypot(0.5 * self.spread.centre_rel, max(camera.centre_sigma_rel for camera in self.cameras)))

@@ -23,8 +23,9 @@ PARTLY_EXPLAINED = 0.8  # of one camera's matches
 MOSTLY_EXPLAINED = 0.72  # of all matches
 SOME_PATCHES = 2.0  # found, in standard errors beyond chance
 FEW_CONFIRMED = 5.0  # points of a camera that two others see
-UNCERTAIN_DEG, UNCERTAIN_REL = 1.0, 0.0145  # errors to be expected of rotations and centres
+UNCERTAIN_DEG, UNCERTAIN_REL = 1.0, 0.0103  # errors to be expected of rotations and centres
 FLAT = 0.985  # share of the points on one plane; facades, and meadows from afar, reach 0.98
+FLAT_AND_EXPLAINED = 0.87  # of all matches: a bare facade reaches 0.85, a flat thing that moves 0.81
 MIRRORED = 1.3  # cost of the mirrored answer over that of this one
 
 
@@ -60,8 +61,9 @@ def weigh(evidence: Evidence) -> Odds:
     whole = {
         "agreement": _bounded(15.0 * (evidence.agreement - MOSTLY_EXPLAINED), -5.0, 0.3),
         "rotations": _bounded(3.0 * np.log(UNCERTAIN_DEG / max(evidence.rotation_deg, 1e-3)), -6.0, 0.3),
-        "centres": _bounded(3.0 * np.log(UNCERTAIN_REL / max(evidence.centre_rel, 1e-4)), -6.0, 0.3),
-        "plane": -_bounded(40.0 * (1.0 - evidence.agreement), 0.0, 6.0)
+        # Right answers are expected to be 1.16 % wrong and less, wrong ones (by 1.5 % and more) 1.35 % and more.
+        "centres": _bounded(12.0 * np.log(UNCERTAIN_REL / max(evidence.centre_rel, 1e-4)), -6.0, 0.3),
+        "plane": -_bounded(60.0 * (FLAT_AND_EXPLAINED - evidence.agreement), 0.0, 6.0)
         * _bounded((evidence.flatness - FLAT) / 0.01, 0.0, 1.0),
         "mirror": _bounded(12.0 * np.log(evidence.mirrored_cost / MIRRORED), -4.0, 0.2),
     }
