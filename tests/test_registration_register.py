@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from capture.cameras import synthetic
@@ -9,6 +10,7 @@ from capture.frame import Frame
 from recon.keyframe import Keyframe
 from recon.registration import features, register
 from recon.view_graph import ViewGraph
+from tests.synthetic import photographs, renumbered, view_graph
 
 
 def test_the_lens_of_a_frame_that_is_left_out_makes_no_focal_length_uncertain():
@@ -21,3 +23,17 @@ def test_the_lens_of_a_frame_that_is_left_out_makes_no_focal_length_uncertain():
     registration = register.register(graph.keyframes, graph.pairs, config)
     assert registration is not None and [camera.index for camera in registration.cameras] == [0, 1, 2]
     assert registration.focal_sigma < 0.5 * config.voted_sigma
+
+
+def test_the_robots_own_body_in_the_picture_is_not_what_moves():
+    """A bumper with much texture that stands still in every picture explains most matches, and says nothing."""
+    bumper = np.random.default_rng(0).integers(0, 256, (60, 160, 3), np.uint8)
+    bumper = cv2.resize(bumper, (320, 120), interpolation=cv2.INTER_CUBIC)
+    images = [frame.image.copy() for frame in photographs()[:2]]
+    for image in images:
+        image[120:] = bumper
+    graph = view_graph(renumbered(images))
+    pair = graph.pairs[0, 1]
+    motion = np.linalg.norm(pair.points2 - pair.points1, axis=1)
+    assert len(motion) > 60 and np.median(motion) > 3.0
+    assert (pair.points1[:, 1] < 0).mean() > 0.9  # above the middle of the image, where the bumper begins

@@ -31,6 +31,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # connect the frames already: of 40 such pairs that squeezed features verified, 39 were below, of others one in ten.
     hint_log10_nfa: float = -1.0
     exif_sigma: float = 0.05  # of log focal: nominal focal lengths are rounded, and focusing changes them
+    still_px: float = 1.0  # median motion of a pair, at 1024 px, below which it may show the robot itself
+    enough_moved: int = 60  # matches that moved by more, so that they are asked by themselves
     voted_sigma: float = 0.3  # of log focal when frames voted for it
 
 
@@ -122,7 +124,19 @@ def _examine(keyframe1: Keyframe, keyframe2: Keyframe, matches: Index, config: C
     points1 = keyframe1.features.points[matches[:, 0]] - principal_point(keyframe1.frame)
     points2 = keyframe2.features.points[matches[:, 1]] - principal_point(keyframe2.frame)
     size = (keyframe2.frame.width, keyframe2.frame.height)
-    return Compared(matches, *two_view.examine(points1, points2, matches, size, config.two_view))
+    pair, log10_nfa = two_view.examine(points1, points2, matches, size, config.two_view)
+    if pair is not None and _motion_px(pair.points1, pair.points2, size) < config.still_px:
+        # What stands still in both pictures may be the robot itself: what moves is asked by itself.
+        (moved,) = np.nonzero(np.linalg.norm(points2 - points1, axis=1) * 1024.0 / max(size) >= config.still_px)
+        if len(moved) >= config.enough_moved:
+            among = two_view.examine(points1[moved], points2[moved], matches[moved], size, config.two_view)
+            pair, log10_nfa = among if among[0] is not None else (pair, log10_nfa)
+    return Compared(matches, pair, log10_nfa)
+
+
+def _motion_px(points1: Array, points2: Array, size: tuple[int, int]) -> float:
+    """Median motion at 1024 pixels on the longer side."""
+    return float(np.median(np.linalg.norm(points2 - points1, axis=1))) * 1024.0 / max(size)
 
 
 def place_in_order(keyframe: Keyframe) -> bytes:
