@@ -10,6 +10,8 @@ import uuid
 from collections.abc import Mapping
 from pathlib import Path
 
+from capture.durable import sync_folder
+
 
 class ResultWriteError(OSError):
     """A result could not be written; nothing that was there before has been changed. `errno` tells why."""
@@ -34,7 +36,7 @@ def write_files(folder: Path, contents: Mapping[str, bytes]) -> None:
         for target, source in temporary.items():
             os.replace(source, target)
         for parent in {target.parent for target in temporary}:
-            _sync_folder(parent)
+            sync_folder(parent)
     except OSError as error:
         raise ResultWriteError(error.errno, _explain(error, folder, contents)) from error
     finally:
@@ -58,16 +60,6 @@ def _write_through(path: Path, content: bytes) -> None:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
-
-
-def _sync_folder(folder: Path) -> None:
-    """Makes the renames survive a power cut. A file system that cannot do it has done what it can."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def _explain(error: OSError, folder: Path, contents: Mapping[str, bytes]) -> str:
