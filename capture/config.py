@@ -52,9 +52,20 @@ class Plugin:
 
     @classmethod
     def kinds(cls) -> list[str]:
-        names = sorted(module.name for module in iter_modules(import_module(cls.package).__path__))
-        modules = {name: import_module(f"{cls.package}.{name}") for name in names}
-        return [name for name, module in modules.items() if all(hasattr(module, needed) for needed in cls.needs)]
+        """All there are. It imports every module of the package, to see what each has."""
+        return [name for name in cls._names() if cls.is_kind(name)]
+
+    @classmethod
+    def is_kind(cls, name: object) -> bool:
+        """Whether there is a plug-in of this name; no other module is imported."""
+        if name not in cls._names():
+            return False
+        module = import_module(f"{cls.package}.{name}")
+        return all(hasattr(module, needed) for needed in cls.needs)
+
+    @classmethod
+    def _names(cls) -> list[str]:
+        return sorted(module.name for module in iter_modules(import_module(cls.package).__path__))
 
 
 class Camera(Plugin):
@@ -159,7 +170,7 @@ def _checked(raw: Any, schema: Any, where: str) -> Any:
 
 def _plugin(raw: Mapping[str, Any], schema: type[Plugin], where: str) -> Plugin:
     kind = raw.get("kind", schema.usual)
-    if kind not in schema.kinds():
+    if not schema.is_kind(kind):
         raise ConfigError(f"{_join(where, 'kind')}: expected one of {', '.join(schema.kinds())}, got {kind!r}")
     module = import_module(f"{schema.package}.{kind}")
     rest = {key: value for key, value in raw.items() if key != "kind"}
