@@ -49,6 +49,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_confidence: float = 0.3  # of the points that are drawn and of the depths that are known
     compare_unseen: bool = False  # pull pseudo views towards white where no point shows anything, as the paper writes
 
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        return self.point_render, self.depth, self.normal, self.semantic
+
 
 PAPER = Config(
     point_render=Term(0.25, 0.1, 0.8),
@@ -94,7 +98,9 @@ class Regularisation:
         self._encode = None if network is None else PooledFeatures(network)
         with torch.no_grad():
             self._embeddings = [] if self._encode is None else [self._encode(_unit(image)) for image in images]
-        self._pseudo = self._imagine(pointmaps, images) if len(pointmaps) > 1 and self._needs_pseudo_views() else []
+        self._pseudo = (
+            self._imagine(pointmaps, images) if len(pointmaps) > 1 and any(term.weight for term in config.terms) else []
+        )
 
     @property
     def served_by(self) -> dict[str, str]:
@@ -124,8 +130,7 @@ class Regularisation:
     def pseudo_loss(self, draw: Callable[[PseudoView, Collection[str]], Render], progress: float) -> Tensor | None:
         """All terms on a pseudo view drawn at random, as `draw` renders it; None while none is active."""
         config = self._config
-        active = [term for term in (config.point_render, config.depth, config.normal, config.semantic)]
-        if not self._pseudo or not any(term.at(progress) for term in active):
+        if not self._pseudo or not any(term.at(progress) for term in config.terms):
             return None
         imagined = self._pseudo[int(self._rng.integers(len(self._pseudo)))]
         render = draw(imagined.view, self.channels(progress))
@@ -139,10 +144,6 @@ class Regularisation:
             parts.append(weight * semantic_loss(embedding, self._embeddings[imagined.view.nearest]))
         losses = [part for part in parts if part is not None]
         return torch.stack(losses).sum() if losses else None
-
-    def _needs_pseudo_views(self) -> bool:
-        config = self._config
-        return any(term.weight for term in (config.point_render, config.depth, config.normal, config.semantic))
 
     def _geometric(self, render: Render, known: _Known, progress: float) -> Tensor | None:
         config = self._config

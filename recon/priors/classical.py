@@ -52,8 +52,6 @@ class ClassicalPrior:
         self._config, self._depth_maps, self.matcher = config, depth_maps, matcher
 
     def register(self, graph: ViewGraph) -> Registration | None:
-        if not graph.pairs:
-            return None
         return register.register(graph.keyframes, graph.pairs, self._config.registration)
 
     def pointmaps(

@@ -30,9 +30,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     score_px: float = 1.25  # error at which a match counts no more for an attempt, at 1024 px on the longer side
     same_rotation_deg: float = 0.5  # two attempts whose cameras and
     same_focal: float = 0.02  # focal lengths differ by less have found the same
-    rival_rotation_deg: float = (
-        5.0  # two attempts that have cameras in common which differ by more contradict each other
-    )
+    rival_rotation_deg: float = 5.0  # two attempts whose common cameras differ by more contradict each other
 
 
 @dataclass(frozen=True, eq=False)

@@ -151,6 +151,8 @@ def register(
 
     `pairs` holds the verified pairs by position (i < j). The answer is the same in whatever order the keyframes come.
     """
+    if not pairs:
+        return None
     order = sorted(range(len(keyframes)), key=lambda index: place_in_order(keyframes[index]))
     ordered = [keyframes[index] for index in order]
     built = _build(ordered, _renumbered(pairs, np.argsort(order)), config)

@@ -65,7 +65,7 @@ def measure(scene: EvaluationScene, names: tuple[str, ...], config: Config) -> R
     for frame, of_frame in zip(frames, found, strict=True):
         graph.add(Keyframe(frame, modelled_image(frame.image, config.size), of_frame))
     laps.append(time.perf_counter())
-    registration = register.register(graph.keyframes, graph.pairs, registering) if graph.pairs else None
+    registration = register.register(graph.keyframes, graph.pairs, registering)
     laps.append(time.perf_counter())
     evidence = verify(graph, registration, config.verification)
     laps.append(time.perf_counter())

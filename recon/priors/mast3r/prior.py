@@ -54,8 +54,6 @@ class Mast3rPrior:
         self.matcher = DescriptorMatcher(self._asked)
 
     def register(self, graph: ViewGraph) -> Registration | None:
-        if not graph.pairs:
-            return None
         return register.register(graph.keyframes, graph.pairs, self._config.registration)
 
     def pointmaps(
