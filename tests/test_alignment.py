@@ -14,6 +14,7 @@ from recon.evaluate.alignment import (
     centre_error_pct,
     umeyama,
 )
+from recon.evaluate.appearance import Splats
 from recon.geometry import Similarity, exp_se3
 from recon.preview import render_rgb
 from recon.rasterize.cpu import rasterize
@@ -154,7 +155,7 @@ def test_test_pose_is_found_again(levels, steps):
     gaussians, true = make_wall(), motion(5, 0.05)
     image = torch.from_numpy(render_rgb(gaussians, true, K, WIDTH, HEIGHT))
     start = true @ motion(6, 0.02)
-    found = align_test_pose(gaussians, image, start, K, rasterize, steps=steps, levels=levels)
+    found = align_test_pose(Splats(gaussians, rasterize), image, start, K, steps=steps, levels=levels)
     assert float(np.linalg.norm(start[:3, 3] - true[:3, 3])) > 0.02
     assert float(np.linalg.norm(found.T_world_camera[:3, 3] - true[:3, 3])) < 0.002
     assert angles_deg(found.T_world_camera[:3, :3], true[:3, :3]) < 0.03
@@ -165,6 +166,6 @@ def test_test_pose_is_found_again(levels, steps):
 def test_search_never_ends_worse_than_it_started():
     gaussians = make_wall()
     image = torch.from_numpy(render_rgb(gaussians, np.eye(4), K, WIDTH, HEIGHT))
-    found = align_test_pose(gaussians, image, np.eye(4), K, rasterize, steps=3, levels=2, learning_rate=0.5)
+    found = align_test_pose(Splats(gaussians, rasterize), image, np.eye(4), K, steps=3, levels=2, learning_rate=0.5)
     assert found.loss == pytest.approx(0.0, abs=1e-6)
     assert np.array_equal(found.T_world_camera, np.eye(4))

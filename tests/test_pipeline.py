@@ -19,6 +19,7 @@ from capture.frame import DroppedFrame, Frame
 from recon import optimize
 from recon.config import Config
 from recon.evaluate.alignment import CameraErrors, align_test_pose, camera_errors
+from recon.evaluate.appearance import Splats
 from recon.evaluate.metrics import psnr
 from recon.evaluate.protocol import mean_intrinsics
 from recon.evaluate.splits import load_split
@@ -101,7 +102,7 @@ def held_out_psnr(snapshot: Snapshot, index: int) -> float:
     )
     K = mean_intrinsics(snapshot.cameras, SMALL.width, SMALL.height)
     start = to_estimated.camera(T_world_camera)
-    aligned = align_test_pose(snapshot.gaussians, image, start, K, rasterize, steps=60, levels=2)
+    aligned = align_test_pose(Splats(snapshot.gaussians, rasterize), image, start, K, steps=60, levels=2)
     rendered = render_rgb(snapshot.gaussians, aligned.T_world_camera, K, SMALL.width, SMALL.height)
     return psnr(torch.from_numpy(rendered), image)
 

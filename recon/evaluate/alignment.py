@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,12 +11,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from recon.evaluate.appearance import Appearance
 from recon.geometry import Similarity, align_cameras, exp_se3, twist_gradient
-from recon.rasterize.render import Render
-from recon.snapshot import GaussianArrays
 
 Array = npt.NDArray[np.float64]
-Rasterize = Callable[..., Render]
 
 _BETA1, _BETA2 = 0.9, 0.999  # of Adam (Kingma and Ba 2015)
 
@@ -135,17 +132,16 @@ class AlignedPose:
 
 
 def align_test_pose(
-    gaussians: GaussianArrays,
+    scene: Appearance,
     image: Tensor,  # (H, W, 3) in [0, 1]
     T_world_camera: Array,  # (4, 4) where the search starts
     K: Array,  # (3, 3) of `image`
-    rasterize: Rasterize,
     *,
     steps: int = 500,
     levels: int = 1,
     learning_rate: float = 0.003,
 ) -> AlignedPose:
-    """Equation 18: the pose from which the frozen Gaussians look most like the image, in mean absolute difference.
+    """Equation 18: the pose from which the frozen scene looks most like the image, in mean absolute difference.
 
     Adam moves a twist at the current pose, with a learning rate that falls to 0 along a cosine; the best pose seen is
     returned, never one worse than the start. `learning_rate` is in radians, and for the translation in parts of the
@@ -154,17 +150,16 @@ def align_test_pose(
     """
     if steps < 1 or levels < 1:
         raise ValueError(f"steps and levels must be at least 1, got {steps} and {levels}")
-    tensors = [torch.from_numpy(array).to(image) for array in _parameters(gaussians)]
     start = torch.from_numpy(np.ascontiguousarray(T_world_camera, np.float64))
     units = torch.ones(6, dtype=torch.float64)
-    units[:3] = _depth(gaussians, T_world_camera)
+    units[:3] = scene.depth(T_world_camera)
     first, second = torch.zeros(6, dtype=torch.float64), torch.zeros(6, dtype=torch.float64)  # Adam's moments
 
     T, best_T, best_loss = start, start, math.inf
     for step in range(steps):
         level = step * levels // steps
         reduced, reduced_K = _reduced(image, K, 2 ** (levels - 1 - level))
-        loss, gradient = _loss_and_gradient(tensors, reduced, T, reduced_K, rasterize)
+        loss, gradient = _loss_and_gradient(scene, reduced, T, reduced_K)
         if level == levels - 1 and loss < best_loss:
             best_T, best_loss = T, loss
         slope = twist_gradient(T, gradient) * units
@@ -175,31 +170,18 @@ def align_test_pose(
         # The moments live in the camera's own frame, which turns with it: each step is a twist at the current pose.
         T = T @ exp_se3(-rate * unbiased[0] / (unbiased[1].sqrt() + 1e-12) * units)
     for candidate in (T, start):
-        loss, _ = _loss_and_gradient(tensors, image, candidate, torch.from_numpy(K), rasterize)
+        loss, _ = _loss_and_gradient(scene, image, candidate, torch.from_numpy(K))
         if loss < best_loss:
             best_T, best_loss = candidate, loss
     return AlignedPose(best_T.numpy(), best_loss)
 
 
-def _loss_and_gradient(
-    tensors: list[Tensor], image: Tensor, T_world_camera: Tensor, K: Tensor, rasterize: Rasterize
-) -> tuple[float, Tensor]:
+def _loss_and_gradient(scene: Appearance, image: Tensor, T_world_camera: Tensor, K: Tensor) -> tuple[float, Tensor]:
     """The mean absolute difference, and its gradient (4, 4) with respect to the pose alone."""
     T = T_world_camera.to(image).requires_grad_()
-    height, width = image.shape[:2]
-    rgb = _rasterize_rgb(tensors, T, K.to(image), width, height, rasterize)
-    loss = (rgb - image).abs().mean()
+    loss = scene.difference(image, T, K.to(image))
     (gradient,) = torch.autograd.grad(loss, T)
     return float(loss.detach()), gradient.double()
-
-
-def _rasterize_rgb(
-    tensors: list[Tensor], T_world_camera: Tensor, K: Tensor, width: int, height: int, rasterize: Rasterize
-) -> Tensor:
-    rgb = rasterize(*tensors, T_world_camera, K, width, height, channels=("rgb",)).rgb
-    if rgb is None:
-        raise ValueError("the rasteriser was asked for the channel rgb and gave none")
-    return rgb
 
 
 def _reduced(image: Tensor, K: Array, factor: int) -> tuple[Tensor, Tensor]:
@@ -210,14 +192,3 @@ def _reduced(image: Tensor, K: Array, factor: int) -> tuple[Tensor, Tensor]:
     if size != (height, width):
         image = functional.interpolate(image.permute(2, 0, 1)[None], size=size, mode="area")[0].permute(1, 2, 0)
     return image, torch.from_numpy(K) * ratios[:, None]
-
-
-def _depth(gaussians: GaussianArrays, T_world_camera: Array) -> float:
-    """The median depth of the Gaussians in front of the camera; 1 where there are none."""
-    z = (gaussians.means - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
-    ahead = z[z > 0]
-    return float(np.median(ahead)) if len(ahead) else 1.0
-
-
-def _parameters(gaussians: GaussianArrays) -> tuple[npt.NDArray[np.float32], ...]:
-    return gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from capture.frame import Frame
-from recon.evaluate.alignment import Rasterize
+from recon.evaluate.appearance import Rasterize
 from recon.evaluate.protocol import STAGES, Networks, Row, Run, Settings, evaluate
 from recon.evaluate.splits import Split, load_split
 from recon.evaluate.summary import markdown

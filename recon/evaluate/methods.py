@@ -1,11 +1,13 @@
 """The methods that a benchmark compares, by name: our presets, and others as configurations of the same engine.
 
-All methods get the same cameras and point maps, so that what differs is how a scene is made of them.
+Methods that are configurations get the same cameras and point maps, so that what differs is how a scene is made of
+them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import msgspec
 
@@ -44,7 +46,7 @@ def _instantsplat(iterations: int, terms: regularise.Config) -> Config:
 
 
 _NO_TERMS = regularise.Config()
-METHODS: dict[str, Config] = {
+CONFIGS: dict[str, Config] = {
     **PRESETS,
     "instantsplat-s": _instantsplat(200, _NO_TERMS),
     "instantsplat-xl": _instantsplat(1000, _NO_TERMS),
@@ -52,8 +54,18 @@ METHODS: dict[str, Config] = {
 }
 
 
-def method(name: str) -> Config:
-    """The configuration of the method called `name`. Raises ValueError when there is none."""
+Method = Callable[[Sequence[Frame], int], Iterator[Snapshot]]  # photographs and a seed in, the scene as it grows out
+
+
+def _configured(config: Config, frames: Sequence[Frame], seed: int) -> Iterator[Snapshot]:
+    return reconstruct(frames, msgspec.structs.replace(config, seed=seed))
+
+
+METHODS: dict[str, Method] = {name: partial(_configured, config) for name, config in CONFIGS.items()}
+
+
+def method(name: str) -> Method:
+    """The method called `name`. Raises ValueError when there is none."""
     if name not in METHODS:
         raise ValueError(f"no method {name!r}; there are: {', '.join(METHODS)}")
     return METHODS[name]
@@ -61,4 +73,4 @@ def method(name: str) -> Config:
 
 def by_name(frames: Sequence[Frame], name: str, seed: int) -> Iterator[Snapshot]:
     """Runs the method called `name`. At module level, so that a fresh process can be told to run it."""
-    return reconstruct(frames, msgspec.structs.replace(method(name), seed=seed))
+    return method(name)(frames, seed)

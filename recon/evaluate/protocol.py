@@ -10,16 +10,14 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from recon.evaluate.alignment import CameraErrors, Rasterize, align_test_pose, camera_errors
+from recon.evaluate.alignment import CameraErrors, align_test_pose, camera_errors
+from recon.evaluate.appearance import Appearance, Rasterize, appearance_of
 from recon.evaluate.metrics import psnr, ssim
 from recon.evaluate.splits import Split
 from recon.evaluate.truth import EvaluationScene
-from recon.export import viewer_safe
-from recon.export.ply import ply_bytes
 from recon.geometry import align_cameras
 from recon.keyframe import modelled_image
 from recon.losses.lpips import Lpips, load_lpips
-from recon.preview import render_rgb
 from recon.snapshot import CameraEstimate, Snapshot
 
 STAGES = ("poses", "points", "optimise")
@@ -103,9 +101,8 @@ def evaluate(
     """
     estimated = [camera for camera in snapshot.cameras if camera.name in scene.cameras]
     errors = _camera_errors(estimated, scene)
-    gaussians = viewer_safe(snapshot.gaussians)
-    publishable = snapshot.verdict.publishable and len(gaussians) > 0
-    views = _score_test_views(snapshot, estimated, scene, split, rasterize, networks, settings) if publishable else []
+    appearance = appearance_of(snapshot, rasterize)
+    views = _score_test_views(appearance, snapshot.cameras, estimated, scene, split, networks, settings)
     return Row(
         scene=scene.name,
         views=len(split.train),
@@ -125,9 +122,9 @@ def evaluate(
         ate_instantsplat=errors.ate_instantsplat,
         seconds=run.seconds,
         peak_rss_mb=run.peak_rss_mb,
-        num_gaussians=len(gaussians),
+        num_gaussians=0 if appearance is None else appearance.num_gaussians,
         num_cameras=len(snapshot.cameras),
-        scene_bytes=ply_bytes(len(gaussians), gaussians.sh.shape[1]) if publishable else 0,
+        scene_bytes=0 if appearance is None else appearance.num_bytes,
         verdict=snapshot.verdict.code.value,
     )
 
@@ -141,11 +138,11 @@ class _ViewScore:
 
 
 def _score_test_views(
-    snapshot: Snapshot,
+    appearance: Appearance | None,
+    cameras: Sequence[CameraEstimate],
     estimated: Sequence[CameraEstimate],
     scene: EvaluationScene,
     split: Split,
-    rasterize: Rasterize,
     networks: Networks,
     settings: Settings,
 ) -> list[_ViewScore]:
@@ -154,30 +151,28 @@ def _score_test_views(
     The search starts from the true pose, carried into the estimated world by the similarity that aligns the training
     cameras. No view can be scored with fewer than two of them.
     """
-    if len(estimated) < 2:
+    if appearance is None or len(estimated) < 2:
         return []
     true_to_estimated = align_cameras(
         np.stack([scene.cameras[camera.name].T_world_camera for camera in estimated]),
         np.stack([camera.T_world_camera for camera in estimated]),
     )
-    gaussians = viewer_safe(snapshot.gaussians)
     scores = []
     for name in split.test:
         if name not in scene.cameras:
             continue
         truth = torch.from_numpy(modelled_image(scene.image(name), settings.longer_side)).float() / 255.0
         height, width = truth.shape[:2]
-        K = mean_intrinsics(snapshot.cameras, width, height)
+        K = mean_intrinsics(cameras, width, height)
         aligned = align_test_pose(
-            gaussians,
+            appearance,
             truth,
             true_to_estimated.camera(scene.cameras[name].T_world_camera),
             K,
-            rasterize,
             steps=settings.alignment_steps,
             levels=settings.alignment_levels,
         )
-        image = torch.from_numpy(render_rgb(gaussians, aligned.T_world_camera, K, width, height))
+        image = appearance.picture(aligned.T_world_camera, K, width, height)
         scores.append(
             _ViewScore(
                 psnr=psnr(image, truth),
