@@ -65,31 +65,21 @@ class Adam:
         for group in moving.values():
             torch.autograd.graph.increment_version(group.param)
 
-    def append(self, params: Mapping[str, Tensor]) -> None:
-        """Goes on with `params`, which have new rows after the old ones. The state of the old rows is kept."""
-        for name, param in params.items():
-            group = self._group(name)
-            added = len(param) - len(group.param)
-            if added < 0 or param.shape[1:] != group.param.shape[1:]:
-                raise ValueError(f"{name} must be {tuple(group.param.shape)} with rows added, got {tuple(param.shape)}")
-            zeros = torch.zeros(added, *param.shape[1:])
-            self._groups[name] = _Group(
-                _checked(name, param), torch.cat([group.first, zeros]), torch.cat([group.second, zeros]), group.steps
-            )
+    def follow(self, params: Mapping[str, Tensor], origin: Tensor) -> None:
+        """Goes on with `params`, of M rows each, in place of the old ones.
 
-    def subset(self, params: Mapping[str, Tensor], index: Tensor) -> None:
-        """Goes on with `params`, which are the old ones at `index` (integers or a mask), and their state."""
+        `origin` (M,) is the old row whose state each goes on with; one of -1 starts with moments of 0.
+        """
+        if set(params) != set(self._groups):
+            raise ValueError(f"params must have the names {sorted(self._groups)}, got {sorted(params)}")
+        fresh = origin < 0
         for name, param in params.items():
-            group = self._group(name)
-            first, second = group.first[index], group.second[index]
-            if first.shape != param.shape:
-                raise ValueError(f"{name} must be {tuple(first.shape)} for this index, got {tuple(param.shape)}")
+            group = self._groups[name]
+            if param.shape != (len(origin), *group.param.shape[1:]):
+                shape = (len(origin), *group.param.shape[1:])
+                raise ValueError(f"{name} must be {shape} for these origins, got {tuple(param.shape)}")
+            first, second = (moment[origin].masked_fill_(_beside(fresh, moment), 0) for moment in group.moments)
             self._groups[name] = _Group(_checked(name, param), first, second, group.steps)
-
-    def _group(self, name: str) -> _Group:
-        if name not in self._groups:
-            raise ValueError(f"no parameter {name!r} here; there are {sorted(self._groups)}")
-        return self._groups[name]
 
 
 @dataclass(eq=False)
@@ -98,6 +88,10 @@ class _Group:
     first: Tensor  # moment: running mean of the gradient
     second: Tensor  # and of its square
     steps: int
+
+    @property
+    def moments(self) -> tuple[Tensor, Tensor]:
+        return self.first, self.second
 
 
 class _NativeGroup(ctypes.Structure):
@@ -110,6 +104,11 @@ class _NativeGroup(ctypes.Structure):
         ("step_size", ctypes.c_float),
         ("root_correction", ctypes.c_float),
     ]
+
+
+def _beside(rows: Tensor, values: Tensor) -> Tensor:
+    """`rows` (N,) in a shape that broadcasts with `values` (N, ...)."""
+    return rows.view(-1, *[1] * (values.dim() - 1))
 
 
 def _new_group(name: str, param: Tensor) -> _Group:

@@ -58,8 +58,17 @@ def overlaid(config: Config, changes: Mapping[str, Any]) -> Config:
 
     Another kind of prior starts from its own defaults.
     """
-    tree = msgspec.to_builtins(config)
-    kind, settings = tree["prior"]["kind"], tree["prior"]["config"]
-    same = changes.get("prior", {}).get("kind", kind) == kind
-    tree["prior"] = {"kind": kind, **settings} if same else {}
+    tree = _as_in_files(msgspec.to_builtins(config))
+    kind = tree["prior"]["kind"]
+    if changes.get("prior", {}).get("kind", kind) != kind:
+        tree["prior"] = {}
     return typed(merged(tree, changes), Config)
+
+
+def _as_in_files(tree: Any) -> Any:
+    """The tree with the settings of plug-ins beside their kinds, as files have them."""
+    if not isinstance(tree, dict):
+        return tree
+    if set(tree) == {"kind", "config"}:
+        tree = {"kind": tree["kind"], **tree["config"]}
+    return {key: _as_in_files(value) for key, value in tree.items()}

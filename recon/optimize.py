@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import cv2
 import msgspec
 import numpy as np
 import torch
@@ -15,14 +14,17 @@ from torch import Tensor
 
 from recon import regularise
 from recon.adam import Adam
+from recon.control.control import Control, ControlChoice, Step
 from recon.gaussians import Gaussians
 from recon.geometry import exp_se3, twist_gradient
-from recon.photometric import PhotometricLoss
 from recon.pseudo_views import PseudoView
 from recon.rasterize.cpu import rasterize
 from recon.rasterize.render import Render
 from recon.regularise import Regularisation
-from recon.scene import Scene, View
+from recon.scene import Scene
+from recon.target import Target, scaled, target
+
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # of Gaussians, that are optimised
 
 
 class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -47,6 +49,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     refine_poses: bool = True
     rates: Rates = Rates()
     regularise: regularise.Config = regularise.Config()  # losses beside the photometric one; none by default
+    control: ControlChoice | None = None  # what adds and takes away Gaussians meanwhile
 
 
 def refine(scene: Scene, config: Config, *, seed: int, deadline: float | None = None) -> Iterator[Scene]:
@@ -85,16 +88,6 @@ def _single_torch_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-@dataclass(frozen=True, eq=False)
-class _Target:
-    """A photograph at one resolution."""
-
-    K: Tensor
-    width: int
-    height: int
-    loss: PhotometricLoss
-
-
 class _Fit:
     """Parameters, targets and optimisers of one refinement."""
 
@@ -103,40 +96,50 @@ class _Fit:
         gaussians = scene.gaussians.map(lambda tensor: tensor.clone())
         self._gaussians = gaussians
         rates = config.rates
-        self._groups = {
-            name: getattr(gaussians, name).requires_grad_(True)
-            for name in ("means", "quats", "log_scales", "logit_opacities", "sh")
-        }
-        self._rates = {name: getattr(rates, name) for name in self._groups}
-        self._adam = Adam(self._groups, self._rates)
+        self._rates = {name: getattr(rates, name) for name in PARAMETERS}
+        self._adam = Adam(_leaves(gaussians), self._rates)
+        self._control: Control | None = None
+        if config.control is not None:
+            self._control = config.control.module.load(config.control.config, seed)
         self._Ts_world_camera = [view.T_world_camera.clone() for view in scene.views]
         self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
         self._pose_moments = [(torch.zeros(6), torch.zeros(6), 0) for _ in scene.views]
-        self._targets = [[_target(view, scale, config.dssim) for view in scene.views] for scale in (1.0, 0.5)]
+        self._targets = [[target(view, scale, config.dssim) for view in scene.views] for scale in (1.0, 0.5)]
         self._terms = _terms(scene, config.regularise, seed)
         self._iterations = scene.iterations
 
     def step(self, index: int, progress: float) -> None:
         """One iteration on view `index`; `progress` in [0, 1] sets resolution and step sizes."""
         half = progress < self._config.half_resolution_share
-        target = self._targets[half][index]
+        photograph = self._targets[half][index]
         rates = self._config.rates
         decay, pose_decay = rates.final**progress, rates.final_pose**progress
         refine_pose = self._config.refine_poses and index > 0
         T_world_camera = self._Ts_world_camera[index].requires_grad_(refine_pose)
         channels = self._terms.channels(progress) if self._terms else ("rgb",)
-        render = self._render(T_world_camera, target.K, target.width, target.height, channels)
+        render = self._render(T_world_camera, photograph.K, photograph.width, photograph.height, channels)
         assert render.rgb is not None  # it was asked for
-        loss = target.loss(render.rgb)
+        loss = photograph.loss(render.rgb)
         if self._terms is not None:
             loss = loss + self._regularisation(self._terms, index, render, progress, 0.5 if half else 1.0)
         loss.backward()
         self._adam.lrs = {name: rate * decay for name, rate in self._rates.items()}
         self._adam.step()
-        self._adam.zero_grad()
         if refine_pose and T_world_camera.grad is not None:
             self._move_camera(index, twist_gradient(T_world_camera.detach(), T_world_camera.grad), pose_decay)
         self._iterations += 1
+        self._control_density(index, self._targets[half])
+        self._adam.zero_grad()
+
+    def _control_density(self, index: int, targets: Sequence[Target]) -> None:
+        if self._control is None:
+            return
+        cameras = tuple(T.detach() for T in self._Ts_world_camera)
+        made = self._iterations - self._scene.iterations
+        change = self._control.after_step(Step(made, self._config.iterations, index, self._gaussians, cameras, targets))
+        if change is not None:
+            self._gaussians = change.gaussians
+            self._adam.follow(_leaves(change.gaussians), change.origin)
 
     def _render(self, T_world_camera: Tensor, K: Tensor, width: int, height: int, channels: Collection[str]) -> Render:
         gaussians = self._gaussians
@@ -161,7 +164,7 @@ class _Fit:
         def draw(view: PseudoView, channels: Collection[str]) -> Render:
             T_world_camera = torch.from_numpy(view.T_world_camera).float()
             return self._render(
-                T_world_camera, *_scaled(torch.from_numpy(view.K), view.width, view.height, scale), channels
+                T_world_camera, *scaled(torch.from_numpy(view.K), view.width, view.height, scale), channels
             )
 
         parts = (terms.training_loss(index, render, progress), terms.pseudo_loss(draw, progress))
@@ -182,26 +185,12 @@ class _Fit:
             replace(view, T_world_camera=T.detach().clone())
             for view, T in zip(self._scene.views, self._Ts_world_camera, strict=True)
         )
-        learnt = Gaussians(
-            **{name: tensor.detach().clone() for name, tensor in self._groups.items()},
-            source_frame=self._gaussians.source_frame,
-        )
-        return Scene(views, learnt, self._iterations)
+        return Scene(views, self._gaussians.map(lambda tensor: tensor.detach().clone()), self._iterations)
 
 
-def _target(view: View, scale: float, dssim: float) -> _Target:
-    K, width, height = _scaled(view.K, view.width, view.height, scale)
-    image = view.image
-    if (width, height) != (view.width, view.height):
-        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    return _Target(K, width, height, PhotometricLoss(torch.from_numpy(image).float() / 255.0, dssim))
-
-
-def _scaled(K: Tensor, width: int, height: int, scale: float) -> tuple[Tensor, int, int]:
-    """Intrinsics, width and height of the same view at `scale` of its resolution."""
-    scaled_width, scaled_height = max(1, round(width * scale)), max(1, round(height * scale))
-    sizes = torch.tensor([[scaled_width / width], [scaled_height / height], [1.0]])
-    return K.float() * sizes, scaled_width, scaled_height
+def _leaves(gaussians: Gaussians) -> dict[str, Tensor]:
+    """What Adam moves, by name."""
+    return {name: getattr(gaussians, name).requires_grad_(True) for name in PARAMETERS}
 
 
 def _terms(scene: Scene, config: regularise.Config, seed: int) -> Regularisation | None:

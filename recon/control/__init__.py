@@ -1,0 +1,1 @@
+"""How the number of Gaussians changes while they are optimised: control.py is the interface, the rest is one a file."""
