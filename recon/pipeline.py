@@ -7,14 +7,13 @@ The daemon (recon/daemon) takes the same steps of `Reconstruction`, in the order
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 
 import msgspec
 
 from capture.frame import DroppedFrame, Frame
 from recon import growth, optimize
+from recon.clock import Clock
 from recon.config import Config
 from recon.judge import hopeless, judge
 from recon.keyframe import Features, Keyframe, modelled_image
@@ -61,11 +60,17 @@ def reconstruct(frames: Iterable[Frame | DroppedFrame], config: Config) -> Itera
         if not all_at_hand:
             work.work_in()
             yield work.snapshot()
-    work.estimate()
+    work.find_points()
+    yield from finished(work, at_once=all_at_hand)
+
+
+def finished(work: Reconstruction, *, at_once: bool) -> Iterator[Snapshot]:
+    """What comes of the points that were found: the scene as it begins, if it is to be seen `at_once`, and refined."""
+    work.begin()
     work.show(work.begun)
-    if all_at_hand:
+    if at_once:
         yield work.snapshot()
-    for scene in work.refine(work.begun, config.optimize, work.deadline):
+    for scene in work.refine(work.begun, work.config.optimize, work.deadline):
         work.show(scene)
         yield work.snapshot()
     yield work.snapshot(final=True)
@@ -81,27 +86,12 @@ def prepare(frame: Frame, config: Config, found: Features | None = None) -> Keyf
     return Keyframe(frame, modelled_image(frame.image, config.size), found)
 
 
-@dataclass
-class _Clock:
-    """Seconds by stage; "wait" is for the next frame, and for whoever reads the snapshots."""
-
-    started: float = field(default_factory=time.monotonic)
-    last: float = field(default_factory=time.monotonic)
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    def lap(self, stage: str) -> None:
-        """Books the time since the last lap on `stage`."""
-        now = time.monotonic()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
-        self.last = now
-
-
 class Reconstruction:
     """What lives as long as the stream of frames does: keyframes, their cameras and verdict, and the scene."""
 
     def __init__(self, config: Config) -> None:
         self.config = config
-        self.clock = _Clock()
+        self.clock = Clock()
         settings = config.prior.config
         self._prior: Prior = config.prior.module.load(msgspec.structs.replace(settings, seed=config.seed))
         self.graph = ViewGraph(settings.registration, self._prior.matcher)
@@ -133,7 +123,7 @@ class Reconstruction:
         A frame that turns out to be blurred beside a sharper one is left out again.
         """
         if not self._looks:
-            self.clock = _Clock()
+            self.clock = Clock()
         self.clock.lap("wait")
         self._looks[frame.name] = look(frame)
         _, rejected = screen(list(self._looks.values()), self.config.screening)
@@ -218,15 +208,27 @@ class Reconstruction:
 
         `pause` is called several times a second; it may raise to abandon the work, and nothing has happened then.
         """
+        self.find_points(pause)
+        self.begin()
+
+    def find_points(self, pause: Callable[[], None] = lambda: None) -> None:
+        """Point maps of all keyframes that have a camera; none where the verdict forbids a scene. `pause` as above."""
         registration, verdict = self.judge()
         pause()
+        if registration is not None and verdict.publishable:
+            pointmaps = self._prior.pointmaps(self.graph, registration, pause)
+            self._pointmaps = {pointmap.name: pointmap for pointmap in pointmaps}
+            self.clock.lap("points")
+
+    def begin(self) -> None:
+        """Begins a scene from the points that were found last, which is not shown yet."""
+        registration, verdict = self.judge()
         if registration is None or not verdict.publishable:
             self.begun = None
             return
-        pointmaps = self._prior.pointmaps(self.graph, registration, pause)
         config = self.config
         self.begun = begin(
-            pointmaps,
+            tuple(self._pointmaps.values()),
             {keyframe.name: keyframe.image for keyframe in self.graph.keyframes},
             registration.cameras,
             config.completion,
@@ -235,7 +237,6 @@ class Reconstruction:
             config.max_gaussians,
             config.pixelwise,
         )
-        self._pointmaps = {pointmap.name: pointmap for pointmap in pointmaps}
         self.clock.lap("points")
 
     def refine(self, scene: Scene | None, config: optimize.Config, deadline: float | None = None) -> Iterator[Scene]:
@@ -265,7 +266,7 @@ class Reconstruction:
             images={view.name: view.image for view in scene.views} if scene else {},
             dropped=tuple(self.dropped),
             iterations=scene.iterations if scene else 0,
-            seconds={**self.clock.seconds, "total": time.monotonic() - self.clock.started},
+            seconds=self.clock.booked,
             final=final,
             evidence=record(evidence) if evidence is not None else None,
         )

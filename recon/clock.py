@@ -1,0 +1,26 @@
+"""Where the seconds of a reconstruction go."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+
+@dataclass
+class Clock:
+    """Seconds by stage; "wait" is for the next frame, and for whoever reads the snapshots."""
+
+    started: float = field(default_factory=time.monotonic)
+    last: float = field(default_factory=time.monotonic)
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def lap(self, stage: str) -> None:
+        """Books the time since the last lap on `stage`."""
+        now = time.monotonic()
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
+        self.last = now
+
+    @property
+    def booked(self) -> dict[str, float]:
+        """Seconds by stage, and from the start on as "total"."""
+        return {**self.seconds, "total": time.monotonic() - self.started}
