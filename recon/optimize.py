@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon import regularise
+from recon import regularise, rim
 from recon.adam import Adam
 from recon.control.control import Control, ControlChoice, Step
 from recon.gaussians import Gaussians
@@ -104,7 +104,11 @@ class _Fit:
         self._Ts_world_camera = [view.T_world_camera.clone() for view in scene.views]
         self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
         self._pose_moments = [(torch.zeros(6), torch.zeros(6), 0) for _ in scene.views]
-        self._targets = [[target(view, scale, config.dssim) for view in scene.views] for scale in (1.0, 0.5)]
+        shown = rim.shown([view.image for view in scene.views])
+        self._targets = [
+            [target(*each, scale, config.dssim) for each in zip(scene.views, shown, strict=True)]
+            for scale in (1.0, 0.5)
+        ]
         self._terms = _terms(scene, config.regularise, seed)
         self._iterations = scene.iterations
 

@@ -18,13 +18,20 @@ class PhotometricLoss:
     together in the compiled core, in float32; the target's moments are kept.
     """
 
-    def __init__(self, target: Tensor, ssim_weight: float = 0.2):
-        """`target`: (H, W, 3) in [0, 1]. Raises ValueError for other shapes and for values that are not finite."""
+    def __init__(self, target: Tensor, ssim_weight: float = 0.2, weights: Tensor | None = None):
+        """`target`: (H, W, 3) in [0, 1]; `weights`: (H, W) >= 0 weigh the pixels of both means, None: all alike.
+
+        A pixel of weight 0 is ignored: it has no gradient, and in its neighbours' windows it counts as the target's.
+        With all weights 0 the loss is 0. Raises ValueError for other shapes and for targets that are not finite.
+        """
         if target.dim() != 3 or target.shape[2] != 3 or 0 in target.shape or not target.is_floating_point():
             raise ValueError(f"target must be (H, W, 3) floats, got {tuple(target.shape)} {target.dtype}")
         if not 0 <= ssim_weight <= 1:
             raise ValueError(f"ssim_weight must be from 0 to 1, got {ssim_weight}")
+        if weights is not None and weights.shape != target.shape[:2]:
+            raise ValueError(f"weights must be {tuple(target.shape[:2])}, got {tuple(weights.shape)}")
         self.ssim_weight = ssim_weight
+        self._weights = None if weights is None else weights.detach().to(torch.float32).contiguous()
         self.target = _planar(target.detach())
         if not bool(torch.isfinite(self.target).all()):
             raise ValueError("target must be finite")
@@ -34,26 +41,19 @@ class PhotometricLoss:
             _address(self.target), width, height, _address(self._mean), _address(self._variance)
         )
 
-    def __call__(self, rgb: Tensor, weights: Tensor | None = None) -> Tensor:
-        """The loss of `rgb` (H, W, 3), scalar; `weights` (H, W) >= 0 weigh the pixels of both means.
-
-        A pixel of weight 0 is ignored: it has no gradient, and in its neighbours' windows it counts as the target's.
-        With all weights 0 the loss is 0. The weights are constants: no gradient flows to them.
-        """
+    def __call__(self, rgb: Tensor) -> Tensor:
+        """The loss of `rgb` (H, W, 3), scalar."""
         _, height, width = self.target.shape
         if tuple(rgb.shape) != (height, width, 3) or not rgb.is_floating_point():
             raise ValueError(
                 f"rgb must be ({height}, {width}, 3) floats as the target, got {tuple(rgb.shape)} {rgb.dtype}"
             )
-        if weights is not None and tuple(weights.shape) != (height, width):
-            raise ValueError(f"weights must be ({height}, {width}), got {tuple(weights.shape)}")
-        return _Photometric.apply(rgb, self, weights)
+        return _Photometric.apply(rgb, self)
 
-    def evaluate(self, planar: Tensor, weights: Tensor | None, gradient: Tensor | None) -> float:
+    def evaluate(self, planar: Tensor, gradient: Tensor | None) -> float:
         """The loss of a planar (3, H, W) image; fills `gradient`, of the same shape, where given."""
         _, height, width = self.target.shape
-        if weights is not None:
-            weights = weights.detach().to(torch.float32).contiguous()
+        weights = self._weights
         total = float(height * width) if weights is None else float(weights.sum(dtype=torch.float64))
         evaluate = library().core_photometric
         evaluate.restype = ctypes.c_double
@@ -65,10 +65,10 @@ class PhotometricLoss:
 
 class _Photometric(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, rgb: Tensor, loss: PhotometricLoss, weights: Tensor | None) -> Tensor:
+    def forward(ctx: Any, rgb: Tensor, loss: PhotometricLoss) -> Tensor:
         planar = _planar(rgb)
         gradient = torch.empty_like(planar) if ctx.needs_input_grad[0] else None
-        value = loss.evaluate(planar, weights, gradient)
+        value = loss.evaluate(planar, gradient)
         ctx.gradient, ctx.dtype = gradient, rgb.dtype
         return rgb.new_tensor(value)
 
@@ -77,7 +77,7 @@ class _Photometric(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
         factor = float(upstream)
         gradient = ctx.gradient if factor == 1 else ctx.gradient * factor
-        return gradient.permute(1, 2, 0).to(ctx.dtype), None, None
+        return gradient.permute(1, 2, 0).to(ctx.dtype), None
 
 
 def _planar(image: Tensor) -> Tensor:

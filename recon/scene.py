@@ -9,7 +9,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recon import background, completion, density, pixelwise
+from recon import background, completion, density, pixelwise, rim
 from recon.gaussians import Gaussians, concatenate
 from recon.priors.pointmap import Pointmap
 from recon.registration.register import RegisteredCamera
@@ -89,6 +89,8 @@ def begin(
     With `by_pixel` it has a Gaussian for each pixel that stereo knows, and neither completion nor a far shell.
     """
     pictures = [images[pointmap.name] for pointmap in pointmaps]
+    shown = rim.shown(pictures)
+    pointmaps = tuple(map(completion.only, pointmaps, shown))
     views = tuple(
         View(
             name=pointmap.name,
@@ -105,7 +107,7 @@ def begin(
     if by_pixel is not None:
         return Scene(views, pixelwise.pixelwise_gaussians(pointmaps, pictures, by_pixel, max_gaussians))
     telling = [completion.only(each, each.confidence >= completing.least_confidence) for each in pointmaps]
-    completed = completion.complete(telling, pictures, completing)
+    completed = list(map(completion.only, completion.complete(telling, pictures, completing), shown))
     behind = background.background(telling, pictures, shell, None if max_gaussians is None else max_gaussians // 10)
     left = None if max_gaussians is None else max_gaussians - len(behind)
     surfaces = density.initial_gaussians(completed, pictures, sampling, left)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -17,16 +19,22 @@ class Target:
     K: Tensor  # (3, 3) for the image at this size
     width: int
     height: int
-    loss: PhotometricLoss  # with the photograph as its target
+    loss: PhotometricLoss  # with the photograph as its target, where it shows the scene
 
 
-def target(view: View, scale: float, dssim: float) -> Target:
-    """The photograph of `view` at `scale` of its size; `dssim` weighs the two parts of the loss."""
+def target(view: View, shown: npt.NDArray[np.bool_], scale: float, dssim: float) -> Target:
+    """The photograph of `view` at `scale` of its size; `dssim` weighs the two parts of the loss.
+
+    Only pixels that are `shown` (h, w) entirely are compared.
+    """
     K, width, height = scaled(view.K, view.width, view.height, scale)
-    image = view.image
+    image, weights = view.image, None
     if (width, height) != (view.width, view.height):
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-    return Target(K, width, height, PhotometricLoss(torch.from_numpy(image).float() / 255.0, dssim))
+    if not shown.all():
+        share = cv2.resize(shown.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+        weights = torch.from_numpy(np.floor(share + np.float32(1e-3)))
+    return Target(K, width, height, PhotometricLoss(torch.from_numpy(image).float() / 255.0, dssim, weights))
 
 
 def scaled(K: Tensor, width: int, height: int, scale: float) -> tuple[Tensor, int, int]:

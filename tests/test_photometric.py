@@ -56,7 +56,7 @@ def test_value_and_gradient(height, width, weighted, instruction_set, monkeypatc
     expected = plain_loss(expected_rgb, target, weights)
     expected.backward()
     actual_rgb = rgb.float().requires_grad_()
-    actual = PhotometricLoss(target)(actual_rgb, weights if weighted else None)
+    actual = PhotometricLoss(target, weights=weights if weighted else None)(actual_rgb)
     (3 * actual).backward()
     assert actual.item() == pytest.approx(expected.item(), rel=1e-5)
     assert expected_rgb.grad is not None and actual_rgb.grad is not None
@@ -89,9 +89,9 @@ def test_ignored_pixels_have_no_influence():
     weights[10:20, 10:30] = 0
     changed = rgb.clone()
     changed[10:20, 10:30] = 100
-    loss = PhotometricLoss(target)
-    assert loss(rgb, weights).item() == loss(changed, weights).item()
-    assert loss(rgb, torch.zeros(40, 50)).item() == 0
+    loss = PhotometricLoss(target, weights=weights)
+    assert loss(rgb).item() == loss(changed).item()
+    assert PhotometricLoss(target, weights=torch.zeros(40, 50))(rgb).item() == 0
 
 
 def test_the_result_does_not_depend_on_threads():
@@ -129,4 +129,4 @@ def test_planar_images_are_not_copied():
 )
 def test_bad_input_is_named(target, rgb, weights, message):
     with pytest.raises(ValueError, match=message):
-        PhotometricLoss(target)(rgb, weights)
+        PhotometricLoss(target, weights=weights)(rgb)
