@@ -11,8 +11,9 @@ import pytest
 from recon.snapshot import GaussianArrays
 from tests.test_viewer_scene import K, camera, moment, wall
 from viewer.analysis import Analyst, analyse
+from viewer.canvas import BACKGROUND, project
 from viewer.moment import Moment
-from viewer.paint import BACKGROUND, blended, caption, paint, paint_gaussians, project
+from viewer.paint import blended, caption, paint, paint_gaussians
 from viewer.session import Session
 from viewer.shapes import Lines, Photograph, Shapes, arrow, frustum, frustum_depth, image_corners, path, shapes
 from viewer.sources import Finished
@@ -142,11 +143,11 @@ def test_a_photograph_lies_where_its_rectangle_is():
     picture[:, :10], picture[:, 10:] = RED, GREEN
     rectangle = np.array([[-0.2, -0.1, 1], [0.2, -0.1, 1], [0.2, 0.1, 1], [-0.2, 0.1, 1]])
     image = paint(
-        GaussianArrays.empty(), Shapes((), (Photograph("a", rectangle, picture),)), viewpoint(), State(), 100, 80
+        GaussianArrays.empty(), Shapes((), (Photograph("a", rectangle, (picture,)),)), viewpoint(), State(), 100, 80
     )
     assert (image[32:48, 32:48] == RED).all() and (image[32:48, 53:68] == GREEN).all()
     assert (image[:28] == BACKGROUND).all() and (image[:, :28] == BACKGROUND).all()
-    hidden = Photograph("a", rectangle + [0, 0, 1.0], picture)
+    hidden = Photograph("a", rectangle + [0, 0, 1.0], (picture,))
     assert (paint(wall(half=0.5), Shapes((), (hidden,)), viewpoint(), State(), 100, 80)[40, 40] > 150).all()
 
 

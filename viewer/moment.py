@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
 from recon.snapshot import CameraEstimate, Snapshot
 
 MEMORY_BYTES = 256_000_000
+_SMALLEST = 16  # pixels: a photograph that is drawn smaller is a spot
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,11 +24,16 @@ class Moment:
     tracked: CameraEstimate | None = None  # where the live camera is just now; None: not known
     scene_id: str = ""  # another one is another place: a viewpoint does not carry over
 
+    @cached_property
+    def photographs(self) -> dict[str, tuple[npt.NDArray[np.uint8], ...]]:
+        """The images at their size, at half of it, at a quarter and so on: what is drawn small must not flicker."""
+        return {name: _halvings(image) for name, image in self.snapshot.images.items()}
+
     @property
     def num_bytes(self) -> int:
         gaussians = self.snapshot.gaussians
-        arrays = [getattr(gaussians, field.name) for field in fields(gaussians)]
-        return sum(array.nbytes for array in [*arrays, *self.snapshot.images.values()])
+        arrays = sum(getattr(gaussians, field.name).nbytes for field in fields(gaussians))
+        return arrays + sum(4 * image.nbytes // 3 for image in self.snapshot.images.values())  # with `photographs`
 
 
 History = tuple[Moment, ...]  # oldest first
@@ -41,3 +50,13 @@ def remembered(history: History, moment: Moment, memory_bytes: int = MEMORY_BYTE
         gaps = [after.received_s - before.received_s for before, after in zip(kept, kept[2:], strict=False)]
         del kept[1 + int(np.argmin(gaps))]
     return tuple(kept)
+
+
+def _halvings(image: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint8], ...]:
+    levels = [image]
+    while min(levels[-1].shape[:2]) >= 2 * _SMALLEST:
+        height, width = levels[-1].shape[:2]
+        levels.append(
+            np.asarray(cv2.resize(levels[-1], (width // 2, height // 2), interpolation=cv2.INTER_AREA), np.uint8)
+        )
+    return tuple(levels)

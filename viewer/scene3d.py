@@ -14,7 +14,7 @@ from open3d.visualization import rendering  # pyright: ignore[reportMissingImpor
 
 from recon.export.prepare import base_rgb
 from recon.snapshot import GaussianArrays
-from viewer.paint import BACKGROUND
+from viewer.canvas import BACKGROUND
 from viewer.shapes import Lines, Photograph, Shapes
 from viewer.state import State
 from viewer.viewpoint import Viewpoint
@@ -117,7 +117,7 @@ def _photograph(photograph: Photograph) -> tuple[o3d.geometry.TriangleMesh, rend
     mesh.triangle_uvs = o3d.utility.Vector2dVector(corners[triangles.ravel()])
     levels = np.rint(255 * _encoded(np.arange(256) / 255.0)).astype(np.uint8)
     material = _material("defaultUnlit")
-    material.albedo_img = image3d(levels[photograph.image])
+    material.albedo_img = image3d(levels[photograph.levels[0]])
     return mesh, material
 
 

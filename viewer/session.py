@@ -5,20 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from recon.snapshot import CameraEstimate, GaussianArrays
 from viewer.analysis import Analysis, Analyst
+from viewer.canvas import Image, project
 from viewer.colours import coloured
 from viewer.moment import History, Moment, remembered
-from viewer.paint import blended, paint, project
+from viewer.paint import blended, paint
 from viewer.shapes import Photograph, Shapes, live_camera, shapes
 from viewer.sources import Source
 from viewer.state import Colouring, State, go_to_camera, press, shown_moment
 from viewer.support import Support
 from viewer.viewpoint import Viewpoint, at_camera, overview, scene_pivot
-
-Image = npt.NDArray[np.uint8]
 
 _CLICK_RADIUS = 14  # pixels around a camera's centre that are the camera
 

@@ -37,7 +37,7 @@ class Photograph:
 
     name: str
     corners: Array  # (4, 3) world: top left, top right, bottom right, bottom left
-    image: npt.NDArray[np.uint8]  # (h, w, 3) RGB
+    levels: tuple[npt.NDArray[np.uint8], ...]  # (h, w, 3) RGB, each half as large as the one before
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +62,8 @@ def shapes(moment: Moment, state: State, advice: Advice | None, eye: Array | Non
         for index, camera in others:
             corners = image_corners(camera, camera.T_world_camera, depth)
             lines.append(Lines(frustum(camera.T_world_camera, corners), source_colour(index), 2))
-            image = snapshot.images.get(camera.name)
-            if state.photographs and image is not None:
-                photographs.append(Photograph(camera.name, corners, image))
+            if state.photographs and camera.name in moment.photographs:
+                photographs.append(Photograph(camera.name, corners, moment.photographs[camera.name]))
     live = moment.tracked
     if state.tracked and live is not None and not state.follow:
         corners = image_corners(live, live.T_world_camera, 1.2 * depth)

@@ -20,7 +20,7 @@ import open3d as o3d  # pyright: ignore[reportMissingImports]
 from open3d.visualization import gui, rendering  # pyright: ignore[reportMissingImports]
 
 from recon.export import write_file
-from viewer.paint import BACKGROUND
+from viewer.canvas import BACKGROUND
 from viewer.panel import Panel
 from viewer.scene3d import Scene3D, image3d, look_from
 from viewer.session import Session

@@ -38,11 +38,14 @@ from viewer.moment import Moment
 from viewer.session import Session
 from viewer.sources import Finished, load_result
 from viewer.state import Engine, State
-from viewer.viewpoint import orbited
+from viewer.viewpoint import orbited, scene_pivot
 
 GAUSSIANS = 30_000
 WINDOW = 1280, 800
 VIEWS = 24  # pictures that are timed
+PARTS = ("pictures", "agreement", "live")
+PIXEL = 60, 60  # of the screen, where the colour of a scene is looked for: no camera is drawn there
+COLOURS = [(1.0, 0.3, 0.5), (0.3, 1.0, 0.5), (0.3, 0.5, 1.0), (0.9, 0.9, 0.2), (0.2, 0.9, 0.9)]  # of scenes, in turn
 CASES = [(engine, as_points) for engine in Engine for as_points in (False, True)]
 
 
@@ -51,6 +54,7 @@ def main() -> None:
     parser.add_argument("result", type=Path, help="a result's folder")
     parser.add_argument("--minutes", type=float, default=5.0, help="of scenes that grow and shrink")
     parser.add_argument("--period-s", type=float, default=1.0, help="between those scenes")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="what to measure (default: all)")
     parser.add_argument("--out", type=Path, help="where the figures go, as JSON")
     parser.add_argument("--child", choices=("pictures", "agreement"), help="used by this program itself")
     parser.add_argument("--case", type=int, default=0, help="used by this program itself")
@@ -64,17 +68,20 @@ def main() -> None:
 
     report = {
         "command": f"python -m tests.bench viewer RESULT --minutes {arguments.minutes:g} "
-        f"--period-s {arguments.period_s:g}",
+        f"--period-s {arguments.period_s:g} --parts {' '.join(arguments.parts)}",
         "machine": {"processor": processor_name(), "processors": os.cpu_count(), "load_average": os.getloadavg()[0]},
         "gaussians": GAUSSIANS,
         "window": WINDOW,
-        "pictures": {
+    }
+    if "pictures" in arguments.parts:
+        report["pictures"] = {
             f"{engine.name.lower()} {'points' if as_points else 'Gaussians'}": in_child(arguments.result, case)
             for case, (engine, as_points) in enumerate(CASES)
-        },
-        "agreement": in_child(arguments.result, None),
-        "live": watch(arguments.result, arguments.minutes, arguments.period_s),
-    }
+        }
+    if "agreement" in arguments.parts:
+        report["agreement"] = in_child(arguments.result, None)
+    if "live" in arguments.parts:
+        report["live"] = watch(arguments.result, arguments.minutes, arguments.period_s)
     report["machine"]["load_average_after"] = os.getloadavg()[0]
     print(json.dumps(report, indent=1))
     if arguments.out:
@@ -209,7 +216,6 @@ def watch(result: Path, minutes: float, period_s: float) -> dict:
     """Latency, memory and processor time of a viewer of a node whose scene changes in size and colour."""
     moment = load_result(result)
     screen, numbering, rng = Screen(), Numbering(), np.random.default_rng(0)
-    middle = 300, 300
     latencies, memory, sizes, missed = [], [], [], 0
     with tempfile.TemporaryDirectory(prefix="splatnode-") as folder:
         config = Path(folder, "node.yaml")
@@ -223,18 +229,17 @@ def watch(result: Path, minutes: float, period_s: float) -> dict:
             try:
                 first = scene_of_colour(moment, 20_000, (1.0, 1.0, 1.0))
                 server.publish(*to_message(first.snapshot, "place", numbering.next()))
-                wait_for_colour(screen, middle, (255, 255, 255), server, 120.0)
+                wait_for_colour(screen, PIXEL, (1.0, 1.0, 1.0), server, 120.0)
                 started, processor = time.monotonic(), processor_seconds(viewer.pid)
-                while time.monotonic() - started < 60 * minutes:
+                while time.monotonic() - started < 60 * minutes and viewer.poll() is None:
                     begin = time.monotonic()
                     number = int(rng.integers(1000, len(moment.snapshot.gaussians)))
-                    level = 1.0 if len(sizes) % 2 else 0.3
-                    there = scene_of_colour(moment, number, (level, 1.3 - level, 0.5))
+                    colour = COLOURS[len(sizes) % len(COLOURS)]
+                    there = scene_of_colour(moment, number, colour)
                     message = to_message(there.snapshot, "place", numbering.next())
                     published = time.monotonic()
                     server.publish(*message)
-                    wanted = tuple(round(255 * one) for one in (level, 1.3 - level, 0.5))
-                    seen = wait_for_colour(screen, middle, wanted, server, 10.0)
+                    seen = wait_for_colour(screen, PIXEL, colour, server, 10.0)
                     missed += not seen
                     if seen:
                         latencies.append(time.monotonic() - published)
@@ -251,7 +256,7 @@ def watch(result: Path, minutes: float, period_s: float) -> dict:
                 alive = viewer.poll() is None
                 viewer.terminate()
                 code = viewer.wait()
-    tenth = max(1, len(memory) // 10)
+    part = max(1, len(memory) // 20)
     return {
         "updates": len(sizes),
         "not_seen_within_10_s": missed,
@@ -260,9 +265,10 @@ def watch(result: Path, minutes: float, period_s: float) -> dict:
             f"percentile_{share}": round(1000 * float(np.percentile(latencies, share))) for share in (50, 95, 100)
         },
         "memory_mb": {
-            "after_a_tenth": round(float(np.median(memory[tenth : 2 * tenth]))),
-            "at_the_end": round(float(np.median(memory[-tenth:]))),
-            "every_tenth": [round(one) for one in memory[::tenth]],
+            "at_the_end": round(float(np.median(memory[-part:]))),
+            "median_of_each_twentieth": [
+                round(float(np.median(memory[start : start + part]))) for start in range(0, 20 * part, part)
+            ],
         },
         "processor_seconds_per_update": round(processor / len(sizes), 3),
         "processors_taken": round(processor / elapsed, 3),
@@ -273,26 +279,29 @@ def watch(result: Path, minutes: float, period_s: float) -> dict:
 
 
 def scene_of_colour(moment: Moment, number: int, rgb: tuple[float, float, float]) -> Moment:
-    """`number` of the Gaussians, wide, opaque and of one colour, so that it fills the middle of the window.
+    """`number` of the Gaussians in one colour, and the first of them so wide and opaque that it fills the window.
 
     The cameras stay, so that the viewpoint does. Their photographs are as small as can be.
     """
     part = thinned(moment, number)
     gaussians = part.snapshot.gaussians
-    sh = np.zeros_like(gaussians.sh)
-    sh[:, 0] = (np.array(rgb) - 0.5) / SH_C0
-    painted = replace(
-        gaussians, scales=4.0 * gaussians.scales, opacities=np.full(len(gaussians), 0.99, np.float32), sh=sh
+    sh, means, scales, opacities = (
+        np.copy(array)
+        for array in (np.zeros_like(gaussians.sh), gaussians.means, gaussians.scales, gaussians.opacities)
     )
+    sh[:, 0] = (np.array(rgb) - 0.5) / SH_C0
+    means[0], scales[0], opacities[0] = scene_pivot(moment), 4.0, 0.999
+    painted = replace(gaussians, means=means, scales=scales, opacities=opacities, sh=sh)
     images = {camera.name: np.zeros((2, 2, 3), np.uint8) for camera in part.snapshot.cameras}
     return replace(part, snapshot=replace(part.snapshot, gaussians=painted, images=images))
 
 
 def wait_for_colour(screen: Screen, place: tuple[int, int], rgb, server: StateServer, timeout_s: float) -> bool:
-    """Whether the pixel takes the colour, to 24 levels, in time."""
+    """Whether the pixel takes the colour (RGB in [0, 1]), to 24 levels, in time."""
     deadline = time.monotonic() + timeout_s
+    levels = [round(255 * value) for value in rgb]
     while time.monotonic() < deadline:
-        if max(abs(a - b) for a, b in zip(screen.pixel(*place), rgb, strict=True)) <= 24:
+        if max(abs(a - b) for a, b in zip(screen.pixel(*place), levels, strict=True)) <= 24:
             return True
         server.serve(0.004)
     return False

@@ -1,0 +1,92 @@
+"""Photographs and lines painted among the Gaussians: what something hides is left out or dim."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from viewer.canvas import NEAR, Array, Canvas, Image, in_camera
+from viewer.shapes import Lines, Photograph, Shapes
+
+_BEHIND = 1.02  # a shape this many times as far as the surface is behind it
+_PIECES = 24  # that a line is cut into, each of them hidden or not
+_HIDDEN = 0.3  # how much of a line's colour is left where it is behind something
+
+
+def paint_shapes(canvas: Canvas, shapes: Shapes, T_camera_world: Array, K: Array) -> None:
+    """The photographs, the nearest on top, and over them the lines."""
+    placed = [(in_camera(photograph.corners, T_camera_world), photograph) for photograph in shapes.photographs]
+    for corners, photograph in sorted(placed, key=lambda one: -float(one[0][:, 2].mean())):
+        _paint_photograph(canvas, photograph, corners, K)
+    for lines in shapes.lines:
+        _paint_lines(canvas, lines, T_camera_world, K)
+
+
+def _paint_photograph(canvas: Canvas, photograph: Photograph, corners: Array, K: Array) -> None:
+    """The image on its rectangle (camera frame), where nothing is in front; not if that reaches behind the eye."""
+    height, width = canvas.depth.shape
+    if corners[:, 2].min() < NEAR:
+        return
+    pixels = (corners / corners[:, 2:]) @ K.T
+    low = np.maximum(np.floor(pixels[:, :2].min(0)).astype(int), 0)
+    high = np.minimum(np.ceil(pixels[:, :2].max(0)).astype(int), [width, height])
+    if (high <= low).any():
+        return
+    image = _level(photograph.levels, high - low)
+    image_height, image_width = image.shape[:2]
+    source = np.array([[0, 0], [image_width, 0], [image_width, image_height], [0, image_height]], np.float32) - 0.5
+    target = (pixels[:, :2] - low - 0.5).astype(np.float32)
+    homography = cv2.getPerspectiveTransform(source, target)
+    size = (int(high[0] - low[0]), int(high[1] - low[1]))
+    warped = cv2.warpPerspective(image, homography, size, flags=cv2.INTER_LINEAR)
+    inside = cv2.warpPerspective(np.full((image_height, image_width), 255, np.uint8), homography, size) > 127
+    box = np.s_[low[1] : high[1], low[0] : high[0]]
+    nearness = _plane_nearness(corners, K, low, size)
+    shown = inside & (_BEHIND * canvas.depth[box] * nearness >= 1.0)
+    np.copyto(canvas.image[box], warped, where=shown[..., None])
+    np.divide(1.0, nearness, out=canvas.depth[box], where=shown)
+
+
+def _level(levels: tuple[Image, ...], size: npt.NDArray[np.int_]) -> Image:
+    """The smallest of the images that has at least 0.7 pixels for each of `size` (width, height): none flickers."""
+    enough = [image for image in levels if (np.array([image.shape[1], image.shape[0]]) >= 0.7 * size).all()]
+    return enough[-1] if enough else levels[0]
+
+
+def _plane_nearness(
+    corners: Array, K: Array, low: npt.NDArray[np.int_], size: tuple[int, int]
+) -> npt.NDArray[np.float32]:
+    """(h, w) 1 / z, at the pixels of the box, of the plane through `corners` (camera frame): affine in the pixel."""
+    normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
+    height = corners[0] @ normal  # over the eye; 0 where the plane is seen edge-on, and then it covers no pixel
+    columns = (low[0] + np.arange(size[0]) + 0.5 - K[0, 2]) / K[0, 0]
+    rows = (low[1] + np.arange(size[1]) + 0.5 - K[1, 2]) / K[1, 1]
+    sums = (rows * normal[1] + normal[2])[:, None] + (columns * normal[0])[None]
+    return (sums / (height if abs(height) > 1e-12 else np.inf)).astype(np.float32)
+
+
+def _paint_lines(canvas: Canvas, lines: Lines, T_camera_world: Array, K: Array) -> None:
+    """Lines, bright where nothing is in front of them, dim where something is."""
+    height, width = canvas.depth.shape
+    steps = np.linspace(0.0, 1.0, _PIECES + 1)
+    start, end = (in_camera(lines.ends[:, i], T_camera_world) for i in (0, 1))
+    points = start[:, None] + steps[None, :, None] * (end - start)[:, None]  # (M, pieces + 1, 3)
+    ahead = points[..., 2] > NEAR
+    pixels = ((points / np.where(ahead, points[..., 2], 1.0)[..., None]) @ K.T)[..., :2]
+    near_window = (np.abs(pixels) < 4 * max(width, height)).all(-1) & ahead
+    columns, rows = ((pixels[:, :-1] + pixels[:, 1:]) / 2.0).transpose(2, 0, 1)
+    surface = canvas.depth[np.clip(rows, 0, height - 1).astype(int), np.clip(columns, 0, width - 1).astype(int)]
+    hidden = (points[:, :-1, 2] + points[:, 1:, 2]) / 2.0 > _BEHIND * surface
+    drawable = near_window[:, :-1] & near_window[:, 1:]
+    bright = tuple(round(255 * value) for value in lines.colour)
+    dim = tuple(round(_HIDDEN * value + (1 - _HIDDEN) * 60) for value in bright)
+    for chosen, colour, thick in ((drawable & hidden, dim, 1), (drawable & ~hidden, bright, lines.width)):
+        for piece in np.rint((_runs(pixels, chosen) - 0.5) * 16).astype(np.int32):
+            cv2.line(canvas.image, piece[0].tolist(), piece[1].tolist(), colour, thick, cv2.LINE_AA, 4)
+
+
+def _runs(pixels: Array, chosen: npt.NDArray[np.bool_]) -> Array:
+    """(R, 2, 2) ends of the parts of M lines (M, pieces + 1, 2) whose pieces are all `chosen` (M, pieces)."""
+    edges = np.diff(np.pad(chosen, ((0, 0), (1, 1))).astype(np.int8), axis=1)  # a line is straight in the picture too
+    return np.stack([pixels[edges > 0], pixels[edges < 0]], 1)
