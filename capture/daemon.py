@@ -12,6 +12,7 @@ import cv2
 from capture.config import CaptureConfig, is_live, open_stream
 from capture.frame import DroppedFrame, Frame
 from capture.logs import event
+from capture.memory import keep_freed
 from capture.messaging.broadcast import Publisher
 from capture.messaging.keyframes import KeyframeServer
 from capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
@@ -33,6 +34,7 @@ def capture(config: CaptureConfig) -> None:
 
     Raises CameraUnavailable, AlreadyRunning, NetworkError, OSError. SystemExit and KeyboardInterrupt end it cleanly.
     """
+    keep_freed()
     cv2.setNumThreads(1)  # small images: threads would cost more than they give, and the processor is recon's
     with ExitStack() as resources:
         manager = ServiceManager()

@@ -22,6 +22,7 @@ TRACKED_SIDE = 320  # the longer side of the images in which corners are followe
 CORNERS = 100
 LEAST_CORNERS = 12  # fewer tell nothing
 ROUND_TRIP_PX = 1.0  # a corner that is followed there and back must come home
+FOLLOWING = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03)  # iterations and pixels at which it is enough
 REMEMBERED_VIEWS = 64  # of which a new one must not be a copy
 DIFFERENT_GIST = 0.3  # mean difference; copies have 0.05, and a look at the gist costs nothing
 
@@ -140,7 +141,7 @@ def follow(
     guess: Points,  # where they were a moment ago
 ) -> tuple[Points, npt.NDArray[np.bool_]]:
     """Where the corners are now, and which of them were found: those that are in the picture and come home."""
-    window = {"winSize": (15, 15), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW}
+    window = {"winSize": (15, 15), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW, "criteria": FOLLOWING}
     there, found, _ = cv2.calcOpticalFlowPyrLK(start, now, corners, guess.copy(), **window)
     back, returned, _ = cv2.calcOpticalFlowPyrLK(now, start, there, corners.copy(), **window)
     home = np.linalg.norm(back - corners, axis=2).ravel() < ROUND_TRIP_PX
