@@ -9,40 +9,26 @@ import argparse
 import json
 import os
 import pickle
-import zlib
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from recon.priors.mast3r.checkpoint import check_names_and_shapes, load_network
+from recon.networks.checkpoint import check_names_and_shapes
+from recon.networks.rotary import Rotary, grid_positions
+from recon.priors.mast3r.checkpoint import load_network
 from recon.priors.mast3r.network import Mast3r, Size
-from recon.priors.mast3r.rotary import Rotary, grid_positions
+from tests.generated import generated, generated_weights, shapes_of
 
 TINY = Size(encoder_width=96, encoder_depth=3, encoder_heads=6, decoder_width=64, decoder_depth=12, decoder_heads=4)
 SMALLEST = Size(encoder_width=32, encoder_depth=1, encoder_heads=2, decoder_width=32, decoder_depth=4, decoder_heads=2)
 
 
-def generated(name: str, shape: tuple[int, ...]) -> torch.Tensor:
-    rng = np.random.Generator(np.random.PCG64(zlib.crc32(name.encode())))
-    noise = rng.standard_normal(shape, dtype=np.float32)
-    if "norm" in name and name.endswith("weight"):
-        return torch.from_numpy(1 + np.float32(0.05) * noise)
-    if len(shape) == 1:
-        return torch.from_numpy(np.float32(0.05) * noise)
-    return torch.from_numpy(noise * np.float32((1 / np.prod(shape[1:])) ** 0.5))
-
-
-def weights(size: Size) -> dict[str, torch.Tensor]:
-    with torch.device("meta"):
-        shapes = {name: tuple(value.shape) for name, value in Mast3r(size).state_dict().items()}
-    return {name: generated(name, shape) for name, shape in shapes.items()}
-
-
 @pytest.fixture(scope="module")
 def smallest() -> dict[str, torch.Tensor]:
-    return weights(SMALLEST)
+    return generated_weights(partial(Mast3r, SMALLEST))
 
 
 @pytest.mark.parametrize("orientation", ["landscape", "portrait"])
@@ -71,19 +57,21 @@ def test_outputs_equal_the_golden_values(shared, tmp_path, orientation):
 
 def test_the_official_checkpoints_names_and_shapes_are_those_of_the_full_size(shared):
     official = json.loads((shared / "golden" / "mast3r_vitl_state_dict.json").read_text())
-    with torch.device("meta"):
-        names = {name: tuple(value.shape) for name, value in Mast3r().state_dict().items()}
+    names = shapes_of(Mast3r)
     assert len(official) == 1017
     stand_ins = {name: torch.empty(shape, device="meta") for name, shape in official.items()}
-    check_names_and_shapes(stand_ins, names, Path("official.pth"))
+    path = Path("official.pth")
+    check_names_and_shapes(stand_ins, names, path, "MASt3R")
     lacking = dict(stand_ins)
     del lacking["enc_blocks.7.attn.qkv.bias"]
     with pytest.raises(ValueError, match=r"lacks enc_blocks\.7\.attn\.qkv\.bias"):
-        check_names_and_shapes(lacking, names, Path("official.pth"))
+        check_names_and_shapes(lacking, names, path, "MASt3R")
     with pytest.raises(ValueError, match="has enc_blocks.99.bias, which does not belong"):
-        check_names_and_shapes(stand_ins | {"enc_blocks.99.bias": torch.zeros(1)}, names, Path("official.pth"))
+        check_names_and_shapes(
+            stand_ins | {"enc_blocks.99.bias": torch.zeros(1)}, names, Path("official.pth"), "MASt3R"
+        )
     with pytest.raises(ValueError, match=r"mask_token of shape \(2,\) instead of \(1, 1, 768\)"):
-        check_names_and_shapes(stand_ins | {"mask_token": torch.zeros(2)}, names, Path("official.pth"))
+        check_names_and_shapes(stand_ins | {"mask_token": torch.zeros(2)}, names, path, "MASt3R")
 
 
 def test_both_layouts_of_the_file_are_read(tmp_path, smallest):
@@ -127,7 +115,7 @@ def test_damaged_and_foreign_files_are_named(tmp_path, smallest):
     for path, complaint in (
         (cut, "damaged"),
         (text, "was not loaded|damaged"),
-        (foreign, "not the checkpoint of this"),
+        (foreign, "not the checkpoint of MASt3R"),
     ):
         with pytest.raises(ValueError, match=complaint):
             load_network(path, SMALLEST)

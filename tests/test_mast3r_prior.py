@@ -15,8 +15,9 @@ from recon.evaluate.alignment import camera_errors
 from recon.judge import Config as JudgeConfig
 from recon.judge import hopeless, judge
 from recon.keyframe import Features, Keyframe
+from recon.networks.crop import crop
 from recon.priors.depth_normals import normals_of_depth
-from recon.priors.mast3r.inference import Asked, crop, prepared
+from recon.priors.mast3r.inference import PATCH, Asked, prepared
 from recon.priors.mast3r.network import Encoded, Prediction
 from recon.priors.mast3r.prior import Config, Mast3rPrior, load
 from recon.verification.verify import Config as VerificationConfig
@@ -43,7 +44,7 @@ class Oracle:
 
     def encode(self, image: torch.Tensor) -> Encoded:
         self.encoded.append(image)
-        known = [prepared(photographs()[k].image, crop(SMALL.width, SMALL.height, 320)) for k in range(VIEWS)]
+        known = [prepared(photographs()[k].image, crop(SMALL.width, SMALL.height, 320, PATCH)) for k in range(VIEWS)]
         gaps = [float((image - other).abs().mean()) if image.shape == other.shape else np.inf for other in known]
         index = torch.tensor([[float(np.argmin(gaps))]])
         return Encoded(index, torch.zeros(1, 2), image.shape[1], image.shape[2])
@@ -59,7 +60,7 @@ class Oracle:
         self, index: int, to_first: np.ndarray, scale: float, encoded: Encoded, rng: np.random.Generator
     ) -> Prediction:
         T_world_camera, K = synthetic.scene_cameras(SMALL)[index]
-        to = crop(SMALL.width, SMALL.height, 320)
+        to = crop(SMALL.width, SMALL.height, 320, PATCH)
         depth = true_depth(index)
         top, left = int(to.top), int(to.left)
         v, u = np.mgrid[top : top + encoded.height, left : left + encoded.width] + 0.5
@@ -133,9 +134,9 @@ def test_what_a_lying_network_invents_is_refused(noise):
 
 
 def test_crops_are_whole_patches_and_keep_the_middle():
-    to = crop(4032, 3024, 512)
+    to = crop(4032, 3024, 512, PATCH)
     assert (to.width, to.height, to.left, to.top) == (512, 384, 0, 0)
-    to = crop(300, 1000, 512)
+    to = crop(300, 1000, 512, PATCH)
     assert (to.width, to.height) == (144, 512)
     np.testing.assert_allclose(to.to_network(np.array([[150.0, 500.0]])), [[72.0, 256.0]], atol=0.5)
     image = np.zeros((1000, 300, 3), np.uint8)
@@ -143,7 +144,7 @@ def test_crops_are_whole_patches_and_keep_the_middle():
     seen = prepared(image, to)
     assert seen.shape == (3, 512, 144) and seen[0].min() == 1.0 and seen[1].max() == -1.0
     with pytest.raises(ValueError, match="too thin"):
-        crop(4000, 60, 512)
+        crop(4000, 60, 512, PATCH)
 
 
 def test_with_many_frames_only_neighbours_are_asked_about():

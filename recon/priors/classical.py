@@ -81,7 +81,7 @@ class ClassicalPrior:
         views, sparse = [], []
         for camera in registration.cameras:
             keyframe = graph.keyframes[camera.index]
-            points = _sparse_points(registration, camera, keyframe.scale)
+            points = sparse_points(registration, camera, keyframe.scale)
             near, far = stereo.depth_range(points.depths)
             near_far = (near, self._config.far_margin * far)
             views.append(stereo.View(keyframe.image, modelled_K(graph, camera), camera.T_world_camera, near_far))
@@ -116,9 +116,10 @@ def modelled_K(graph: ViewGraph, camera: register.RegisteredCamera) -> Array:
     return np.array([[camera.focal * sx, 0.0, cx * sx], [0.0, camera.focal * sy, cy * sy], [0.0, 0.0, 1.0]])
 
 
-def _sparse_points(
+def sparse_points(
     registration: Registration, camera: register.RegisteredCamera, scale: tuple[float, float]
 ) -> stereo.Sparse:
+    """The registered points that a camera sees, at the modelled size that `scale` leads to."""
     mine = registration.observed_by == camera.index
     world = registration.points[registration.observed_point[mine]]
     to_camera = np.linalg.inv(camera.T_world_camera)

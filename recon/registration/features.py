@@ -58,11 +58,7 @@ def add_squeezed(features: Features, image: Image, squeezes: Sequence[float], co
 
 
 def _detect(image: Image, squeeze: float, config: Config) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
-    """Points (M, 2) in pixels of `image`, strongest first, and their descriptors (M, 128).
-
-    Descriptors are RootSIFT (Arandjelovic and Zisserman, 2012): L1-normalised, then square-rooted, so that their dot
-    product is the Bhattacharyya similarity of two gradient histograms.
-    """
+    """Points (M, 2) in pixels of `image`, strongest first, and their descriptors (M, 128)."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
     scale = float(np.clip(1.0, config.shortest_longer_side / max(grey.shape), config.longer_side / max(grey.shape)))
@@ -80,5 +76,12 @@ def _detect(image: Image, squeeze: float, config: Config) -> tuple[npt.NDArray[n
         return np.zeros((0, 2)), np.zeros((0, 128), np.uint8)
     order = np.argsort([-keypoint.response for keypoint in keypoints], kind="stable")
     points = (np.array([keypoint.pt for keypoint in keypoints])[order] + 0.5) * (width / size[0], height / size[1])
-    raw = raw[order]
-    return points, quantise(np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-9)))
+    return points, root_sift(raw[order])
+
+
+def root_sift(raw: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
+    """(M, 128) RootSIFT (Arandjelovic and Zisserman, 2012) of SIFT descriptors: L1-normalised, then square-rooted.
+
+    Their dot product is the Bhattacharyya similarity of two gradient histograms.
+    """
+    return quantise(np.sqrt(raw / np.maximum(raw.sum(1, keepdims=True), 1e-9)))

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor, nn
-from torch.nn import functional
+
+from recon.networks.fusion import Fusion
 
 _WIDTH = 256  # of the fused features
 _LAYER_WIDTHS = (96, 192, 384, 768)
@@ -60,27 +60,4 @@ class _Scratch(nn.Module):
         reduce = [nn.Conv2d(width, _WIDTH, 3, padding=1, bias=False) for width in _LAYER_WIDTHS]
         self.layer1_rn, self.layer2_rn, self.layer3_rn, self.layer4_rn = reduce
         self.layer_rn = nn.ModuleList(reduce)
-        self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4 = (_Fusion() for _ in range(4))
-
-
-class _Fusion(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.resConfUnit1, self.resConfUnit2 = _Residual(), _Residual()
-        self.out_conv = nn.Conv2d(_WIDTH, _WIDTH, 1)
-
-    def forward(self, coarse: Tensor, fine: Tensor | None = None) -> Tensor:
-        fused = coarse if fine is None else coarse + self.resConfUnit1(fine)
-        fused = self.resConfUnit2(fused)
-        # The convolution has one tap: before the upsampling it gives the same for a quarter of the work.
-        return functional.interpolate(self.out_conv(fused), scale_factor=2, mode="bilinear", align_corners=True)
-
-
-class _Residual(nn.Module):
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv1 = nn.Conv2d(_WIDTH, _WIDTH, 3, padding=1)
-        self.conv2 = nn.Conv2d(_WIDTH, _WIDTH, 3, padding=1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return x + self.conv2(torch.relu(self.conv1(torch.relu(x))))
+        self.refinenet1, self.refinenet2, self.refinenet3, self.refinenet4 = (Fusion(_WIDTH) for _ in range(4))

@@ -14,8 +14,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from recon.networks.rotary import Rotary, grid_positions
+from recon.networks.transformer import Attention, Block, Mlp, PatchEmbedding, attend, by_head
 from recon.priors.mast3r.dpt import DensePrediction
-from recon.priors.mast3r.rotary import Rotary, grid_positions
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,8 @@ class Mast3r(nn.Module):
         self.size = size
         encoder, decoder = size.encoder_width, size.decoder_width
         self.mask_token = nn.Parameter(torch.zeros(1, 1, decoder))  # of the pre-training; the checkpoint holds it
-        self.patch_embed = _PatchEmbedding(size.patch, encoder)
-        self.enc_blocks = nn.ModuleList(_EncoderBlock(encoder, size.encoder_heads) for _ in range(size.encoder_depth))
+        self.patch_embed = PatchEmbedding(size.patch, encoder)
+        self.enc_blocks = nn.ModuleList(Block(encoder, size.encoder_heads) for _ in range(size.encoder_depth))
         self.enc_norm = _norm(encoder)
         self.decoder_embed = nn.Linear(encoder, decoder)
         self.dec_blocks = nn.ModuleList(_DecoderBlock(decoder, size.decoder_heads) for _ in range(size.decoder_depth))
@@ -78,7 +79,7 @@ class Mast3r(nn.Module):
         if image.shape[0] != 3 or height % patch or width % patch or not height * width:
             raise ValueError(f"image must be (3, H, W) with H and W multiples of {patch}, got {tuple(image.shape)}")
         positions = grid_positions(height // patch, width // patch).to(image.device)
-        tokens = self.patch_embed(image)
+        tokens = self.patch_embed(image[None])[0]
         rotary = Rotary.of(positions, self.size.encoder_width // self.size.encoder_heads)
         for block in self.enc_blocks:
             tokens = block(tokens, rotary)
@@ -105,28 +106,6 @@ class Mast3r(nn.Module):
         )
 
 
-class _PatchEmbedding(nn.Module):
-    def __init__(self, patch: int, width: int) -> None:
-        super().__init__()
-        self.proj = nn.Conv2d(3, width, patch, stride=patch)
-
-    def forward(self, image: Tensor) -> Tensor:
-        """(h w, width) tokens, row by row, of an image (3, H, W)."""
-        return self.proj(image[None])[0].flatten(1).T
-
-
-class _Attention(nn.Module):
-    def __init__(self, width: int, heads: int) -> None:
-        super().__init__()
-        self._heads = heads
-        self.qkv = nn.Linear(width, 3 * width)
-        self.proj = nn.Linear(width, width)
-
-    def forward(self, x: Tensor, rotary: Rotary) -> Tensor:
-        query, key, value = (_by_head(part, self._heads) for part in self.qkv(x).chunk(3, dim=-1))
-        return self.proj(_attend(rotary.turned(query), rotary.turned(key), value))
-
-
 class _CrossAttention(nn.Module):
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
@@ -135,40 +114,18 @@ class _CrossAttention(nn.Module):
         self.proj = nn.Linear(width, width)
 
     def forward(self, x: Tensor, other: Tensor, rotary: Rotary, rotary_other: Rotary) -> Tensor:
-        query = _by_head(self.projq(x), self._heads)
-        key, value = _by_head(self.projk(other), self._heads), _by_head(self.projv(other), self._heads)
-        return self.proj(_attend(rotary.turned(query), rotary_other.turned(key), value))
-
-
-class _Mlp(nn.Module):
-    def __init__(self, width: int, hidden: int, out: int) -> None:
-        super().__init__()
-        self.fc1 = nn.Linear(width, hidden)
-        self.fc2 = nn.Linear(hidden, out)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.fc2(functional.gelu(self.fc1(x)))
-
-
-class _EncoderBlock(nn.Module):
-    def __init__(self, width: int, heads: int) -> None:
-        super().__init__()
-        self.norm1, self.norm2 = _norm(width), _norm(width)
-        self.attn = _Attention(width, heads)
-        self.mlp = _Mlp(width, 4 * width, width)
-
-    def forward(self, x: Tensor, rotary: Rotary) -> Tensor:
-        x = x + self.attn(self.norm1(x), rotary)
-        return x + self.mlp(self.norm2(x))
+        query = by_head(self.projq(x), self._heads)
+        key, value = by_head(self.projk(other), self._heads), by_head(self.projv(other), self._heads)
+        return self.proj(attend(rotary.turned(query), rotary_other.turned(key), value))
 
 
 class _DecoderBlock(nn.Module):
     def __init__(self, width: int, heads: int) -> None:
         super().__init__()
         self.norm1, self.norm2, self.norm3, self.norm_y = (_norm(width) for _ in range(4))
-        self.attn = _Attention(width, heads)
+        self.attn = Attention(width, heads)
         self.cross_attn = _CrossAttention(width, heads)
-        self.mlp = _Mlp(width, 4 * width, width)
+        self.mlp = Mlp(width, 4 * width, width)
 
     def forward(self, x: Tensor, other: Tensor, rotary: Rotary, rotary_other: Rotary) -> Tensor:
         x = x + self.attn(self.norm1(x), rotary)
@@ -184,7 +141,7 @@ class _Head(nn.Module):
         self._patch, self._descriptor = size.patch, size.descriptor
         self.dpt = DensePrediction(size.encoder_width, size.decoder_width, size.decoder_depth, channels=4)
         width = size.encoder_width + size.decoder_width
-        self.head_local_features = _Mlp(width, 4 * width, (size.descriptor + 1) * size.patch**2)
+        self.head_local_features = Mlp(width, 4 * width, (size.descriptor + 1) * size.patch**2)
 
     def forward(self, layers: list[Tensor], height: int, width: int) -> Prediction:
         rows, columns = height // self._patch, width // self._patch
@@ -207,14 +164,3 @@ def _exponential_points(raw: Tensor) -> Tensor:
 
 def _norm(width: int) -> nn.LayerNorm:
     return nn.LayerNorm(width, eps=1e-6)
-
-
-def _by_head(x: Tensor, heads: int) -> Tensor:
-    """(heads, N, D) from (N, heads * D)."""
-    return x.unflatten(-1, (heads, -1)).transpose(0, 1)
-
-
-def _attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
-    """(N, heads * D) softmax attention of (heads, N, D) queries to (heads, M, D) keys and values."""
-    attended = functional.scaled_dot_product_attention(query[None], key[None], value[None])[0]
-    return attended.transpose(0, 1).flatten(1)

@@ -7,22 +7,21 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import msgspec
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from recon.keyframe import Keyframe
-from recon.priors.classical import modelled_K
-from recon.priors.depth_normals import normals_of_depth
-from recon.priors.mast3r.alignment import AlignedView, align
+from recon.networks.crop import Crop
+from recon.priors.mast3r.alignment import align
 from recon.priors.mast3r.checkpoint import LICENCE, load_network
-from recon.priors.mast3r.inference import Asked, Crop, Network
+from recon.priors.mast3r.inference import Asked, Network
 from recon.priors.mast3r.network import Prediction
+from recon.priors.placed import pointmap_of
 from recon.priors.pointmap import Pointmap
 from recon.registration import register
-from recon.registration.register import RegisteredCamera, Registration
+from recon.registration.register import Registration
 from recon.view_graph import ViewGraph
 from recon.weights import find
 
@@ -65,7 +64,7 @@ class Mast3rPrior:
         pause()
         crops = [self._asked.crop_of(keyframe) for keyframe in keyframes]
         return tuple(
-            _pointmap(graph, registration, camera, view, to)
+            pointmap_of(graph, registration, camera, to, view.depth, view.confidence)
             for camera, view, to in zip(registration.cameras, views, crops, strict=True)
         )
 
@@ -118,49 +117,3 @@ def _mutual(descriptors1: npt.NDArray[np.float32], descriptors2: npt.NDArray[np.
     (chosen,) = torch.nonzero(alike.argmax(0)[nearest] == torch.arange(len(nearest)), as_tuple=True)
     chosen = chosen[score[chosen].argsort(descending=True, stable=True)]
     return torch.stack([chosen, nearest[chosen]], 1).numpy()
-
-
-def _pointmap(
-    graph: ViewGraph, registration: Registration, camera: RegisteredCamera, view: AlignedView, crop: Crop
-) -> Pointmap:
-    keyframe = graph.keyframes[camera.index]
-    height, width = keyframe.image.shape[:2]
-    K = modelled_K(graph, camera)
-    # From modelled pixels to those of the network's image; pixels outside the crop are unknown.
-    step = keyframe.frame.width / width * crop.scale, keyframe.frame.height / height * crop.scale
-    u = ((np.arange(width) + 0.5) * step[0] - crop.left - 0.5).astype(np.float32)
-    v = ((np.arange(height) + 0.5) * step[1] - crop.top - 0.5).astype(np.float32)
-    map_u, map_v = np.meshgrid(u, v)
-    depth = np.asarray(
-        cv2.remap(view.depth, map_u, map_v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0),
-        np.float32,
-    )
-    sure = cv2.remap(view.confidence, map_u, map_v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1)
-    depth = (depth * _scale_to_points(registration, camera, keyframe, depth)).astype(np.float32)
-    known = depth > 0
-    confidence = np.where(known, 1.0 - 1.0 / np.maximum(sure, 1.0), 0).astype(np.float32)
-    return Pointmap(
-        name=keyframe.name,
-        frame_id=keyframe.frame.frame_id,
-        depth=depth,
-        confidence=confidence,
-        normal=normals_of_depth(depth, K),
-        T_world_camera=camera.T_world_camera,
-        K=K,
-    )
-
-
-def _scale_to_points(
-    registration: Registration, camera: RegisteredCamera, keyframe: Keyframe, depth: npt.NDArray[np.float32]
-) -> float:
-    """What `depth` (h, w) has to be multiplied by to agree with the registered points, in the median."""
-    mine = registration.observed_by == camera.index
-    world = registration.points[registration.observed_point[mine]]
-    to_camera = np.linalg.inv(camera.T_world_camera)
-    z = world @ to_camera[2, :3] + to_camera[2, 3]
-    pixels = np.floor(registration.observed_pixels[mine] * keyframe.scale).astype(np.int64)
-    height, width = depth.shape
-    inside = ((pixels >= 0) & (pixels < [width, height])).all(1)
-    there = depth[pixels[inside, 1], pixels[inside, 0]]
-    both = (there > 0) & (z[inside] > 0)
-    return float(np.median(z[inside][both] / there[both])) if both.any() else 1.0

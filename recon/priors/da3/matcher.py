@@ -1,0 +1,88 @@
+"""Matches from far apart: one photograph is drawn as the network says that the other camera saw it, then compared.
+
+What is alike is decided by looks alone, anywhere in the two pictures: where the network is right the two look the same
+from one viewpoint; where it is wrong the drawn one shows something else, and matches are lost, but none are made.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import KDTree
+
+from recon.keyframe import Keyframe
+from recon.networks.crop import cropped
+from recon.priors.da3.inference import Answer, Network, ask
+from recon.registration import matching
+from recon.registration.features import root_sift
+
+Array = npt.NDArray[np.float64]
+Grey = npt.NDArray[np.uint8]
+
+_PATCH_SIZE = 6.0  # of a keypoint, network pixels: its descriptor looks at 6 times as much
+_NEAR = 1.0  # pixel: a point is drawn where the drawing has a pixel that comes from this near
+
+
+@dataclass(frozen=True, eq=False)
+class WarpMatcher:
+    """A `recon.view_graph.Matcher` of the points that keyframes have."""
+
+    network: Network
+    longer_side: int
+
+    def with_points(self, keyframe: Keyframe) -> Keyframe:
+        return keyframe
+
+    def match(self, keyframe1: Keyframe, keyframe2: Keyframe) -> npt.NDArray[np.int64]:
+        first, second = ask(self.network, [keyframe1, keyframe2], self.longer_side)
+        origin = _origin(first, second)
+        grey1, grey2 = (
+            (cropped(keyframe.frame.image, answer.crop).mean(-1) * 255).byte().numpy()
+            for keyframe, answer in ((keyframe1, first), (keyframe2, second))
+        )
+        from_u, from_v = np.moveaxis((origin - 0.5).astype(np.float32), -1, 0)
+        drawn = np.asarray(cv2.remap(grey1, from_u, from_v, cv2.INTER_LINEAR), np.uint8)
+        where1, chosen1 = _drawn_at(first.crop.to_network(keyframe1.features.points), origin)
+        where2 = second.crop.to_network(keyframe2.features.points)
+        (chosen2,) = np.nonzero(((where2 >= 0) & (where2 < [second.crop.width, second.crop.height])).all(1))
+        described1, described2 = _described(drawn, where1), _described(grey2, where2[chosen2])
+        found = matching.match(described1, described2, matching.Config())
+        return np.stack([chosen1[found[:, 0]], chosen2[found[:, 1]]], 1)
+
+
+def _origin(first: Answer, second: Answer) -> Array:
+    """(H, W, 2): the pixel of the first photograph that each pixel of the second shows; far outside where none."""
+    depth, camera2, camera1 = second.estimate.depth, second.estimate.camera, first.estimate.camera
+    v, u = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
+    rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(camera2.K).T
+    T_first_second = np.linalg.inv(camera1.T_world_camera) @ camera2.T_world_camera
+    points = (rays * depth[..., None]) @ T_first_second[:3, :3].T + T_first_second[:3, 3]
+    ahead = points[..., 2] > 1e-6
+    projected = (points @ camera1.K.T)[..., :2] / np.where(ahead, points[..., 2], 1.0)[..., None]
+    inside = ahead & (np.abs(projected) < 1e4).all(-1)
+    return np.where(inside[..., None], projected, -1e4)
+
+
+def _drawn_at(points: Array, origin: Array) -> tuple[Array, npt.NDArray[np.int64]]:
+    """(M, 2) pixels of the drawing that show these of `points` (F, 2) of the first photograph, and which (M,)."""
+    inside = (origin > -1e4).all(-1)
+    rows, columns = np.nonzero(inside)
+    if not len(rows) or not len(points):
+        return np.zeros((0, 2)), np.zeros(0, np.int64)
+    distance, nearest = (np.asarray(found) for found in KDTree(origin[inside]).query(points))
+    (chosen,) = np.nonzero(distance < _NEAR)
+    pixels = np.stack([columns, rows], 1)[nearest[chosen].astype(np.int64)]
+    return pixels.astype(np.float64) + 0.5, chosen
+
+
+def _described(image: Grey, points: Array) -> npt.NDArray[np.uint8]:
+    """(M, 128) descriptors of upright patches of one size: both pictures are from one viewpoint."""
+    if not len(points):
+        return np.zeros((0, 128), np.uint8)
+    keypoints = [cv2.KeyPoint(float(x), float(y), _PATCH_SIZE, 0.0) for x, y in points - 0.5]
+    kept, raw = cv2.SIFT.create().compute(image, keypoints)
+    assert len(kept) == len(points)  # SIFT describes whatever it is given
+    return root_sift(np.asarray(raw, np.float32))

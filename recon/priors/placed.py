@@ -1,0 +1,69 @@
+"""A network's depth map as the point map of a registered camera."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from recon.keyframe import Keyframe
+from recon.networks.crop import Crop
+from recon.priors.classical import modelled_K, sparse_points
+from recon.priors.depth_normals import normals_of_depth
+from recon.priors.pointmap import Pointmap
+from recon.registration.register import RegisteredCamera, Registration
+from recon.view_graph import ViewGraph
+
+Map = npt.NDArray[np.float32]
+
+
+def pointmap_of(
+    graph: ViewGraph, registration: Registration, camera: RegisteredCamera, crop: Crop, depth: Map, sure: Map
+) -> Pointmap:
+    """`depth` (H, W) of the network's image, brought to the scale of the registered points that the camera sees.
+
+    `sure` (H, W) is the network's confidence, from 1. Pixels outside the crop are unknown.
+    """
+    keyframe = graph.keyframes[camera.index]
+    K = modelled_K(graph, camera)
+    depth, sure = at_modelled_size(keyframe, crop, depth, unknown=0), at_modelled_size(keyframe, crop, sure, unknown=1)
+    depth = (depth * _scale_to_points(registration, camera, keyframe, depth)).astype(np.float32)
+    confidence = np.where(depth > 0, 1.0 - 1.0 / np.maximum(sure, 1.0), 0).astype(np.float32)
+    return Pointmap(
+        name=keyframe.name,
+        frame_id=keyframe.frame.frame_id,
+        depth=depth,
+        confidence=confidence,
+        normal=normals_of_depth(depth, K),
+        T_world_camera=camera.T_world_camera,
+        K=K,
+    )
+
+
+def at_modelled_size(keyframe: Keyframe, crop: Crop, values: Map, *, unknown: float) -> Map:
+    """(h, w): the nearest of `values` (H, W) of the network's image, `unknown` outside of it."""
+    height, width = keyframe.image.shape[:2]
+    step = keyframe.frame.width / width * crop.scale, keyframe.frame.height / height * crop.scale
+    u = ((np.arange(width) + 0.5) * step[0] - crop.left - 0.5).astype(np.float32)
+    v = ((np.arange(height) + 0.5) * step[1] - crop.top - 0.5).astype(np.float32)
+    map_u, map_v = np.meshgrid(u, v)
+    border = cv2.BORDER_CONSTANT
+    return np.asarray(cv2.remap(values, map_u, map_v, cv2.INTER_NEAREST, None, border, unknown), np.float32)
+
+
+def _scale_to_points(registration: Registration, camera: RegisteredCamera, keyframe: Keyframe, depth: Map) -> float:
+    """What `depth` (h, w) has to be multiplied by to agree with the registered points, in the median."""
+    there, truth = depth_at_points(registration, camera, keyframe, depth)
+    both = (there > 0) & (truth > 0)
+    return float(np.median(truth[both] / there[both])) if both.any() else 1.0
+
+
+def depth_at_points(
+    registration: Registration, camera: RegisteredCamera, keyframe: Keyframe, depth: Map
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """(M,) `depth` (h, w) where the camera sees the registered points, and (M,) the depth of these."""
+    points = sparse_points(registration, camera, keyframe.scale)
+    pixels = np.floor(points.points).astype(np.int64)
+    height, width = depth.shape
+    inside = ((pixels >= 0) & (pixels < [width, height])).all(1)
+    return depth[pixels[inside, 1], pixels[inside, 0]].astype(np.float64), points.depths[inside]
