@@ -30,6 +30,20 @@ def shown(images: Sequence[Image]) -> list[Mask]:
     return [~rims[image.shape] for image in images]
 
 
+def rectangle(shown: Mask) -> tuple[slice, slice]:
+    """Rows and columns of an upright rectangle, as large as can be, all of which a photograph shows.
+
+    The side that shows least is taken away until all sides show everything.
+    """
+    top, left = 0, 0
+    bottom, right = shown.shape
+    while not (inside := shown[top:bottom, left:right]).all():
+        sides = inside[0], inside[-1], inside[:, 0], inside[:, -1]
+        worst = int(np.argmin([side.mean() for side in sides]))
+        top, bottom, left, right = top + (worst == 0), bottom - (worst == 1), left + (worst == 2), right - (worst == 3)
+    return slice(top, bottom), slice(left, right)
+
+
 def _rim(images: Sequence[Image]) -> Mask:
     """(h, w) what is dark in all of several images, from the border inwards, and a pixel more."""
     dark = reduce(np.maximum, images).max(2) <= BRIGHTEST

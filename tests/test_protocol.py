@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +16,7 @@ import pytest
 import torch
 
 from capture.frame import Frame
+from recon import rim
 from recon.evaluate.bench import Plan, run_alone, run_bench
 from recon.evaluate.protocol import Networks, Run, Settings, evaluate, mean_intrinsics
 from recon.evaluate.splits import Split, load_split, paper_split
@@ -241,6 +243,23 @@ def test_worse_scene_scores_worse_by_what_is_wrong(scene_folder):
     assert good.psnr is not None and bad.psnr is not None and bad.psnr < good.psnr - 15
     zoomed = replace(perfect, cameras=tuple(replace(c, K=c.K * [[1.04], [1.04], [1]]) for c in perfect.cameras))
     assert score(zoomed, scene_folder).focal_error_pct == pytest.approx(4.0)
+
+
+def test_what_photographs_do_not_show_is_not_scored(scene_folder, tmp_path, monkeypatch):
+    spoilt = tmp_path / scene_folder.parent.name
+    shutil.copytree(scene_folder.parent, spoilt)
+    for path in (spoilt / scene_folder.name / "images").iterdir():
+        image = cv2.imread(str(path))
+        image[:3] = 255
+        cv2.imwrite(str(path), image)
+
+    def below(images):
+        return [np.arange(len(image))[:, None] >= np.array([3] * image.shape[1]) for image in images]
+
+    monkeypatch.setattr(rim, "shown", below)
+    row = score(perfect_snapshot(), spoilt / scene_folder.name)
+    assert row.psnr is not None and row.psnr > 50
+    assert row.psnr_with_rim is not None and row.psnr_with_rim < 20
 
 
 def test_refused_scene_is_not_scored_but_its_cameras_are(scene_folder):

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from recon.rim import shown
+from recon.rim import rectangle, shown
 
 HEIGHT, WIDTH = 80, 120
 
@@ -49,3 +49,10 @@ def test_one_photograph_does_not_tell_a_rim_from_the_scene():
     (image,) = photographs(1)
     image[:2] = 0
     assert shown([image])[0].all()
+
+
+def test_a_photograph_is_cut_down_to_what_shows_the_scene():
+    mask = np.ones((HEIGHT, WIDTH), bool)
+    assert rectangle(mask) == (slice(0, HEIGHT), slice(0, WIDTH))
+    mask[:2], mask[:, -1], mask[-1, :5] = False, False, False
+    assert rectangle(mask) == (slice(2, HEIGHT - 1), slice(0, WIDTH - 1))

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from recon import rim
 from recon.evaluate.alignment import CameraErrors, align_test_pose, camera_errors
 from recon.evaluate.appearance import Appearance, Rasterize, appearance_of
 from recon.evaluate.metrics import psnr, ssim
@@ -54,7 +55,8 @@ class Row:
     checkpoint: int | None  # the iterations at which this row was asked for; None: the end of the run
     final: bool
     iterations: int | None = None
-    psnr: float | None = None  # dB, mean over the test views, as are the next three
+    psnr: float | None = None  # dB, mean over the test views, as are the next four
+    psnr_with_rim: float | None = None  # over whole photographs, with the black rims that undistortion left
     ssim: float | None = None
     lpips_alex: float | None = None
     lpips_vgg: float | None = None
@@ -112,6 +114,7 @@ def evaluate(
         final=run.checkpoint is None,
         iterations=snapshot.iterations,
         psnr=_mean([view.psnr for view in views]),
+        psnr_with_rim=_mean([view.psnr_with_rim for view in views]),
         ssim=_mean([view.ssim for view in views]),
         lpips_alex=_mean([view.lpips_alex for view in views]),
         lpips_vgg=_mean([view.lpips_vgg for view in views]),
@@ -132,6 +135,7 @@ def evaluate(
 @dataclass(frozen=True, eq=False)
 class _ViewScore:
     psnr: float
+    psnr_with_rim: float
     ssim: float
     lpips_alex: float | None
     lpips_vgg: float | None
@@ -149,7 +153,8 @@ def _score_test_views(
     """Renders each test view from the pose that equation 18 finds, with the intrinsics of the training cameras.
 
     The search starts from the true pose, carried into the estimated world by the similarity that aligns the training
-    cameras. No view can be scored with fewer than two of them.
+    cameras. No view can be scored with fewer than two of them. Photographs are compared where they show the scene: a
+    black rim that undistortion left is cut off, for the search too.
     """
     if appearance is None or len(estimated) < 2:
         return []
@@ -157,13 +162,16 @@ def _score_test_views(
         np.stack([scene.cameras[camera.name].T_world_camera for camera in estimated]),
         np.stack([camera.T_world_camera for camera in estimated]),
     )
+    names = [name for name in split.test if name in scene.cameras]
+    photographs = [modelled_image(scene.image(name), settings.longer_side) for name in names]
     scores = []
-    for name in split.test:
-        if name not in scene.cameras:
-            continue
-        truth = torch.from_numpy(modelled_image(scene.image(name), settings.longer_side)).float() / 255.0
+    for name, photograph, shown in zip(names, photographs, rim.shown(photographs), strict=True):
+        whole = torch.from_numpy(photograph).float() / 255.0
+        whole_K = mean_intrinsics(cameras, photograph.shape[1], photograph.shape[0])
+        rows, columns = rim.rectangle(shown)
+        truth = whole[rows, columns]
         height, width = truth.shape[:2]
-        K = mean_intrinsics(cameras, width, height)
+        K = whole_K - np.array([[0.0, 0.0, columns.start], [0.0, 0.0, rows.start], [0.0, 0.0, 0.0]])
         aligned = align_test_pose(
             appearance,
             truth,
@@ -173,9 +181,11 @@ def _score_test_views(
             levels=settings.alignment_levels,
         )
         image = appearance.picture(aligned.T_world_camera, K, width, height)
+        with_rim = appearance.picture(aligned.T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
         scores.append(
             _ViewScore(
                 psnr=psnr(image, truth),
+                psnr_with_rim=psnr(with_rim, whole),
                 ssim=ssim(image, truth),
                 lpips_alex=networks.alex(image, truth) if networks.alex else None,
                 lpips_vgg=networks.vgg(image, truth) if networks.vgg else None,
