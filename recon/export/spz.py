@@ -22,6 +22,7 @@ _MAGIC, _VERSION = 0x5053474E, 3
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
 _FLAG_EXTENSIONS = 0x2  # records follow that a reader may ignore
 _MOST_GAUSSIANS = 10_000_000  # bounds what a hostile header can make us allocate
+_STEPS_IN_EXTENT = 25.0  # digits below cannot be seen, and are noise, which does not compress
 _COLOUR_SCALE = 0.15  # smaller than the basis function's 0.28: colours may leave [0, 1] before SH brings them back
 _NUM_BASES = {0: 1, 1: 4, 2: 9, 3: 16}
 
@@ -33,12 +34,12 @@ _AXES = np.array([1, -1, -1], np.float32)
 def encode_spz(gaussians: GaussianArrays) -> bytes:
     """The file's bytes. Scales and opacities must be positive and finite (see `viewer_safe`).
 
-    Rounding errors: log scales 1/32, opacities 1/510, f_dc 1/76, rotations 0.3 degrees, and centres 2^-23 of the
-    largest coordinate (at least 2^-24).
+    Rounding errors: log scales 1/32, opacities 1/510, f_dc 1/76, rotations 0.3 degrees, and centres 1/50 of a typical
+    Gaussian's extent, or 2^-23 of the largest coordinate where that is more.
     """
     num_gaussians, num_bases = gaussians.sh.shape[:2]
     degree = {bases: degree for degree, bases in _NUM_BASES.items()}[num_bases]
-    bits = _fractional_bits(gaussians.means)
+    bits = _fractional_bits(gaussians)
     fixed = np.rint(gaussians.means.astype(np.float64) * _AXES * 2.0**bits).astype("<i4")
     parts = [
         _HEADER.pack(_MAGIC, _VERSION, num_gaussians, degree, bits, 0, 0),
@@ -120,13 +121,17 @@ def _to_bytes(values: npt.NDArray) -> bytes:
     return np.clip(np.rint(values), 0, 255).astype(np.uint8).tobytes()
 
 
-def _fractional_bits(means: npt.NDArray[np.float32]) -> int:
-    """As many as let the largest coordinate fit in 24 bits: the scale of our scenes is arbitrary."""
-    largest = float(np.abs(means).max(initial=0.0))
-    bits = int(np.floor(np.log2((2**23 - 1) / max(largest, 1.0))))
-    if bits < 0:
+def _fractional_bits(gaussians: GaussianArrays) -> int:
+    """As many as the extents call for and let the largest coordinate fit in 24 bits: our scenes' scale is arbitrary."""
+    if not len(gaussians):
+        return 0
+    largest = float(np.abs(gaussians.means).max())
+    fitting = int(np.floor(np.log2((2**23 - 1) / max(largest, 1.0))))
+    if fitting < 0:
         raise ValueError(f"centres must be within 2^23 of the origin for .spz, the farthest is at {largest:g}")
-    return bits
+    extent = float(np.median(np.sort(gaussians.scales, axis=1)[:, 1]))
+    telling = int(np.ceil(np.log2(_STEPS_IN_EXTENT / extent)))
+    return min(fitting, max(telling, 0))
 
 
 def _unpack_fixed(centre: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
