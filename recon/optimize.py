@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon import regularise, rim
+from recon import dropout, regularise, rim
 from recon.adam import Adam
 from recon.control.control import Control, ControlChoice, Step
 from recon.gaussians import Gaussians
@@ -46,6 +46,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     checkpoints: tuple[int, ...] = (150,)  # iterations after which the scene is shown, besides the last one
     half_resolution_share: float = 0.25  # of the iterations, at the start
     dssim: float = 0.2  # lambda of (1 - lambda) L1 + lambda D-SSIM
+    dropout: dropout.Config = dropout.Config()
     refine_poses: bool = True
     rates: Rates = Rates()
     regularise: regularise.Config = regularise.Config()  # losses beside the photometric one; none by default
@@ -101,6 +102,7 @@ class _Fit:
         self._control: Control | None = None
         if config.control is not None:
             self._control = config.control.module.load(config.control.config, seed)
+        self._dropout = dropout.Dropout(config.dropout, seed)
         self._Ts_world_camera = [view.T_world_camera.clone() for view in scene.views]
         self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
         self._pose_moments = [(torch.zeros(6), torch.zeros(6), 0) for _ in scene.views]
@@ -121,7 +123,8 @@ class _Fit:
         refine_pose = self._config.refine_poses and index > 0
         T_world_camera = self._Ts_world_camera[index].requires_grad_(refine_pose)
         channels = self._terms.channels(progress) if self._terms else ("rgb",)
-        render = self._render(T_world_camera, photograph.K, photograph.width, photograph.height, channels)
+        opacities = self._dropout(self._gaussians.opacities, progress)
+        render = self._render(opacities, T_world_camera, photograph.K, photograph.width, photograph.height, channels)
         assert render.rgb is not None  # it was asked for
         loss = photograph.loss(render.rgb)
         if self._terms is not None:
@@ -145,13 +148,21 @@ class _Fit:
             self._gaussians = change.gaussians
             self._adam.follow(_leaves(change.gaussians), change.origin)
 
-    def _render(self, T_world_camera: Tensor, K: Tensor, width: int, height: int, channels: Collection[str]) -> Render:
+    def _render(
+        self,
+        opacities: Tensor,
+        T_world_camera: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        channels: Collection[str],
+    ) -> Render:
         gaussians = self._gaussians
         return rasterize(
             gaussians.means,
             gaussians.quats,
             gaussians.scales,
-            gaussians.opacities,
+            opacities,
             gaussians.sh,
             T_world_camera,
             K,
@@ -168,7 +179,7 @@ class _Fit:
         def draw(view: PseudoView, channels: Collection[str]) -> Render:
             T_world_camera = torch.from_numpy(view.T_world_camera).float()
             return self._render(
-                T_world_camera, *scaled(torch.from_numpy(view.K), view.width, view.height, scale), channels
+                self._gaussians.opacities, T_world_camera, *scaled(torch.from_numpy(view.K), view.width, view.height, scale), channels
             )
 
         parts = (terms.training_loss(index, render, progress), terms.pseudo_loss(draw, progress))
