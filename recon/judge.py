@@ -58,7 +58,9 @@ def judge(graph: ViewGraph, registration: Registration | None, evidence: Evidenc
     """
     if registration is None or evidence is None or len(registration.cameras) < config.min_cameras:
         return _not_placed(graph, registration, config)
-    return _refused(graph, evidence, weigh(evidence), config) or _accepted(graph, registration, evidence, config)
+    return _refused(graph, registration, evidence, weigh(evidence), config) or _accepted(
+        graph, registration, evidence, config
+    )
 
 
 def _too_little(graph: ViewGraph, rejected: Sequence[Rejected], config: Config) -> Verdict | None:
@@ -128,7 +130,9 @@ def _doubted_focal(graph: ViewGraph, config: Config) -> Verdict | None:
     return refusals.wrong_given_focal([keyframe.name for keyframe in graph.keyframes], told, voted)
 
 
-def _refused(graph: ViewGraph, evidence: Evidence, odds: Odds, config: Config) -> Verdict | None:
+def _refused(
+    graph: ViewGraph, registration: Registration, evidence: Evidence, odds: Odds, config: Config
+) -> Verdict | None:
     names = [camera.name for camera in evidence.cameras]
     doubted = [freed for freed in evidence.freed if _contradicted(freed, config)]
     if doubted:
@@ -143,7 +147,7 @@ def _refused(graph: ViewGraph, evidence: Evidence, odds: Odds, config: Config) -
     if evidence.median_angle_deg < config.min_angle_deg:
         return _too_close(graph, evidence)
     if odds.total < config.min_log_odds or odds.doubtful:
-        return _reason(graph, evidence, odds, config)
+        return _reason(graph, registration, evidence, odds, config)
     if evidence.focal_sigma > config.max_focal_sigma:
         return refusals.uncertain_focal(names, evidence.focal_sigma)
     return None
@@ -156,10 +160,10 @@ def _contradicted(freed: FreedLens, config: Config) -> bool:
     return off > config.nominal_change and abs(np.log(freed.found / freed.registered)) > config.held_back
 
 
-def _reason(graph: ViewGraph, evidence: Evidence, odds: Odds, config: Config) -> Verdict:
+def _reason(graph: ViewGraph, registration: Registration, evidence: Evidence, odds: Odds, config: Config) -> Verdict:
     """Why the odds are against the poses: first what is wrong with the frames, then what is wrong with the poses."""
     names = [camera.name for camera in evidence.cameras]
-    foreign = _of_another_size(graph, names)
+    foreign = _through_other_lenses(graph, registration)
     if foreign:
         return refusals.mixed_cameras(foreign, len(names))
     widths = {
@@ -198,12 +202,12 @@ def _too_close(graph: ViewGraph, evidence: Evidence) -> Verdict:
     )
 
 
-def _of_another_size(graph: ViewGraph, names: Sequence[str]) -> list[str]:
-    """Frames that have not the size, turned or not, that most have; none where the camera was calibrated."""
-    frames = {keyframe.name: keyframe.frame for keyframe in graph.keyframes if keyframe.name in names}
-    sizes = {name: tuple(sorted((frame.width, frame.height))) for name, frame in frames.items()}
-    common = max(sorted(set(sizes.values())), key=list(sizes.values()).count)
-    return [name for name in names if sizes[name] != common and frames[name].intrinsics is None]
+def _through_other_lenses(graph: ViewGraph, registration: Registration) -> list[str]:
+    """Frames that were not taken through the lens that took most; none where the camera was calibrated."""
+    lenses = [camera.lens for camera in registration.cameras]
+    common = max(sorted(set(lenses)), key=lenses.count)
+    others = [graph.keyframes[camera.index] for camera in registration.cameras if camera.lens != common]
+    return [keyframe.name for keyframe in others if keyframe.frame.intrinsics is None]
 
 
 def _accepted(graph: ViewGraph, registration: Registration, evidence: Evidence, config: Config) -> Verdict:

@@ -69,7 +69,7 @@ def registration(indices: tuple[int, ...]) -> Registration:
     for index in indices:
         T_world_camera = np.eye(4)
         T_world_camera[0, 3] = 0.2 * index
-        cameras.append(RegisteredCamera(index, T_world_camera, 64.0, np.array([32.0, 24.0]), 0.0, 0.05, 0.005))
+        cameras.append(RegisteredCamera(index, T_world_camera, 0, 64.0, np.array([32.0, 24.0]), 0.0, 0.05, 0.005))
     return Registration(
         cameras=tuple(cameras),
         points=np.zeros((0, 3)),
@@ -303,12 +303,11 @@ def test_a_flat_thing_that_moves_is_not_taken_for_the_scene():
     assert verdict(4, flatness=0.97, agreement=0.85).code == Code.OK  # a facade in relief
 
 
-def test_frames_of_another_size_that_do_not_fit_are_named():
-    mixed = graph(4, all_pairs(4))
-    mixed.keyframes[1] = keyframe(1, size=(50, 40))
-    mixed.keyframes[2] = keyframe(2, size=(48, 64))  # the common size, turned
+def test_frames_through_another_lens_that_do_not_fit_are_named():
+    mixed = registration((0, 1, 2, 3))
+    mixed = replace(mixed, cameras=tuple(replace(camera, lens=int(camera.index == 1)) for camera in mixed.cameras))
     uncertain = evidence((0, 1, 2, 3), spread=Spread(0.1, 0.2, 0.01))
-    given = refused(judge(mixed, registration((0, 1, 2, 3)), uncertain, Config()), Code.MIXED_CAMERAS)
+    given = refused(judge(graph(4, all_pairs(4)), mixed, uncertain, Config()), Code.MIXED_CAMERAS)
     assert given.frames == names(1)
 
 

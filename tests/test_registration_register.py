@@ -22,7 +22,7 @@ def test_the_lens_of_a_frame_that_is_left_out_makes_no_focal_length_uncertain():
         graph.add(Keyframe(frame, frame.image, features.extract(frame.image, config.features)))
     registration = register.register(graph.keyframes, graph.pairs, config)
     assert registration is not None and [camera.index for camera in registration.cameras] == [0, 1, 2]
-    assert registration.focal_sigma < 0.5 * config.voted_sigma
+    assert registration.focal_sigma < 0.5 * config.lenses.voted_sigma
 
 
 def test_the_robots_own_body_in_the_picture_is_not_what_moves():

@@ -35,7 +35,7 @@ def scene_of(
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     principal = np.array([WIDTH / 2, HEIGHT / 2])
     cameras = tuple(
-        RegisteredCamera(i, pointmap.T_world_camera, 1.1 * WIDTH, principal, 0.0, 0.1 + i, 0.01)
+        RegisteredCamera(i, pointmap.T_world_camera, 0, 1.1 * WIDTH, principal, 0.0, 0.1 + i, 0.01)
         for i, pointmap in enumerate(pointmaps)
     )
     images = {pointmap.name: noise for pointmap in pointmaps}

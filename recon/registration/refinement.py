@@ -51,6 +51,10 @@ class Picture:
     def from_grey(self, pixels: Array) -> Array:
         return pixels / self.scale - self.principal
 
+    def enlarged(self, by: float) -> Picture:
+        """The picture of a frame that is larger by this factor and shows the same."""
+        return Picture(self.grey, self.scale / by, by * self.principal, by * self.size)
+
 
 def picture(image: npt.NDArray[np.uint8], principal: Array, config: Config) -> Picture:
     """The picture of a frame's `image` (H, W, 3) RGB."""

@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from capture.frame import Frame
 from recon.keyframe import Features, Keyframe
-from recon.registration import bundle, features, focal, mapper, matching, refinement, two_view, uncertainty
-from recon.registration.survey import Lens, View
+from recon.registration import bundle, features, lenses, mapper, matching, refinement, two_view, uncertainty
+from recon.registration.lenses import Grouping
+from recon.registration.survey import View
 from recon.registration.two_view import TwoView
 
 Array = npt.NDArray[np.float64]
@@ -23,6 +24,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     features: features.Config = features.Config()
     matching: matching.Config = matching.Config()
     two_view: two_view.Config = two_view.Config()
+    lenses: lenses.Config = lenses.Config()
     mapper: mapper.Config = mapper.Config()
     squeezes: tuple[float, ...] = (1.6,)  # of the image's width, for pairs that share little
     firm_matches: int = 150  # verified matches from which on a pair needs no squeezed features
@@ -30,10 +32,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # log10 of the false alarms of a pair's plain matches from which on squeezed ones are tried although firm pairs
     # connect the frames already: of 40 such pairs that squeezed features verified, 39 were below, of others one in ten.
     hint_log10_nfa: float = -1.0
-    exif_sigma: float = 0.05  # of log focal: nominal focal lengths are rounded, and focusing changes them
     still_px: float = 1.0  # median motion of a pair, at 1024 px, below which it may show the robot itself
     enough_moved: int = 60  # matches that moved by more, so that they are asked by themselves
-    voted_sigma: float = 0.3  # of log focal when frames voted for it
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +42,7 @@ class RegisteredCamera:
 
     index: int  # position among the keyframes
     T_world_camera: Array  # (4, 4)
+    lens: int  # cameras with the same number share focal length and distortion, relative to their longer side
     focal: float  # pixels of the full-size image
     principal: Array  # (2,) pixels of the full-size image
     radial: float  # first radial distortion coefficient
@@ -121,7 +122,9 @@ def _match(features1: Features, features2: Features, squeezes: tuple[float, floa
 
 
 def _examine(keyframe1: Keyframe, keyframe2: Keyframe, matches: Index, config: Config) -> Compared:
-    points1 = keyframe1.features.points[matches[:, 0]] - principal_point(keyframe1.frame)
+    """One focal length may serve both frames if they count in pixels of one size: the first is taken as enlarged."""
+    enlarged = _longer_side(keyframe2.frame) / _longer_side(keyframe1.frame)
+    points1 = enlarged * (keyframe1.features.points[matches[:, 0]] - principal_point(keyframe1.frame))
     points2 = keyframe2.features.points[matches[:, 1]] - principal_point(keyframe2.frame)
     size = (keyframe2.frame.width, keyframe2.frame.height)
     pair, log10_nfa = two_view.examine(points1, points2, matches, size, config.two_view)
@@ -131,7 +134,7 @@ def _examine(keyframe1: Keyframe, keyframe2: Keyframe, matches: Index, config: C
         if len(moved) >= config.enough_moved:
             among = two_view.examine(points1[moved], points2[moved], matches[moved], size, config.two_view)
             pair, log10_nfa = among if among[0] is not None else (pair, log10_nfa)
-    return Compared(matches, pair, log10_nfa)
+    return Compared(matches, pair.enlarged(1.0 / enlarged, 1.0) if pair else None, log10_nfa)
 
 
 def _motion_px(points1: Array, points2: Array, size: tuple[int, int]) -> float:
@@ -156,7 +159,12 @@ def register(
     order = sorted(range(len(keyframes)), key=lambda index: place_in_order(keyframes[index]))
     ordered = [keyframes[index] for index in order]
     built = _build(ordered, _renumbered(pairs, np.argsort(order)), config)
-    return _in_first_camera(built.renumbered(order), keyframes) if built else None
+    if built is None:
+        return None
+    found, grouping = built
+    place = np.argsort(order)
+    enlarged = [grouping.enlarged[i] for i in place]
+    return _in_first_camera(found.renumbered(order), keyframes, enlarged)
 
 
 def _renumbered(pairs: Mapping[tuple[int, int], TwoView], place: Index) -> dict[tuple[int, int], TwoView]:
@@ -170,22 +178,42 @@ def _renumbered(pairs: Mapping[tuple[int, int], TwoView], place: Index) -> dict[
 
 def _build(
     keyframes: Sequence[Keyframe], pairs: Mapping[tuple[int, int], TwoView], config: Config
+) -> tuple[mapper.Map, Grouping] | None:
+    """The map, in the pixels of its lenses, and these: one for all sizes unless the map contradicts that."""
+    together, apart = (lenses.group(keyframes, across_sizes) for across_sizes in (True, False))
+    built = _map(keyframes, pairs, together, config)
+    if built is None or together == apart:
+        return None if built is None else (built, together)
+    if not lenses.contradicted(built.problem, built.prior, built.loss, built.views[0], together, config.lenses):
+        return built, together
+    built = _map(keyframes, pairs, apart, config)
+    return None if built is None else (built, apart)
+
+
+def _map(
+    keyframes: Sequence[Keyframe], pairs: Mapping[tuple[int, int], TwoView], grouping: Grouping, config: Config
 ) -> mapper.Map | None:
-    groups, lenses = _lenses(keyframes, pairs, config)
+    enlarged = grouping.enlarged
     views = [
         View(
-            points=keyframe.features.points - principal_point(keyframe.frame),
-            lens=groups[i],
-            longer_side=max(keyframe.frame.width, keyframe.frame.height),
+            points=enlarged[i] * (keyframe.features.points - principal_point(keyframe.frame)),
+            lens=grouping.lens_of[i],
+            longer_side=grouping.longer_sides[grouping.lens_of[i]],
         )
         for i, keyframe in enumerate(keyframes)
     ]
     of_refinement = config.mapper.finishing.refinement
     pictures = [
-        refinement.picture(keyframe.frame.image, principal_point(keyframe.frame), of_refinement)
-        for keyframe in keyframes
+        refinement.picture(keyframe.frame.image, principal_point(keyframe.frame), of_refinement).enlarged(enlarged[i])
+        for i, keyframe in enumerate(keyframes)
     ]
-    return mapper.build_map(views, lenses, pairs, config.mapper, pictures)
+    known = lenses.lenses(keyframes, grouping, pairs, config.lenses)
+    in_lens = {(i, j): pair.enlarged(enlarged[i], enlarged[j]) for (i, j), pair in pairs.items()}
+    return mapper.build_map(views, known, in_lens, config.mapper, pictures)
+
+
+def _longer_side(frame: Frame) -> int:
+    return max(frame.width, frame.height)
 
 
 def principal_point(frame: Frame) -> Array:
@@ -195,34 +223,11 @@ def principal_point(frame: Frame) -> Array:
     return np.array([frame.width / 2.0, frame.height / 2.0])
 
 
-def _lenses(
-    keyframes: Sequence[Keyframe], pairs: Mapping[tuple[int, int], TwoView], config: Config
-) -> tuple[list[int], list[Lens]]:
-    """Frames of one size (turned or not) and one nominal focal length share a lens."""
-    keys, groups = [], []
-    for keyframe in keyframes:
-        frame, given = keyframe.frame, keyframe.frame.intrinsics
-        nominal = None if given is None else (given.source, round(float(np.log(given.fx)) / 0.01))
-        key = (max(frame.width, frame.height), min(frame.width, frame.height), nominal)
-        if key not in keys:
-            keys.append(key)
-        groups.append(keys.index(key))
-    lenses = []
-    for group, (longer_side, _, _) in enumerate(keys):
-        members = [i for i, member in enumerate(groups) if member == group]
-        given = keyframes[members[0]].frame.intrinsics
-        if given is not None:
-            known = given.source in ("given", "calibration")
-            lenses.append(Lens((given.fx,), 0.0 if known else config.exif_sigma))
-            continue
-        inside = [pair for key, pair in pairs.items() if key[0] in members and key[1] in members]
-        ratios = focal.vote(inside, num_candidates=3)
-        lenses.append(Lens(tuple(ratio * longer_side for ratio in ratios), config.voted_sigma))
-    return groups, lenses
+def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe], enlarged: Sequence[float]) -> Registration:
+    """The map with the first registered keyframe as the world's frame and a median point depth of 1.
 
-
-def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe]) -> Registration:
-    """The map with the first registered keyframe as the world's frame and a median point depth of 1."""
+    Its pixels are those of the frames `enlarged` to the size of their lens.
+    """
     state = built.problem
     order = sorted(built.views)
     covariances = bundle.covariance(state, built.prior, built.loss, built.views[0])
@@ -241,8 +246,9 @@ def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe]) -> Regist
             RegisteredCamera(
                 index=i,
                 T_world_camera=T_world_camera,
-                focal=float(np.exp(state.log_focals[lens])),
-                principal=principal_point(keyframes[i].frame) + state.shifts[lens],
+                lens=int(lens),
+                focal=float(np.exp(state.log_focals[lens])) / enlarged[i],
+                principal=principal_point(keyframes[i].frame) + state.shifts[lens] / enlarged[i],
                 radial=float(state.radials[lens]),
                 rotation_sigma_deg=float(rotation_sigmas[place]),
                 centre_sigma_rel=float(centre_sigmas[place]),
@@ -254,7 +260,7 @@ def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe]) -> Regist
         points=points,
         observed_by=state.camera_of,
         observed_point=state.point_of,
-        observed_pixels=state.pixels + principal[state.camera_of],
+        observed_pixels=state.pixels / np.array(enlarged)[state.camera_of, None] + principal[state.camera_of],
         agreement=built.agreement,
         focal_sigma=float(np.sqrt(covariances.log_focals[state.lens_of_camera[order]].max())),
         median_angle_deg=built.median_angle_deg,

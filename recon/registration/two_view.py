@@ -24,7 +24,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 @dataclass(frozen=True, eq=False)
 class TwoView:
     """A verified pair of frames. `points1[k]` and `points2[k]` are the pixels of one inlier match,
-    relative to the principal points."""
+    relative to the principal points, each of its own frame."""
 
     matches: npt.NDArray[np.int64]  # (M, 2) feature indices of the inliers
     points1: Array  # (M, 2)
@@ -44,6 +44,10 @@ class TwoView:
     def swapped(self) -> TwoView:
         """The same of the second frame and the first."""
         return replace(self, matches=self.matches[:, ::-1], points1=self.points2, points2=self.points1)
+
+    def enlarged(self, by1: float, by2: float) -> TwoView:
+        """The same of frames that are larger by these factors."""
+        return replace(self, points1=by1 * self.points1, points2=by2 * self.points2)
 
 
 def verify(

@@ -26,8 +26,8 @@ class Fit:
     problem: bundle.Problem
     prior: bundle.FocalPrior
     loss: bundle.Config
-    scale: Array  # (C,) longer side of each frame over 1024
-    told: Array  # (G,) focal length in pixels that came with the frames; NaN where none did
+    scale: Array  # (C,) longer side of each frame's lens over 1024
+    told: Array  # (G,) focal length that came with the frames, pixels of the lens; NaN where none did
 
     @property
     def Ts_world_camera(self) -> Array:
@@ -43,8 +43,8 @@ class Fit:
 def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_camera: int) -> Fit:
     """The registration as a bundle of at most about `tracks_per_camera` tracks a camera, the longest first.
 
-    Cameras whose lens came out the same to the last digit share it. A given focal length is kept, others are almost
-    free.
+    A given focal length is kept, others are almost free. Pixels are those of frames enlarged to the largest of their
+    lens.
     """
     cameras = registration.cameras
     position = np.full(len(keyframes), -1)
@@ -52,13 +52,16 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
     camera_of = position[registration.observed_by]
     chosen = _longest(camera_of, registration.observed_point, len(registration.points), tracks_per_camera)
     observed = chosen[registration.observed_point]
-    lenses = [(camera.focal, camera.radial, *camera.principal) for camera in cameras]
-    unique = sorted(set(lenses))
-    lens_of_camera = np.array([unique.index(lens) for lens in lenses])
-    sigmas, told = np.zeros(len(unique)), np.full(len(unique), np.nan)
-    for camera, lens in zip(cameras, lens_of_camera, strict=True):
+    sides = np.array([max(keyframes[c.index].frame.width, keyframes[c.index].frame.height) for c in cameras])
+    lenses, lens_of_camera = np.unique([camera.lens for camera in cameras], return_inverse=True)
+    longer_sides = np.array([sides[lens_of_camera == lens].max() for lens in range(len(lenses))])
+    enlarged = longer_sides[lens_of_camera] / sides
+    focals, radials, sigmas = np.zeros(len(lenses)), np.zeros(len(lenses)), np.zeros(len(lenses))
+    told = np.full(len(lenses), np.nan)
+    for camera, lens, by in zip(cameras, lens_of_camera, enlarged, strict=True):
         given = keyframes[camera.index].frame.intrinsics
-        told[lens] = np.nan if given is None else given.fx
+        focals[lens], radials[lens] = by * camera.focal, camera.radial
+        told[lens] = np.nan if given is None else by * given.fx
         sigmas[lens] = FREE_SIGMA if given is None or given.source not in ("given", "calibration") else 0.0
     principal = np.stack([camera.principal for camera in cameras])
     Ts_camera_world: Array = np.linalg.inv(np.stack([camera.T_world_camera for camera in cameras])).astype(np.float64)
@@ -67,16 +70,16 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
         rotations=Ts_camera_world[:, :3, :3],
         translations=Ts_camera_world[:, :3, 3],
         lens_of_camera=lens_of_camera,
-        log_focals=np.log([lens[0] for lens in unique]),
-        radials=np.array([lens[1] for lens in unique]),
-        shifts=np.zeros((len(unique), 2)),
+        log_focals=np.log(focals),
+        radials=radials,
+        shifts=np.zeros((len(lenses), 2)),
         points=registration.points[kept],
         camera_of=camera_of[observed],
         point_of=np.searchsorted(kept, registration.observed_point[observed]),
-        pixels=(registration.observed_pixels - principal[camera_of])[observed],
+        pixels=(enlarged[camera_of, None] * (registration.observed_pixels - principal[camera_of]))[observed],
     )
-    scale = np.array([max(keyframes[c.index].frame.width, keyframes[c.index].frame.height) for c in cameras]) / 1024.0
-    prior = bundle.FocalPrior(problem.log_focals, sigmas, np.zeros(len(unique)), np.zeros((len(unique), 2))[:, 0])
+    scale = longer_sides[lens_of_camera] / 1024.0
+    prior = bundle.FocalPrior(problem.log_focals, sigmas, np.zeros(len(lenses)), np.zeros(len(lenses)))
     errors = bundle.reprojection_errors(problem)
     robust_px = float(np.clip(3.0 * np.median(errors), *(np.array([0.4, 1.5]) * np.median(scale))))
     return Fit(problem, prior, bundle.Config(robust_px=robust_px), scale, told)
