@@ -149,8 +149,9 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", metavar="P", help="a named set of parameters (default: balanced)")
     parser.add_argument("--prior", metavar="K", help="what gives poses and first points (default: classical)")
     parser.add_argument("--size", type=_positive, metavar="PIXELS", help="longer side as modelled (default: 512)")
-    parser.add_argument("--budget-s", type=_seconds, metavar="S", help="stop refining after this many seconds")
-    parser.add_argument("--max-gaussians", type=_positive, metavar="N")
+    parser.add_argument("--budget-s", type=_seconds, metavar="S", help="the best scene within this many seconds")
+    parser.add_argument("--max-gaussians", type=_positive, metavar="N", help="and with at most so many Gaussians")
+    parser.add_argument("--max-mb", type=_megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes")
     parser.add_argument("--seed", type=_natural, metavar="N")
     parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
     chosen = parser.add_mutually_exclusive_group()
@@ -166,7 +167,7 @@ def _export_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _bench_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help="folders with images and true cameras")
+    parser.add_argument("scenes", type=Path, nargs="*", metavar="SCENE", help="folders with images and true cameras")
     parser.add_argument(
         "--views", type=_counts, default=(3, 6, 12), metavar="N,N,N", help="training views (default: 3,6,12)"
     )
@@ -175,11 +176,15 @@ def _bench_arguments(parser: argparse.ArgumentParser) -> None:
         type=_names,
         default=("balanced",),
         metavar="A,B,C",
-        help="presets, instantsplat-s or -xl, paper",
+        help="by name, or the sets presets, rivals, ablation (default: balanced)",
     )
     parser.add_argument("--checkpoints", type=_counts, default=(), metavar="N,N", help="iterations scored on the way")
     parser.add_argument("--seeds", type=_positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--resume", action="store_true", help="go on: runs that --out holds are not run again")
+    parser.add_argument(
+        "--redraw", type=Path, nargs="+", metavar="BENCH.json", help="measure nothing: tables and charts of these"
+    )
     parser.add_argument("--weights-dir", type=Path, metavar="DIR", help="LPIPS networks (default: $SPLATNODE_WEIGHTS)")
 
 
@@ -295,13 +300,21 @@ _positive, _natural = _whole_number(1), _whole_number(0)
 
 
 def _seconds(text: str) -> float:
+    return _above_zero(text, "seconds")
+
+
+def _megabytes(text: str) -> float:
+    return _above_zero(text, "megabytes")
+
+
+def _above_zero(text: str, unit: str) -> float:
     try:
-        seconds = float(text)
+        number = float(text)
     except ValueError:
-        seconds = math.nan
-    if not 0 < seconds < math.inf:
-        raise argparse.ArgumentTypeError(f"must be a number of seconds above 0; got {text!r}")
-    return seconds
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a number of {unit} above 0; got {text!r}")
+    return number
 
 
 def _names(text: str) -> tuple[str, ...]:

@@ -18,10 +18,12 @@ from capture.config import read_yaml
 from capture.frame import DroppedFrame, Frame
 from recon.audience import viewer
 from recon.config import Config, overlaid, preset
-from recon.evaluate.bench import Plan, run_bench
+from recon.evaluate import methods
+from recon.evaluate.bench import Entrants, Plan, Scoring, run_bench, told
 from recon.evaluate.demo import write_capture
-from recon.evaluate.methods import by_name, method
 from recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
+from recon.evaluate.records import merged, read_bench
+from recon.evaluate.report import redraw
 from recon.evaluate.splits import Split
 from recon.evaluate.truth import load_scene
 from recon.pipeline import reconstruct
@@ -97,23 +99,26 @@ def held_out_quality(snapshot: Snapshot, capture: Path, split: Split) -> dict[st
 
 
 def bench(args: argparse.Namespace) -> int:
-    """Measures methods on scenes with true cameras."""
-    plan = Plan(args.scenes, args.views, args.methods, tuple(range(args.seeds)), args.checkpoints)
-    for name in plan.methods:
-        method(name)
-    rows = run_bench(
-        plan,
-        by_name,
-        args.out,
-        rasterize=rasterize,
-        networks=load_networks(args.weights_dir),
-        settings=Settings(),
-        command=shlex.join(["splatnode", *sys.argv[1:]]),
-    )
-    for row in rows:
-        score = "not scored" if row.psnr is None else f"{row.psnr:.2f} dB, {row.ssim:.3f} SSIM"
-        print(f"{row.scene} {row.views} views, {row.method}, seed {row.seed}: {row.verdict}, {score}")
-    print(f"results: {args.out}/ (bench.json, bench.csv, report.md)")
+    """Measures methods on scenes with true cameras, or draws again what was measured."""
+    if bool(args.scenes) == bool(args.redraw):
+        raise ValueError("bench must get scenes to measure, or --redraw with what was measured")
+    if args.redraw:
+        found = merged([read_bench(path) for path in args.redraw])
+    else:
+        chosen = methods.chosen(args.methods)
+        found = run_bench(
+            Plan(tuple(args.scenes), args.views, chosen, tuple(range(args.seeds)), args.checkpoints),
+            Entrants(methods.by_name, methods.start_of),
+            args.out,
+            scoring=Scoring(rasterize, load_networks(args.weights_dir), Settings()),
+            command=shlex.join(["splatnode", *sys.argv[1:]]),
+            resume=args.resume,
+        )
+        for row in found.rows:
+            if row.final:
+                print(told(row))
+    redraw(found, args.out)
+    print(f"results: {args.out}/ (report.html, report.md, bench.json, bench.csv)")
     return EXIT_GOOD
 
 

@@ -20,6 +20,11 @@ class Clock:
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
         self.last = now
 
+    def resume(self) -> None:
+        """Goes on as if no time had passed since the last lap: the work lay by."""
+        gap = time.monotonic() - self.last
+        self.started, self.last = self.started + gap, self.last + gap
+
     @property
     def booked(self) -> dict[str, float]:
         """Seconds by stage, and from the start on as "total"."""

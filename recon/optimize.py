@@ -200,7 +200,9 @@ class _Fit:
             replace(view, T_world_camera=T.detach().clone())
             for view, T in zip(self._scene.views, self._Ts_world_camera, strict=True)
         )
-        return Scene(views, self._gaussians.map(lambda tensor: tensor.detach().clone()), self._iterations)
+        learnt = self._gaussians.map(lambda tensor: tensor.detach().clone())
+        served_by = {} if self._terms is None else self._terms.served_by
+        return Scene(views, learnt, self._iterations, served_by)
 
 
 def _leaves(gaussians: Gaussians) -> dict[str, Tensor]:

@@ -268,6 +268,7 @@ class Reconstruction:
             iterations=scene.iterations if scene else 0,
             seconds=self.clock.booked,
             final=final,
+            served_by=scene.served_by if scene else {},
             evidence=record(evidence) if evidence is not None else None,
         )
         log.info("snapshot %d: %s, %d Gaussians", self.sequence, verdict.code.value, len(snapshot.gaussians))

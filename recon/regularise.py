@@ -25,6 +25,7 @@ from recon.point_render import PointRender, render_points
 from recon.priors.pointmap import Pointmap
 from recon.pseudo_views import PseudoView, pseudo_views
 from recon.rasterize.render import Render
+from recon.target import scaled
 
 
 class Term(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -42,6 +43,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     normal: Term = Term()  # 10
     semantic: Term = Term()  # 12
     pseudo_views: int = 12
+    pseudo_scale: float = 0.5  # of the training views' resolution: networks look at a quarter of the pixels
     off_path: float = 0.1  # of the distance between neighbouring cameras
     nearest_points: int = 8  # K of equation 6
     depth_patch: int = 32  # pixels
@@ -165,8 +167,7 @@ class Regularisation:
         cloud = _cloud(pointmaps, images, config.min_confidence)
         views = pseudo_views(
             [pointmap.T_world_camera for pointmap in pointmaps],
-            [pointmap.K for pointmap in pointmaps],
-            [(pointmap.depth.shape[1], pointmap.depth.shape[0]) for pointmap in pointmaps],
+            *_lenses(pointmaps, config.pseudo_scale),
             config.pseudo_views,
             off_path=config.off_path,
             rng=self._rng,
@@ -180,6 +181,12 @@ class Regularisation:
             seen = torch.from_numpy(shown.seen)[..., None]
             imagined.append(_Imagined(view, _known_from_points(shown), looks, seen))
         return imagined
+
+
+def _lenses(pointmaps: Sequence[Pointmap], scale: float) -> tuple[list[npt.NDArray[np.float64]], list[tuple[int, int]]]:
+    """K (3, 3) and size (width, height) of each view at `scale` of its resolution."""
+    lenses = [scaled(torch.from_numpy(each.K), each.depth.shape[1], each.depth.shape[0], scale) for each in pointmaps]
+    return [K.double().numpy() for K, _, _ in lenses], [(width, height) for _, width, height in lenses]
 
 
 def _cloud(

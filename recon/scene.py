@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +46,7 @@ class Scene:
     views: tuple[View, ...]
     gaussians: Gaussians
     iterations: int = 0
+    served_by: Mapping[str, str] = field(default_factory=dict)  # network or measure, by regularisation that was used
 
     def cameras(self) -> tuple[CameraEstimate, ...]:
         return tuple(

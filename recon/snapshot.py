@@ -65,4 +65,5 @@ class Snapshot:
     iterations: int
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
     final: bool = False
+    served_by: Mapping[str, str] = field(default_factory=dict)  # network or measure, by regularisation that was used
     evidence: Mapping[str, object] | None = None  # recon.verification.likelihood.record; None: nothing to verify

@@ -2,118 +2,49 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import shutil
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-import torch
 
-from capture.frame import Frame
 from recon import rim
-from recon.evaluate.bench import Plan, run_alone, run_bench
-from recon.evaluate.protocol import Networks, Run, Settings, evaluate, mean_intrinsics
-from recon.evaluate.splits import Split, load_split, paper_split
+from recon.evaluate.protocol import Run, evaluate, mean_intrinsics
+from recon.evaluate.splits import load_split, paper_split
 from recon.evaluate.truth import load_scene
 from recon.export import write_result
 from recon.export.cameras import encode_cameras, encode_colmap, encode_nerfstudio
 from recon.export.ply import encode_ply
-from recon.geometry import Similarity, exp_se3
-from recon.preview import render_rgb
 from recon.rasterize.cpu import rasterize
 from recon.report import build_report
-from recon.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from recon.snapshot import CameraEstimate, Snapshot
 from recon.verdict import Code, Verdict
+from tests.blobs import (
+    HEIGHT,
+    NAMES,
+    NO_NETWORKS,
+    QUICK,
+    SPLIT,
+    WIDTH,
+    K,
+    estimate,
+    make_gaussians,
+    perfect_snapshot,
+    true_pose,
+    write_scene,
+)
 
-WIDTH, HEIGHT = 96, 72
-K = np.array([[90.0, 0, 48], [0, 90.0, 36], [0, 0, 1]])
-NAMES = [f"{i:02d}.png" for i in range(8)]
-SPLIT = Split(("00.png", "04.png", "07.png"), ("01.png", "03.png"))
-NO_NETWORKS = Networks(None, None)
-QUICK = Settings(alignment_steps=20, alignment_levels=1)
 RUN = Run("exact", 0, None, {"poses": 1.0, "points": None, "optimise": 2.0, "total": 3.5}, 123.0)
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Tiny images: threads would only wait for each other, for long where the machine has other work."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
-def true_pose(i: int) -> np.ndarray:
-    return exp_se3(
-        torch.tensor([0.25 * (i - 4), 0.05 * (i % 3), 0, 0, -0.05 * (i - 4), 0], dtype=torch.float64)
-    ).numpy()
-
-
-def make_gaussians() -> GaussianArrays:
-    rng = np.random.default_rng(0)
-    count = 500
-    return GaussianArrays(
-        means=rng.uniform([-4, -3, 3], [4, 3, 6], (count, 3)).astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-        scales=np.full((count, 3), 0.15, np.float32),
-        opacities=np.full(count, 0.8, np.float32),
-        sh=rng.uniform(-1.5, 1.5, (count, 1, 3)).astype(np.float32),
-        source_frame=np.zeros(count, np.int32),
-    )
-
-
-def estimate(name: str, T_world_camera: np.ndarray) -> CameraEstimate:
-    return CameraEstimate(name, int(name[:2]), T_world_camera, K, WIDTH, HEIGHT, None, None)
-
-
-def perfect_snapshot() -> Snapshot:
-    """The true scene, in a world of another scale, orientation and origin."""
-    world = exp_se3(torch.tensor([1.0, -2, 0.5, 0.3, 0.9, -0.4], dtype=torch.float64)).numpy()
-    similarity = Similarity(0.4, world[:3, :3], world[:3, 3])
-    gaussians = make_gaussians()
-    return Snapshot(
-        sequence=0,
-        verdict=Verdict(Code.OK, "Good.", "", publishable=True),
-        cameras=tuple(estimate(name, similarity.camera(true_pose(int(name[:2])))) for name in SPLIT.train),
-        gaussians=replace(
-            gaussians,
-            means=(0.4 * gaussians.means @ world[:3, :3].T + world[:3, 3]).astype(np.float32),
-            scales=gaussians.scales * np.float32(0.4),
-        ),
-        images={},
-        dropped=(),
-        iterations=100,
-        seconds={"poses": 1.0, "optimise": 2.0},
-        final=True,
-    )
-
-
-def write_images(folder: Path) -> None:
-    (folder / "images").mkdir(parents=True)
-    for name in NAMES:
-        image = render_rgb(make_gaussians(), true_pose(int(name[:2])), K, WIDTH, HEIGHT)
-        pixels = np.rint(image * 255).astype(np.uint8)
-        cv2.imwrite(str(folder / "images" / name), pixels[..., ::-1])
-
-
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def scene_folder(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("scenes") / "blobs"
-    write_images(folder)
-    entries = []
-    for name in NAMES:
-        T_camera_world = np.linalg.inv(true_pose(int(name[:2])))
-        pose = {"R": T_camera_world[:3, :3].tolist(), "t": T_camera_world[:3, 3].tolist()}
-        entries.append({"name": name, "width": WIDTH, "height": HEIGHT, "K": K.tolist(), **pose})
-    (folder / "cameras.json").write_text(json.dumps({"images": entries}))
-    splits = {"blobs": {"train3": SPLIT.train, "test": SPLIT.test}}
-    (folder.parent / "splits.json").write_text(json.dumps(splits))
+    write_scene(folder)
     return folder
 
 
@@ -280,76 +211,6 @@ def test_intrinsics_are_carried_to_an_image_of_another_size():
     second = replace(first, K=np.array([[110.0, 0, 52], [0, 110, 30], [0, 0, 1]]))
     found = mean_intrinsics([first, second], 200, 120)
     assert np.allclose(found, [[210, 0, 102], [0, 210, 60], [0, 0, 1]])
-
-
-# --- the benchmark
-
-
-def reconstruct(frames: Sequence[Frame], method: str, seed: int) -> Iterator[Snapshot]:
-    """Stands in for the pipeline, in the benchmark's own processes."""
-    assert all(frame.intrinsics is None for frame in frames)
-    if method == "broken":
-        raise RuntimeError("this method is broken")
-    if method == "killed":
-        os._exit(7)
-    verdict = Verdict(Code.NO_OVERLAP, "No.", "Add views.") if method == "refuses" else perfect_snapshot().verdict
-    for iterations in (0, 100, 200, 300):
-        final = iterations == 300
-        yield replace(perfect_snapshot(), verdict=verdict, iterations=iterations, final=final, sequence=seed)
-
-
-def test_bench_writes_a_row_a_checkpoint_and_keeps_what_was_measured(scene_folder, tmp_path):
-    plan = Plan((scene_folder,), views=(3,), methods=("exact", "broken"), checkpoints=(50, 150, 100000))
-    rows = run_bench(
-        plan, reconstruct, tmp_path, rasterize=rasterize, networks=NO_NETWORKS, settings=QUICK, command="bench"
-    )
-    assert [(row.method, row.checkpoint, row.iterations, row.final) for row in rows] == [
-        ("exact", 50, 100, False),
-        ("exact", 150, 200, False),
-        ("exact", None, 300, True),
-        ("broken", None, None, True),
-    ]
-    content = json.loads((tmp_path / "bench.json").read_text())
-    assert content["command"] == "bench" and content["machine"]["threads"] >= 1
-    assert content["settings"] == {"longer_side": 512, "alignment_steps": 20, "alignment_levels": 1}
-    exact, broken = content["rows"][2], content["rows"][3]
-    assert exact["psnr"] > 50 and exact["seconds"]["total"] > 0 and exact["peak_rss_mb"] > 10
-    assert exact["seconds"]["poses"] == 1.0 and exact["seconds"]["points"] is None
-    assert broken["verdict"] == "FAILED" and broken["psnr"] is None and broken["num_gaussians"] is None
-    assert "this method is broken" in broken["error"]
-    table = list(csv.DictReader((tmp_path / "bench.csv").read_text().splitlines()))
-    assert len(table) == 4 and table[3]["psnr"] == "" and float(table[2]["seconds_total"]) > 0
-    report = (tmp_path / "report.md").read_text()
-    assert "## 3 views" in report and "| exact | 1/1 |" in report and "| broken | 0/1 |" in report
-
-
-def test_bench_of_refusals_is_a_result_without_charts(scene_folder, tmp_path):
-    plan = Plan((scene_folder,), views=(3,), methods=("refuses",))
-    rows = run_bench(plan, reconstruct, tmp_path, rasterize=rasterize, networks=NO_NETWORKS, settings=QUICK, command="")
-    assert [(row.verdict, row.psnr) for row in rows] == [("NO_OVERLAP", None)]
-    assert {path.name for path in tmp_path.iterdir()} == {"bench.json", "bench.csv", "report.md"}
-
-
-def test_process_that_dies_or_takes_too_long_is_told(scene_folder):
-    frames = load_scene(scene_folder).frames(SPLIT.train)
-    dead = run_alone(reconstruct, frames, "killed", 0, (), timeout_s=60)
-    assert dead.moments == () and dead.error is not None and "code 7" in dead.error
-    late = run_alone(reconstruct, frames, "exact", 0, (), timeout_s=0.05)
-    assert late.error == "stopped after 0.05 s"
-
-
-def test_scene_that_is_not_there_stops_the_bench_before_it_starts(tmp_path):
-    with pytest.raises(FileNotFoundError, match="must hold the scene's images"):
-        run_bench(
-            Plan((tmp_path / "absent",), (3,), ("exact",)),
-            reconstruct,
-            tmp_path / "out",
-            rasterize=rasterize,
-            networks=NO_NETWORKS,
-            settings=QUICK,
-            command="",
-        )
-    assert not (tmp_path / "out").exists()
 
 
 def test_a_result_is_itself_a_scene_with_known_cameras(scene_folder, tmp_path):

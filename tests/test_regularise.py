@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from recon.priors.pointmap import Pointmap
+from recon.pseudo_views import PseudoView
 from recon.rasterize.render import Render
 from recon.regularise import PAPER, Config, Regularisation, Term
 
@@ -41,6 +42,18 @@ def truth(x: float) -> Render:
     )
 
 
+def truth_at(view: PseudoView, shift: float = 0.0) -> Render:
+    """What a right scene renders from a pseudo view, which is half as large; a wrong one is shifted."""
+    full = truth(view.T_world_camera[0, 3] + shift)
+    assert full.rgb is not None and full.depth is not None and full.normal is not None
+    assert (view.width, view.height) == (WIDTH // 2, HEIGHT // 2)
+    return Render(half(full.rgb), half(full.depth[..., None])[..., 0], half(full.normal), None)
+
+
+def half(image: torch.Tensor) -> torch.Tensor:
+    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), 2).permute(1, 2, 0)
+
+
 @pytest.fixture
 def without_networks(monkeypatch, tmp_path):
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
@@ -57,9 +70,9 @@ def test_the_papers_schedule(without_networks):
     assert terms.channels(0.15) == ("rgb",)
     assert terms.channels(0.2) == ("rgb", "depth", "normal") == terms.channels(0.69)
     assert terms.channels(0.7) == ("rgb",)
-    assert terms.pseudo_loss(lambda view, channels: truth(0.0), 0.05) is None
-    assert terms.pseudo_loss(lambda view, channels: truth(0.0), 0.1) is not None
-    assert terms.pseudo_loss(lambda view, channels: truth(0.0), 0.8) is None
+    assert terms.pseudo_loss(lambda view, _: truth_at(view), 0.05) is None
+    assert terms.pseudo_loss(lambda view, _: truth_at(view), 0.1) is not None
+    assert terms.pseudo_loss(lambda view, _: truth_at(view), 0.8) is None
     assert terms.training_loss(0, truth(0.0), 0.1) is None
 
 
@@ -77,9 +90,7 @@ def test_training_views_that_agree_with_their_point_maps_cost_nothing(without_ne
 def test_a_right_scene_costs_less_from_a_pseudo_view_than_a_shifted_one(without_networks):
     def loss(shift: float) -> float:
         terms = regularisation(Config(point_render=Term(1.0), depth=Term(1.0), normal=Term(1.0), off_path=0.0))
-        return sum(
-            float(terms.pseudo_loss(lambda view, _: truth(view.T_world_camera[0, 3] + shift), 0.5)) for _ in range(6)
-        )
+        return sum(float(terms.pseudo_loss(lambda view, _: truth_at(view, shift), 0.5)) for _ in range(6))
 
     assert loss(0.0) < 0.6 * loss(0.15)
 

@@ -1,38 +1,35 @@
-"""The benchmark: every method on every scene, each run in a process of its own so that its time and memory are its own.
-
-The reconstruction is an argument, `reconstruct(frames, method, seed) -> Iterator[Snapshot]`; it is sent to the new
-process, so it must be a function of a module (or a functools.partial of one).
-"""
+"""The benchmark: every method on every scene, each run in a process of its own."""
 
 from __future__ import annotations
 
-import csv
-import dataclasses
-import io
 import itertools
 import logging
-import multiprocessing
-import os
-import pickle
-import platform
-import tempfile
 import time
-import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
+import msgspec
+
 from capture.frame import Frame
+from recon.config import Config
 from recon.evaluate.appearance import Rasterize
+from recon.evaluate.process import call_alone, run_alone
 from recon.evaluate.protocol import STAGES, Networks, Row, Run, Settings, evaluate
+from recon.evaluate.records import Bench, bench_files, read_bench, run_of, this_machine
+from recon.evaluate.renders import Renders
+from recon.evaluate.report import report_files
 from recon.evaluate.splits import Split, load_split
-from recon.evaluate.summary import markdown
+from recon.evaluate.start import Start, find_start
 from recon.evaluate.truth import EvaluationScene, load_scene
-from recon.export.staged import json_bytes, write_file, write_files
-from recon.report import peak_rss_mb, versions
+from recon.export.staged import write_files
 from recon.snapshot import Snapshot
 
-Reconstruct = Callable[[Sequence[Frame], str, int], Iterator[Snapshot]]
+# Photographs, a method's name, a seed and what it may start from; it is sent to another process.
+Reconstruct = Callable[[Sequence[Frame], str, int, Start | None], Iterator[Snapshot]]
+
+_SHOWN = 3  # test views of each run whose renders are kept
 
 logger = logging.getLogger(__name__)
 
@@ -49,169 +46,131 @@ class Plan:
     timeout_s: float = 3600.0  # of one run
 
 
+@dataclass(frozen=True)
+class Entrants:
+    """How methods are run. Those whose `start_of` is equal share cameras and points; None: it finds its own."""
+
+    reconstruct: Reconstruct
+    start_of: Callable[[str], Config | None]
+
+
+@dataclass(frozen=True)
+class Scoring:
+    rasterize: Rasterize
+    networks: Networks
+    settings: Settings
+
+
 def run_bench(
     plan: Plan,
-    reconstruct: Reconstruct,
+    entrants: Entrants,
     out_dir: Path,
     *,
-    rasterize: Rasterize,
-    networks: Networks,
-    settings: Settings,
+    scoring: Scoring,
     command: str,
-) -> list[Row]:
-    """Runs the plan and returns its rows.
+    resume: bool = False,
+) -> Bench:
+    """Runs the plan and returns all that `out_dir` then holds; with `resume`, runs that it holds are not run again.
 
-    bench.json, bench.csv and report.md are rewritten after every row, so an
-    interrupted benchmark keeps what it has measured; the charts are drawn at the end.
-
+    bench.json, bench.csv and the reports are rewritten after every run, so an interrupted benchmark keeps what it has
+    measured. Cameras and points that several methods start from are found once for each set of photographs and seed;
+    their seconds count in each method's total.
     A run that fails, or exceeds the time, becomes a row with the verdict "FAILED" and the reason. Raises ValueError or
     FileNotFoundError for a scene or split that is not there, before anything is run.
     """
-    scenes = [(load_scene(folder), folder) for folder in plan.scenes]
-    jobs = [
-        (scene, load_split(folder, list(scene.paths), views), method, seed)
-        for (scene, folder), views, method, seed in itertools.product(scenes, plan.views, plan.methods, plan.seeds)
+    sets = [
+        (scene, load_split(folder, list(scene.paths), views))
+        for scene, folder, views in ((load_scene(f), f, v) for f, v in itertools.product(plan.scenes, plan.views))
     ]
-    rows: list[Row] = []
-    for number, (scene, split, method, seed) in enumerate(jobs, 1):
-        outcome = run_alone(reconstruct, scene.frames(split.train), method, seed, plan.checkpoints, plan.timeout_s)
-        for moment in outcome.moments:
-            run = Run(method, seed, moment.checkpoint, moment.seconds, moment.peak_rss_mb)
-            rows.append(
-                evaluate(moment.snapshot, scene, split, run, rasterize=rasterize, networks=networks, settings=settings)
-            )
-            write_bench(rows, settings, out_dir, command)
-        if outcome.error is not None:
-            rows.append(_failed_row(scene, split, method, seed, outcome.error))
-            write_bench(rows, settings, out_dir, command)
-        logger.info("bench %d/%d: %s, %d views, %s, seed %d: %s", number, len(jobs), *_told(rows[-1]))
-    _draw_charts(rows, out_dir)
-    return rows
+    known = read_bench(out_dir / "bench.json") if resume and (out_dir / "bench.json").exists() else None
+    if known is not None and known.settings != scoring.settings:
+        raise ValueError(f"{out_dir} holds views that were scored with {known.settings}: resume into another folder")
+    bench = Bench(() if known is None else known.rows, scoring.settings, this_machine(), command)
+    finished, started = bench.done(), time.monotonic()
+    jobs = [
+        (scene, split, seed, [m for m in plan.methods if (scene.name, len(split.train), m, seed) not in finished])
+        for (scene, split), seed in itertools.product(sets, plan.seeds)
+    ]
+    total, number = sum(len(methods) for *_, methods in jobs), 0
+    for scene, split, seed, methods in jobs:
+        starts = _Starts(entrants.start_of, scene.frames(split.train), seed, plan.timeout_s)
+        for method in methods:
+            number += 1
+            rows = _run(plan, entrants.reconstruct, starts, scene, split, method, out_dir, scoring)
+            bench = msgspec.structs.replace(bench, rows=(*bench.rows, *rows))
+            write_files(out_dir, bench_files(bench) | report_files(bench, out_dir))
+            left = (time.monotonic() - started) / number * (total - number)
+            logger.info("bench %d/%d, about %.0f min left: %s", number, total, left / 60, told(rows[-1]))
+    return bench
 
 
-def _draw_charts(rows: Sequence[Row], out_dir: Path) -> None:
-    """speed_accuracy.png and parsimony.png, where there is a score to draw and matplotlib to draw it."""
-    if all(row.psnr is None for row in rows):
-        logger.warning("no charts: no run published a scene that could be scored")
-        return
-    try:
-        from recon.evaluate import charts
-    except ImportError:
-        logger.warning("no charts: matplotlib is not installed. Run: pip install 'splatnode[bench]'")
-        return
-    charts.draw(out_dir / "bench.json", out_dir)
+class _Starts:
+    """What the methods start from on one set of photographs, found when the first of them asks for it."""
+
+    def __init__(
+        self, start_of: Callable[[str], Config | None], frames: Sequence[Frame], seed: int, timeout_s: float
+    ) -> None:
+        self.frames, self.seed = frames, seed
+        self._start_of, self._timeout_s = start_of, timeout_s
+        self._found: list[tuple[Config, Start]] = []
+
+    def of(self, method: str) -> Start | None:
+        """Raises RuntimeError where it cannot be found."""
+        wanted = self._start_of(method)
+        if wanted is None:
+            return None
+        for config, start in self._found:
+            if config == wanted:
+                return start
+        seeded = msgspec.structs.replace(wanted, seed=self.seed)
+        start = call_alone(partial(find_start, self.frames, seeded), self._timeout_s)
+        self._found.append((wanted, start))
+        return start
 
 
-def write_bench(rows: Sequence[Row], settings: Settings, out_dir: Path, command: str) -> None:
-    """bench.json, bench.csv and report.md, all or none of them."""
-    records = [dataclasses.asdict(row) for row in rows]
-    content = {
-        "rows": records,
-        "settings": dataclasses.asdict(settings),
-        "machine": machine(),
-        "command": command,
-    }
-    files = {"bench.json": json_bytes(content), "bench.csv": _csv(records), "report.md": markdown(content).encode()}
-    write_files(out_dir, files)
-
-
-def machine() -> dict[str, object]:
-    """What the seconds were measured on."""
-    affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"processor": _processor(), "threads": affinity, **versions()}
-
-
-@dataclass(frozen=True, eq=False)
-class Moment:
-    """A snapshot that is to be scored, with what the run had cost by then."""
-
-    snapshot: Snapshot
-    checkpoint: int | None  # None: the end of the run
-    seconds: Mapping[str, float | None]
-    peak_rss_mb: float | None
-
-
-@dataclass(frozen=True, eq=False)
-class Outcome:
-    moments: tuple[Moment, ...]
-    seconds: float  # wall time of the whole process
-    error: str | None
-
-
-def run_alone(
+def _run(
+    plan: Plan,
     reconstruct: Reconstruct,
-    frames: Sequence[Frame],
+    starts: _Starts,
+    scene: EvaluationScene,
+    split: Split,
     method: str,
-    seed: int,
-    checkpoints: Sequence[int],
-    timeout_s: float,
-) -> Outcome:
-    """One reconstruction in a fresh process. The clock runs only while the reconstruction works, not while it is saved.
-
-    The process leaves its moments in a temporary folder and they are read once it has ended, so that nothing else works
-    on this machine's processors meanwhile.
-    """
-    context = multiprocessing.get_context("spawn")
-    started = time.perf_counter()
-    with tempfile.TemporaryDirectory(prefix="splatnode-bench-") as folder:
-        arguments = (reconstruct, frames, method, seed, tuple(checkpoints), folder)
-        process = context.Process(target=_run_and_save, args=arguments)
-        process.start()
-        try:
-            process.join(timeout_s)
-            timed_out = process.is_alive()
-        finally:
-            if process.is_alive():
-                process.kill()
-                process.join()
-        seconds = time.perf_counter() - started
-        moments = tuple(pickle.loads(path.read_bytes()) for path in sorted(Path(folder).glob("*.moment")))
-        told = Path(folder) / "error.txt"
-        if timed_out:
-            error = f"stopped after {timeout_s:g} s"
-        elif told.exists():
-            error = told.read_text()
-        elif process.exitcode != 0:
-            error = f"the process ended with code {process.exitcode}; -9 mostly means that the memory was used up"
-        else:
-            error = None if moments else "the reconstruction gave no snapshot"
-    return Outcome(moments, seconds, error)
-
-
-def _run_and_save(
-    reconstruct: Reconstruct, frames: Sequence[Frame], method: str, seed: int, checkpoints: Sequence[int], folder: str
-) -> None:
-    """The other process: saves the first snapshot at or beyond each checkpoint, and the last of all."""
+    out_dir: Path,
+    scoring: Scoring,
+) -> list[Row]:
+    """The rows of one run: its checkpoints and its end, or its failure."""
+    seed, views = starts.seed, len(split.train)
     try:
-        waiting = sorted(checkpoints)
-        seconds, saved, snapshot = 0.0, 0, None
-        started = time.perf_counter()
-        for snapshot in reconstruct(frames, method, seed):
-            seconds += time.perf_counter() - started
-            while waiting and snapshot.iterations >= waiting[0]:
-                checkpoint = waiting.pop(0)
-                if not waiting or snapshot.iterations < waiting[0]:
-                    _save(folder, saved, snapshot, checkpoint, seconds)
-                    saved += 1
-            started = time.perf_counter()
-        seconds += time.perf_counter() - started
-        if snapshot is not None:
-            _save(folder, saved, snapshot, None, seconds)
-    except Exception:
-        write_file(Path(folder) / "error.txt", traceback.format_exc().encode())
+        start = starts.of(method)
+    except RuntimeError as error:
+        return [_failed_row(scene, views, method, seed, str(error))]
+    work = partial(reconstruct, starts.frames, method, seed, start)
+    outcome = run_alone(work, plan.checkpoints, plan.timeout_s, 0.0 if start is None else start.seconds)
+    kept = Renders(out_dir, scene.name, views, method, seed, split.test[:: max(1, len(split.test) // _SHOWN)][:_SHOWN])
+    rows = []
+    for moment in outcome.moments:
+        peaks = [peak for peak in (moment.peak_rss_mb, start and start.peak_rss_mb) if peak is not None]
+        run = Run(method, seed, moment.checkpoint, moment.seconds, max(peaks, default=None))
+        shown = {"show": kept.keep} if moment.checkpoint is None else {}
+        rows.append(
+            evaluate(
+                moment.snapshot,
+                scene,
+                split,
+                run,
+                rasterize=scoring.rasterize,
+                networks=scoring.networks,
+                settings=scoring.settings,
+                **shown,
+            )
+        )
+    return rows if outcome.error is None else [*rows, _failed_row(scene, views, method, seed, outcome.error)]
 
 
-def _save(folder: str, number: int, snapshot: Snapshot, checkpoint: int | None, total: float) -> None:
-    peak = peak_rss_mb()
-    stages: dict[str, float | None] = {stage: snapshot.seconds.get(stage) for stage in STAGES}
-    moment = Moment(snapshot, checkpoint, {**stages, "total": total}, peak)
-    write_file(Path(folder) / f"{number:04d}.moment", pickle.dumps(moment))
-
-
-def _failed_row(scene: EvaluationScene, split: Split, method: str, seed: int, error: str) -> Row:
+def _failed_row(scene: EvaluationScene, views: int, method: str, seed: int, error: str) -> Row:
     return Row(
         scene=scene.name,
-        views=len(split.train),
+        views=views,
         method=method,
         seed=seed,
         checkpoint=None,
@@ -223,29 +182,10 @@ def _failed_row(scene: EvaluationScene, split: Split, method: str, seed: int, er
     )
 
 
-def _told(row: Row) -> tuple[str, int, str, int, str]:
-    score = "not scored" if row.psnr is None else f"{row.psnr:.2f} dB"
-    return row.scene, row.views, row.method, row.seed, f"{row.verdict}, {score}, {row.seconds.get('total')} s"
-
-
-def _csv(records: Sequence[Mapping]) -> bytes:
-    """The rows with their seconds as columns of their own; empty where not measured."""
-    flat = []
-    for record in records:
-        seconds = {f"seconds_{stage}": value for stage, value in record["seconds"].items()}
-        flat.append({name: value for name, value in record.items() if name != "seconds"} | seconds)
-    text = io.StringIO()
-    writer = csv.DictWriter(text, list(flat[0]) if flat else [], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(flat)
-    return text.getvalue().encode()
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()
+def told(row: Row) -> str:
+    """A run in a line."""
+    scene, views, method, seed = run_of(row)
+    score = "not scored" if row.psnr is None else f"{row.psnr:.2f} dB, {row.ssim:.3f} SSIM"
+    seconds = row.seconds.get("total")
+    took = "" if seconds is None else f", {seconds:.1f} s"
+    return f"{scene} {views} views, {method}, seed {seed}: {row.verdict}, {score}{took}"

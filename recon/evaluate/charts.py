@@ -1,24 +1,23 @@
-"""Charts of a benchmark, drawn from bench.json alone: `python -m recon.evaluate.charts bench.json --out DIR`.
+"""Charts of a benchmark, drawn from its rows alone: `splatnode bench --redraw bench.json --out DIR`.
 
 Needs matplotlib (pip install 'splatnode[bench]'). Only numbers are drawn, never an image of a scene.
 """
 
 from __future__ import annotations
 
-import argparse
 import io
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from recon.evaluate.ablation import is_variant, variants
+from recon.evaluate.protocol import Row, mean
 from recon.evaluate.summary import Point, points
-from recon.export.staged import write_files
+from recon.evaluate.tables import PSNR, SSIM, Measure, lpips, paired
 
 # Okabe and Ito's colours, which people with any colour vision tell apart, and a marker each for print without colour.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#7F7F7F")
@@ -42,17 +41,19 @@ _LPIPS_VGG = Quality("LPIPS VGG", lambda point: point.lpips_vgg, False)
 _LPIPS_ALEX = Quality("LPIPS Alex", lambda point: point.lpips_alex, False)
 
 
-def draw(bench_json: Path, out_dir: Path) -> list[Path]:
-    """Writes speed_accuracy.png and parsimony.png to `out_dir` and returns their paths.
+def draw(rows: Sequence[Row]) -> dict[str, bytes]:
+    """speed_accuracy.png and parsimony.png, and ablation.png where parts were measured; none where nothing was scored.
 
-    Raises ValueError where bench.json has no row with a scored scene: there is nothing to draw.
+    Methods that were made for the ablation are drawn there alone.
     """
-    measured = [p for p in points(json.loads(bench_json.read_text())["rows"]) if p.psnr is not None]
-    if not measured:
-        raise ValueError(f"{bench_json} must have a row with a scored scene to draw, it has none")
-    files = {"speed_accuracy.png": _png(speed_accuracy(measured)), "parsimony.png": _png(parsimony(measured))}
-    write_files(out_dir, files)
-    return [out_dir / name for name in files]
+    files = {}
+    measured = [p for p in points([row for row in rows if not is_variant(row.method)]) if p.psnr is not None]
+    if measured:
+        files |= {"speed_accuracy.png": _png(speed_accuracy(measured)), "parsimony.png": _png(parsimony(measured))}
+    scored = [row for row in rows if row.final and row.psnr is not None]
+    if any(is_variant(row.method) for row in scored):
+        files["ablation.png"] = _png(ablation(scored))
+    return files
 
 
 def speed_accuracy(measured: Sequence[Point]) -> Figure:
@@ -73,6 +74,33 @@ def parsimony(measured: Sequence[Point]) -> Figure:
     figure = _grid(measured, "Gaussians (log scale)", lambda p: p.num_gaussians, lambda p: 45.0)
     _head(figure, "Quality of held-out views against the number of Gaussians")
     return figure
+
+
+def ablation(scored: Sequence[Row]) -> Figure:
+    """What each variant changes against what it is compared with: bars are means, dots the runs that both have."""
+    shown = [v for v in variants({row.method for row in scored}) if v.method != v.against]
+    measures = [measure for measure in (PSNR, SSIM, lpips(scored)) if measure is not None]
+    figure = Figure(figsize=(4.6 * len(measures), 0.36 * len(shown) + 1.9), dpi=150, layout="constrained")
+    axes = figure.subplots(1, len(measures), squeeze=False, sharey=True)[0]
+    for chart, measure in zip(axes, measures, strict=True):
+        for place, variant in enumerate(shown):
+            changes = paired(scored, variant.method, variant.against, measure)
+            chart.barh(place, mean(changes) or 0.0, height=0.6, color=_COLOURS[_colour_of(changes, measure)], alpha=0.8)
+            chart.scatter(changes, [place] * len(changes), s=14, c=_INK, zorder=3)
+        chart.axvline(0.0, color=_INK, linewidth=1.0)
+        chart.set_title(f"{measure.name} ({'more' if measure.higher_is_better else 'less'} is better)", fontsize=10)
+        _plain(chart)
+    axes[0].set_yticks(range(len(shown)), [f"{v.method}  vs. {v.against}" for v in shown])
+    axes[0].invert_yaxis()
+    figure.suptitle(
+        "What each part changes on held-out views (blue: for the better; dots: runs)", fontsize=11, color=_INK
+    )
+    return figure
+
+
+def _colour_of(changes: Sequence[float], measure: Measure) -> int:
+    """Of a bar: 0 where the change is for the better, else 1."""
+    return int(((mean(changes) or 0.0) > 0) != measure.higher_is_better)
 
 
 def pareto_front(pairs: Sequence[tuple[float, float]], higher_is_better: bool) -> list[tuple[float, float]]:
@@ -149,6 +177,10 @@ def _chart(
     if not quality.higher_is_better:
         chart.invert_yaxis()
     chart.set_ylabel(quality.label if quality.higher_is_better else f"{quality.label} (axis turned)", color=_MUTED)
+    _plain(chart)
+
+
+def _plain(chart: Axes) -> None:
     chart.grid(color=_GRID, linewidth=0.7)
     chart.set_axisbelow(True)
     chart.spines[["top", "right"]].set_visible(False)
@@ -182,16 +214,3 @@ def _png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", facecolor="white")
     return buffer.getvalue()
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Draws the charts of a benchmark from its bench.json.")
-    parser.add_argument("bench_json", type=Path)
-    parser.add_argument("--out", type=Path, required=True, help="the folder for the charts")
-    arguments = parser.parse_args()
-    for path in draw(arguments.bench_json, arguments.out):
-        print(path)
-
-
-if __name__ == "__main__":
-    main()

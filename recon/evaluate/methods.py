@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from importlib import import_module
 
 import msgspec
 
 from capture.frame import Frame
 from recon import optimize, pixelwise, regularise
 from recon.config import PRESETS, Config
+from recon.evaluate import ablation
+from recon.evaluate.start import Start, continued, foundation
 from recon.pipeline import reconstruct
 from recon.snapshot import Snapshot
 
@@ -47,10 +50,12 @@ def _instantsplat(iterations: int, terms: regularise.Config) -> Config:
 
 _NO_TERMS = regularise.Config()
 CONFIGS: dict[str, Config] = {
+_PAPER = _instantsplat(1000, regularise.PAPER)
     **PRESETS,
     "instantsplat-s": _instantsplat(200, _NO_TERMS),
-    "instantsplat-xl": _instantsplat(1000, _NO_TERMS),
-    "paper": _instantsplat(1000, regularise.PAPER),
+    ablation.BASE: _instantsplat(1000, _NO_TERMS),
+    ablation.WHOLE: _PAPER,
+    **ablation.configs(_PAPER),
 }
 
 
@@ -61,16 +66,45 @@ def _configured(config: Config, frames: Sequence[Frame], seed: int) -> Iterator[
     return reconstruct(frames, msgspec.structs.replace(config, seed=seed))
 
 
-METHODS: dict[str, Method] = {name: partial(_configured, config) for name, config in CONFIGS.items()}
+def _rival(name: str, frames: Sequence[Frame], seed: int) -> Iterator[Snapshot]:
+    """The method of the module of recon.rivals that is called like it."""
+    return import_module(f"recon.rivals.{name.replace('-', '_')}").reconstruct(frames, seed)
+
+
+RIVALS = ("colmap-3dgs", "colmap-fsgs", "cf-3dgs", "nerfmm", "nope-nerf")  # these make their own cameras
+METHODS: dict[str, Method] = {
+    **{name: partial(_configured, config) for name, config in CONFIGS.items()},
+    **{name: partial(_rival, name) for name in RIVALS},
+}
+SETS = {"presets": tuple(PRESETS), "rivals": RIVALS, "ablation": ablation.names()}
 
 
 def method(name: str) -> Method:
     """The method called `name`. Raises ValueError when there is none."""
     if name not in METHODS:
-        raise ValueError(f"no method {name!r}; there are: {', '.join(METHODS)}")
+        listed = [each for each in METHODS if not ablation.is_variant(each)]
+        raise ValueError(f"no method {name!r}; there are: {', '.join(listed)}, and the sets {', '.join(SETS)}")
     return METHODS[name]
 
 
-def by_name(frames: Sequence[Frame], name: str, seed: int) -> Iterator[Snapshot]:
-    """Runs the method called `name`. At module level, so that a fresh process can be told to run it."""
-    return method(name)(frames, seed)
+def chosen(names: Sequence[str]) -> tuple[str, ...]:
+    """`names` with the sets among them spelt out. Raises ValueError where there is no such method."""
+    found = tuple(dict.fromkeys(name for each in names for name in SETS.get(each, (each,))))
+    for name in found:
+        method(name)
+    return found
+
+
+def start_of(name: str) -> Config | None:
+    """What decides the cameras and points that a method starts from; None for one that finds its own."""
+    return foundation(CONFIGS[name]) if name in CONFIGS else None
+
+
+def by_name(frames: Sequence[Frame], name: str, seed: int, start: Start | None = None) -> Iterator[Snapshot]:
+    """Runs the method called `name`, from where `start` stands if it is given one that `start_of` asks for.
+
+    At module level, so that a fresh process can be told to run it.
+    """
+    if start is None:
+        return method(name)(frames, seed)
+    return continued(start, msgspec.structs.replace(CONFIGS[name], seed=seed))

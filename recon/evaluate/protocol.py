@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from recon import rim
 from recon.evaluate.alignment import CameraErrors, align_test_pose, camera_errors
@@ -82,6 +83,13 @@ class Networks:
     vgg: Lpips | None
 
 
+Show = Callable[[str, Tensor, Tensor], None]  # name of a test view, photograph, render; both (H, W, 3) in [0, 1]
+
+
+def shown_to_nobody(name: str, truth: Tensor, image: Tensor) -> None:
+    """What is done with a render that nobody wants to see."""
+
+
 def load_networks(weights_dir: Path | None = None) -> Networks:
     return Networks(load_lpips("alex", weights_dir), load_lpips("vgg", weights_dir))
 
@@ -95,8 +103,11 @@ def evaluate(
     rasterize: Rasterize,
     networks: Networks,
     settings: Settings,
+    show: Show = shown_to_nobody,
 ) -> Row:
     """Scores a snapshot on the scene's test views. The truth is used here and nowhere earlier.
+
+    `show` gets the name of each test view, its photograph and what the scene looks like from there.
 
     A snapshot whose verdict forbids publishing it has no scene and is scored on nothing; its cameras are compared all
     the same, which tells whether the refusal was needed.
@@ -104,7 +115,7 @@ def evaluate(
     estimated = [camera for camera in snapshot.cameras if camera.name in scene.cameras]
     errors = _camera_errors(estimated, scene)
     appearance = appearance_of(snapshot, rasterize)
-    views = _score_test_views(appearance, snapshot.cameras, estimated, scene, split, networks, settings)
+    views = _score_test_views(appearance, snapshot.cameras, estimated, scene, split, networks, settings, show)
     return Row(
         scene=scene.name,
         views=len(split.train),
@@ -113,11 +124,11 @@ def evaluate(
         checkpoint=run.checkpoint,
         final=run.checkpoint is None,
         iterations=snapshot.iterations,
-        psnr=_mean([view.psnr for view in views]),
-        psnr_with_rim=_mean([view.psnr_with_rim for view in views]),
-        ssim=_mean([view.ssim for view in views]),
-        lpips_alex=_mean([view.lpips_alex for view in views]),
-        lpips_vgg=_mean([view.lpips_vgg for view in views]),
+        psnr=mean([view.psnr for view in views]),
+        psnr_with_rim=mean([view.psnr_with_rim for view in views]),
+        ssim=mean([view.ssim for view in views]),
+        lpips_alex=mean([view.lpips_alex for view in views]),
+        lpips_vgg=mean([view.lpips_vgg for view in views]),
         rotation_error_deg=errors.rotation_deg,
         rotation_pair_error_deg=errors.rotation_pair_deg,
         centre_error_pct=errors.centre_pct,
@@ -149,6 +160,7 @@ def _score_test_views(
     split: Split,
     networks: Networks,
     settings: Settings,
+    show: Show,
 ) -> list[_ViewScore]:
     """Renders each test view from the pose that equation 18 finds, with the intrinsics of the training cameras.
 
@@ -182,6 +194,7 @@ def _score_test_views(
         )
         image = appearance.picture(aligned.T_world_camera, K, width, height)
         with_rim = appearance.picture(aligned.T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
+        show(name, truth, image)
         scores.append(
             _ViewScore(
                 psnr=psnr(image, truth),
@@ -216,6 +229,7 @@ def _camera_errors(estimated: Sequence[CameraEstimate], scene: EvaluationScene) 
     )
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
+def mean(values: Sequence[float | None]) -> float | None:
+    """Of those that were measured; None where none was."""
     measured = [value for value in values if value is not None]
     return float(np.mean(measured)) if measured else None

@@ -55,13 +55,13 @@ class Lpips:
 
     @torch.no_grad()
     def __call__(self, image: Tensor, truth: Tensor) -> float:
-        """The distance of two images (H, W, 3) in [0, 1]; 0 for equal ones. Sides must be at least 64 pixels."""
+        """The distance of two images (H, W, 3) in [0, 1]; 0 for equal ones. Sides must be at least 32 pixels."""
         return float(self.distance(image, self.features(truth)))
 
     def features(self, image: Tensor) -> tuple[Tensor, ...]:
         """What the network sees in an image (H, W, 3) in [0, 1]: unit vectors (1, C, h, w) of each tapped layer."""
-        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 64:
-            raise ValueError(f"image must be (H, W, 3) of at least 64x64, got {tuple(image.shape)}")
+        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 32:
+            raise ValueError(f"image must be (H, W, 3) of at least 32x32, got {tuple(image.shape)}")
         x = image.to(torch.float32).permute(2, 0, 1)[None] * 2 - 1
         x = (x - x.new_tensor(_SHIFT).view(3, 1, 1)) / x.new_tensor(_SCALE).view(3, 1, 1)
         tapped = []

@@ -9,7 +9,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from recon.evaluate.bench import machine
+from recon.evaluate.records import this_machine
 from recon.evaluate.stability.case import Row
 from recon.evaluate.stability.places import Places, Stage
 from recon.evaluate.stability.summary import report
@@ -43,7 +43,13 @@ def run_campaign(plan: Plan, places: Places, out: Path, command: str) -> list[di
     for trial in _results(plan, places, todo):
         trials.append(asdict(trial))
         ordered = sorted(trials, key=lambda t: (plan_order(plan, t["method"]), *_key(t)))
-        content = {"trials": ordered, **report(ordered), "scenes": scenes, "machine": machine(), "command": command}
+        content = {
+            "trials": ordered,
+            **report(ordered),
+            "scenes": scenes,
+            "machine": this_machine(),
+            "command": command,
+        }
         write_file(path, json_bytes(content))
         seconds = "no answer" if trial.seconds is None else f"{trial.seconds:.1f} s"
         logger.info(

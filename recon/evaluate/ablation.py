@@ -1,0 +1,71 @@
+"""What each part of the paper brings: alone on the base, and missing from the whole.
+
+The base is InstantSplat with as many iterations, which is the paper's method without its losses. It already refines
+poses and thins the points, so these two are only taken away.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import msgspec
+
+from recon import density
+from recon.config import Config
+from recon.regularise import Term
+
+BASE, WHOLE = "instantsplat-xl", "paper"
+_LOSSES = {"point-render": "point_render", "depth": "depth", "normal": "normal", "semantic": "semantic"}
+_SETTINGS = ("pseudo-views", "down-sampling", "pose-refinement")
+_NO_THINNING = density.Config(depth_tolerance=0.0)
+
+
+@dataclass(frozen=True)
+class Variant:
+    method: str
+    against: str
+
+
+def names() -> tuple[str, ...]:
+    """Base, each loss alone, the whole, and the whole without each part."""
+    with_one = (f"{BASE}+{part}" for part in _LOSSES)
+    without_one = (f"{WHOLE}-{part}" for part in (*_LOSSES, *_SETTINGS))
+    return BASE, *with_one, WHOLE, *without_one
+
+
+def is_variant(method: str) -> bool:
+    """Whether a method exists for the ablation alone."""
+    return method in names() and method not in (BASE, WHOLE)
+
+
+def variants(methods: Collection[str]) -> list[Variant]:
+    """Those of `methods` that the ablation compares, in order."""
+    found = [name for name in names() if name in methods]
+    return [Variant(name, WHOLE if name.startswith(f"{WHOLE}-") else BASE) for name in found]
+
+
+def configs(whole: Config) -> dict[str, Config]:
+    """The variants that are no methods by themselves, by name."""
+    terms = whole.optimize.regularise
+
+    def with_terms(config: Config, **changes: object) -> Config:
+        changed = msgspec.structs.replace(config.optimize.regularise, **changes)
+        return msgspec.structs.replace(config, optimize=msgspec.structs.replace(config.optimize, regularise=changed))
+
+    with_one = {
+        f"{BASE}+{part}": with_terms(
+            whole, **{other: getattr(terms, field) if other == field else Term() for other in _LOSSES.values()}
+        )
+        for part, field in _LOSSES.items()
+    }
+    without_one = {f"{WHOLE}-{part}": with_terms(whole, **{field: Term()}) for part, field in _LOSSES.items()}
+    thick = msgspec.structs.replace(whole.pixelwise, down_sampling=_NO_THINNING)
+    fixed = msgspec.structs.replace(whole.optimize, refine_poses=False)
+    return {
+        **with_one,
+        **without_one,
+        f"{WHOLE}-pseudo-views": with_terms(whole, pseudo_views=0),
+        f"{WHOLE}-down-sampling": msgspec.structs.replace(whole, pixelwise=thick),
+        f"{WHOLE}-pose-refinement": msgspec.structs.replace(whole, optimize=fixed),
+    }

@@ -1,0 +1,91 @@
+"""bench.json: what a benchmark has measured, and on what. Everything that is drawn or told comes from it."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+import os
+import platform
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from recon.evaluate.protocol import Row, Settings
+from recon.export.staged import json_bytes
+from recon.report import versions
+
+
+class Bench(msgspec.Struct, frozen=True):
+    rows: tuple[Row, ...]
+    settings: Settings
+    machine: dict[str, Any]
+    command: str
+
+    def done(self) -> set[tuple[str, int, str, int]]:
+        """The runs (scene, views, method, seed) that have come to their end."""
+        return {run_of(row) for row in self.rows if row.final}
+
+
+def run_of(row: Row) -> tuple[str, int, str, int]:
+    return row.scene, row.views, row.method, row.seed
+
+
+def read_bench(path: Path) -> Bench:
+    """Raises FileNotFoundError, or ValueError where the file holds something else."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Bench)
+    except msgspec.DecodeError as error:
+        raise ValueError(f"{path} must be the bench.json of a benchmark: {error}") from error
+
+
+def merged(benches: Sequence[Bench]) -> Bench:
+    """The runs of several benchmarks, each run as the last of them has it. Raises ValueError if they scored otherwise.
+
+    Machine and command are all that were named.
+    """
+    if len({bench.settings for bench in benches}) != 1:
+        told = [dataclasses.asdict(bench.settings) for bench in benches]
+        raise ValueError(f"benchmarks can be put together if their views were scored alike, got settings {told}")
+    last = {run: number for number, bench in enumerate(benches) for run in bench.done()}
+    rows = tuple(row for number, bench in enumerate(benches) for row in bench.rows if last.get(run_of(row)) == number)
+    machine = {key: value for bench in benches for key, value in bench.machine.items()}
+    commands = dict.fromkeys(bench.command for bench in benches)
+    return Bench(rows, benches[0].settings, machine, "; ".join(commands))
+
+
+def bench_files(bench: Bench) -> dict[str, bytes]:
+    """bench.json and bench.csv."""
+    content = msgspec.to_builtins(bench)
+    return {"bench.json": json_bytes(content), "bench.csv": _csv(content["rows"])}
+
+
+def this_machine() -> dict[str, Any]:
+    """What the seconds were measured on."""
+    affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"processor": _processor(), "threads": affinity, **versions()}
+
+
+def _csv(records: Sequence[Mapping[str, Any]]) -> bytes:
+    """The rows with their seconds as columns of their own; empty where not measured."""
+    flat = []
+    for record in records:
+        seconds = {f"seconds_{stage}": value for stage, value in record["seconds"].items()}
+        flat.append({name: value for name, value in record.items() if name != "seconds"} | seconds)
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(flat[0]) if flat else [], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(flat)
+    return text.getvalue().encode()
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

@@ -1,0 +1,47 @@
+"""Renders of test views beside their photographs, as files that report.html shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from torch import Tensor
+
+from recon.evaluate.protocol import Row
+from recon.export.staged import write_files
+
+FOLDER = "renders"
+PHOTOGRAPH = "photograph.jpg"
+_QUALITY = 90
+
+
+@dataclass(frozen=True)
+class Renders:
+    """Of one run. The test views in `shown` are kept."""
+
+    out_dir: Path
+    scene: str
+    views: int
+    method: str
+    seed: int
+    shown: tuple[str, ...]
+
+    def keep(self, name: str, truth: Tensor, image: Tensor) -> None:
+        """A `recon.evaluate.protocol.Show`."""
+        if name in self.shown:
+            folder = self.out_dir / FOLDER / f"{self.scene}-{self.views}" / Path(name).stem
+            write_files(folder, {PHOTOGRAPH: _jpeg(truth), f"{self.method}-{self.seed}.jpg": _jpeg(image)})
+
+
+def kept(out_dir: Path, row: Row) -> dict[str, Path]:
+    """The render of each kept test view, by the view's name, for the run that `row` ends; none if nothing was kept."""
+    found = (out_dir / FOLDER / f"{row.scene}-{row.views}").glob(f"*/{row.method}-{row.seed}.jpg")
+    return {path.parent.name: path for path in sorted(found)}
+
+
+def _jpeg(image: Tensor) -> bytes:
+    pixels = np.rint(image.numpy() * 255).astype(np.uint8)
+    _, encoded = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return encoded.tobytes()

@@ -1,0 +1,109 @@
+"""A benchmark told to people: report.md, and report.html with charts and with renders beside their photographs."""
+
+from __future__ import annotations
+
+import html
+import logging
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from recon.evaluate.protocol import Row
+from recon.evaluate.records import Bench, bench_files
+from recon.evaluate.renders import PHOTOGRAPH, kept
+from recon.evaluate.tables import Table, number, tables
+from recon.export.staged import write_files
+
+logger = logging.getLogger(__name__)
+
+_STYLE = (
+    "body{font:15px/1.45 sans-serif;margin:2em auto;max-width:1500px;padding:0 1em;color:#222}"
+    "table{border-collapse:collapse;margin:1em 0;display:block;overflow-x:auto}td,th{border-bottom:1px solid #ddd;"
+    "padding:.25em .7em;text-align:right;white-space:nowrap}td:first-child,th:first-child{text-align:left}"
+    "img{max-width:100%}figure{display:inline-block;width:23%;margin:.4em}figcaption{font-size:13px;color:#666}"
+)
+
+
+def report_files(bench: Bench, out_dir: Path) -> dict[str, bytes]:
+    """report.md and report.html; the latter shows the charts and renders that lie in `out_dir`."""
+    told = tables(bench.rows)
+    return {"report.md": _markdown(bench, told).encode(), "report.html": _html(bench, told, out_dir).encode()}
+
+
+def redraw(bench: Bench, out_dir: Path) -> None:
+    """Everything that can be made of bench.json: the file itself, as CSV, the charts and both reports."""
+    write_files(out_dir, bench_files(bench) | _charts(bench))
+    write_files(out_dir, report_files(bench, out_dir))
+
+
+def _charts(bench: Bench) -> dict[str, bytes]:
+    """Those that there are numbers for; none without matplotlib to draw them."""
+    try:
+        from recon.evaluate import charts
+    except ImportError:
+        logger.warning("no charts: matplotlib is not installed. Run: pip install 'splatnode[bench]'")
+        return {}
+    drawn = charts.draw(bench.rows)
+    if not drawn:
+        logger.warning("no charts: no run published a scene that could be scored")
+    return drawn
+
+
+def _introduction(bench: Bench) -> str:
+    machine, settings = bench.machine, bench.settings
+    return (
+        f"Machine: {machine.get('processor')}, {machine.get('threads')} threads. Held-out views are scored after their "
+        f"pose was found in the finished scene ({settings.alignment_steps} steps, equation 18), at "
+        f"{settings.longer_side} px. Seconds are wall time of the reconstruction alone, with the cameras and points "
+        "that methods of one prior share. Means are over the runs that published a scene; `±`: standard deviation "
+        "between seeds; `–`: not measured."
+    )
+
+
+def _markdown(bench: Bench, told: Sequence[Table]) -> str:
+    lines = ["# Benchmark", "", f"Command: `{bench.command}`", "", _introduction(bench)]
+    for table in told:
+        rows = (table.head, ["---"] * len(table.head), *table.body)
+        lines += ["", f"## {table.title}", "", *(f"| {' | '.join(row)} |" for row in rows)]
+    return "\n".join(lines) + "\n"
+
+
+def _html(bench: Bench, told: Sequence[Table], out_dir: Path) -> str:
+    charts = [path.name for path in sorted(out_dir.glob("*.png"))]
+    parts = [
+        f"<h1>Benchmark</h1><p><code>{html.escape(bench.command)}</code></p><p>{html.escape(_introduction(bench))}</p>",
+        *(f'<p><img src="{name}" alt="{name}"></p>' for name in charts),
+        *(_html_table(table) for table in told),
+        *_galleries([row for row in bench.rows if row.final], out_dir),
+    ]
+    head = f'<meta charset="utf-8"><title>Benchmark</title><style>{_STYLE}</style>'
+    return f"<!DOCTYPE html><html><head>{head}</head><body>{''.join(parts)}</body></html>\n"
+
+
+def _html_table(table: Table) -> str:
+    def line(cells: Sequence[str], tag: str) -> str:
+        return f"<tr>{''.join(f'<{tag}>{html.escape(cell)}</{tag}>' for cell in cells)}</tr>"
+
+    body = "".join(line(row, "td") for row in table.body)
+    return f"<h2>{html.escape(table.title)}</h2><table>{line(table.head, 'th')}{body}</table>"
+
+
+def _galleries(ends: Sequence[Row], out_dir: Path) -> list[str]:
+    """For each set of photographs and each kept test view: the photograph, then every run's render of it."""
+    parts = []
+    for scene, views in dict.fromkeys((row.scene, row.views) for row in ends):
+        shown: dict[str, list[str]] = {}
+        for row in (row for row in ends if (row.scene, row.views) == (scene, views)):
+            for view, path in kept(out_dir, row).items():
+                photograph = _figure(path.parent / PHOTOGRAPH, f"{view}: photograph", out_dir)
+                told = f"{row.method}, seed {row.seed}: {number(row.psnr, 2)} dB over all views"
+                shown.setdefault(view, [photograph]).append(_figure(path, told, out_dir))
+        if shown:
+            parts.append(f"<h2>{html.escape(scene)}, {views} views</h2>")
+            parts += [f"<div>{''.join(figures)}</div>" for figures in shown.values()]
+    return parts
+
+
+def _figure(path: Path, caption: str, out_dir: Path) -> str:
+    source = html.escape(os.path.relpath(path, out_dir).replace(os.sep, "/"))
+    return f'<figure><img src="{source}" loading="lazy"><figcaption>{html.escape(caption)}</figcaption></figure>'
