@@ -40,6 +40,7 @@ class Weights:
 
 
 _GITHUB = "https://raw.githubusercontent.com"
+_HUGGING_FACE = "https://huggingface.co/depth-anything"
 CATALOGUE = (
     Weights(
         "mast3r/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth",
@@ -54,7 +55,32 @@ CATALOGUE = (
         "da3/da3-small.safetensors",
         "Depth Anything 3 Small: poses, intrinsics and depth of any number of views",
         "Apache-2.0",
-        "https://huggingface.co/depth-anything/DA3-SMALL/resolve/main/model.safetensors",
+        f"{_HUGGING_FACE}/DA3-SMALL/resolve/main/model.safetensors",
+        None,
+        None,
+    ),
+    Weights(
+        "depth_anything_v2/depth_anything_v2_vits.pth",
+        "Depth Anything V2 Small: depth and normals for the paper's losses, from single photographs",
+        "Apache-2.0",
+        f"{_HUGGING_FACE}/Depth-Anything-V2-Small/resolve/main/depth_anything_v2_vits.pth",
+        None,
+        None,
+    ),
+    Weights(
+        "depth_anything_v2/depth_anything_v2_metric_hypersim_vits.pth",
+        "Depth Anything V2 Metric Indoor Small: the scene's size in metres",
+        "Apache-2.0",
+        f"{_HUGGING_FACE}/Depth-Anything-V2-Metric-Hypersim-Small/resolve/main/"
+        "depth_anything_v2_metric_hypersim_vits.pth",
+        None,
+        None,
+    ),
+    Weights(
+        "dinov2/dinov2_vits14_pretrain.pth",
+        "DINOv2 ViT-S/14: the paper's semantic loss",
+        "Apache-2.0",
+        "https://dl.fbaipublicfiles.com/dinov2/dinov2_vits14/dinov2_vits14_pretrain.pth",
         None,
         None,
     ),

@@ -34,6 +34,19 @@ class Scratch(nn.Module):
         return self.refinenet1(fused, first)
 
 
+def resizers(widths: Sequence[int]) -> nn.ModuleList:
+    """What brings the images of four layers, all as large as the grid of patches, to 4, 2, 1 and 1/2 times that."""
+    first, second, _, last = widths
+    return nn.ModuleList(
+        [
+            nn.ConvTranspose2d(first, first, 4, stride=4),
+            nn.ConvTranspose2d(second, second, 2, stride=2),
+            nn.Identity(),
+            nn.Conv2d(last, last, 3, stride=2, padding=1),
+        ]
+    )
+
+
 class Fusion(nn.Module):
     def __init__(self, width: int, *, joins: bool = True) -> None:
         """`joins`: whether it can take a finer image in."""

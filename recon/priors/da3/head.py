@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from recon.networks.dinov2 import PATCH
-from recon.networks.fusion import Scratch, enlarged
+from recon.networks.fusion import Scratch, enlarged, resizers
 from recon.networks.transformer import Block, Mlp
 from recon.priors.da3.backbone import Size
 
@@ -24,14 +24,7 @@ class DepthHead(nn.Module):
         width, widths = size.head_width, size.head_layer_widths
         self.norm = nn.LayerNorm(2 * size.vit.width)
         self.projects = nn.ModuleList(nn.Conv2d(2 * size.vit.width, each, 1) for each in widths)
-        self.resize_layers = nn.ModuleList(
-            [
-                nn.ConvTranspose2d(widths[0], widths[0], 4, stride=4),
-                nn.ConvTranspose2d(widths[1], widths[1], 2, stride=2),
-                nn.Identity(),
-                nn.Conv2d(widths[3], widths[3], 3, stride=2, padding=1),
-            ]
-        )
+        self.resize_layers = resizers(widths)
         self.scratch = _DepthScratch(widths, width)
 
     def forward(self, layers: Sequence[Tensor], height: int, width: int) -> tuple[Tensor, Tensor]:

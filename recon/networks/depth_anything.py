@@ -1,0 +1,117 @@
+"""Depth Anything V2 (Yang et al. 2024): the depth of a single photograph, up to scale and offset or in metres.
+
+Written from the paper; modules carry the names of the official checkpoints, of which there are two kinds: for inverse
+depth of anything, and for metres indoors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor, nn
+
+from recon.networks import checkpoint, dinov2
+from recon.networks.crop import Crop, crop, cropped
+from recon.networks.dinov2 import PATCH, Dinov2, normalised
+from recon.networks.fusion import Scratch, enlarged, resizers
+from recon.weights import located
+
+RELATIVE = "depth_anything_v2/depth_anything_v2_vits.pth"
+METRIC = "depth_anything_v2/depth_anything_v2_metric_hypersim_vits.pth"
+INDOORS_M = 20.0  # metres at most, of the network for metres indoors
+_LONGER_SIDE = 518
+_DETAIL = 32
+
+
+@dataclass(frozen=True)
+class Size:
+    """The defaults are those of the published Small."""
+
+    vit: dinov2.Size = dinov2.SMALL
+    layers: tuple[int, int, int, int] = (2, 5, 8, 11)
+    head_width: int = 64
+    head_layer_widths: tuple[int, int, int, int] = (48, 96, 192, 384)
+
+
+SMALL = Size()
+
+
+class DepthAnythingV2(nn.Module):
+    def __init__(self, size: Size = SMALL, *, most_m: float | None = None) -> None:
+        """`most_m`: the network answers in metres up to this; None: it answers inverse depths."""
+        super().__init__()
+        self._layers, self._most_m = size.layers, most_m
+        self.pretrained = Dinov2(size.vit)
+        self.depth_head = _Head(size)
+
+    @torch.inference_mode()
+    def forward(self, image: Tensor) -> Tensor:
+        """(H, W) of a `recon.networks.dinov2.normalised` image (3, H, W), sides multiples of 14."""
+        raw = self.depth_head(self.pretrained(image[None], self._layers), *image.shape[1:])[0, 0]
+        return torch.relu(raw) if self._most_m is None else self._most_m * torch.sigmoid(raw)
+
+
+class _Head(nn.Module):
+    def __init__(self, size: Size) -> None:
+        super().__init__()
+        self.projects = nn.ModuleList(nn.Conv2d(size.vit.width, each, 1) for each in size.head_layer_widths)
+        self.resize_layers = resizers(size.head_layer_widths)
+        self.scratch = _HeadScratch(size.head_layer_widths, size.head_width)
+
+    def forward(self, layers: Sequence[Tensor], height: int, width: int) -> Tensor:
+        grid = height // PATCH, width // PATCH
+        images = [
+            resize(project(tokens[:, 1:].transpose(1, 2).unflatten(2, grid)))
+            for tokens, project, resize in zip(layers, self.projects, self.resize_layers, strict=True)
+        ]
+        fused = self.scratch.output_conv1(self.scratch.fused(images))
+        return self.scratch.output_conv2(enlarged(fused, (height, width)))
+
+
+class _HeadScratch(Scratch):
+    def __init__(self, widths: Sequence[int], width: int) -> None:
+        super().__init__(widths, width)
+        self.output_conv1 = nn.Conv2d(width, width // 2, 3, padding=1)
+        self.output_conv2 = nn.Sequential(
+            nn.Conv2d(width // 2, _DETAIL, 3, padding=1), nn.ReLU(), nn.Conv2d(_DETAIL, 1, 1)
+        )
+
+
+def load_network(path: Path, size: Size = SMALL, *, most_m: float | None = None) -> DepthAnythingV2:
+    """Raises ValueError where the file is damaged, holds another model or anything but data, and FileNotFoundError."""
+    build = partial(DepthAnythingV2, size, most_m=most_m)
+    return checkpoint.load_network(build, checkpoint.read_weights(path), path, "Depth Anything V2 Small")
+
+
+@dataclass(frozen=True, eq=False)
+class Monocular:
+    """Photographs through a network of either kind."""
+
+    network: DepthAnythingV2
+    name: str
+    longer_side: int = _LONGER_SIDE
+
+    def __call__(self, image: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.float32], Crop]:
+        """What the network says of an image (H, W, 3), and how that image was scaled and cut for it."""
+        to = crop(image.shape[1], image.shape[0], self.longer_side, PATCH)
+        return self.network(normalised(cropped(image, to))).numpy(), to
+
+
+def load_relative() -> Monocular | None:
+    """The network for inverse depths; None without weights. Raises ValueError where they are of another model."""
+    path = located(RELATIVE)
+    return None if path is None else Monocular(load_network(path), "Depth Anything V2 Small")
+
+
+def load_metric() -> Monocular | None:
+    """The network for metres indoors; None without weights. Raises ValueError where they are of another model."""
+    path = located(METRIC)
+    if path is None:
+        return None
+    return Monocular(load_network(path, most_m=INDOORS_M), "Depth Anything V2 Metric Indoor Small")

@@ -1,0 +1,67 @@
+"""A single photograph's depth, learned, brought to what several views say: known where they say nothing, too."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from recon.networks.crop import Crop
+from recon.priors.depth_normals import normals_of_depth
+from recon.priors.pointmap import Pointmap
+
+Map = npt.NDArray[np.float32]
+Network = Callable[[npt.NDArray[np.uint8]], tuple[Map, Crop]]  # image (h, w, 3) -> values (H, W), and their crop
+
+_ENOUGH = 50  # known pixels
+_FARTHEST = 20.0  # times the median depth: beyond, inverse depths say nothing
+
+
+def with_monocular(pointmap: Pointmap, image: npt.NDArray[np.uint8], network: Network) -> Pointmap:
+    """`pointmap` with the depth and the normals of `network`, which gives inverse depths up to scale and offset.
+
+    These two are fitted to the known depths. `image` (h, w, 3) is the view at modelled size. The confidence is 1 where
+    the network's depth is known. A view of which too little is known, or that the network contradicts, stays.
+    """
+    inverse = _at_image(*network(image), image.shape[:2])
+    known = (pointmap.depth > 0) & (inverse > 0)
+    if known.sum() < _ENOUGH:
+        return pointmap
+    slope, offset = _fitted(inverse[known], 1.0 / pointmap.depth[known], pointmap.confidence[known])
+    if slope <= 0:
+        return pointmap
+    fitted = slope * inverse + offset
+    usable = (inverse > 0) & (fitted > 1.0 / (_FARTHEST * np.median(pointmap.depth[known])))
+    depth = np.where(usable, 1.0 / np.where(usable, fitted, 1.0), 0.0).astype(np.float32)
+    return replace(
+        pointmap, depth=depth, confidence=usable.astype(np.float32), normal=normals_of_depth(depth, pointmap.K)
+    )
+
+
+def _at_image(values: Map, crop: Crop, size: tuple[int, ...]) -> Map:
+    """(h, w) of the image that was cropped; 0 outside of the crop."""
+    to_network = np.array([[crop.scale, 0, -crop.left], [0, crop.scale, -crop.top]])
+    to_network[:, 2] += 0.5 * crop.scale - 0.5  # from centres at whole numbers to such
+
+    def warped(source: Map, interpolation: int, border: int) -> Map:
+        flags = interpolation | cv2.WARP_INVERSE_MAP
+        return np.asarray(cv2.warpAffine(source, to_network, (size[1], size[0]), None, flags, border), np.float32)
+
+    inside = warped(np.ones_like(values), cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
+    return inside * warped(values, cv2.INTER_LINEAR, cv2.BORDER_REPLICATE)
+
+
+def _fitted(x: Map, y: Map, weights: Map) -> tuple[float, float]:
+    """Slope and offset of the line through (M,) points, by least absolute deviations."""
+    x64, y64, robust = x.astype(np.float64), y.astype(np.float64), weights.astype(np.float64) + 1e-6
+    slope, offset = 0.0, float(np.median(y64))
+    for _ in range(15):
+        share = robust / robust.sum()
+        mean_x, mean_y = share @ x64, share @ y64
+        slope = float(share @ ((x64 - mean_x) * (y64 - mean_y)) / max(share @ (x64 - mean_x) ** 2, 1e-18))
+        offset = float(mean_y - slope * mean_x)
+        robust = (weights + 1e-6) / np.maximum(np.abs(slope * x64 + offset - y64), 1e-4 * np.median(y64))
+    return slope, offset
