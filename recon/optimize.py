@@ -22,7 +22,7 @@ from recon.rasterize.cpu import rasterize
 from recon.rasterize.render import Render
 from recon.regularise import Regularisation
 from recon.scene import Scene
-from recon.target import Target, scaled, target
+from recon.target import Target, target
 
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # of Gaussians, that are optimised
 
@@ -128,7 +128,7 @@ class _Fit:
         assert render.rgb is not None  # it was asked for
         loss = photograph.loss(render.rgb)
         if self._terms is not None:
-            loss = loss + self._regularisation(self._terms, index, render, progress, 0.5 if half else 1.0)
+            loss = loss + self._regularisation(self._terms, index, render, progress)
         loss.backward()
         self._adam.lrs = {name: rate * decay for name, rate in self._rates.items()}
         self._adam.step()
@@ -171,16 +171,12 @@ class _Fit:
             channels=channels,
         )
 
-    def _regularisation(
-        self, terms: Regularisation, index: int, render: Render, progress: float, scale: float
-    ) -> Tensor | float:
-        """The terms on training view `index`, as rendered, and on a pseudo view at `scale` of its resolution."""
+    def _regularisation(self, terms: Regularisation, index: int, render: Render, progress: float) -> Tensor | float:
+        """The terms on training view `index`, as rendered, and on a pseudo view."""
 
         def draw(view: PseudoView, channels: Collection[str]) -> Render:
-            T_world_camera = torch.from_numpy(view.T_world_camera).float()
-            return self._render(
-                self._gaussians.opacities, T_world_camera, *scaled(torch.from_numpy(view.K), view.width, view.height, scale), channels
-            )
+            camera = torch.from_numpy(view.T_world_camera).float(), torch.from_numpy(view.K).float()
+            return self._render(self._gaussians.opacities, *camera, view.width, view.height, channels)
 
         parts = (terms.training_loss(index, render, progress), terms.pseudo_loss(draw, progress))
         return sum((part for part in parts if part is not None), 0.0)

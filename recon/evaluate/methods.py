@@ -49,8 +49,8 @@ def _instantsplat(iterations: int, terms: regularise.Config) -> Config:
 
 
 _NO_TERMS = regularise.Config()
-CONFIGS: dict[str, Config] = {
 _PAPER = _instantsplat(1000, regularise.PAPER)
+CONFIGS: dict[str, Config] = {
     **PRESETS,
     "instantsplat-s": _instantsplat(200, _NO_TERMS),
     ablation.BASE: _instantsplat(1000, _NO_TERMS),
