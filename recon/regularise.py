@@ -17,11 +17,12 @@ import torch
 from torch import Tensor
 
 from recon.losses.depth import local_depth_loss
-from recon.losses.lpips import load_lpips
 from recon.losses.normal import normal_loss
 from recon.losses.perceptual import Distance, load_perceptual
-from recon.losses.semantic import PooledFeatures, semantic_loss
+from recon.losses.semantic import load_encoder, semantic_loss
+from recon.networks.depth_anything import load_relative
 from recon.point_render import PointRender, render_points
+from recon.priors.monocular import with_monocular
 from recon.priors.pointmap import Pointmap
 from recon.pseudo_views import PseudoView, pseudo_views
 from recon.rasterize.render import Render
@@ -94,10 +95,12 @@ class Regularisation:
         self._config = config
         self._rng = np.random.default_rng(seed)
         self._draws = torch.Generator().manual_seed(seed)
-        self._training = [_known_from(pointmap, config.min_confidence) for pointmap in pointmaps]
+        full, self._depth_from = _depth_everywhere(
+            pointmaps, images if config.depth.weight or config.normal.weight else ()
+        )
+        self._training = [_known_from(pointmap, config.min_confidence) for pointmap in full]
         self._perceptual = load_perceptual() if config.point_render.weight else None
-        network = load_lpips("alex") if config.semantic.weight else None
-        self._encode = None if network is None else PooledFeatures(network)
+        self._encode = load_encoder() if config.semantic.weight else None
         with torch.no_grad():
             self._embeddings = [] if self._encode is None else [self._encode(_unit(image)) for image in images]
         self._pseudo = (
@@ -112,9 +115,9 @@ class Regularisation:
         if self._perceptual is not None:
             served["point_render"] = self._perceptual.name
         if config.depth.weight:
-            served["depth"] = "multi-view depth"
+            served["depth"] = self._depth_from
         if config.normal.weight:
-            served["normal"] = "normals of the multi-view depth"
+            served["normal"] = f"normals of the {self._depth_from}"
         if config.semantic.weight:
             served["semantic"] = "nothing: no weights" if self._encode is None else self._encode.name
         return served
@@ -187,6 +190,21 @@ def _lenses(pointmaps: Sequence[Pointmap], scale: float) -> tuple[list[npt.NDArr
     """K (3, 3) and size (width, height) of each view at `scale` of its resolution."""
     lenses = [scaled(torch.from_numpy(each.K), each.depth.shape[1], each.depth.shape[0], scale) for each in pointmaps]
     return [K.double().numpy() for K, _, _ in lenses], [(width, height) for _, width, height in lenses]
+
+
+def _depth_everywhere(
+    pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]]
+) -> tuple[Sequence[Pointmap], str]:
+    """Point maps with the depth that a network sees in each of `images`, where there is one; and whose depth it is.
+
+    The network never serves without `images`, nor in a view that contradicts it.
+    """
+    network = load_relative() if images else None
+    if network is None:
+        return pointmaps, "multi-view depth"
+    full = [with_monocular(pointmap, image, network) for pointmap, image in zip(pointmaps, images, strict=True)]
+    changed = sum(new is not old for new, old in zip(full, pointmaps, strict=True))
+    return full, f"depth of {network.name} (in {changed} of {len(full)} views, scaled by multi-view depth)"
 
 
 def _cloud(

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from recon.networks.crop import Crop
 from recon.priors.pointmap import Pointmap
 from recon.pseudo_views import PseudoView
 from recon.rasterize.render import Render
@@ -119,3 +120,36 @@ def test_terms_of_weight_zero_ask_for_nothing(without_networks):
     assert terms.channels(0.5) == ("rgb",)
     assert terms.training_loss(0, truth(0.0), 0.5) is None
     assert terms.pseudo_loss(lambda view, channels: truth(0.0), 0.5) is None
+
+
+def test_networks_serve_where_their_weights_are(monkeypatch):
+    """One that sees the true inverse depth up to scale and offset in one view, and its opposite in the other."""
+
+    class Seer:
+        name = "a network"
+
+        def __call__(self, image):
+            at_zero = np.array_equal(image, wall(0.0, 0)[1])
+            inverse = 30.0 / wall(0.0 if at_zero else 0.4, 0)[0].depth + 5.0
+            return inverse if at_zero else 40.0 - inverse, Crop(1.0, 0, 0, WIDTH, HEIGHT)
+
+    class Encoder:
+        name = "an encoder"
+
+        def __call__(self, image):
+            return torch.nn.functional.normalize(image.mean((0, 1)), dim=0)
+
+    monkeypatch.setattr("recon.regularise.load_relative", Seer)
+    monkeypatch.setattr("recon.regularise.load_encoder", Encoder)
+    pointmaps, images = zip(*(wall(x, i) for i, x in enumerate((0.0, 0.4))), strict=True)
+    for pointmap in pointmaps:
+        pointmap.depth[:, ::3] = 0  # several views know only a part
+    served = Regularisation(pointmaps, images, PAPER, seed=0)
+    depth = "depth of a network (in 1 of 2 views, scaled by multi-view depth)"
+    assert served.served_by["depth"] == depth and served.served_by["normal"] == f"normals of the {depth}"
+    assert served.served_by["semantic"] == "an encoder"
+    right, progress = truth(0.0), 0.3
+    wrong = Render(right.rgb, right.depth.flip(1), right.normal, None)
+    losses = [float(served.training_loss(0, render, progress)) for render in (right, wrong)]
+    assert losses[0] < 1e-3 < losses[1]
+    assert Regularisation(pointmaps, images, Config(), seed=0).served_by == {}

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from recon.losses.lpips import Lpips
+from recon.losses.dino import load_dino
+from recon.losses.lpips import Lpips, load_lpips
 
 
 class Encoder(Protocol):
@@ -30,6 +31,15 @@ class PooledFeatures:
 
     def __call__(self, image: Tensor) -> Tensor:
         return functional.normalize(self.network.features(image)[-1].mean((0, 2, 3)), dim=0)
+
+
+def load_encoder() -> Encoder | None:
+    """DINOv2, as in the paper, else the features of LPIPS; None without weights of either."""
+    dino = load_dino()
+    if dino is not None:
+        return dino
+    network = load_lpips("alex")
+    return None if network is None else PooledFeatures(network)
 
 
 def semantic_loss(embedding: Tensor, truth: Tensor) -> Tensor:
