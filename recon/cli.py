@@ -134,6 +134,7 @@ def _config(args: argparse.Namespace) -> Config:
         "seed": args.seed,
         "budget_s": args.budget_s,
         "max_gaussians": args.max_gaussians,
+        "max_mb": args.max_mb,
     }
     return msgspec.structs.replace(config, **{key: value for key, value in flags.items() if value is not None})
 
@@ -173,6 +174,8 @@ def _tell(snapshot: Snapshot, out: Path, report: dict[str, object], *, as_json: 
     held_out = report.get("held_out")
     if isinstance(held_out, dict):
         print(f"held-out views: {held_out['psnr']:.1f} dB PSNR, {held_out['ssim']:.3f} SSIM")
+    for hit in snapshot.budget:
+        print(hit["message"])
     if verdict.publishable:
         counts = f"{len(snapshot.gaussians)} Gaussians, {len(snapshot.cameras)} cameras"
         print(f"{snapshot.seconds['total']:.1f} s, {counts}")

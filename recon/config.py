@@ -9,6 +9,9 @@ import msgspec
 
 from capture.config import Plugin, merged, typed
 from recon import background, completion, density, judge, optimize, pixelwise, screening
+from recon.control import prune
+from recon.control.control import ControlChoice
+from recon.export.ply import most_in_ply
 from recon.priors import classical
 from recon.verification import verify
 
@@ -19,6 +22,9 @@ class PriorChoice(Plugin):
     package = "recon.priors"
     needs = ("Config", "load")
     usual = "classical"
+
+
+PRUNING = ControlChoice("prune", prune.Config())
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -33,16 +39,31 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     background: background.Config = background.Config()
     pixelwise: pixelwise.Config | None = None  # in place of completion, density and background, for comparison
     preview: optimize.Config = optimize.Config(iterations=30, half_resolution_share=1.0)  # after each keyframe
-    optimize: optimize.Config = optimize.Config()  # after the last one
+    optimize: optimize.Config = optimize.Config(control=PRUNING)  # after the last one
     max_gaussians: int | None = None  # None: as many as the scene calls for
+    max_mb: float | None = None  # of scene.ply, in 10^6 bytes; None: as large as it gets
+    surplus: float = 2.0  # with such a limit a scene begins with this many times as many; its control leaves the best
     budget_s: float | None = None  # seconds for everything, from the first frame; None: as many as it takes
+
+    @property
+    def most_gaussians(self) -> int | None:
+        """How many the scene may have, by both limits; None: there is none."""
+        by_size = None if self.max_mb is None else most_in_ply(round(self.max_mb * 1e6))
+        limits = [limit for limit in (self.max_gaussians, by_size) if limit is not None]
+        return min(limits, default=None)
+
+    @property
+    def first_gaussians(self) -> int | None:
+        """How many it may begin with."""
+        most = self.most_gaussians
+        return most if most is None or self.optimize.control is None else round(self.surplus * most)
 
 
 PRESETS: dict[str, Config] = {
-    "preview": Config(size=384, optimize=optimize.Config(iterations=150)),
-    "fast": Config(optimize=optimize.Config(iterations=250)),
+    "preview": Config(size=384, optimize=optimize.Config(iterations=150, control=PRUNING)),
+    "fast": Config(optimize=optimize.Config(iterations=250, control=PRUNING)),
     "balanced": Config(),
-    "quality": Config(optimize=optimize.Config(iterations=1500, checkpoints=(150, 500))),
+    "quality": Config(optimize=optimize.Config(iterations=1500, checkpoints=(150, 500), control=PRUNING)),
 }
 
 

@@ -32,7 +32,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_confidence: float = 0.05  # pixels below get no Gaussian
     largest_px: int = 64  # side of a square beyond which no piece reaches
     smallest_px: float = 3.0  # area of a piece that is not divided
-    most_error: float = 0.06  # squared deviation of colours in [0, 1], summed over a piece's pixels and channels
+    most_error: float = 0.015  # squared deviation of colours in [0, 1], summed over a piece's pixels and channels
     depth_weight: float = 2.0  # a relative difference of depth counts as this many times the difference of colour
     noise: float = 0.01  # standard deviation of colours in [0, 1] that is not worth a Gaussian
     footprint: float = 1.2  # standard deviations of a new Gaussian in units of its piece's

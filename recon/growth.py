@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from recon.config import Config
-from recon.gaussians import Gaussians, concatenate
+from recon.gaussians import concatenate
 from recon.geometry import align_cameras
 from recon.priors.classical import modelled_K
 from recon.priors.pointmap import Pointmap
@@ -95,7 +95,7 @@ def grow(
     ids = torch.tensor([view.frame_id for view in views], dtype=torch.int32)
     fresh = begun.gaussians.subset(torch.isin(begun.gaussians.source_frame, ids))
     grown = concatenate([scene.gaussians, fresh])
-    return replace(scene, views=scene.views + views, gaussians=_most_visible(grown, config.max_gaussians))
+    return within(replace(scene, views=scene.views + views, gaussians=grown), config.most_gaussians)
 
 
 def without(scene: Scene, names: Collection[str]) -> Scene:
@@ -125,9 +125,11 @@ def _neighbours(graph: ViewGraph, index: int, registered: Collection[int]) -> li
     return sorted(matches, key=lambda other: -matches[other])[:NEIGHBOURS]
 
 
-def _most_visible(gaussians: Gaussians, limit: int | None) -> Gaussians:
-    """At most `limit` of the Gaussians: those that cover most."""
+def within(scene: Scene, limit: int | None) -> Scene:
+    """The scene with at most `limit` Gaussians: those that cover most."""
+    gaussians = scene.gaussians
     if limit is None or len(gaussians) <= limit:
-        return gaussians
+        return scene
     across = gaussians.scales.topk(2, dim=1).values.prod(1)
-    return gaussians.subset((gaussians.opacities * across).topk(limit).indices.sort().values)
+    kept = (gaussians.opacities * across).topk(limit).indices.sort().values
+    return replace(scene, gaussians=gaussians.subset(kept))

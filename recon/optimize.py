@@ -53,14 +53,17 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     control: ControlChoice | None = None  # what adds and takes away Gaussians meanwhile
 
 
-def refine(scene: Scene, config: Config, *, seed: int, deadline: float | None = None) -> Iterator[Scene]:
+def refine(
+    scene: Scene, config: Config, *, seed: int, deadline: float | None = None, max_gaussians: int | None = None
+) -> Iterator[Scene]:
     """The scene at every checkpoint and at the end, after at most `config.iterations` steps of one view each.
 
     `deadline` is a time of `time.monotonic()`: the step sizes fall so that they are at their end by then.
+    `max_gaussians` is how many there may be at the end; it is for the control to see to that.
     The first view stays where it is: it is the world.
     """
     with _single_torch_thread():
-        fit = _Fit(scene, config, seed)
+        fit = _Fit(scene, config, seed, max_gaussians)
         order = np.random.default_rng(seed)
         started = time.monotonic()
         queue: list[int] = []
@@ -75,7 +78,7 @@ def refine(scene: Scene, config: Config, *, seed: int, deadline: float | None = 
             fit.step(queue.pop(), progress)
             if iteration + 1 in config.checkpoints and iteration + 1 < config.iterations:
                 yield fit.scene()
-        yield fit.scene()
+        yield replace(fit.scene(), losses=tuple(fit.losses))
 
 
 @contextmanager
@@ -92,8 +95,8 @@ def _single_torch_thread() -> Iterator[None]:
 class _Fit:
     """Parameters, targets and optimisers of one refinement."""
 
-    def __init__(self, scene: Scene, config: Config, seed: int) -> None:
-        self._scene, self._config = scene, config
+    def __init__(self, scene: Scene, config: Config, seed: int, max_gaussians: int | None = None) -> None:
+        self._scene, self._config, self._max_gaussians = scene, config, max_gaussians
         gaussians = scene.gaussians.map(lambda tensor: tensor.clone())
         self._gaussians = gaussians
         rates = config.rates
@@ -113,6 +116,7 @@ class _Fit:
         ]
         self._terms = _terms(scene, config.regularise, seed)
         self._iterations = scene.iterations
+        self.losses: list[float] = []  # photometric, of each step
 
     def step(self, index: int, progress: float) -> None:
         """One iteration on view `index`; `progress` in [0, 1] sets resolution and step sizes."""
@@ -127,6 +131,7 @@ class _Fit:
         render = self._render(opacities, T_world_camera, photograph.K, photograph.width, photograph.height, channels)
         assert render.rgb is not None  # it was asked for
         loss = photograph.loss(render.rgb)
+        self.losses.append(float(loss.detach()))
         if self._terms is not None:
             loss = loss + self._regularisation(self._terms, index, render, progress)
         loss.backward()
@@ -135,15 +140,25 @@ class _Fit:
         if refine_pose and T_world_camera.grad is not None:
             self._move_camera(index, twist_gradient(T_world_camera.detach(), T_world_camera.grad), pose_decay)
         self._iterations += 1
-        self._control_density(index, self._targets[half])
+        self._control_density(index, self._targets[half], progress)
         self._adam.zero_grad()
 
-    def _control_density(self, index: int, targets: Sequence[Target]) -> None:
+    def _control_density(self, index: int, targets: Sequence[Target], progress: float) -> None:
         if self._control is None:
             return
         cameras = tuple(T.detach() for T in self._Ts_world_camera)
-        made = self._iterations - self._scene.iterations
-        change = self._control.after_step(Step(made, self._config.iterations, index, self._gaussians, cameras, targets))
+        change = self._control.after_step(
+            Step(
+                iteration=self._iterations - self._scene.iterations,
+                iterations=self._config.iterations,
+                progress=progress,
+                view=index,
+                gaussians=self._gaussians,
+                Ts_world_camera=cameras,
+                targets=targets,
+                max_gaussians=self._max_gaussians,
+            )
+        )
         if change is not None:
             self._gaussians = change.gaussians
             self._adam.follow(_leaves(change.gaussians), change.origin)

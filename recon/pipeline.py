@@ -13,6 +13,7 @@ import msgspec
 
 from capture.frame import DroppedFrame, Frame
 from recon import growth, optimize
+from recon.budget import hits
 from recon.clock import Clock
 from recon.config import Config
 from recon.judge import hopeless, judge
@@ -234,7 +235,7 @@ class Reconstruction:
             config.completion,
             config.density,
             config.background,
-            config.max_gaussians,
+            config.first_gaussians,
             config.pixelwise,
         )
         self.clock.lap("points")
@@ -244,20 +245,22 @@ class Reconstruction:
         if scene is None:
             return
         self.clock.lap("wait")
-        for refined in optimize.refine(scene, config, seed=self.config.seed, deadline=deadline):
+        most = self.config.most_gaussians
+        for refined in optimize.refine(scene, config, seed=self.config.seed, deadline=deadline, max_gaussians=most):
             self.clock.lap("optimise")
             yield refined
             self.clock.lap("wait")
 
     def show(self, scene: Scene | None) -> None:
-        """Makes `scene` the one that snapshots show."""
-        self.scene = scene
+        """Makes `scene`, or as much of it as there may be, the one that snapshots show."""
+        self.scene = None if scene is None else growth.within(scene, self.config.most_gaussians)
 
     def snapshot(self, final: bool = False) -> Snapshot:
         self.sequence += 1
         _, verdict = self.judge()
         evidence = self._judged[tuple(self.names), len(self.rejected)][1]
         scene = self.scene if verdict.publishable else None
+        bound = hits(self.config, self.begun, scene, self.clock.booked) if final else ()
         snapshot = Snapshot(
             sequence=self.sequence,
             verdict=verdict,
@@ -267,6 +270,7 @@ class Reconstruction:
             dropped=tuple(self.dropped),
             iterations=scene.iterations if scene else 0,
             seconds=self.clock.booked,
+            budget=tuple(hit.record() for hit in bound),
             final=final,
             served_by=scene.served_by if scene else {},
             evidence=record(evidence) if evidence is not None else None,

@@ -42,6 +42,7 @@ def build_report(
         "num_gaussians": len(gaussians),
         "scene_bytes": ply_bytes(len(gaussians), gaussians.sh.shape[1]) if verdict.publishable else 0,
         "iterations": snapshot.iterations,
+        "budget": [dict(hit) for hit in snapshot.budget],
         "served_by": dict(snapshot.served_by),
         "cameras": [camera_record(camera) for camera in snapshot.cameras],
         "frames_used": [camera.name for camera in snapshot.cameras],

@@ -46,6 +46,8 @@ class Scene:
     views: tuple[View, ...]
     gaussians: Gaussians
     iterations: int = 0
+    losses: tuple[float, ...] = ()  # photometric, of each iteration of a refinement that has ended
+    called_for: int = 0  # Gaussians that it would have begun with but for a limit
     served_by: Mapping[str, str] = field(default_factory=dict)  # network or measure, by regularisation that was used
 
     def cameras(self) -> tuple[CameraEstimate, ...]:
@@ -112,5 +114,8 @@ def begin(
     completed = list(map(completion.only, completion.complete(telling, pictures, completing), shown))
     behind = background.background(telling, pictures, shell, None if max_gaussians is None else max_gaussians // 10)
     left = None if max_gaussians is None else max_gaussians - len(behind)
-    surfaces = density.initial_gaussians(completed, pictures, sampling, left)
-    return Scene(views, concatenate([surfaces, behind]))
+    surfaces = density.initial_gaussians(completed, pictures, sampling)
+    called_for = len(surfaces) + len(behind)
+    if left is not None and len(surfaces) > left:
+        surfaces = density.initial_gaussians(completed, pictures, sampling, left)
+    return Scene(views, concatenate([surfaces, behind]), called_for=called_for)

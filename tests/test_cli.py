@@ -111,6 +111,7 @@ def test_signals_end_a_verb_cleanly(number, code):
         (["replay", "photos", "--out", "o", "--views", "0"], "must be a whole number, 1 or more"),
         (["replay", "photos", "--out", "o", "--size", "big"], "must be a whole number, 1 or more"),
         (["replay", "photos", "--out", "o", "--budget-s", "nan"], "must be a number of seconds above 0"),
+        (["replay", "photos", "--out", "o", "--max-mb", "0"], "must be a number of megabytes above 0"),
         (["replay", "photos", "--out", "o", "--views", "3", "--frames", "a,b,c"], "not allowed with"),
         (["replay", "photos", "--out", "o", "--frames", "a,,c"], "commas between them"),
         (["export", "scene.ply", "--to", "docx"], "choose from"),
@@ -134,7 +135,7 @@ def test_replay_flags_arrive_and_unset_ones_are_none():
     args = parser.parse_args(["replay", "photos", "--out", "o", "--frames", "a.jpg, b.jpg", "--budget-s", "2.5"])
     assert args.frames == ("a.jpg", "b.jpg")
     assert args.budget_s == 2.5
-    for unset in ("config", "preset", "prior", "size", "max_gaussians", "seed", "views"):
+    for unset in ("config", "preset", "prior", "size", "max_gaussians", "max_mb", "seed", "views"):
         assert getattr(args, unset) is None
     assert not args.json
 

@@ -20,7 +20,7 @@ from capture.frame import DroppedFrame
 from recon.export import ResultWriteError, SceneFileError, export_scene, read_cameras, read_gaussians, write_result
 from recon.export import staged as staged_module
 from recon.export.cameras import encode_colmap, encode_nerfstudio, encode_tum
-from recon.export.ply import decode_ply, encode_ply, ply_bytes
+from recon.export.ply import decode_ply, encode_ply, most_in_ply, ply_bytes
 from recon.export.prepare import SH_C0, viewer_safe
 from recon.export.quaternions import matrices_from_quats, quats_from_matrices
 from recon.export.splat import decode_splat, encode_splat
@@ -128,6 +128,14 @@ def test_ply_layout_is_the_published_one():
     # f_rest holds red's coefficients, then green's, then blue's.
     expected = [1, 2, 3, 0, 0, 0, 0, 1, 2, 3, 6, 9, 4, 7, 10, 5, 8, 11, 0, 0, 1, 2, 0.5, 0.5, -0.5, 0.5]
     assert np.allclose(np.frombuffer(body, "<f4"), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 9, 10, 12_345, 99_999, 100_000])
+def test_as_many_fit_into_a_ply_of_a_size_as_its_size_says(count):
+    exactly = ply_bytes(count, 1)
+    assert count - 1 <= most_in_ply(exactly) <= count
+    assert ply_bytes(most_in_ply(exactly), 1) <= exactly
+    assert most_in_ply(10) == 1
 
 
 def test_ply_of_another_program_may_have_another_order_and_more_properties():

@@ -25,11 +25,13 @@ class Step:
     """An iteration that the optimiser has just made."""
 
     iteration: int  # 1 for the first
-    iterations: int  # how many there are to be
+    iterations: int  # how many there are to be, if time allows
+    progress: float  # in [0, 1]: how much of the refinement had been done before this step, by iterations and by time
     view: int  # index of the training view that was rendered
     gaussians: Gaussians  # the optimiser's own, after the step; `.grad` is still that of the step. Not to be written to
     Ts_world_camera: Sequence[Tensor]  # (4, 4) each, of all training views, as they are now
     targets: Sequence[Target]  # their photographs, at the resolution of this step
+    max_gaussians: int | None  # how many there may be at the end
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,7 @@ from recon.export.prepare import unknown_source
 from recon.snapshot import GaussianArrays
 
 _LONGEST_HEADER = 65536
+_LONGER_HEADER = 8  # bytes by which a header with a large number exceeds one with a single digit
 _NORMAL = ("nx", "ny", "nz")  # part of the layout, always zero and never read
 _TYPES = {
     **{name: "<i1" for name in ("char", "int8")},
@@ -47,6 +48,13 @@ def encode_ply(gaussians: GaussianArrays) -> bytes:
 def ply_bytes(num_gaussians: int, num_bases: int) -> int:
     """The size of `encode_ply`'s result."""
     return len(_header(num_gaussians, num_bases)) + 4 * num_gaussians * len(_property_names(num_bases))
+
+
+def most_in_ply(num_bytes: int, num_bases: int = 1) -> int:
+    """How many Gaussians a file of at most that size holds; at least 1."""
+    for_one = ply_bytes(1, num_bases)
+    further = (num_bytes - for_one - _LONGER_HEADER) // (4 * len(_property_names(num_bases)))
+    return max(1, 1 + further)
 
 
 def decode_ply(data: bytes, name: str = "scene.ply") -> GaussianArrays:

@@ -1,0 +1,98 @@
+"""Pruning: what a Gaussian is worth, against leaving it out, and what is kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from msgspec import structs
+
+from recon.background import SOURCE_FRAME
+from recon.control.control import ControlChoice, Step
+from recon.control.prune import Config, changes_without, load, most_worth
+from recon.gaussians import Gaussians, concatenate
+from recon.optimize import Config as Optimising
+from recon.optimize import refine
+from recon.scene import Scene, View
+from recon.target import Target, target
+from tests.test_optimize import render, truth  # noqa: F401  a fixture
+
+
+def targets_of(scene: Scene, scale: float = 1.0) -> list[Target]:
+    return [target(view, np.ones(view.image.shape[:2], bool), scale, 0.2) for view in scene.views]
+
+
+def worth(scene: Scene, probes: int, scale: float = 1.0) -> torch.Tensor:
+    Ts_world_camera = [view.T_world_camera for view in scene.views]
+    generator = torch.Generator().manual_seed(0)
+    return changes_without(scene.gaussians, Ts_world_camera, targets_of(scene, scale), probes, generator)
+
+
+def left_out(gaussians: Gaussians, view: View, index: int) -> float:
+    """The squared difference to the picture without Gaussian `index`, as worth is counted."""
+    others = gaussians.subset(torch.arange(len(gaussians)) != index)
+    difference = render(gaussians, view) - render(others, view)
+    return float((difference**2).sum()) * (512 / max(view.width, view.height)) ** 2
+
+
+def test_the_worth_of_a_gaussian_is_what_leaving_it_out_changes(truth):  # noqa: F811
+    faint = replace(truth.gaussians, logit_opacities=truth.gaussians.logit_opacities - 1.0)  # no alpha is clamped
+    scene = replace(truth, gaussians=faint)
+    estimated = worth(scene, probes=64)
+    exact = torch.tensor([sum(left_out(faint, view, i) for view in scene.views) for i in range(len(faint))])
+    seen = exact > 1e-2 * exact.max()
+    assert seen.sum() > 5
+    torch.testing.assert_close(estimated[seen].log(), exact[seen].log(), rtol=0, atol=0.5)
+    assert torch.equal(estimated[exact == 0], exact[exact == 0])
+
+
+def test_photographs_of_another_size_are_worth_about_the_same(truth):  # noqa: F811
+    ratio = worth(truth, 64, scale=0.5) / worth(truth, 64)
+    assert 0.7 < float(ratio.nanmedian()) < 1.4
+
+
+def test_of_too_many_the_best_are_kept_in_their_order():
+    values = torch.tensor([0.5, 3.0, 0.1, 2.0, 9.0])
+    assert most_worth(values, 0.4, None).tolist() == [0, 1, 3, 4]
+    assert most_worth(values, 0.4, 2).tolist() == [1, 4]
+    assert most_worth(values, 0.4, 9).tolist() == [0, 1, 3, 4]
+
+
+def pruned(scene: Scene, config: Config, limit: int | None = None) -> Scene:
+    optimising = Optimising(iterations=4, checkpoints=(), control=ControlChoice("prune", config))
+    return list(refine(scene, optimising, seed=0, max_gaussians=limit))[-1]
+
+
+def test_what_no_photograph_shows_goes_and_the_far_shell_stays(truth):  # noqa: F811
+    behind = replace(truth.gaussians, means=truth.gaussians.means - torch.tensor([0.0, 0.0, 1e3]))
+    ids = torch.full((len(behind),), 77, dtype=torch.int32)
+    unseen, shell = replace(behind, source_frame=ids), replace(behind, source_frame=0 * ids + SOURCE_FRAME)
+    scene = replace(truth, gaussians=concatenate([unseen, truth.gaussians, shell]))
+    found = pruned(scene, Config(least_change=1e-6)).gaussians.source_frame
+    assert not (found == 77).any()
+    assert (found == SOURCE_FRAME).sum() == len(shell)
+    assert ((found != 77) & (found != SOURCE_FRAME)).sum() > len(truth.gaussians) / 2
+
+
+@pytest.mark.parametrize("limit", [1, 7])
+def test_a_limit_is_kept_to_the_one(truth, limit):  # noqa: F811
+    assert len(pruned(truth, Config(), limit).gaussians) == limit
+
+
+def test_it_is_done_once_when_it_is_due_however_fast_time_goes(truth):  # noqa: F811
+    control = load(Config(at=(0.3, 0.6), least_change=0.0), seed=0)
+    step = Step(1, 9, 0.0, 0, truth.gaussians, [v.T_world_camera for v in truth.views], targets_of(truth), None)
+    changed = [
+        control.after_step(replace(step, progress=progress)) is not None for progress in (0.2, 0.4, 0.5, 0.9, 0.95)
+    ]
+    assert changed == [False, True, False, True, False]
+    late = load(Config(at=(0.3, 0.6)), seed=0)
+    assert [late.after_step(replace(step, progress=progress)) is not None for progress in (0.9, 0.95)] == [True, False]
+
+
+def test_the_same_seed_prunes_the_same(truth):  # noqa: F811
+    few = structs.replace(Config(), probes=1)
+    first, second = (pruned(truth, few, 9).gaussians.means for _ in range(2))
+    assert torch.equal(first, second)
