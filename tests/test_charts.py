@@ -100,7 +100,7 @@ def test_ablation_compares_run_by_run():
         "paper  vs. instantsplat-xl",
         "paper-depth  vs. paper",
     ]
-    assert [bar.get_width() for bar in chart.patches] == pytest.approx([-0.25, 1.0, -0.2])
+    assert [bar.get_bbox().width for bar in chart.patches] == pytest.approx([-0.25, 1.0, -0.2])
     told = {table.title: table.body for table in tables(ABLATION)}["Ablation"]
     assert ("instantsplat-xl+depth", "instantsplat-xl", "20.75", "-0.25", "0.8000", "+0.0000", "2") in told
 

@@ -14,7 +14,6 @@ import pytest
 
 from recon import rim
 from recon.evaluate.protocol import Run, evaluate, mean_intrinsics
-from recon.evaluate.splits import load_split, paper_split
 from recon.evaluate.truth import load_scene
 from recon.export import write_result
 from recon.export.cameras import encode_cameras, encode_colmap, encode_nerfstudio
@@ -58,48 +57,6 @@ def score(snapshot: Snapshot, folder: Path, **settings):
         networks=NO_NETWORKS,
         settings=replace(QUICK, **settings),
     )
-
-
-# --- splits
-
-
-def test_paper_split_of_24_frames():
-    names = [str(i) for i in range(24)]
-    assert paper_split(names, 3).train == ("0", "11", "23")
-    assert paper_split(names, 6).train == ("0", "5", "9", "13", "17", "23")
-    assert paper_split(names, 12).train == ("0", "3", "5", "7", "9", "11", "13", "15", "17", "19", "21", "23")
-    assert paper_split(names, 3).test == ("1", "2", "4", "6", "8", "10", "12", "14", "16", "18", "20", "22")
-
-
-@pytest.mark.parametrize("count", [6, 11, 23, 30, 100])
-def test_no_image_both_trains_and_tests(count):
-    names = [f"{i:03d}" for i in range(count)]
-    split = paper_split(names, 3)
-    assert len(set(split.train)) == 3 and not set(split.train) & set(split.test)
-    assert len(split.test) == min(12, count // 2)
-    assert split.train[0] == names[0] and split.train[-1] == names[-1]
-
-
-def test_more_views_than_there_are_is_a_clear_error():
-    with pytest.raises(ValueError, match="views must be 1 to 5 for 10 images, got 6"):
-        paper_split([str(i) for i in range(10)], 6)
-
-
-def test_listed_split_wins_over_the_paper_s(scene_folder, tmp_path):
-    assert load_split(scene_folder, NAMES, 3) == SPLIT
-    with pytest.raises(ValueError, match="must list train6 for blobs"):
-        load_split(scene_folder, NAMES, 6)
-    assert load_split(tmp_path / "elsewhere", NAMES, 2) == paper_split(NAMES, 2)
-
-
-def test_recorded_scenes_are_complete(shared):
-    splits = json.loads((shared / "scenes" / "splits.json").read_text())
-    for name in splits:
-        folder = shared / "scenes" / name
-        scene = load_scene(folder)
-        split = load_split(folder, list(scene.paths), 3)
-        assert len(split.train) == 3 and not set(split.train) & set(split.test)
-        assert set(split.train + split.test) <= set(scene.cameras), f"{name} must know its cameras"
 
 
 # --- scenes

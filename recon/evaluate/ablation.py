@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from recon import density
+from recon import density, pixelwise
 from recon.config import Config
 from recon.regularise import Term
 
@@ -60,7 +60,7 @@ def configs(whole: Config) -> dict[str, Config]:
         for part, field in _LOSSES.items()
     }
     without_one = {f"{WHOLE}-{part}": with_terms(whole, **{field: Term()}) for part, field in _LOSSES.items()}
-    thick = msgspec.structs.replace(whole.pixelwise, down_sampling=_NO_THINNING)
+    thick = msgspec.structs.replace(whole.pixelwise or pixelwise.Config(), down_sampling=_NO_THINNING)
     fixed = msgspec.structs.replace(whole.optimize, refine_poses=False)
     return {
         **with_one,

@@ -79,7 +79,7 @@ def run_bench(
     FileNotFoundError for a scene or split that is not there, before anything is run.
     """
     sets = [
-        (scene, load_split(folder, list(scene.paths), views))
+        (scene, load_split(folder, list(scene.cameras), views))
         for scene, folder, views in ((load_scene(f), f, v) for f, v in itertools.product(plan.scenes, plan.views))
     ]
     known = read_bench(out_dir / "bench.json") if resume and (out_dir / "bench.json").exists() else None

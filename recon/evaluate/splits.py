@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from recon.evaluate.truth import scene_folder
+
 _PAPER_FRAMES, _PAPER_TEST = 24, 12
 
 
@@ -23,13 +25,14 @@ def load_split(folder: Path, names: Sequence[str], views: int) -> Split:
 
     It is that of the splits.json beside the scene's folder where that lists the scene, else the paper's of `names`.
     """
-    listed = folder.parent / "splits.json"
+    place = scene_folder(folder)
+    listed = place.parent / "splits.json"
     splits = json.loads(listed.read_text()) if listed.is_file() else {}
-    if folder.name not in splits:
+    if place.name not in splits:
         return paper_split(names, views)
-    split = splits[folder.name]
+    split = splits[place.name]
     if f"train{views}" not in split:
-        raise ValueError(f"{listed} must list train{views} for {folder.name}, has {sorted(split)}")
+        raise ValueError(f"{listed} must list train{views} for {place.name}, has {sorted(split)}")
     return Split(tuple(split[f"train{views}"]), tuple(split["test"]))
 
 

@@ -15,6 +15,7 @@ from capture.frame import Frame
 from recon.export import read_cameras
 
 _SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+_CHOSEN = "24_views"  # of InstantSplat's data sets: the frames that its protocol uses
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
@@ -54,18 +55,26 @@ def load_scene(folder: Path) -> EvaluationScene:
     """The scene in `folder`: images/ and one of cameras.json, transforms.json or sparse/0, in this order.
 
     cameras.json is ours ("cameras": T_world_camera) or that of recorded data sets ("images": R, t); transforms.json is
-    nerfstudio's; sparse/0 is a COLMAP model, text or binary. Images must be undistorted. Raises FileNotFoundError where
-    a part is missing, ValueError where it cannot be what it should be.
+    nerfstudio's; sparse/0 is a COLMAP model, text or binary. Tanks and Temples and MVImgNet as InstantSplat gives them
+    have all that in a folder 24_views of the scene's, which is found from either. Images must be undistorted. Raises
+    FileNotFoundError where a part is missing, ValueError where it cannot be what it should be.
     """
-    paths = {path.name: path for path in sorted((folder / "images").glob("*")) if path.suffix.lower() in _SUFFIXES}
+    place = scene_folder(folder)
+    data = place / _CHOSEN if (place / _CHOSEN).is_dir() else place
+    paths = {path.name: path for path in sorted((data / "images").glob("*")) if path.suffix.lower() in _SUFFIXES}
     if not paths:
-        raise FileNotFoundError(f"{folder / 'images'} must hold the scene's images; there are none")
+        raise FileNotFoundError(f"{data / 'images'} must hold the scene's images; there are none")
     readers = {"cameras.json": _cameras_json, "transforms.json": _transforms_json, "sparse/0": _colmap}
     for source, read in readers.items():
-        if (folder / source).exists():
-            cameras = read(folder / source)
-            return EvaluationScene(folder.name, paths, {name: cameras[name] for name in paths if name in cameras})
-    raise FileNotFoundError(f"{folder} must hold the true cameras as one of {', '.join(readers)}; there is none")
+        if (data / source).exists():
+            cameras = read(data / source)
+            return EvaluationScene(place.name, paths, {name: cameras[name] for name in paths if name in cameras})
+    raise FileNotFoundError(f"{data} must hold the true cameras as one of {', '.join(readers)}; there is none")
+
+
+def scene_folder(folder: Path) -> Path:
+    """The folder with the scene's name, where `folder` may be the one of its chosen frames."""
+    return folder.parent if folder.name == _CHOSEN else folder
 
 
 def _cameras_json(path: Path) -> dict[str, TrueCamera]:
