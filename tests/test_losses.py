@@ -44,6 +44,8 @@ def test_local_depth_loss_by_hand():
     depth = torch.tensor([[2.0, 4.0, 4.0, 3.0], [6.0, 8.0, 2.0, 1.0]])
     loss = local_depth_loss(depth, truth, torch.ones(2, 4), patch=2, share=1.0, generator=generator())
     assert loss.item() == pytest.approx((0.0 + 2.0) / 2)
+    other_scale = local_depth_loss(3 * truth + 1, truth, torch.ones(2, 4), patch=2, share=1.0, generator=generator())
+    assert other_scale.item() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_local_depth_loss_draws_its_share_and_skips_what_has_no_shape():

@@ -55,6 +55,13 @@ def half(image: torch.Tensor) -> torch.Tensor:
     return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), 2).permute(1, 2, 0)
 
 
+def mirrored(render: Render) -> Render:
+    """A scene that is wrong in colour, depth and normals."""
+    assert render.rgb is not None and render.depth is not None and render.normal is not None
+    normal = render.normal.flip(1) * torch.tensor([-1.0, 1.0, 1.0])
+    return Render(render.rgb.flip(1), render.depth.flip(1), normal, None)
+
+
 @pytest.fixture
 def without_networks(monkeypatch, tmp_path):
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
@@ -81,10 +88,7 @@ def test_training_views_that_agree_with_their_point_maps_cost_nothing(without_ne
     terms = regularisation(Config(depth=Term(1.0), normal=Term(1.0)))
     right = terms.training_loss(0, truth(0.0), 0.5)
     assert right is not None and right.item() == pytest.approx(0.0, abs=1e-4)
-    flat = truth(0.0)
-    assert flat.depth is not None and flat.normal is not None
-    wrong = Render(flat.rgb, flat.depth.flip(1), flat.normal.flip(1) * torch.tensor([-1.0, 1.0, 1.0]), None)
-    against = terms.training_loss(0, wrong, 0.5)
+    against = terms.training_loss(0, mirrored(truth(0.0)), 0.5)
     assert against is not None and against.item() > 1.0
 
 
@@ -94,6 +98,20 @@ def test_a_right_scene_costs_less_from_a_pseudo_view_than_a_shifted_one(without_
         return sum(float(terms.pseudo_loss(lambda view, _: truth_at(view, shift), 0.5)) for _ in range(6))
 
     assert loss(0.0) < 0.6 * loss(0.15)
+
+
+def test_the_total_is_the_weighted_sum_of_its_terms(without_networks):
+    """Equation 13, on training and pseudo views."""
+
+    def loss(**weights: float) -> float:
+        terms = regularisation(Config(depth_share=1.0, **{name: Term(weight) for name, weight in weights.items()}))
+        pseudo = terms.pseudo_loss(lambda view, _: mirrored(truth_at(view)), 0.5)
+        training = terms.training_loss(0, mirrored(truth(0.0)), 0.5)
+        return sum(part.item() for part in (pseudo, training) if part is not None)
+
+    alone = [loss(point_render=1.0), loss(depth=1.0), loss(normal=1.0)]
+    total = 0.25 * alone[0] + 0.05 * alone[1] + 0.01 * alone[2]
+    assert min(alone) > 1e-4 and loss(point_render=0.25, depth=0.05, normal=0.01) == pytest.approx(total, rel=1e-4)
 
 
 def test_half_size_renders_are_compared_with_half_of_what_is_known(without_networks):
