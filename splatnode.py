@@ -152,6 +152,9 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--budget-s", type=_seconds, metavar="S", help="the best scene within this many seconds")
     parser.add_argument("--max-gaussians", type=_positive, metavar="N", help="and with at most so many Gaussians")
     parser.add_argument("--max-mb", type=_megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes")
+    parser.add_argument(
+        "--baseline", nargs=3, metavar=("A", "B", "METRES"), help="how far apart photographs A and B were taken"
+    )
     parser.add_argument("--seed", type=_natural, metavar="N")
     parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
     chosen = parser.add_mutually_exclusive_group()

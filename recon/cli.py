@@ -26,6 +26,7 @@ from recon.evaluate.records import merged, read_bench
 from recon.evaluate.report import redraw
 from recon.evaluate.splits import Split
 from recon.evaluate.truth import load_scene
+from recon.metric import in_metres
 from recon.pipeline import reconstruct
 from recon.rasterize.cpu import rasterize
 from recon.result import finish
@@ -41,6 +42,7 @@ def replay(args: argparse.Namespace) -> int:
     config = _config(args)
     with viewer(args.out / "view") if args.view else contextlib.nullcontext(_shown_to_nobody) as show:
         snapshot = run(frames, with_looks(config, LOOK_EVERY) if args.view else config, show)
+        snapshot = in_metres(snapshot, config.metric)
         report = finish(snapshot, args.out, seed=config.seed, preset_name=args.preset or "balanced")
         _tell(snapshot, args.out, report, as_json=args.json)
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
@@ -122,6 +124,13 @@ def bench(args: argparse.Namespace) -> int:
     return EXIT_GOOD
 
 
+def _metres(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        raise ValueError(f"--baseline must end with a distance in metres, got {text!r}") from error
+
+
 def _config(args: argparse.Namespace) -> Config:
     """The preset, then the configuration file, then the flags: what comes later wins."""
     config = preset(args.preset or "balanced")
@@ -129,6 +138,9 @@ def _config(args: argparse.Namespace) -> Config:
         config = overlaid(config, read_yaml(args.config))
     if args.prior is not None and args.prior != config.prior.kind:
         config = overlaid(config, {"prior": {"kind": args.prior}})
+    if args.baseline is not None:
+        first, second, metres = args.baseline
+        config = overlaid(config, {"metric": {"baseline": [first, second, _metres(metres)]}})
     flags = {
         "size": args.size,
         "seed": args.seed,

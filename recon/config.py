@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from capture.config import Plugin, merged, typed
-from recon import background, completion, density, judge, optimize, pixelwise, screening
+from recon import background, completion, density, judge, metric, optimize, pixelwise, screening
 from recon.control import prune
 from recon.control.control import ControlChoice
 from recon.export.ply import most_in_ply
@@ -40,6 +40,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pixelwise: pixelwise.Config | None = None  # in place of completion, density and background, for comparison
     preview: optimize.Config = optimize.Config(iterations=30, half_resolution_share=1.0)  # after each keyframe
     optimize: optimize.Config = optimize.Config(control=PRUNING)  # after the last one
+    metric: metric.Config = metric.Config()  # of what is published
     max_gaussians: int | None = None  # None: as many as the scene calls for
     max_mb: float | None = None  # of scene.ply, in 10^6 bytes; None: as large as it gets
     surplus: float = 2.0  # with such a limit a scene begins with this many times as many; its control leaves the best

@@ -28,7 +28,7 @@ def build_report(
     if seconds_total is None:
         seconds_total = snapshot.seconds.get("total", sum(stages.values()))
     return {
-        "scale": "relative",
+        **snapshot.scale.record(),
         "verdict": {
             "code": verdict.code.value,
             "message": verdict.message,
@@ -40,7 +40,7 @@ def build_report(
         "seconds": {**stages, "total": seconds_total},
         "peak_rss_mb": peak_rss_mb,
         "num_gaussians": len(gaussians),
-        "scene_bytes": ply_bytes(len(gaussians), gaussians.sh.shape[1]) if verdict.publishable else 0,
+        "scene_bytes": ply_bytes(len(gaussians), gaussians.sh.shape[1], snapshot.scale) if verdict.publishable else 0,
         "iterations": snapshot.iterations,
         "budget": [dict(hit) for hit in snapshot.budget],
         "served_by": dict(snapshot.served_by),

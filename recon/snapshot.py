@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from capture.frame import DroppedFrame
+from recon.scale import RELATIVE, Scale
 from recon.verdict import Verdict
 
 Array = npt.NDArray[np.float32]
@@ -54,7 +55,7 @@ class GaussianArrays:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The scene after a step of the reconstruction. The world is the first camera's frame, without metric scale."""
+    """The scene after a step of the reconstruction. The world is the first camera's frame."""
 
     sequence: int
     verdict: Verdict
@@ -68,3 +69,4 @@ class Snapshot:
     final: bool = False
     served_by: Mapping[str, str] = field(default_factory=dict)  # network or measure, by regularisation that was used
     evidence: Mapping[str, object] | None = None  # recon.verification.likelihood.record; None: nothing to verify
+    scale: Scale = RELATIVE  # the unit of all lengths

@@ -18,6 +18,7 @@ from recon.daemon.status import State
 from recon.daemon.store import Store
 from recon.daemon.watcher import Finished
 from recon.keyframe import Keyframe
+from recon.metric import in_metres
 from recon.pipeline import Reconstruction, prepare
 from recon.result import finish
 from recon.snapshot import Snapshot
@@ -236,7 +237,7 @@ class Worker:
         """The result folder, whole or not at all."""
         folder = self._config.out / self._store.scene_id
         try:
-            finish(snapshot, folder, seed=self._recipe.seed, preset_name="live")
+            finish(in_metres(snapshot, self._recipe.metric), folder, seed=self._recipe.seed, preset_name="live")
         except OSError as error:
             self._complain(str(error))
         else:

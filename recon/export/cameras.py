@@ -1,7 +1,7 @@
 """Cameras as text: cameras.json (ours), COLMAP's text model, nerfstudio's transforms.json, a TUM trajectory.
 
 All are for the images at modelled size, with the centre of the top-left pixel at (0.5, 0.5) (COLMAP's and nerfstudio's
-convention too). The world has no metric scale, and every file says so.
+convention too). Every file says whether the world's unit is the metre.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from recon.export.error import SceneFileError
 from recon.export.prepare import base_rgb
 from recon.export.quaternions import quats_from_matrices
 from recon.export.staged import json_bytes
+from recon.scale import RELATIVE, Scale
 from recon.snapshot import CameraEstimate, GaussianArrays
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes right, up, back
@@ -33,11 +34,11 @@ def camera_record(camera: CameraEstimate) -> dict[str, object]:
     }
 
 
-def encode_cameras(cameras: Sequence[CameraEstimate]) -> bytes:
+def encode_cameras(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -> bytes:
     """cameras.json."""
     return json_bytes(
         {
-            "scale": "relative",
+            **scale.record(),
             "axes": "OpenCV: x right, y down, z forward",
             "T_world_camera": "p_world = T_world_camera @ p_camera",
             "pixel_origin": "the centre of the top-left pixel is (0.5, 0.5)",
@@ -52,6 +53,12 @@ def decode_cameras(data: bytes, name: str = "cameras.json") -> tuple[CameraEstim
         return tuple(_camera_from_record(record) for record in json.loads(data)["cameras"])
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise SceneFileError(f"{name} is not a cameras.json of splatnode, or is damaged: {error!r}") from error
+
+
+def decode_scale(data: bytes) -> Scale:
+    """The scale that a cameras.json of ours states."""
+    record = json.loads(data)
+    return Scale(record.get("scale") == "metric", record.get("scale_source"))
 
 
 def _camera_from_record(record: Mapping) -> CameraEstimate:
@@ -74,7 +81,9 @@ def _camera_from_record(record: Mapping) -> CameraEstimate:
     )
 
 
-def encode_colmap(cameras: Sequence[CameraEstimate], gaussians: GaussianArrays) -> dict[str, bytes]:
+def encode_colmap(
+    cameras: Sequence[CameraEstimate], gaussians: GaussianArrays, scale: Scale = RELATIVE
+) -> dict[str, bytes]:
     """COLMAP's text model: cameras.txt, images.txt and points3D.txt (the Gaussians' centres, without tracks).
 
     Images with the same calibration share a camera; the number of an image is its place in `cameras`, from 1.
@@ -93,13 +102,13 @@ def encode_colmap(cameras: Sequence[CameraEstimate], gaussians: GaussianArrays) 
         for i, ((x, y, z), (r, g, b)) in enumerate(zip(gaussians.means.tolist(), colours.tolist(), strict=True), 1)
     ]
     return {
-        "cameras.txt": _text(["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"], camera_lines),
-        "images.txt": _text(["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"], image_lines),
-        "points3D.txt": _text(["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"], point_lines),
+        "cameras.txt": _text(["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"], camera_lines, scale),
+        "images.txt": _text(["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"], image_lines, scale),
+        "points3D.txt": _text(["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"], point_lines, scale),
     }
 
 
-def encode_nerfstudio(cameras: Sequence[CameraEstimate]) -> bytes:
+def encode_nerfstudio(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -> bytes:
     """transforms.json for nerfstudio and instant-ngp: OpenGL camera axes, images expected in images/."""
     frames = [
         {
@@ -114,10 +123,12 @@ def encode_nerfstudio(cameras: Sequence[CameraEstimate]) -> bytes:
         }
         for camera in cameras
     ]
-    return json_bytes({"camera_model": "OPENCV", "scale": "relative", "frames": frames})
+    return json_bytes({"camera_model": "OPENCV", **scale.record(), "frames": frames})
 
 
-def encode_tum(cameras: Sequence[CameraEstimate], stamps_ns: Mapping[str, int] | None = None) -> bytes:
+def encode_tum(
+    cameras: Sequence[CameraEstimate], stamps_ns: Mapping[str, int] | None = None, scale: Scale = RELATIVE
+) -> bytes:
     """trajectory.tum: `time x y z qx qy qz qw` a line, camera to world.
 
     The time is the exposure's, in seconds, where `stamps_ns` (by camera name) is given, and the frame's id otherwise.
@@ -128,7 +139,7 @@ def encode_tum(cameras: Sequence[CameraEstimate], stamps_ns: Mapping[str, int] |
         time = _seconds(stamps_ns[camera.name]) if stamps_ns else str(camera.frame_id)
         lines.append(f"{time} {_row([*camera.T_world_camera[:3, 3], x, y, z, w])}")
     meaning = "seconds" if stamps_ns else "frame id"
-    return _text([f"# time ({meaning}), x y z, qx qy qz qw of T_world_camera"], lines)
+    return _text([f"# time ({meaning}), x y z, qx qy qz qw of T_world_camera"], lines, scale)
 
 
 def _seconds(stamp_ns: int) -> str:
@@ -139,5 +150,5 @@ def _row(values: Sequence[float]) -> str:
     return " ".join(str(int(value)) if float(value).is_integer() else repr(float(value)) for value in values)
 
 
-def _text(head: Sequence[str], lines: Sequence[str]) -> bytes:
-    return ("\n".join([*head, "# scale: relative (no metric unit)", *lines]) + "\n").encode()
+def _text(head: Sequence[str], lines: Sequence[str], scale: Scale) -> bytes:
+    return ("\n".join([*head, f"# scale: {scale.sentence}", *lines]) + "\n").encode()

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
-from recon.export.cameras import decode_cameras, encode_colmap, encode_nerfstudio, encode_tum
+from recon.export.cameras import decode_cameras, decode_scale, encode_colmap, encode_nerfstudio, encode_tum
 from recon.export.error import SceneFileError
 from recon.export.ply import decode_ply, encode_ply
 from recon.export.prepare import viewer_safe
 from recon.export.splat import decode_splat, encode_splat
 from recon.export.spz import decode_spz, encode_spz
 from recon.export.staged import write_file, write_files
+from recon.scale import RELATIVE, Scale
 from recon.snapshot import CameraEstimate, GaussianArrays
 
 _DECODERS: dict[str, Callable[[bytes, str], GaussianArrays]] = {
@@ -56,13 +58,18 @@ def export_scene(source: Path, to: str, destination: Path) -> Path:
     scene = source / "scene.ply" if source.is_dir() else source
     cameras = scene.with_name("cameras.json")
     if to in _SCENE_ENCODERS:
-        write_file(destination, _SCENE_ENCODERS[to](read_gaussians(_existing(scene))))
+        encode = partial(encode_ply, scale=_scale(cameras)) if to == "ply" else _SCENE_ENCODERS[to]
+        write_file(destination, encode(read_gaussians(_existing(scene))))
     elif to in _CAMERA_ENCODERS:
-        write_file(destination, _CAMERA_ENCODERS[to](read_cameras(_existing(cameras))))
+        write_file(destination, _CAMERA_ENCODERS[to](read_cameras(_existing(cameras)), scale=_scale(cameras)))
     else:
-        model = encode_colmap(read_cameras(_existing(cameras)), read_gaussians(_existing(scene)))
+        model = encode_colmap(read_cameras(_existing(cameras)), read_gaussians(_existing(scene)), _scale(cameras))
         write_files(destination, model)
     return destination
+
+
+def _scale(cameras: Path) -> Scale:
+    return decode_scale(cameras.read_bytes()) if cameras.is_file() else RELATIVE
 
 
 def _existing(path: Path) -> Path:

@@ -12,6 +12,7 @@ import numpy as np
 
 from recon.export.error import SceneFileError
 from recon.export.prepare import unknown_source
+from recon.scale import RELATIVE, Scale
 from recon.snapshot import GaussianArrays
 
 _LONGEST_HEADER = 65536
@@ -29,7 +30,7 @@ _TYPES = {
 }
 
 
-def encode_ply(gaussians: GaussianArrays) -> bytes:
+def encode_ply(gaussians: GaussianArrays, scale: Scale = RELATIVE) -> bytes:
     """The file's bytes. Scales and opacities must be positive and finite (see `viewer_safe`)."""
     num_gaussians, num_bases = gaussians.sh.shape[:2]
     names = _property_names(num_bases)
@@ -42,12 +43,12 @@ def encode_ply(gaussians: GaussianArrays) -> bytes:
     rows[:, rest] = np.log(opacities) - np.log1p(-opacities)
     rows[:, rest + 1 : rest + 4] = np.log(gaussians.scales)
     rows[:, rest + 4 : rest + 8] = gaussians.quats
-    return _header(num_gaussians, num_bases) + rows.tobytes()
+    return _header(num_gaussians, num_bases, scale) + rows.tobytes()
 
 
-def ply_bytes(num_gaussians: int, num_bases: int) -> int:
+def ply_bytes(num_gaussians: int, num_bases: int, scale: Scale = RELATIVE) -> int:
     """The size of `encode_ply`'s result."""
-    return len(_header(num_gaussians, num_bases)) + 4 * num_gaussians * len(_property_names(num_bases))
+    return len(_header(num_gaussians, num_bases, scale)) + 4 * num_gaussians * len(_property_names(num_bases))
 
 
 def most_in_ply(num_bytes: int, num_bases: int = 1) -> int:
@@ -100,11 +101,11 @@ def _property_names(num_bases: int) -> list[str]:
     return [*start, *rest, "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
 
 
-def _header(num_gaussians: int, num_bases: int) -> bytes:
+def _header(num_gaussians: int, num_bases: int, scale: Scale) -> bytes:
     # Some readers take the third line for the element and read lines until end_header, so the comment comes last.
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {num_gaussians}"]
     lines += [f"property float {field}" for field in _property_names(num_bases)]
-    lines += ["comment splatnode: scale relative, OpenCV axes of the first camera", "end_header"]
+    lines += [f"comment splatnode: scale {scale.word}, OpenCV axes of the first camera", "end_header"]
     return ("\n".join(lines) + "\n").encode()
 
 

@@ -36,7 +36,7 @@ def write_result(
         files = _scene_files(snapshot, preview, stamps_ns) | files
     previous = _read_manifest(out_dir)
     manifest = {
-        "scale": "relative",
+        **snapshot.scale.record(),
         "verdict": snapshot.verdict.code.value,
         "files": {name: {"bytes": len(data), "sha256": _sha256(data)} for name, data in files.items()},
     }
@@ -47,13 +47,14 @@ def write_result(
 
 def _scene_files(snapshot: Snapshot, preview: bytes | None, stamps_ns: Mapping[str, int] | None) -> dict[str, bytes]:
     gaussians = viewer_safe(snapshot.gaussians)
-    colmap = encode_colmap(snapshot.cameras, gaussians)
+    cameras, scale = snapshot.cameras, snapshot.scale
+    colmap = encode_colmap(cameras, gaussians, scale)
     return {
-        "scene.ply": encode_ply(gaussians),
-        "cameras.json": encode_cameras(snapshot.cameras),
+        "scene.ply": encode_ply(gaussians, scale),
+        "cameras.json": encode_cameras(cameras, scale),
         **{f"colmap/{name}": data for name, data in colmap.items()},
-        "trajectory.tum": encode_tum(snapshot.cameras, stamps_ns),
-        "transforms.json": encode_nerfstudio(snapshot.cameras),
+        "trajectory.tum": encode_tum(cameras, stamps_ns, scale),
+        "transforms.json": encode_nerfstudio(cameras, scale),
         **({"preview.png": preview} if preview is not None else {}),
     }
 

@@ -1,0 +1,27 @@
+"""The unit of a result's lengths, which every file that is written states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Scale:
+    metric: bool = False  # lengths are metres
+    source: str | None = None  # of the metres, or why there are none although they were asked for
+
+    @property
+    def word(self) -> str:
+        return "metric" if self.metric else "relative"
+
+    @property
+    def sentence(self) -> str:
+        meaning = "metres" if self.metric else "no metric unit"
+        return f"{self.word} ({meaning}{f': {self.source}' if self.source else ''})"
+
+    def record(self) -> dict[str, object]:
+        """As JSON files state it."""
+        return {"scale": self.word, "scale_source": self.source}
+
+
+RELATIVE = Scale()
