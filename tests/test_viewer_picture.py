@@ -90,6 +90,10 @@ def test_the_overview_shows_all_cameras_and_the_swing_goes_around():
     centres = np.array([one.T_world_camera[:3, 3] for one in there.snapshot.cameras])
     pixels = project(centres, overview(there), 100, 80)
     assert (pixels[:, 2] > 0).all() and (pixels[:, :2] > 0).all() and (pixels[:, :2] < [100, 80]).all()
+    aside = np.array([1.5, 0.0, 0.3])
+    assert (np.abs(project(aside[None], overview(there), 100, 80)[0, :2] - [50, 40]) > [50, 40]).any()
+    wider = project(np.array([aside, *centres]), overview(there, [aside]), 100, 80)
+    assert (wider[:, :2] > 0).all() and (wider[:, :2] < [100, 80]).all()
     tour = swing(there, 8)
     assert len(tour) == 8 and all(np.allclose(view.pivot, tour[0].pivot) for view in tour)
     assert max(view.T_world_camera[0, 3] for view in tour) > 0.15 > -0.15 > min(v.T_world_camera[0, 3] for v in tour)
@@ -151,6 +155,20 @@ def test_a_photograph_lies_where_its_rectangle_is():
     assert (paint(wall(half=0.5), Shapes((), (hidden,)), viewpoint(), State(), 100, 80)[40, 40] > 150).all()
 
 
+def test_a_photograph_that_is_drawn_small_does_not_flicker():
+    stripes = np.zeros((64, 64, 3), np.uint8)
+    stripes[:, ::2] = 255
+    there = moment(wall(), camera(0.0), images={"0.png": stripes})
+    levels = there.photographs["0.png"]
+    assert [level.shape for level in levels] == [(64, 64, 3), (32, 32, 3), (16, 16, 3)]
+    assert (np.abs(levels[1].astype(int) - 128) <= 1).all() and there.num_bytes > moment(wall()).num_bytes
+    rectangle = np.array([[-0.08, -0.08, 1], [0.08, -0.08, 1], [0.08, 0.08, 1], [-0.08, 0.08, 1]])
+    image = paint(
+        GaussianArrays.empty(), Shapes((), (Photograph("a", rectangle, levels),)), viewpoint(), State(), 100, 80
+    )
+    assert (np.abs(image[36:44, 46:54].astype(int) - 128) <= 2).all()
+
+
 def test_a_photograph_covers_the_render_pixel_by_pixel():
     one = camera(0.0)
     view = at_camera(viewpoint(), one)
@@ -166,6 +184,8 @@ def test_a_photograph_covers_the_render_pixel_by_pixel():
 def test_captions_stand_below():
     image = caption(np.zeros((20, 300, 3), np.uint8), ["a line of 12°", "another"])
     assert image.shape[0] > 50 and image.shape[1] == 300 and image[20:].max() > 200
+    wrapped = caption(np.zeros((20, 300, 3), np.uint8), ["words " * 30])
+    assert wrapped.shape[0] > image.shape[0] and (wrapped[20:, -4:] == BACKGROUND).all()
 
 
 # ---- Shapes -------------------------------------------------------------------------------------------------------

@@ -5,6 +5,7 @@ It needs neither a display nor a graphics driver, and it is what the viewer show
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 
 import cv2
@@ -18,6 +19,8 @@ from viewer.points import paint_points
 from viewer.shapes import Shapes
 from viewer.state import State
 from viewer.viewpoint import Viewpoint
+
+_LETTER = 8  # pixels, the width of a wide letter of a caption
 
 
 def paint(gaussians: GaussianArrays, shapes: Shapes, view: Viewpoint, state: State, width: int, height: int) -> Image:
@@ -61,11 +64,12 @@ def blended(image: Image, photograph: Image, camera: CameraEstimate, K: Array, w
 
 
 def caption(image: Image, lines: Sequence[str]) -> Image:
-    """The image with lines of text on a dark band below it; signs that OpenCV's font lacks become plain ones."""
-    step = 18
-    band = np.full((step * len(lines) + 10, image.shape[1], 3), BACKGROUND, np.uint8)
-    for row, line in enumerate(lines):
-        plain = line.replace("°", " deg").replace("×", "x").encode("ascii", "replace").decode()
+    """The image with text on a dark band below it, wrapped; signs that OpenCV's font lacks become plain ones."""
+    step, letters = 18, max((image.shape[1] - 16) // _LETTER, 10)
+    plain = [line.replace("°", " deg").replace("×", "x").encode("ascii", "replace").decode() for line in lines]
+    wrapped = [part for line in plain for part in textwrap.wrap(line, letters)]
+    band = np.full((step * len(wrapped) + 10, image.shape[1], 3), BACKGROUND, np.uint8)
+    for row, line in enumerate(wrapped):
         origin = (8, step * (row + 1) - 2)
-        cv2.putText(band, plain, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (225, 225, 225), 1, cv2.LINE_AA)
+        cv2.putText(band, line, origin, cv2.FONT_HERSHEY_SIMPLEX, 0.42, (225, 225, 225), 1, cv2.LINE_AA)
     return np.vstack([image, band])

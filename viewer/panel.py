@@ -1,4 +1,4 @@
-"""The panel beside the picture: words and switches."""
+"""The panel beside the picture: switches first, which stay where they are, and below them words of any length."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
+from recon.verdict import Code
 from viewer import words
 from viewer.session import Session
 from viewer.state import (
@@ -17,21 +18,22 @@ from viewer.state import (
     State,
     go_to_camera,
     go_to_moment,
-    help_lines,
     moment_index,
 )
 
-_LINE = 44  # characters
+_LINE = 47  # characters
 _FREE = "free viewpoint"
 _SWITCHES = (
-    ("gaussians", "Gaussians"),
-    ("as_points", "as points"),
-    ("cameras", "cameras"),
-    ("photographs", "photographs"),
-    ("path", "path"),
-    ("tracked", "tracked camera"),
-    ("advice", "next view"),
+    ("gaussians", "Gaussians (1)"),
+    ("as_points", "as points (g)"),
+    ("cameras", "cameras (2)"),
+    ("photographs", "photographs (3)"),
+    ("path", "path (4)"),
+    ("tracked", "tracked camera (5)"),
+    ("advice", "next view (6)"),
 )
+_BUTTONS = (("Pause", "space"), ("Follow", "f"), ("Whole", "r"), ("Save", "s"), ("Help", "h"))
+_GOOD, _BAD = gui.Color(0.5, 0.9, 0.5), gui.Color(1.0, 0.65, 0.4)
 
 
 class Panel:
@@ -43,33 +45,31 @@ class Panel:
         self._session: Session | None = None
         self.root = gui.ScrollableVert(round(0.3 * em), gui.Margins(round(0.5 * em)))
         self._labels: dict[str, gui.Label] = {}
-        for name in ("help", "verdict", "advice", "counts"):
-            self._add_label(name)
-        self._time = self._slider(
-            gui.Slider.INT, lambda state, history, value: go_to_moment(state, history, int(value))
-        )
-        self._add_label("time")
         buttons = gui.Horiz(round(0.3 * em))
-        for text, key in (("Pause", "space"), ("Follow", "f"), ("Whole", "r"), ("Save", "s"), ("Help", "h")):
+        for text, key in _BUTTONS:
             button = gui.Button(text)
             button.horizontal_padding_em, button.vertical_padding_em = 0.4, 0.1
             button.set_on_clicked(lambda key=key: command(key))
             buttons.add_child(button)
         self.root.add_child(buttons)
-        self._switches = {field: self._switch(field, text) for field, text in _SWITCHES}
-        self._add_label("point size", "point size")
-        self._points = self._slider(gui.Slider.INT, lambda state, _, value: replace(state, point_size=int(value)))
-        self._points.set_limits(*POINT_SIZES)
+        pairs = gui.VGrid(2, round(0.3 * em))
+        self._switches = {field: self._switch(pairs, field, text) for field, text in _SWITCHES}
+        self.root.add_child(pairs)
         self._colouring = self._choice(
             [c.value for c in Colouring], lambda s, i, _: replace(s, colouring=list(Colouring)[i])
         )
         self._engine = self._choice([e.value for e in Engine], lambda s, i, _: replace(s, engine=list(Engine)[i]))
         self._cameras = self._choice([_FREE], lambda s, i, name: go_to_camera(s, name if i else None))
         self._names: tuple[str, ...] = ()
-        self._add_label("blend", "photograph over the render")
-        self._blend = self._slider(gui.Slider.DOUBLE, lambda state, _, value: replace(state, blend=float(value)))
+        self._points = self._slider("point size", gui.Slider.INT, lambda s, _, value: replace(s, point_size=int(value)))
+        self._points.set_limits(*POINT_SIZES)
+        self._blend = self._slider(
+            "photograph over the render, at a camera", gui.Slider.DOUBLE, lambda s, _, value: replace(s, blend=value)
+        )
         self._blend.set_limits(0.0, 1.0)
-        self._add_label("dropped")
+        self._time = self._slider("time", gui.Slider.INT, lambda s, past, value: go_to_moment(s, past, int(value)))
+        for name in ("notice", "verdict", "advice", "counts", "dropped"):
+            self._add_label(name)
 
     def show(self, session: Session, seconds: float | None, notice: str) -> None:
         """Everything as it is now; `seconds` is what a picture takes, None where that is not known."""
@@ -78,20 +78,22 @@ class Panel:
         age = session.source.age_s
         feed = words.feed_line(age, bool(moment and moment.snapshot.final))
         rate = [f"{1 / seconds:.0f} pictures/s ({1000 * seconds:.0f} ms each)"] if seconds else []
-        self._set("help", help_lines() if state.help else ["h: help"])
         for field, switch in self._switches.items():
             switch.checked = getattr(state, field)
         self._points.int_value = state.point_size
         self._colouring.selected_index = list(Colouring).index(state.colouring)
         self._engine.selected_index = list(Engine).index(state.engine)
+        self._set("notice", [notice] if notice else [])
         if moment is None:
             self._set("verdict", [feed])
             return
+        verdict = moment.snapshot.verdict
+        self._labels["verdict"].text_color = _GOOD if verdict.code is Code.OK else _BAD
         self._set("verdict", words.verdict_lines(moment))
         self._set("advice", ["Next view: " + words.advice_line(analysis.advice if analysis else None, moment)])
         self._set("counts", [*words.count_lines(moment), *rate, feed + (", paused" if state.paused else "")])
-        self._set("time", [words.time_line(state, session.history), *([notice] if notice else [])])
         self._set("dropped", words.dropped_lines(moment))
+        self._set("time", [words.time_line(state, session.history)])
         self._time.set_limits(0, max(len(session.history) - 1, 1))
         self._time.int_value = moment_index(state, session.history)
         self._show_cameras(tuple(camera.name for camera in moment.snapshot.cameras), state.camera)
@@ -116,15 +118,17 @@ class Panel:
         self._labels[name] = gui.Label(text)
         self.root.add_child(self._labels[name])
 
-    def _switch(self, field: str, text: str) -> gui.Checkbox:
+    def _switch(self, grid: gui.VGrid, field: str, text: str) -> gui.Checkbox:
         switch = gui.Checkbox(text)
         switch.set_on_checked(
             lambda checked: self._session and self._change(replace(self._session.state, **{field: checked}))
         )
-        self.root.add_child(switch)
+        grid.add_child(switch)
         return switch
 
-    def _slider(self, kind, changed: Callable) -> gui.Slider:
+    def _slider(self, name: str, kind, changed: Callable) -> gui.Slider:
+        """A slider below its label, which is called by its first text."""
+        self._add_label(name, name)
         slider = gui.Slider(kind)
         slider.set_on_value_changed(
             lambda value: self._session and self._change(changed(self._session.state, self._session.history, value))

@@ -72,7 +72,7 @@ def turntable(moment: Moment, width: int, height: int, frames: int) -> Iterator[
 def overview_picture(analysis: Analysis, width: int, height: int) -> Image:
     """The whole scene with cameras, photographs, path and advice, and below it what the panel of a window says."""
     moment, state = analysis.moment, State()
-    view: Viewpoint = overview(moment)
+    view: Viewpoint = overview(moment, analysis.advice.arrow or ())
     image = paint(moment.snapshot.gaussians, shapes(moment, state, analysis.advice), view, state, width, height)
     said = [*words.verdict_lines(moment), f"Next view: {words.advice_line(analysis.advice, moment)}"]
     said += [*words.count_lines(moment), *words.dropped_lines(moment)]

@@ -48,7 +48,7 @@ class Session:
         if elsewhere:
             self._touched = False
         if not self._touched and (self._view is None or moment.snapshot.cameras):
-            self._view = overview(moment)
+            self._see_all(moment)
         return True
 
     @property
@@ -65,7 +65,14 @@ class Session:
         if usable and not self._needs_support():
             return known  # what is advised depends on the cameras: the same ones need no second look
         self._analysis = self._analyst.of(moment) or (known if usable else None)
+        if self._analysis is not None and not usable and not self._touched:
+            self._see_all(moment)
         return self._analysis
+
+    def _see_all(self, moment: Moment) -> None:
+        known = self._analysis
+        advised = known.advice.arrow if known is not None and _same_cameras(known.moment, moment) else None
+        self._view = overview(moment, advised or ())
 
     def _needs_support(self) -> bool:
         return self.state.colouring in (Colouring.SUPPORT, Colouring.SOURCE)
@@ -78,7 +85,7 @@ class Session:
         self.state = replace(self.state, camera=None, follow=False)
         self._touched = False
         if self.moment is not None:
-            self._view = overview(self.moment)
+            self._see_all(self.moment)
 
     def camera(self) -> CameraEstimate | None:
         """The camera whose viewpoint is taken, followed or chosen; None for a free one."""

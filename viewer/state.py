@@ -149,8 +149,8 @@ def _leave(state: State, _history: History) -> State:
 BINDINGS = (
     Binding("h", "show or hide this help", _toggle("help")),
     Binding("g", "Gaussians as Gaussians or as points", _toggle("as_points")),
-    Binding("e", "drawn by splatnode or by Open3D (where Vulkan is)", _engine),
-    Binding("c", "next colouring: photograph, depth, normal, support, source", _colouring),
+    Binding("e", "drawn by splatnode or by Open3D", _engine),
+    Binding("c", "next colouring", _colouring),
     Binding("[", "smaller points", _resize(-1)),
     Binding("]", "larger points", _resize(1)),
     Binding("1", "show or hide the Gaussians", _toggle("gaussians")),
@@ -174,12 +174,11 @@ COMMANDS = {"r": "look at the whole scene", "s": "save a screenshot", "q": "clos
 
 MOUSE = (
     ("left button", "orbit; a click on a camera goes there"),
-    ("right or middle button", "pan"),
+    ("right button", "pan"),
     ("wheel", "zoom"),
 )
 
 
-def help_lines() -> list[str]:
-    """What can be done, a line each."""
-    keys = [(binding.key, binding.help) for binding in BINDINGS]
-    return [f"{name}: {text}" for name, text in [*MOUSE, *keys, *COMMANDS.items()]]
+def help_lines() -> list[tuple[str, str]]:
+    """What can be done: with what, and what it does."""
+    return [*MOUSE, *((binding.key, binding.help) for binding in BINDINGS), *COMMANDS.items()]

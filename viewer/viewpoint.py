@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -87,8 +88,8 @@ def at_camera(view: Viewpoint, camera: CameraEstimate) -> Viewpoint:
     return replace(view, T_world_camera=camera.T_world_camera, lens=lens)
 
 
-def overview(moment: Moment) -> Viewpoint:
-    """From behind and above the cameras, at the middle of what they see."""
+def overview(moment: Moment, also: Sequence[Array] = ()) -> Viewpoint:
+    """From behind and above the cameras, at the middle of what they see; the points (3,) `also` are in the picture."""
     cameras = moment.snapshot.cameras
     up, pivot = scene_up(cameras), scene_pivot(moment)
     if not cameras:
@@ -100,10 +101,11 @@ def overview(moment: Moment) -> Viewpoint:
     middle = cameras[len(cameras) // 2]
     lens = middle.K, float(middle.width), float(middle.height)
     slope = np.array([middle.width, middle.height]) / (2.0 * middle.K[[0, 1], [0, 1]])
+    seen = np.array([*centres, *also])
     for factor in np.arange(1.3, 4.0, 0.15):  # as close as it can be with every camera in the picture
         centre = pivot + factor * (backwards + 0.25 * float(np.linalg.norm(backwards)) * up)
         view = Viewpoint(look_at(centre, pivot, up), float(np.linalg.norm(centre - pivot)), up, lens)
-        local = (centres - centre) @ view.T_world_camera[:3, :3]
+        local = (seen - centre) @ view.T_world_camera[:3, :3]
         if (np.abs(local[:, :2]) < 0.93 * slope * local[:, 2:]).all():
             break
     return view

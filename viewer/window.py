@@ -21,6 +21,7 @@ from open3d.visualization import gui, rendering  # pyright: ignore[reportMissing
 
 from recon.export import write_file
 from viewer.canvas import BACKGROUND
+from viewer.help_sheet import HelpSheet
 from viewer.panel import Panel
 from viewer.scene3d import Scene3D, image3d, look_from
 from viewer.session import Session
@@ -84,7 +85,8 @@ class _Window:
         self._scene_widget.visible = False  # before it is first drawn: later, the memory is kept all the same
         self._scene = Scene3D(self._scene_widget.scene)
         self._panel = Panel(self._window, self._guarded(self._change), self._guarded(self._command))
-        for widget in (self._picture, self._scene_widget, self._panel.root):
+        self._help = HelpSheet(self._window)
+        for widget in (self._picture, self._scene_widget, self._panel.root, self._help.root):
             self._window.add_child(widget)
         self._picture.set_on_mouse(self._guarded(self._mouse, gui.ImageWidget.EventCallbackResult.HANDLED))
         self._scene_widget.set_on_mouse(self._guarded(self._mouse, gui.Widget.EventCallbackResult.CONSUMED))
@@ -173,12 +175,14 @@ class _Window:
         self._words_at = time.monotonic()
         seconds = self._painted_s if self._session.state.engine is Engine.CORE else None
         self._panel.show(self._session, seconds, self._notice)
+        self._help.show(self._session.state.help)
 
-    def _layout(self, _context: object) -> None:
+    def _layout(self, context: gui.LayoutContext) -> None:
         area = self._window.content_rect
         panel = min(round(_PANEL_EMS * self._window.theme.font_size), area.width // 2)
         frame = gui.Rect(area.x, area.y, area.width - panel, area.height)
         self._panel.root.frame = gui.Rect(area.get_right() - panel, area.y, panel, area.height)
+        self._help.lay_out(context, frame)
         if (frame.width, frame.height) == self._size:  # the panel's words have changed, no more
             return
         self._picture.frame = self._scene_widget.frame = frame
