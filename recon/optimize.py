@@ -37,7 +37,8 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sh: float = 2e-2
     translation: float = 2e-4
     rotation: float = 2e-4  # radians
-    final: float = 0.1  # those of the Gaussians have fallen to this part at the end, exponentially
+    final_means: float = 0.1  # those of the means have fallen to this part at the end, exponentially
+    final: float = 0.1  # the Gaussians' others to this
     final_pose: float = 0.1  # and those of the cameras to this
 
 
@@ -101,6 +102,7 @@ class _Fit:
         self._gaussians = gaussians
         rates = config.rates
         self._rates = {name: getattr(rates, name) for name in PARAMETERS}
+        self._finals = dict.fromkeys(PARAMETERS, rates.final) | {"means": rates.final_means}
         self._adam = Adam(_leaves(gaussians), self._rates)
         self._control: Control | None = None
         if config.control is not None:
@@ -122,8 +124,6 @@ class _Fit:
         """One iteration on view `index`; `progress` in [0, 1] sets resolution and step sizes."""
         half = progress < self._config.half_resolution_share
         photograph = self._targets[half][index]
-        rates = self._config.rates
-        decay, pose_decay = rates.final**progress, rates.final_pose**progress
         refine_pose = self._config.refine_poses and index > 0
         T_world_camera = self._Ts_world_camera[index].requires_grad_(refine_pose)
         channels = self._terms.channels(progress) if self._terms else ("rgb",)
@@ -135,10 +135,11 @@ class _Fit:
         if self._terms is not None:
             loss = loss + self._regularisation(self._terms, index, render, progress)
         loss.backward()
-        self._adam.lrs = {name: rate * decay for name, rate in self._rates.items()}
+        self._adam.lrs = {name: rate * self._finals[name] ** progress for name, rate in self._rates.items()}
         self._adam.step()
         if refine_pose and T_world_camera.grad is not None:
-            self._move_camera(index, twist_gradient(T_world_camera.detach(), T_world_camera.grad), pose_decay)
+            gradient = twist_gradient(T_world_camera.detach(), T_world_camera.grad)
+            self._move_camera(index, gradient, self._config.rates.final_pose**progress)
         self._iterations += 1
         self._control_density(index, self._targets[half], progress)
         self._adam.zero_grad()

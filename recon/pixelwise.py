@@ -7,12 +7,11 @@ from collections.abc import Sequence
 import msgspec
 import numpy as np
 import numpy.typing as npt
-import torch
-from scipy.spatial import KDTree
 
 from recon.density import Config as DownSampling
 from recon.density import redundant
-from recon.gaussians import SH_C0, Gaussians
+from recon.gaussians import Gaussians
+from recon.points import NEIGHBOURS, gaussians_at
 from recon.priors.pointmap import Pointmap
 
 
@@ -20,7 +19,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     down_sampling: DownSampling = DownSampling(coarser=1e9)  # equations 14 to 17 as they are written
     min_confidence: float = 0.05
     opacity: float = 0.1
-    neighbours: int = 3  # whose mean squared distance is a new Gaussian's variance
+    neighbours: int = NEIGHBOURS  # whose mean squared distance is a new Gaussian's variance
 
 
 def pixelwise_gaussians(
@@ -43,21 +42,4 @@ def pixelwise_gaussians(
     if max_gaussians is not None and len(means) > max_gaussians:
         chosen = np.linspace(0, len(means) - 1, max_gaussians).round().astype(np.int64)
         means, rgb, source_frame = means[chosen], rgb[chosen], source_frame[chosen]
-    count = len(means)
-    logit = float(np.log(config.opacity / (1 - config.opacity)))
-    return Gaussians(
-        means=torch.from_numpy(means),
-        quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        log_scales=torch.from_numpy(np.log(_spacing(means, config.neighbours)))[:, None].repeat(1, 3),
-        logit_opacities=torch.full((count,), logit),
-        sh=torch.from_numpy((rgb - 0.5) / np.float32(SH_C0))[:, None],
-        source_frame=torch.from_numpy(source_frame),
-    )
-
-
-def _spacing(points: npt.NDArray[np.float32], neighbours: int) -> npt.NDArray[np.float32]:
-    """(N,) root mean squared distance to the nearest other points."""
-    if len(points) <= neighbours:
-        return np.full(len(points), 1e-2, np.float32)
-    distances, _ = KDTree(points).query(points, neighbours + 1, workers=-1)
-    return np.sqrt(np.maximum((distances[:, 1:] ** 2).mean(1), 1e-14)).astype(np.float32)
+    return gaussians_at(means, rgb, source_frame, config.opacity, config.neighbours)

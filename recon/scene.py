@@ -26,8 +26,8 @@ class View:
     image: npt.NDArray[np.uint8]  # (h, w, 3) RGB
     T_world_camera: Tensor  # (4, 4), refined
     K: Tensor  # (3, 3)
-    rotation_sigma_deg: float
-    centre_sigma_rel: float
+    rotation_sigma_deg: float | None  # None: not estimated
+    centre_sigma_rel: float | None
     pointmap: Pointmap | None = None  # what stereo knows of it, with the camera as registered; None: nothing
 
     @property

@@ -32,8 +32,8 @@ class GraphRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class ViewRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
-    rotation_sigma_deg: float
-    centre_sigma_rel: float
+    rotation_sigma_deg: float | None
+    centre_sigma_rel: float | None
 
 
 class SceneRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -30,6 +30,7 @@ _INSTANTSPLAT_RATES = optimize.Rates(
     sh=2.5e-2,
     translation=1e-4,
     rotation=1e-4,
+    final_means=1.0,
     final=1.0,
     final_pose=0.01,
 )

@@ -23,8 +23,17 @@ class Pointmap:
     @property
     def points(self) -> npt.NDArray[np.float32]:
         """(h, w, 3) world points; the camera's centre where the depth is unknown."""
-        height, width = self.depth.shape
-        u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-        rays = np.stack([(u - self.K[0, 2]) / self.K[0, 0], (v - self.K[1, 2]) / self.K[1, 1], np.ones_like(u)], -1)
-        camera_points = rays * self.depth[..., None]
-        return (camera_points @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]).astype(np.float32)
+        return world_points(self.depth, self.T_world_camera, self.K)
+
+
+def world_points(
+    depth: npt.NDArray[np.float32],  # (h, w) z in the camera frame
+    T_world_camera: npt.NDArray[np.float64],  # (4, 4)
+    K: npt.NDArray[np.float64],  # (3, 3)
+) -> npt.NDArray[np.float32]:
+    """(h, w, 3) what a camera's pixels show, in the world."""
+    height, width = depth.shape
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1)
+    camera_points = rays * depth[..., None]
+    return (camera_points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]).astype(np.float32)

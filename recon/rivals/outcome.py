@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import replace
 
 from capture.frame import Frame
 from recon.clock import Clock
 from recon.scene import Scene
-from recon.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from recon.snapshot import GaussianArrays, Snapshot
 from recon.verdict import Code, Verdict
 
 MIN_CAMERAS = 3  # a model of two cameras counts as no answer, for every method
@@ -24,43 +25,39 @@ def verdict(frames: Sequence[Frame], placed: Collection[str]) -> Verdict:
 
 def refused(frames: Sequence[Frame], clock: Clock) -> Snapshot:
     """No scene, because too few cameras were found."""
-    return _snapshot(verdict(frames, ()), (), GaussianArrays.empty(), 0, clock, sequence=1, final=True)
-
-
-def told(frames: Sequence[Frame], scenes: Iterable[Scene], clock: Clock) -> Iterator[Snapshot]:
-    """A snapshot of every scene that an optimisation gives, and a final one of the last. Its time is "optimise"."""
-    sequence, scene = 0, None
-    for sequence, scene in enumerate(scenes, 1):
-        clock.lap("optimise")
-        yield _of_scene(frames, scene, clock, sequence, final=False)
-        clock.lap("wait")
-    assert scene is not None  # an optimisation gives its end
-    yield _of_scene(frames, scene, clock, sequence + 1, final=True)
-
-
-def _of_scene(frames: Sequence[Frame], scene: Scene, clock: Clock, sequence: int, *, final: bool) -> Snapshot:
-    said = verdict(frames, {view.name for view in scene.views})
-    return _snapshot(said, scene.cameras(), scene.arrays(), scene.iterations, clock, sequence=sequence, final=final)
-
-
-def _snapshot(
-    said: Verdict,
-    cameras: tuple[CameraEstimate, ...],
-    gaussians: GaussianArrays,
-    iterations: int,
-    clock: Clock,
-    *,
-    sequence: int,
-    final: bool,
-) -> Snapshot:
     return Snapshot(
-        sequence=sequence,
-        verdict=said,
-        cameras=cameras,
-        gaussians=gaussians,
+        sequence=1,
+        verdict=verdict(frames, ()),
+        cameras=(),
+        gaussians=GaussianArrays.empty(),
         images={},
         dropped=(),
-        iterations=iterations,
+        iterations=0,
         seconds=clock.booked,
-        final=final,
+        final=True,
     )
+
+
+def of_scene(frames: Sequence[Frame], scene: Scene) -> Snapshot:
+    """What is published of Gaussians and the cameras that they were fitted with."""
+    return Snapshot(
+        sequence=0,
+        verdict=verdict(frames, {view.name for view in scene.views}),
+        cameras=scene.cameras(),
+        gaussians=scene.arrays(),
+        images={},
+        dropped=(),
+        iterations=scene.iterations,
+    )
+
+
+def told(snapshots: Iterable[Snapshot], clock: Clock) -> Iterator[Snapshot]:
+    """The snapshots that an optimisation gives, numbered and timed as "optimise", and the last one again as final."""
+    last = None
+    for sequence, snapshot in enumerate(snapshots, 1):
+        clock.lap("optimise")
+        last = replace(snapshot, sequence=sequence, seconds=clock.booked)
+        yield last
+        clock.lap("wait")
+    assert last is not None  # an optimisation gives its end
+    yield replace(last, sequence=last.sequence + 1, final=True)

@@ -1,0 +1,107 @@
+"""CF-3DGS (Fu et al. 2024): frame by frame, without known poses.
+
+For each frame Gaussians are made from its depth and fitted to it alone; the rigid motion under which they look like the
+next frame, with all else frozen, is its pose. The scene starts from the first frame and is refined with all frames so
+far after each new one, with adaptive density control.
+
+As published: this order, the losses, and the step sizes of 3DGS. Compact: 100 iterations for a frame alone, 200 for a
+motion, 100 after each frame and 600 at the end, where the publication has several hundred each and grows with the
+length of a film; photographs of 512 pixels; a Gaussian for every fourth pixel. A monocular network's place takes
+`known_depth`, which also gives the focal length.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+import torch
+
+from capture.frame import Frame
+from recon import optimize
+from recon.clock import Clock
+from recon.control import adaptive
+from recon.control.control import ControlChoice
+from recon.evaluate.alignment import align_test_pose
+from recon.evaluate.appearance import Splats
+from recon.gaussians import Gaussians
+from recon.points import gaussians_at
+from recon.priors.pointmap import world_points
+from recon.rasterize.cpu import rasterize
+from recon.rivals import colmap_3dgs, outcome
+from recon.rivals.known_depth import Sight, sights
+from recon.scene import Scene, View
+from recon.snapshot import Snapshot
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    alone: int = 100  # iterations of a frame's own Gaussians
+    motion: int = 200  # steps to the next frame's pose
+    growing: int = 100  # iterations with all frames so far
+    final: int = 600  # with all frames
+    stride: int = 2  # between the pixels that get a Gaussian
+    opacity: float = 0.5  # of a Gaussian that starts from a pixel
+
+
+_ALONE = msgspec.structs.replace(colmap_3dgs.OPTIMIZE, checkpoints=(), control=None)
+_TOGETHER = msgspec.structs.replace(
+    _ALONE,
+    control=ControlChoice("adaptive", adaptive.Config(start=0.0, end=0.8, reset_every=adaptive.NEVER)),
+)
+
+
+def reconstruct(frames: Sequence[Frame], seed: int, config: Config | None = None) -> Iterator[Snapshot]:
+    """Snapshots of the scene while all frames refine it; one refusal where fewer than three have a depth."""
+    config = config or Config()
+    clock = Clock()
+    known = sights(frames, seed)
+    clock.lap("points")
+    if len(known) < outcome.MIN_CAMERAS:
+        yield outcome.refused(frames, clock)
+        return
+    scene = Scene((_view(known[0], np.eye(4)),), _from_depth(known[0], np.eye(4), config))
+    for sight, following in pairwise(known):
+        T_world_camera = _next_pose(sight, scene.views[-1], following, seed, config)
+        scene = replace(scene, views=(*scene.views, _view(following, T_world_camera)))
+        scene = _refined(scene, _TOGETHER, config.growing, seed)
+    clock.lap("poses")
+    together = msgspec.structs.replace(_TOGETHER, iterations=config.final, checkpoints=(config.final // 3,))
+    refined = optimize.refine(scene, colmap_3dgs.in_extent(together, scene), seed=seed)
+    yield from outcome.told((outcome.of_scene(frames, each) for each in refined), clock)
+
+
+def _next_pose(sight: Sight, view: View, following: Sight, seed: int, config: Config) -> np.ndarray:
+    """(4, 4) T_world_camera from which the Gaussians of `sight` alone look like the following frame."""
+    T_world_camera = view.T_world_camera.double().numpy()
+    alone = Scene((view,), _from_depth(sight, T_world_camera, config))
+    fitted = _refined(alone, _ALONE, config.alone, seed)
+    image = torch.from_numpy(following.image).float() / 255.0
+    look = Splats(fitted.arrays(), rasterize)
+    return align_test_pose(look, image, T_world_camera, following.K, steps=config.motion, levels=3).T_world_camera
+
+
+def _refined(scene: Scene, config: optimize.Config, iterations: int, seed: int) -> Scene:
+    """One view has no extent: lengths are then in parts of its depth, which is about 1."""
+    config = msgspec.structs.replace(config, iterations=iterations)
+    if len(scene.views) > 1:
+        config = colmap_3dgs.in_extent(config, scene)
+    (last,) = deque(optimize.refine(scene, config, seed=seed), maxlen=1)
+    return last
+
+
+def _view(sight: Sight, T_world_camera: np.ndarray) -> View:
+    T, K = torch.from_numpy(T_world_camera).float(), torch.from_numpy(sight.K).float()
+    return View(sight.name, sight.frame_id, sight.image, T, K, None, None)
+
+
+def _from_depth(sight: Sight, T_world_camera: np.ndarray, config: Config) -> Gaussians:
+    """A Gaussian for every `stride`-th pixel of every such row."""
+    chosen = slice(config.stride // 2, None, config.stride), slice(config.stride // 2, None, config.stride)
+    points = world_points(sight.depth, T_world_camera, sight.K)[chosen].reshape(-1, 3)
+    rgb = (sight.image[chosen].reshape(-1, 3) / 255.0).astype(np.float32)
+    frame = np.full(len(points), sight.frame_id, np.int32)
+    return gaussians_at(np.ascontiguousarray(points), rgb, frame, config.opacity)

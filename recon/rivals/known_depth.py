@@ -1,0 +1,55 @@
+"""A depth for every pixel of a photograph, where a rival's publication has a monocular network.
+
+What serves is splatnode's own multi-view depth, its gaps filled from their surroundings, and the focal length that was
+estimated with it. Unlike a network's, these depths are right up to one scale that all views share: that helps a rival.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from capture.frame import Frame
+from recon import completion
+from recon.config import Config
+from recon.pipeline import Reconstruction
+from recon.priors.pointmap import Pointmap
+
+SERVED_BY = "multi-view depth"
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A photograph with its depth. Where its camera stood is not said."""
+
+    name: str
+    frame_id: int
+    image: npt.NDArray[np.uint8]  # (h, w, 3) RGB at modelled size
+    depth: npt.NDArray[np.float32]  # (h, w) z, everywhere
+    K: npt.NDArray[np.float64]  # (3, 3)
+
+
+def sights(frames: Sequence[Frame], seed: int, config: Config | None = None) -> tuple[Sight, ...]:
+    """The frames whose depth is known, in their order; none where our own verdict is that they make no scene."""
+    work = Reconstruction(msgspec.structs.replace(config or Config(), seed=seed))
+    for frame in frames:
+        work.take(frame)
+    work.estimate()
+    if work.begun is None:
+        return ()
+    views = sorted(work.begun.views, key=lambda view: view.frame_id)
+    return tuple(
+        Sight(view.name, view.frame_id, view.image, _everywhere(view.pointmap, view.image), view.K.double().numpy())
+        for view in views
+        if view.pointmap is not None
+    )
+
+
+def _everywhere(pointmap: Pointmap, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    settings = completion.Config()
+    known = completion.only(pointmap, pointmap.confidence >= settings.min_confidence)
+    return np.where(known.depth > 0, known.depth, completion.smooth_depth(known, image, settings)).astype(np.float32)
