@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float32]
+_STEPS = 2**16  # that distances from a pixel are told apart in: one key sorts faster than two
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +57,10 @@ def render_points(
     np.minimum.at(depth, pixel, z[point])
     front = z[point] <= depth[pixel] * (1 + same_surface)
     pixel, point, distance = pixel[front], point[front], distance[front]
-    order = np.lexsort((distance, pixel))
+    order = np.argsort(pixel * _STEPS + (distance * (_STEPS / (radius + 1.0))).astype(np.int64))
     pixel, point, distance = pixel[order], point[order], distance[order]
-    rank = np.arange(len(pixel)) - np.searchsorted(pixel, pixel)
+    first = np.flatnonzero(np.diff(pixel, prepend=-1))
+    rank = np.arange(len(pixel)) - np.repeat(first, np.diff(first, append=len(pixel)))
     chosen = rank < nearest
     pixel, point, weight = pixel[chosen], index[point[chosen]], np.exp(-distance[chosen])
 
@@ -84,15 +86,21 @@ def _candidates(
     u: Array, v: Array, width: int, height: int, radius: float
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Array]:
     """(pixel, point, distance) of every pixel centre within `radius` of a projection (u, v), each of shape (C,)."""
-    reach = int(np.ceil(radius))
-    column, row = np.floor(u).astype(np.int64), np.floor(v).astype(np.int64)
+    reach = int(np.ceil(radius - 0.5))
+    columns = [_reached(u, step, width) for step in range(-reach, reach + 1)]
+    rows = [_reached(v, step, height) for step in range(-reach, reach + 1)]
     pixels, members, distances = [], [], []
-    for down in range(-reach, reach + 1):
-        for right in range(-reach, reach + 1):
-            x, y = column + right, row + down
-            distance = np.hypot(x + np.float32(0.5) - u, y + np.float32(0.5) - v)
-            inside = np.flatnonzero((distance <= radius) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
+    for y, vertical, in_rows in rows:
+        for x, horizontal, in_columns in columns:
+            squared = vertical + horizontal
+            inside = np.flatnonzero((squared <= radius * radius) & in_rows & in_columns)
             pixels.append(y[inside] * width + x[inside])
             members.append(inside)
-            distances.append(distance[inside])
+            distances.append(np.sqrt(squared[inside]))
     return np.concatenate(pixels), np.concatenate(members), np.concatenate(distances)
+
+
+def _reached(at: Array, step: int, size: int) -> tuple[npt.NDArray[np.int64], Array, npt.NDArray[np.bool_]]:
+    """The pixels `step` beside those at (C,) along one axis, the squared distances of their centres, if they exist."""
+    pixel = np.floor(at).astype(np.int64) + step
+    return pixel, (pixel.astype(np.float32) + np.float32(0.5) - at) ** 2, (pixel >= 0) & (pixel < size)
