@@ -193,7 +193,9 @@ def _score_test_views(
             levels=settings.alignment_levels,
         )
         image = appearance.picture(aligned.T_world_camera, K, width, height)
-        with_rim = appearance.picture(aligned.T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
+        with_rim = image
+        if truth.shape != whole.shape:
+            with_rim = appearance.picture(aligned.T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
         show(name, truth, image)
         scores.append(
             _ViewScore(
