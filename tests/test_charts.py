@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -156,4 +157,13 @@ def test_pieces_of_a_benchmark_are_put_together():
     ]
     with pytest.raises(ValueError, match="scored alike"):
         merged([first, Bench((), Settings(alignment_steps=1), {}, "")])
-    assert set(bench_files(first)) == {"bench.json", "bench.csv"}
+
+
+def test_rows_of_an_older_benchmark_lack_what_was_measured_later(tmp_path):
+    content = json.loads(bench_files(bench(*ROWS))["bench.json"])
+    for record in content["rows"]:
+        del record["psnr_with_rim"]
+    (tmp_path / "old.json").write_text(json.dumps(content))
+    both = merged([read_bench(tmp_path / "old.json"), bench(row("other", None, 20.0, 1.0, psnr_with_rim=19.0))])
+    lines = bench_files(both)["bench.csv"].decode().splitlines()
+    assert len(lines) == 1 + len(ROWS) + 1 and "psnr_with_rim" in lines[0]

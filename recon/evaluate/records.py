@@ -58,8 +58,14 @@ def merged(benches: Sequence[Bench]) -> Bench:
 
 def bench_files(bench: Bench) -> dict[str, bytes]:
     """bench.json and bench.csv."""
-    content = msgspec.to_builtins(bench)
-    return {"bench.json": json_bytes(content), "bench.csv": _csv(content["rows"])}
+    rows = [dataclasses.asdict(row) for row in bench.rows]  # msgspec leaves out what an older file did not have
+    content = {
+        "rows": rows,
+        "settings": dataclasses.asdict(bench.settings),
+        "machine": bench.machine,
+        "command": bench.command,
+    }
+    return {"bench.json": json_bytes(content), "bench.csv": _csv(rows)}
 
 
 def this_machine() -> dict[str, Any]:
