@@ -34,6 +34,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     planar_share: float = 0.9  # of a pair's matches on one plane; a facade with its relief reaches 0.84
     min_log_odds: float = 0.0  # of poses that are published: more likely right than not, after all bounds
     min_joint_points: int = 20  # that hold two parts together; mirror images share 3, the loosest right answer 62
+    max_reflection: float = 0.4  # gain of a group of frames when mirrored; right answers reach 0.25, mirrored frames 1
     min_angle_deg: float = 1.5  # median of the points' widest viewing angles
     max_focal_sigma: float = 0.1  # of log focal; right up to 0.073, wrong from 0.13
     focal_gain: float = 0.8  # a given lens is doubted when setting it free lowers the cost to this share
@@ -144,6 +145,8 @@ def _refused(
         return refusals.apart([graph.keyframes[index].name for index in evidence.joint.group])
     if evidence.loose:
         return refusals.apart(evidence.loose)
+    if evidence.reflection.gain > config.max_reflection:
+        return refusals.reflected(evidence.reflection.frames)
     if evidence.median_angle_deg < config.min_angle_deg:
         return _too_close(graph, evidence)
     if odds.total < config.min_log_odds or odds.doubtful:

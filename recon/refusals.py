@@ -178,5 +178,14 @@ def mirrored(names: Names) -> Verdict:
     )
 
 
+def reflected(names: Names) -> Verdict:
+    return Verdict(
+        Code.AMBIGUOUS,
+        f"{len(names)} frames show the place the wrong way round: turned left to right, they match the others better.",
+        "Leave out photographs that were mirrored, or turn them back.",
+        tuple(names),
+    )
+
+
 def too_close(names: Names, found: str) -> Verdict:
     return Verdict(Code.BASELINE_TOO_SMALL, found, _SIDEWAYS, tuple(names))

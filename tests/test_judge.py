@@ -20,6 +20,7 @@ from recon.verification.evidence import CameraEvidence, Evidence
 from recon.verification.joints import Joint
 from recon.verification.lens import Distortion, FreedLens
 from recon.verification.photometric import Score
+from recon.verification.reflection import Reflection
 from recon.verification.stability import Spread
 from recon.view_graph import ViewGraph
 
@@ -97,6 +98,7 @@ def evidence(
         agreement=1.0,
         joint=Joint(group=(indices[-1],), points=500, matches=200, explained=200.0, patches=FOUND),
         loose=(),
+        reflection=Reflection(("0.png",), 0.0),
         flatness=0.5,
         spread=Spread(0.1, 0.005, 0.01),
         mirrored_cost=10.0,
@@ -294,6 +296,11 @@ def test_two_places_that_almost_no_point_joins():
 
 def test_frames_that_only_contradicted_matches_join_to_the_others():
     assert refused(verdict(5, loose=("4.png",)), Code.SPLIT).frames == names(4)
+
+
+def test_frames_that_fit_better_mirrored_are_named():
+    assert refused(verdict(5, reflection=Reflection(("1.png", "3.png"), 0.5)), Code.AMBIGUOUS).frames == names(1, 3)
+    assert verdict(5, reflection=Reflection(("1.png",), 0.25)).code == Code.OK  # a symmetric place
 
 
 def test_a_flat_thing_that_moves_is_not_taken_for_the_scene():

@@ -129,27 +129,35 @@ def log10_number_of_false_alarms(num_matches: int, num_inliers: int, sample_size
 def fit_rotation(points1: Array, points2: Array, threshold: float, longer_side: int) -> tuple[int, float]:
     """How many matches (centred pixels) a pure rotation explains, and with which focal length in pixels.
 
-    One focal length after the other is tried; given it, the rotation has a closed form (Kabsch, 1976), which is
-    refitted to the matches that agree until they no longer change.
+    One focal length after the other is tried, coarsely with some of the matches, then around the best with all.
     """
-    best = (0, float(longer_side))
-    for focal in longer_side * np.geomspace(0.35, 4.0, 50):
-        rays1, rays2 = _unit_rays(points1, focal), _unit_rays(points2, focal)
-        inlier = np.ones(len(points1), bool)
-        for _ in range(6):
-            u, _, vt = np.linalg.svd(rays2[inlier].T @ rays1[inlier])
-            rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-            turned = rays1 @ rotation.T
-            error = np.linalg.norm(turned[:, :2] / np.maximum(turned[:, 2:], 1e-3) * focal - points2, axis=1)
-            # The first fits are to all matches: their threshold starts wide and closes.
-            agreed = error < max(threshold, float(np.quantile(error, 0.7)) if inlier.all() else threshold)
-            if agreed.sum() < 8 or (agreed == inlier).all():
-                break
-            inlier = agreed
-        count = int(np.count_nonzero(error < threshold))
-        if count > best[0]:
-            best = (count, float(focal))
-    return best
+    focals = longer_side * np.geomspace(0.35, 4.0, 49)
+    some = slice(None, None, 1 + len(points1) // 300)
+    counts = [_turned(points1[some], points2[some], focal, threshold) for focal in focals[::3]]
+    middle = 3 * int(np.argmax(counts))
+    near = focals[max(0, middle - 2) : middle + 3]
+    counts = [_turned(points1, points2, focal, threshold) for focal in near]
+    return max(counts), float(near[int(np.argmax(counts))])
+
+
+def _turned(points1: Array, points2: Array, focal: float, threshold: float) -> int:
+    """How many matches a rotation of a camera with this focal length explains.
+
+    The rotation has a closed form (Kabsch, 1976), which is refitted to the matches that agree until these stay.
+    """
+    rays1, rays2 = _unit_rays(points1, focal), _unit_rays(points2, focal)
+    inlier, error = np.ones(len(points1), bool), np.zeros(len(points1))
+    for _ in range(6):
+        u, _, vt = np.linalg.svd(rays2[inlier].T @ rays1[inlier])
+        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        turned = rays1 @ rotation.T
+        error = np.linalg.norm(turned[:, :2] / np.maximum(turned[:, 2:], 1e-3) * focal - points2, axis=1)
+        # The first fits are to all matches: their threshold starts wide and closes.
+        agreed = error < max(threshold, float(np.quantile(error, 0.7)) if inlier.all() else threshold)
+        if agreed.sum() < 8 or (agreed == inlier).all():
+            break
+        inlier = agreed
+    return int(np.count_nonzero(error < threshold))
 
 
 def _unit_rays(points: Array, focal: float) -> Array:

@@ -10,6 +10,7 @@ from recon.verification.cycles import Cycles
 from recon.verification.joints import Joint
 from recon.verification.lens import Distortion, FreedLens
 from recon.verification.photometric import Score
+from recon.verification.reflection import Reflection
 from recon.verification.stability import Spread
 
 
@@ -34,6 +35,7 @@ class Evidence:
     agreement: float  # share of all matches that the cameras explain
     joint: Joint  # the weakest
     loose: tuple[str, ...]  # frames that only contradicted matches join to most of the others
+    reflection: Reflection  # the frames that stand out most as mirror images
     flatness: float  # share of the points on one plane
     spread: Spread  # how much the answer changes without parts of the pictures
     mirrored_cost: float  # of the mirrored answer over that of this one

@@ -9,9 +9,21 @@ import msgspec
 import numpy as np
 
 from recon.registration.register import Registration
-from recon.verification import cycles, exposure, flatness, joints, lens, photometric, refit, reversal, stability
+from recon.verification import (
+    cycles,
+    exposure,
+    flatness,
+    joints,
+    lens,
+    photometric,
+    refit,
+    reflection,
+    reversal,
+    stability,
+)
 from recon.verification.evidence import CameraEvidence, Evidence
 from recon.verification.photometric import Picture
+from recon.verification.reflection import Reflection
 from recon.view_graph import ViewGraph
 
 
@@ -19,6 +31,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tracks_per_camera: int = 300  # with which answers are found again
     photometric: photometric.Config = photometric.Config()
     cycles: cycles.Config = cycles.Config()
+    reflection: reflection.Config = reflection.Config()
 
 
 def verify(graph: ViewGraph, registration: Registration | None, config: Config) -> Evidence | None:
@@ -32,6 +45,7 @@ def verify(graph: ViewGraph, registration: Registration | None, config: Config) 
         agreement=_agreement(graph, registration, None),
         joint=joints.weakest(registration, graph.pairs, views, config.photometric),
         loose=tuple(graph.keyframes[index].name for index in joints.loose(registration, graph.pairs)),
+        reflection=_reflection(graph, registration, config.reflection),
         flatness=flatness.share_on_plane(registration.points),
         spread=stability.by_regions(fit),
         mirrored_cost=reversal.mirrored_cost(fit),
@@ -64,6 +78,11 @@ def _of_cameras(
         )
         for camera in registration.cameras
     )
+
+
+def _reflection(graph: ViewGraph, registration: Registration, config: reflection.Config) -> Reflection:
+    registered = [graph.keyframes[camera.index] for camera in registration.cameras]
+    return reflection.measure(registered, config)
 
 
 def _agreement(graph: ViewGraph, registration: Registration, index: int | None) -> float:

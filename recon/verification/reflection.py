@@ -1,0 +1,83 @@
+"""Mirror images among the frames: do some look more like the others when they are turned left to right?
+
+Where a place is symmetric, the mirror image of a photograph fits the others as one taken from the other side, to the
+pixel. But it shows the details that are not symmetric, too, the wrong way round: turned back, it matches better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from recon.keyframe import Features, Keyframe
+from recon.registration import matching
+
+Array = npt.NDArray[np.float64]
+Bytes = npt.NDArray[np.uint8]
+Flags = npt.NDArray[np.bool_]
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    num_features: int = 1500  # of each frame, the strongest
+    by_chance: float = 50.0  # matches of frames that have nothing in common, which say nothing
+    matching: matching.Config = matching.Config()
+
+
+@dataclass(frozen=True)
+class Reflection:
+    """The frames that stand out most as mirror images of what the others show."""
+
+    frames: tuple[str, ...]  # at most half of them
+    gain: float  # mean logarithm of the matches of mirrored over plain pairs of one of them and one of the others
+
+
+def measure(keyframes: Sequence[Keyframe], config: Config) -> Reflection:
+    """Of two frames or more."""
+    plain = [_strongest(keyframe.features, config.num_features) for keyframe in keyframes]
+    mirrored = [mirrored_descriptors(descriptors) for descriptors in plain]
+    gains = np.zeros((len(plain), len(plain)))
+    for j in range(len(plain)):
+        for i in range(j):
+            found, expected = (
+                len(matching.match(plain[i], other[j], config.matching)) + config.by_chance
+                for other in (mirrored, plain)
+            )
+            gains[i, j] = gains[j, i] = np.log(found / expected)
+    group, gain = max((_grown(gains, first) for first in range(len(plain))), key=lambda found: found[1])
+    return Reflection(tuple(keyframes[index].name for index in np.flatnonzero(group).tolist()), gain)
+
+
+def _strongest(features: Features, count: int) -> Bytes:
+    return features.descriptors[features.squeeze == 1.0][:count]
+
+
+def mirrored_descriptors(descriptors: Bytes) -> Bytes:
+    """SIFT descriptors (M, 128) as they are in the mirrored image.
+
+    They are histograms of 8 directions in 4 x 4 cells, along and across the direction of the keypoint: mirroring
+    reverses the rows of cells across it, and the sense of the directions.
+    """
+    cells = descriptors.reshape(-1, 4, 4, 8)
+    return np.ascontiguousarray(cells[:, ::-1][..., -np.arange(8) % 8].reshape(-1, 128))
+
+
+def _grown(gains: Array, first: int) -> tuple[Flags, float]:
+    """The group with the largest mean gain across its border, grown from one frame by the frame that suits best."""
+    group = np.zeros(len(gains), bool)
+    group[first] = True
+    best = group, _across(gains, group)
+    while 2 * (group.sum() + 1) <= len(gains):
+        larger = [group | (np.arange(len(gains)) == other) for other in np.nonzero(~group)[0]]
+        group = max(larger, key=lambda candidate: _across(gains, candidate))
+        gain = _across(gains, group)
+        if gain > best[1]:
+            best = group, gain
+    return best
+
+
+def _across(gains: Array, group: Flags) -> float:
+    return float(gains[np.ix_(group, ~group)].mean())
