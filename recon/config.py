@@ -38,7 +38,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     density: density.Config = density.Config()
     background: background.Config = background.Config()
     pixelwise: pixelwise.Config | None = None  # in place of completion, density and background, for comparison
-    preview: optimize.Config = optimize.Config(iterations=30, half_resolution_share=1.0)  # after each keyframe
+    preview: optimize.Config = optimize.Config(iterations=20, half_resolution_share=1.0)  # after each keyframe
     optimize: optimize.Config = optimize.Config(control=PRUNING)  # after the last one
     metric: metric.Config = metric.Config()  # of what is published
     max_gaussians: int | None = None  # None: as many as the scene calls for

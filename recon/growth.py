@@ -3,40 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from recon.config import Config
-from recon.gaussians import concatenate
-from recon.geometry import align_cameras
+from recon.gaussians import Gaussians, concatenate
+from recon.geometry import Similarity, align_cameras, multiply_quats, quat_from_matrix
+from recon.keyframe import Keyframe
 from recon.priors.classical import modelled_K
 from recon.priors.pointmap import Pointmap
-from recon.registration.register import Registration
-from recon.scene import Scene, begin
+from recon.registration.register import RegisteredCamera, Registration
+from recon.scene import Scene, View, begin
 from recon.view_graph import ViewGraph
 
-NEIGHBOURS = 4  # views beside a further one that tell what of it is known, hidden or empty
+LEAST_POINTS = 8  # that a camera observes where its point map knows the depth, to say how far away it is
+STRETCHED = 2.0  # by more than this factor no scene is
+NEIGHBOURS = 3  # views beside a further one that tell what of it is known, hidden or empty
 
 
-def in_world_of(scene: Scene, registration: Registration, graph: ViewGraph, tolerance: float) -> Registration | None:
-    """The registration carried into the scene's world by the cameras that both have; None where it does not fit.
-
-    It fits when it has all cameras of the scene, none of which it moved by more than `tolerance` of the scene's depth,
-    and no focal length changed by more than that part of it.
-    """
+def in_world_of(scene: Scene, registration: Registration, graph: ViewGraph) -> Registration | None:
+    """The registration in the scene's world, which its first camera defines; None where it lacks one of the scene's."""
     cameras = {graph.keyframes[camera.index].name: camera for camera in registration.cameras}
     if len(scene.views) < 2 or any(view.name not in cameras for view in scene.views):
         return None
     Ts_registered = np.stack([cameras[view.name].T_world_camera for view in scene.views])
     Ts_scene = np.stack([view.T_world_camera.double().numpy() for view in scene.views])
-    similarity = align_cameras(Ts_registered, Ts_scene)
-    carried = np.stack([similarity.camera(T) for T in Ts_registered])
-    zoomed = max(abs(modelled_K(graph, cameras[view.name])[0, 0] / float(view.K[0, 0]) - 1) for view in scene.views)
-    if np.abs(carried[:, :3] - Ts_scene[:, :3]).max() > tolerance or zoomed > tolerance:
-        return None
+    scale = align_cameras(Ts_registered, Ts_scene).scale
+    rotation = Ts_scene[0, :3, :3] @ Ts_registered[0, :3, :3].T
+    similarity = Similarity(scale, rotation, Ts_scene[0, :3, 3] - scale * rotation @ Ts_registered[0, :3, 3])
     return replace(
         registration,
         cameras=tuple(
@@ -47,24 +45,96 @@ def in_world_of(scene: Scene, registration: Registration, graph: ViewGraph, tole
 
 
 def carried(pointmaps: Mapping[str, Pointmap], registration: Registration, graph: ViewGraph) -> dict[str, Pointmap]:
-    """The point maps of registered cameras, at the scale and with the cameras of `registration`."""
-    cameras = {graph.keyframes[camera.index].name: camera for camera in registration.cameras}
-    names = [name for name in pointmaps if name in cameras]
-    if len(names) < 2:
-        return {}
-    scale = align_cameras(
-        np.stack([pointmaps[name].T_world_camera for name in names]),
-        np.stack([cameras[name].T_world_camera for name in names]),
-    ).scale
-    return {
-        name: replace(
-            pointmaps[name],
-            depth=pointmaps[name].depth * np.float32(scale),
-            T_world_camera=cameras[name].T_world_camera,
-            K=modelled_K(graph, cameras[name]),
+    """The point maps of registered cameras, with the cameras of `registration` and as far away as its points are."""
+    moved = {}
+    for camera in registration.cameras:
+        keyframe = graph.keyframes[camera.index]
+        if keyframe.name not in pointmaps:
+            continue
+        before = pointmaps[keyframe.name]
+        moved[keyframe.name] = replace(
+            before,
+            depth=before.depth * np.float32(_farther(before, registration, camera, keyframe)),
+            T_world_camera=camera.T_world_camera,
+            K=modelled_K(graph, camera),
         )
-        for name in names
-    }
+    return moved
+
+
+def _farther(pointmap: Pointmap, registration: Registration, camera: RegisteredCamera, keyframe: Keyframe) -> float:
+    """Median of the depths of the points that a camera observes, over those that its point map has there."""
+    mine = registration.observed_by == camera.index
+    T_camera_world = np.linalg.inv(camera.T_world_camera)
+    depths = registration.points[registration.observed_point[mine]] @ T_camera_world[2, :3] + T_camera_world[2, 3]
+    height, width = pointmap.depth.shape
+    column, row = np.clip(registration.observed_pixels[mine] * keyframe.scale, 0, [width - 1, height - 1]).astype(int).T
+    known = (pointmap.depth[row, column] > 0) & (depths > 0)
+    if known.sum() < LEAST_POINTS:
+        return 1.0
+    return float(np.median(depths[known] / pointmap.depth[row, column][known]))
+
+
+def moved(
+    scene: Scene, before: Mapping[str, Pointmap], after: Mapping[str, Pointmap], tolerance: float
+) -> Scene | None:
+    """The scene with its views where their point maps moved to, and the Gaussians that each view started with it.
+
+    The far shell goes with the first view. None where a map is missing or the scene would not hold together: a camera
+    moved by more than `tolerance` of the scene's depth, or the depths changed by more than a factor of STRETCHED.
+    """
+    if any(view.name not in before or view.name not in after for view in scene.views):
+        return None
+    motions = [_motion(view, before[view.name], after[view.name]) for view in scene.views]
+    if any(motion.displaced > tolerance or motion.stretched > STRETCHED for motion in motions):
+        return None
+    gaussians = scene.gaussians.map(torch.clone)
+    source, views = scene.gaussians.source_frame, []
+    of_views = torch.tensor([view.frame_id for view in scene.views], dtype=source.dtype)
+    for place, (view, motion) in enumerate(zip(scene.views, motions, strict=True)):
+        going = source == view.frame_id
+        _move(gaussians, going | ~torch.isin(source, of_views) if place == 0 else going, motion)
+        T, K = (torch.from_numpy(matrix).float() for matrix in (after[view.name].T_world_camera, after[view.name].K))
+        views.append(replace(view, T_world_camera=T, K=K))
+    return replace(scene, views=tuple(views), gaussians=gaussians)
+
+
+@dataclass(frozen=True, eq=False)
+class _Motion:
+    """How a view moves: what it shows is stretched in its camera's frame, and goes with the camera."""
+
+    T_world_camera: npt.NDArray[np.float64]  # (4, 4) before
+    stretch: npt.NDArray[np.float64]  # (3,)
+    rigid: npt.NDArray[np.float64]  # (4, 4) of the world
+
+    @property
+    def displaced(self) -> float:
+        """The largest change of the camera's matrix."""
+        return float(np.abs((self.rigid @ self.T_world_camera - self.T_world_camera)[:3]).max())
+
+    @property
+    def stretched(self) -> float:
+        """The largest change of a length, as a factor."""
+        return float(np.exp(np.abs(np.log(self.stretch)).max()))
+
+
+def _motion(view: View, before: Pointmap, after: Pointmap) -> _Motion:
+    known = (before.depth > 0) & (after.depth > 0)
+    farther = float(np.median(after.depth[known] / before.depth[known])) if known.any() else 1.0
+    wider = np.diag(before.K)[:2] / np.diag(after.K)[:2]
+    stretch = farther * np.array([*wider, 1.0])
+    T_world_camera = view.T_world_camera.double().numpy()
+    return _Motion(T_world_camera, stretch, after.T_world_camera @ np.linalg.inv(T_world_camera))
+
+
+def _move(gaussians: Gaussians, going: torch.Tensor, motion: _Motion) -> None:
+    """Moves the Gaussians `going` (N,) in place; a stretch makes them larger and does not bend them."""
+    T_before = torch.from_numpy(motion.T_world_camera).float()
+    stretch, rigid = torch.from_numpy(motion.stretch).float(), torch.from_numpy(motion.rigid).float()
+    in_camera = (gaussians.means[going] - T_before[:3, 3]) @ T_before[:3, :3]
+    stretched = (in_camera * stretch) @ T_before[:3, :3].T + T_before[:3, 3]
+    gaussians.means[going] = stretched @ rigid[:3, :3].T + rigid[:3, 3]
+    gaussians.quats[going] = multiply_quats(quat_from_matrix(rigid[:3, :3]), gaussians.quats[going])
+    gaussians.log_scales[going] += stretch.log().mean()
 
 
 def grow(

@@ -16,29 +16,23 @@ from recon import growth, optimize
 from recon.budget import hits
 from recon.clock import Clock
 from recon.config import Config
-from recon.judge import hopeless, judge
+from recon.judging import Judgement, Judging
 from recon.keyframe import Features, Keyframe, modelled_image
 from recon.priors.pointmap import Pointmap
 from recon.priors.prior import Prior
 from recon.registration import features
-from recon.registration.register import Registration
 from recon.registration.two_view import TwoView
 from recon.scene import Scene, begin
 from recon.screening import Look, Rejected, look, screen
 from recon.snapshot import GaussianArrays, Snapshot
 from recon.undistort import undistorted
-from recon.verdict import Verdict
-from recon.verification.evidence import Evidence
 from recon.verification.likelihood import record
-from recon.verification.verify import verify
 from recon.view_graph import ViewGraph
 
 log = logging.getLogger(__name__)
 
-Judged = tuple[Registration | None, Verdict]
-Known = tuple[tuple[str, ...], int]  # keyframes, and how many frames were left out
-REMEMBERED_VERDICTS = 3  # a keyframe may be tried, and taken back
-FITS = 0.02  # of the scene's depth: a scene grows while a new estimate moves its cameras by less
+REMEMBERED_REJECTED = 100  # frames: what is said of them changes no more
+FITS = 0.1  # of the scene's depth: a scene grows while a new estimate moves its cameras by less
 
 
 def reconstruct(frames: Iterable[Frame | DroppedFrame], config: Config) -> Iterator[Snapshot]:
@@ -102,7 +96,7 @@ class Reconstruction:
         self.scene: Scene | None = None  # what is shown
         self.sequence = 0
         self._looks: dict[str, Look] = {}  # of the frames that were taken
-        self._judged: dict[Known, tuple[Judged, Evidence | None]] = {}  # as the keyframes are, and as they were
+        self._judging = Judging(self._prior, config)
         self._pointmaps: dict[str, Pointmap] = {}  # by keyframe, as they were last computed
 
     @property
@@ -126,12 +120,9 @@ class Reconstruction:
         if not self._looks:
             self.clock = Clock()
         self.clock.lap("wait")
-        self._looks[frame.name] = look(frame)
-        _, rejected = screen(list(self._looks.values()), self.config.screening)
-        self.rejected += rejected
-        for name, reason in ((each.name, each.reason) for each in rejected):
-            del self._looks[name]
-            self.drop(DroppedFrame(name, reason))
+        rejected = self.screen(frame)
+        for each in rejected:
+            self.drop(DroppedFrame(each.name, each.reason))
         gone = {each.name for each in rejected} & set(self.names)
         if gone:
             self.retract(gone)
@@ -139,9 +130,19 @@ class Reconstruction:
         if frame.name in self._looks:
             self.add(prepare(frame, self.config))
 
+    def screen(self, frame: Frame) -> list[Rejected]:
+        """The frames that say nothing beside the others, now that there is this one too: it, or earlier ones."""
+        self._looks[frame.name] = look(frame)
+        _, rejected = screen(list(self._looks.values()), self.config.screening)
+        self.rejected = [*self.rejected, *rejected][-REMEMBERED_REJECTED:]
+        for each in rejected:
+            del self._looks[each.name]
+        return rejected
+
     def add(self, keyframe: Keyframe) -> None:
-        """Adds a frame that was prepared elsewhere to the view graph."""
-        self.graph.add(keyframe)
+        """Adds a frame that was prepared elsewhere to the view graph, compared with a few others for now."""
+        self._looks.setdefault(keyframe.name, look(keyframe.frame))
+        self.graph.add(keyframe, soon=True)
         newest = len(self.graph.keyframes) - 1
         overlapping = sum(newest in pair for pair in self.graph.pairs)
         num_features = len(keyframe.features.points)
@@ -152,34 +153,42 @@ class Reconstruction:
         """Forgets keyframes and what the scene has from them alone. What is shown waits for the next estimate."""
         self.graph = self.graph.without(names)
         self.begun = None
+        self._looks = {name: seen for name, seen in self._looks.items() if name not in names}
         self._pointmaps = {name: pointmap for name, pointmap in self._pointmaps.items() if name not in names}
         if self.scene is not None:
             self.scene = growth.without(self.scene, names) if len(self.scene.views) > len(names) else None
 
-    def restore(self, keyframes: Sequence[Keyframe], pairs: Mapping[tuple[str, str], TwoView]) -> None:
-        """Takes over keyframes whose pairs, by their names, are known from an earlier process."""
+    def restore(
+        self,
+        keyframes: Sequence[Keyframe],
+        pairs: Mapping[tuple[str, str], TwoView],
+        pending: Collection[tuple[str, str]] = (),
+    ) -> None:
+        """Takes over keyframes whose pairs, by their names, an earlier process knew; it had not looked at `pending`."""
         self.graph.keyframes[:] = keyframes
         place = {keyframe.name: index for index, keyframe in enumerate(keyframes)}
         self.graph.pairs = {(place[i], place[j]): pair for (i, j), pair in pairs.items() if i in place and j in place}
+        self.graph.pending = {(place[i], place[j]) for i, j in pending if i in place and j in place}
+        self._looks |= {keyframe.name: look(keyframe.frame) for keyframe in keyframes}
 
-    def judge(self) -> Judged:
-        """Cameras of the keyframes and the verdict on them; at once for keyframes that were judged a moment ago."""
+    def judge(self) -> Judgement:
+        """Cameras of the keyframes and the verdict on them, as soon as possible: maybe for now only."""
         self.clock.lap("wait")
-        known = tuple(self.names), len(self.rejected)
-        if known not in self._judged:
-            newest = known, self._verified()
-            self._judged = dict([*self._judged.items(), newest][-REMEMBERED_VERDICTS:])
+        judgement = self._judging.soon(self.graph, self.rejected)
         self.clock.lap("poses")
-        return self._judged[known][0]
+        return judgement
 
-    def _verified(self) -> tuple[Judged, Evidence | None]:
-        """A registration of the keyframes, judged by its evidence; none where it would be of no use."""
-        refusal = hopeless(self.graph, self.rejected, self.config.judge)
-        if refusal is not None:
-            return (None, refusal), None
-        registration = self._prior.register(self.graph)
-        evidence = verify(self.graph, registration, self.config.verification)
-        return (registration, judge(self.graph, registration, evidence, self.config.judge)), evidence
+    @property
+    def proven(self) -> frozenset[str]:
+        """The keyframes that a publishable verdict was last given on thoroughly."""
+        return self._judging.proven
+
+    def judge_thoroughly(self, pause: Callable[[], None] = lambda: None) -> Judgement:
+        """The same from all that there is to know, whatever it takes. `pause` may raise to abandon the work."""
+        self.clock.lap("wait")
+        judgement = self._judging.thorough(self.graph, self.rejected, pause)
+        self.clock.lap("poses")
+        return judgement
 
     def work_in(self) -> None:
         """Shows a scene of all keyframes as soon as possible: grown from the one that is shown, else begun."""
@@ -191,16 +200,17 @@ class Reconstruction:
 
     def grow(self) -> bool:
         """Adds to the shown scene what new keyframes show; False where it has to be begun anew, or given up."""
-        registration, verdict = self.judge()
-        if self.scene is None or registration is None or not verdict.publishable:
+        judged = self.judge()
+        if self.scene is None or judged.registration is None or not judged.verdict.publishable:
             return False
-        placed = growth.in_world_of(self.scene, registration, self.graph, FITS)
+        placed = growth.in_world_of(self.scene, judged.registration, self.graph)
         known = growth.carried(self._pointmaps, placed, self.graph) if placed else {}
-        if placed is None or any(view.name not in known for view in self.scene.views):
+        moved = growth.moved(self.scene, self._pointmaps, known, FITS)
+        if placed is None or moved is None:
             return False
         further = self._prior.further_pointmaps(self.graph, placed, known)
         self._pointmaps = known | {pointmap.name: pointmap for pointmap in further}
-        self.show(growth.grow(self.scene, self._pointmaps, self.graph, placed, self.config))
+        self.show(growth.grow(moved, self._pointmaps, self.graph, placed, self.config))
         self.clock.lap("points")
         return True
 
@@ -214,17 +224,18 @@ class Reconstruction:
 
     def find_points(self, pause: Callable[[], None] = lambda: None) -> None:
         """Point maps of all keyframes that have a camera; none where the verdict forbids a scene. `pause` as above."""
-        registration, verdict = self.judge()
+        judged = self.judge_thoroughly(pause)
         pause()
-        if registration is not None and verdict.publishable:
-            pointmaps = self._prior.pointmaps(self.graph, registration, pause)
+        if judged.registration is not None and judged.verdict.publishable:
+            pointmaps = self._prior.pointmaps(self.graph, judged.registration, pause)
             self._pointmaps = {pointmap.name: pointmap for pointmap in pointmaps}
             self.clock.lap("points")
 
     def begin(self) -> None:
         """Begins a scene from the points that were found last, which is not shown yet."""
-        registration, verdict = self.judge()
-        if registration is None or not verdict.publishable:
+        judged = self.judge_thoroughly()
+        registration = judged.registration
+        if registration is None or not judged.verdict.publishable:
             self.begun = None
             return
         config = self.config
@@ -257,8 +268,8 @@ class Reconstruction:
 
     def snapshot(self, final: bool = False) -> Snapshot:
         self.sequence += 1
-        _, verdict = self.judge()
-        evidence = self._judged[tuple(self.names), len(self.rejected)][1]
+        judged = self.judge()
+        verdict, evidence = judged.verdict, judged.evidence
         scene = self.scene if verdict.publishable else None
         bound = hits(self.config, self.begun, scene, self.clock.booked) if final else ()
         snapshot = Snapshot(

@@ -38,3 +38,4 @@ class Verdict:
     advice: str  # what to do about it; empty when there is nothing to do
     frames: tuple[str, ...] = ()
     publishable: bool = False
+    provisional: bool = False  # whether evidence is still to be looked at that may change it

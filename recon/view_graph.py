@@ -29,6 +29,10 @@ class Matcher(Protocol):
         ...
 
 
+AT_FIRST = 4  # keyframes that a further one is compared with before it is used
+CONNECTED = 2  # pairs, so that it can be
+
+
 class ViewGraph:
     """Grows by one keyframe at a time. What its pairs say does not depend on the order in which keyframes came.
 
@@ -37,6 +41,8 @@ class ViewGraph:
     from further to the side and cost twice as much again. They may overlap when something in their matches hints at it,
     when they have a firm partner in common, or when firm pairs do not connect them at all. What a prior's matcher finds
     there is added to them.
+
+    A keyframe may be added `soon`: compared with a few others, and with the rest by `complete`.
     """
 
     def __init__(self, config: register.Config, matcher: Matcher | None = None) -> None:
@@ -45,15 +51,53 @@ class ViewGraph:
         self.pairs: dict[tuple[int, int], TwoView] = {}  # verified, by position (i < j)
         self._plain: dict[tuple[int, int], Compared] = {}  # the first frame is the first in order of content
         self._squeezed: dict[tuple[int, int], Compared] = {}
+        self.pending: set[tuple[int, int]] = set()  # that have not been compared (i < j)
 
-    def add(self, keyframe: Keyframe) -> None:
-        """Takes in `keyframe` and verifies it against every other keyframe."""
+    def add(self, keyframe: Keyframe, soon: bool = False) -> None:
+        """Takes in `keyframe` and verifies it against every other keyframe.
+
+        If this is to be `soon`, it is verified against a few at first, if these connect it, and without squeezed
+        features: against the latest and then those that have most in common with what it has something in common with.
+        """
         new = len(self.keyframes)
         self.keyframes.append(keyframe)
-        for index in range(new):
-            first, second = self._in_order(index, new)
-            self._plain[first, second] = register.compare(self.keyframes[first], self.keyframes[second], self._config)
+        self.pending |= {(index, new) for index in range(new)}
+        if not soon:
+            self.complete()
+            return
+        for _ in range(min(AT_FIRST, new)):
+            self._compare(self._most_promising(new), new)
+        if len(self._partners(new)) < CONNECTED:
+            self.complete()
+
+    def complete(self) -> None:
+        """Makes all comparisons that have not been made."""
+        for pair in sorted(self.pending):
+            self._compare(*pair)
         self._settle()
+
+    def _compare(self, index: int, new: int) -> None:
+        """Compares two keyframes by their plain features, for now."""
+        first, second = self._in_order(index, new)
+        compared = register.compare(self.keyframes[first], self.keyframes[second], self._config)
+        self._plain[first, second] = compared
+        self.pending.discard((index, new))
+        if compared.pair is not None:
+            self.pairs[index, new] = compared.pair if first < second else compared.pair.swapped()
+
+    def _most_promising(self, new: int) -> int:
+        """Of the keyframes that `new` is not compared with, the one that shares most with its partners; the latest."""
+        mine = self._partners(new)
+        score = {
+            index: sum(shared * mine.get(partner, 0) for partner, shared in self._partners(index).items())
+            for index in range(new)
+            if (index, new) in self.pending
+        }
+        return max(score, key=lambda index: (score[index], index))
+
+    def _partners(self, index: int) -> dict[int, int]:
+        """The keyframes that share something with keyframe `index`, and how many matches."""
+        return {i + j - index: len(pair.matches) for (i, j), pair in self.pairs.items() if index in (i, j)}
 
     def without(self, names: Collection[str]) -> ViewGraph:
         """A view graph of the other keyframes, with what their pairs say."""
@@ -70,7 +114,9 @@ class ViewGraph:
             remaining(self._plain),
             remaining(self._squeezed),
         )
-        rest._settle()
+        rest.pending = set(remaining(dict.fromkeys(self.pending)))
+        if not rest.pending:
+            rest._settle()
         return rest
 
     def _settle(self) -> None:

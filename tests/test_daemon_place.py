@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -20,20 +21,36 @@ class FakeReconstruction:
     """Frames called bad make everything unpublishable; those called far are not placed."""
 
     def __init__(self, names: list[str], scene: object | None) -> None:
-        self.names, self.scene = names, scene
+        self.graph = SimpleNamespace(keyframes=[keyframe(name) for name in names])
+        self.scene, self.proven = scene, frozenset(names)
         self.judgements = 0
 
+    @property
+    def names(self) -> list[str]:
+        return [each.name for each in self.graph.keyframes]
+
     def add(self, added: SimpleNamespace) -> None:
-        self.names.append(added.name)
+        self.graph.keyframes.append(added)
 
     def retract(self, names: set[str]) -> None:
-        self.names = [name for name in self.names if name not in names]
+        self.graph.keyframes = [each for each in self.graph.keyframes if each.name not in names]
 
-    def judge(self) -> tuple[SimpleNamespace, Verdict]:
+    def judge(self) -> SimpleNamespace:
         self.judgements += 1
         placed = [SimpleNamespace(index=i) for i, name in enumerate(self.names) if not name.startswith("far")]
         spoilt = any(name.startswith("bad") for name in self.names)
-        return SimpleNamespace(cameras=placed), Verdict(Code.OK, "", "", publishable=not spoilt)
+        verdict = Verdict(Code.OK, "", "", publishable=not spoilt)
+        return SimpleNamespace(registration=SimpleNamespace(cameras=placed), verdict=verdict)
+
+    def judge_thoroughly(self, pause=lambda: None) -> SimpleNamespace:
+        """Finds what is wrong with the frames called worse, too."""
+        pause()
+        judged = self.judge()
+        spoilt = any(name.startswith("worse") for name in self.names)
+        verdict = replace(judged.verdict, publishable=judged.verdict.publishable and not spoilt)
+        if verdict.publishable:
+            self.proven = frozenset(self.names)
+        return SimpleNamespace(registration=judged.registration, verdict=verdict)
 
 
 def test_before_there_is_a_scene_every_keyframe_is_taken():
@@ -58,6 +75,31 @@ def test_of_a_batch_only_the_keyframe_that_spoils_the_scene_is_taken_back():
     work = FakeReconstruction(["a", "b", "c"], scene=object())
     assert place.add(work, [keyframe("d"), keyframe("bad"), keyframe("e")]) == {"bad"}
     assert work.names == ["a", "b", "c", "d", "e"]
+
+
+def test_what_was_added_for_now_and_spoils_the_scene_is_found_when_all_is_proven():
+    work = FakeReconstruction(["a", "b", "c"], scene=object())
+    assert place.add(work, [keyframe("d"), keyframe("worse"), keyframe("e")]) == set()
+    assert [stranger.name for stranger in place.prove(work)] == ["worse"]
+    assert work.names == ["a", "b", "c", "d", "e"]
+    assert place.prove(work) == []
+
+
+def test_proof_that_is_abandoned_changes_nothing():
+    def pause() -> None:
+        raise InterruptedError
+
+    work = FakeReconstruction(["a", "b", "c"], scene=object())
+    place.add(work, [keyframe("worse")])
+    with pytest.raises(InterruptedError):
+        place.prove(work, pause)
+    assert work.names == ["a", "b", "c", "worse"]
+
+
+def test_a_scene_that_was_never_proven_is_not_taken_apart():
+    work = FakeReconstruction([], scene=None)
+    place.add(work, [keyframe("a"), keyframe("b"), keyframe("worse")])
+    assert place.prove(work) == [] and work.names == ["a", "b", "worse"]
 
 
 @pytest.mark.parametrize(

@@ -41,8 +41,11 @@ def same(one, other) -> bool:
 
 
 def test_features_and_pairs_come_back_to_the_bit(graph):
-    features, pairs = graph_from(over_the_disk(*graph_message(graph)))
+    graph.pending = {(0, 2)}
+    found = graph_from(over_the_disk(*graph_message(graph)))
+    features, pairs = found.features, found.pairs
     names = [keyframe.name for keyframe in graph.keyframes]
+    assert found.pending == [(names[0], names[2])]
     assert list(features) == names
     assert all(same(features[keyframe.name], keyframe.features) for keyframe in graph.keyframes)
     assert len(pairs) == len(graph.pairs) == 3
@@ -71,7 +74,7 @@ def test_a_scene_of_which_a_frame_is_gone_is_made_anew(graph, scene):
 
 def test_what_another_version_wrote_is_told(graph, scene):
     header, arrays = graph_message(graph)
-    strange = GraphRecord(header.names, [{"colour": 1.0}, *header.features[1:]], header.pairs)
+    strange = GraphRecord(header.names, [{"colour": 1.0}, *header.features[1:]], header.pairs, [])
     with pytest.raises(ValueError, match="Features with colour"):
         graph_from(Message(strange, tuple(arrays)))
     with pytest.raises(ValueError, match="missing"):

@@ -13,7 +13,7 @@ import pytest
 from recon.keyframe import Keyframe
 from recon.registration import features, register
 from recon.registration.register import Compared
-from recon.view_graph import ViewGraph
+from recon.view_graph import AT_FIRST, ViewGraph
 from tests.synthetic import photographs, places, view_graph
 
 NO_MATCHES = np.zeros((0, 2), np.int64)
@@ -178,3 +178,33 @@ def test_cameras_do_not_depend_on_the_order_of_the_photographs():
         relative.append([np.linalg.inv(first.T_world_camera) @ camera.T_world_camera for camera in others])
         assert cameras[frames[0].name].focal == pytest.approx(found[0, 1, 2][frames[0].name].focal, rel=1e-12)
     np.testing.assert_allclose(relative[0], relative[1], atol=1e-9)
+
+
+def test_a_keyframe_added_soon_is_compared_with_a_few_first_and_in_the_end_with_all(compared):
+    names = [f"a{number}" for number in range(8)]
+    graph = graph_of(*names[:7])
+    compared.clear()
+    graph.add(keyframe("a7"), soon=True)
+    assert len(compared) == AT_FIRST and not squeezed(compared)
+    assert {i for i, j in graph.pending if j == 7} == {i for i in range(7) if (i, 7) not in graph.pairs}
+    graph.complete()
+    assert not graph.pending
+    assert names_of(graph) == names_of(graph_of(*names))
+
+
+def test_what_shares_most_with_the_partners_of_a_keyframe_is_looked_at_before_the_rest(compared):
+    graph = graph_of("a1", "a2", "a3", "a4", "b1", "b2", "b3")
+    compared.clear()
+    graph.add(keyframe("a5"), soon=True)
+    # The latest tell nothing, one after the other, until one of the a's is met.
+    assert compared[:AT_FIRST] == [("a5", "b3"), ("a5", "b2"), ("a5", "b1"), ("a4", "a5")]
+    # One partner is too little to be used: then all is compared.
+    assert not graph.pending and len(names_of(graph)) == len(names_of(graph_of("a1", "a2", "a3", "a4", "a5"))) + 3
+
+
+def test_what_is_pending_stays_so_without_another_keyframe(compared):
+    graph = graph_of(*(f"a{number}" for number in range(7)))
+    graph.add(keyframe("a7"), soon=True)
+    (later,) = {i for i, _ in graph.pending} & {0}
+    rest = graph.without({"a6"})
+    assert (later, 6) in rest.pending and len(rest.keyframes) == 7

@@ -42,6 +42,7 @@ log = logging.getLogger(__name__)
 
 SERVE_S = 0.05  # between looks at what the threads have made
 END_S = 20.0  # for the threads to end; an export takes seconds
+STUCK_S = 300.0  # without the worker getting on: what takes longest, a verification of all views, takes tens of seconds
 
 
 def recon(args: argparse.Namespace) -> int:
@@ -105,7 +106,8 @@ class Daemon:
                     next_status_s = time.monotonic() + self._config.status_every_s
                     status = self._status()
                     self._heartbeat.send(status)
-                    manager.alive(f"{status.state.value}, {status.keyframes} key frames, {status.verdict}")
+                    if time.monotonic() - self._worker.moved_s < STUCK_S:  # else the service manager starts it anew
+                        manager.alive(f"{status.state.value}, {status.keyframes} key frames, {status.verdict}")
         finally:
             self._stopping.set()
             manager.stopping()

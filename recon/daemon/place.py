@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+from recon.judging import Judgement
 from recon.keyframe import Keyframe
 from recon.pipeline import Reconstruction
 from recon.view_graph import ViewGraph
@@ -22,13 +23,44 @@ def add(work: Reconstruction, keyframes: Sequence[Keyframe]) -> set[str]:
     if not had_scene:
         return set()
     names = {keyframe.name for keyframe in keyframes}
-    registration, verdict = work.judge()
-    if verdict.publishable and registration is not None:
-        return names - {work.names[camera.index] for camera in registration.cameras}
+    judged = work.judge()
+    if judged.verdict.publishable:
+        return names - _placed(work, judged)
     work.retract(names)
     if len(keyframes) == 1:
         return names
     return set().union(*(add(work, [keyframe]) for keyframe in keyframes))
+
+
+def prove(work: Reconstruction, pause: Callable[[], None] = lambda: None) -> list[Keyframe]:
+    """Judges thoroughly what was added for now; returns keyframes that do not belong to the scene after all.
+
+    Of these, keyframes by which the scene fails are taken back. `pause` may raise to abandon the work, and nothing has
+    happened then.
+    """
+    doubted = [keyframe for keyframe in work.graph.keyframes if keyframe.name not in work.proven]
+    judged = work.judge_thoroughly(pause)
+    if not work.proven or not doubted:
+        return []
+    if judged.verdict.publishable:
+        return [keyframe for keyframe in doubted if keyframe.name not in _placed(work, judged)]
+    work.retract({keyframe.name for keyframe in doubted})
+    strangers = []
+    for keyframe in doubted:
+        work.add(keyframe)
+        judged = work.judge_thoroughly()
+        if not judged.verdict.publishable:
+            work.retract({keyframe.name})
+        if keyframe.name not in _placed(work, judged):
+            strangers.append(keyframe)
+    return strangers
+
+
+def _placed(work: Reconstruction, judged: Judgement) -> set[str]:
+    """The keyframes that have a camera in a scene that may be published."""
+    if not judged.verdict.publishable or judged.registration is None:
+        return set()
+    return {work.names[camera.index] for camera in judged.registration.cameras}
 
 
 def most_redundant(graph: ViewGraph) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from typing import Any, TypeVar
 
 import msgspec
@@ -28,6 +28,7 @@ class GraphRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     names: list[str]
     features: list[Numbers]
     pairs: list[tuple[int, int, Numbers]]
+    pending: list[tuple[int, int]]  # that have not been compared
 
 
 class ViewRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -51,16 +52,27 @@ def graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
         names=[keyframe.name for keyframe in graph.keyframes],
         features=[numbers for numbers, _ in features],
         pairs=[(*key, numbers) for key, (numbers, _) in pairs.items()],
+        pending=sorted(graph.pending),
     )
     return header, [array for _, arrays in (*features, *pairs.values()) for array in arrays]
 
 
-def graph_from(message: Message[GraphRecord]) -> tuple[dict[str, Features], dict[tuple[str, str], TwoView]]:
-    """Features and pairs by the names of the keyframes. Raises ValueError where another version wrote the message."""
+@dataclass(frozen=True, eq=False)
+class SavedGraph:
+    """By the names of the keyframes."""
+
+    features: dict[str, Features]
+    pairs: dict[tuple[str, str], TwoView]
+    pending: list[tuple[str, str]]
+
+
+def graph_from(message: Message[GraphRecord]) -> SavedGraph:
+    """What `graph_message` was given. Raises ValueError where another version wrote the message."""
     names, arrays = message.header.names, iter(message.arrays)
     features = [_put_together(Features, numbers, arrays) for numbers in message.header.features]
     pairs = {(names[i], names[j]): _put_together(TwoView, numbers, arrays) for i, j, numbers in message.header.pairs}
-    return dict(zip(names, features, strict=True)), pairs
+    pending = [(names[i], names[j]) for i, j in message.header.pending]
+    return SavedGraph(dict(zip(names, features, strict=True)), pairs, pending)
 
 
 def scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDArray]]:

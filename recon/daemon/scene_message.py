@@ -49,6 +49,7 @@ class SceneHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     advice: str
     frames: tuple[str, ...]
     publishable: bool
+    provisional: bool  # evidence is still to be looked at
     cameras: Annotated[tuple[CameraRecord, ...], msgspec.Meta(max_length=MAX_CAMERAS)]
     dropped: tuple[tuple[str, str], ...]  # name, reason
     iterations: int
@@ -81,6 +82,7 @@ def to_message(
         advice=verdict.advice,
         frames=verdict.frames,
         publishable=verdict.publishable,
+        provisional=verdict.provisional,
         cameras=tuple(_record(camera) for camera in snapshot.cameras),
         dropped=tuple((frame.name, frame.reason) for frame in snapshot.dropped),
         iterations=snapshot.iterations,
@@ -106,7 +108,14 @@ def from_message(message: Message[SceneHeader]) -> LiveScene:
         raise WireError(f"no verdict is called {header.code[:40]!r}")
     snapshot = Snapshot(
         sequence=header.sequence,
-        verdict=Verdict(Code[header.code], header.message, header.advice, header.frames, header.publishable),
+        verdict=Verdict(
+            Code[header.code],
+            header.message,
+            header.advice,
+            header.frames,
+            publishable=header.publishable,
+            provisional=header.provisional,
+        ),
         cameras=tuple(_camera(record) for record in header.cameras),
         gaussians=gaussians,
         images={record.name: image for record, image in zip(header.cameras, thumbnails, strict=True)},

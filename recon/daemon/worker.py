@@ -61,11 +61,13 @@ class Worker:
         self.problem = ""
         self.keyframe_s: float | None = None
         self.finished: Finished | None = None  # while no key frame waits
+        self.moved_s = time.monotonic()  # when the work last got on
 
     def run(self) -> None:
         """Until the daemon stops; an export that has begun is finished."""
         self._guarded(self._restore)
         while not self._stopping.is_set():
+            self.moved_s = time.monotonic()
             events = self._inbox.get(IDLE_S if self._settled else self._config.settle_s)
             arrived = [each for each in events if isinstance(each, Arrived)]
             left_out = [each.name for each in events if isinstance(each, LeftOut)]
@@ -89,12 +91,12 @@ class Worker:
 
     def _restore(self) -> None:
         """Goes on where an earlier process was."""
-        features, pairs, scene = {}, {}, None
+        graph, scene = saved.SavedGraph({}, {}, []), None
         try:
-            if (graph := self._store.load("graph", saved.GraphRecord)) is not None:
-                features, pairs = saved.graph_from(graph)
+            if (record := self._store.load("graph", saved.GraphRecord)) is not None:
+                graph = saved.graph_from(record)
             keyframes = {
-                stored.frame.name: prepare(stored.frame, self._recipe, features.get(stored.frame.name))
+                stored.frame.name: prepare(stored.frame, self._recipe, graph.features.get(stored.frame.name))
                 for stored in self._store.frames()
             }
             if (found := self._store.load("scene", saved.SceneRecord)) is not None:
@@ -104,9 +106,10 @@ class Worker:
             log.warning("the checkpoint's scene is made anew: %s", error)
             keyframes = {stored.frame.name: prepare(stored.frame, self._recipe) for stored in self._store.frames()}
         self._work.dropped = self._store.dropped
-        self._work.restore([keyframe for name, keyframe in keyframes.items() if name in features], pairs)
+        known = [keyframe for name, keyframe in keyframes.items() if name in graph.features]
+        self._work.restore(known, graph.pairs, graph.pending)
         self._work.show(scene)
-        new = [keyframe for name, keyframe in keyframes.items() if name not in features]
+        new = [keyframe for name, keyframe in keyframes.items() if name not in graph.features]
         if keyframes:
             event(log, logging.INFO, "restored", scene=self._store.scene_id, keyframes=len(keyframes), new=len(new))
         if new or (keyframes and scene is None):
@@ -120,8 +123,8 @@ class Worker:
         self.state, self.problem = State.GROWING, ""
         self._settled, self.finished = False, None
         self._make_room(len(arrived))
-        for keyframe in self._tried([each.keyframe for each in arrived]):
-            event(log, logging.WARNING, "does_not_fit", frame=keyframe.name, scene=self._store.scene_id)
+        for keyframe in self._tried(self._screened([each.keyframe for each in arrived])):
+            self._tell_stranger(keyframe)
         if len(self._aside) >= self._config.lost_after:
             self._begin_place()
         self.state = State.LOST if self._aside else State.GROWING
@@ -135,8 +138,24 @@ class Worker:
         )  # fmt: skip
         self._save(final=False)
 
+    def _screened(self, keyframes: Sequence[Keyframe]) -> list[Keyframe]:
+        """Those of the keyframes that show something new, and sharply; what does not is given up."""
+        kept = []
+        for keyframe in keyframes:
+            gone = {each.name: each.reason for each in self._work.screen(keyframe.frame)}
+            kept = [each for each in (*kept, keyframe) if each.name not in gone]
+            for name, reason in gone.items():
+                event(log, logging.INFO, "left_out", frame=name, reason=reason)
+                self._forget(name, reason)
+        return kept
+
+    def _tell_stranger(self, keyframe: Keyframe) -> None:
+        event(log, logging.WARNING, "does_not_fit", frame=keyframe.name, scene=self._store.scene_id)
+
     def _tried(self, keyframes: list[Keyframe]) -> list[Keyframe]:
         """Adds keyframes to the view graph; returns those that do not fit, of which the last in a row are kept."""
+        if not keyframes:
+            return []
         try:
             strangers = place.add(self._work, keyframes)
         except Exception as error:  # one bad frame must not keep others out
@@ -199,6 +218,11 @@ class Worker:
         self.state = State.REFINING
         config = self._recipe.optimize
         steps = msgspec.structs.replace(config, checkpoints=tuple(range(STEP, config.iterations, STEP)))
+        for keyframe in place.prove(self._work, self._pause):
+            self._tell_stranger(keyframe)
+            self._aside.append(keyframe)
+        if len(self._aside) >= self._config.lost_after:
+            self._begin_place()
         self._work.estimate(self._pause)
         refined = None
         for refined in self._work.refine(self._work.begun, steps):
@@ -215,6 +239,7 @@ class Worker:
         self.state = State.WAITING if refined is None else State.LOST if self._aside else State.IDLE
 
     def _pause(self) -> None:
+        self.moved_s = time.monotonic()
         if self._stopping.is_set() or len(self._inbox):
             raise _Abandoned
 

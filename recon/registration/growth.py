@@ -27,7 +27,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def grow(of: Survey, focals: list[float], first: tuple[int, int], config: Config) -> Growth | None:
     """A map from the pair `first` on, with every view that finds its place. `focals` (one a lens) are in pixels."""
     growth = _begin(of, focals, first, config)
-    return _repair(of, _extend(of, growth, config), config) if growth else None
+    return _repair(of, extend(of, growth, config), config) if growth else None
 
 
 def score(of: Survey, growth: Growth, zero_px: float) -> float:
@@ -53,7 +53,8 @@ def adjusted(
     return replace(growth, problem=problem, track_of_point=track_of_point)
 
 
-def _quickly_adjusted(of: Survey, growth: Growth, widen: float, config: Config) -> Growth:
+def quickly_adjusted(of: Survey, growth: Growth, widen: float, config: Config) -> Growth:
+    """`adjusted` with few tracks and few iterations, as it is done after each view."""
     robust_px = config.robust_px * float(np.median(of.scale))
     loss = bundle.Config(robust_px=robust_px, max_iterations=10, tolerance=1e-3)
     return adjusted(of, growth, of.coarse, loss, widen, config.triangulation)
@@ -91,11 +92,11 @@ def _begin(of: Survey, focals: list[float], first: tuple[int, int], config: Conf
     )
     tight = replace(prior, sigmas=np.minimum(prior.sigmas, config.pair_focal_sigma))
     start = Growth(first, problem, tight, np.zeros(0, np.int64))
-    grown = _quickly_adjusted(of, start, 4.0, config)
+    grown = quickly_adjusted(of, start, 4.0, config)
     return replace(grown, prior=prior) if len(grown.problem.points) >= config.min_points else None
 
 
-def _extend(of: Survey, growth: Growth, config: Config) -> Growth:
+def extend(of: Survey, growth: Growth, config: Config) -> Growth:
     """The map with every further view that finds its place.
 
     Of the views that observe most of the map, the one comes next whose matches agree best on where it stands: one that
@@ -112,7 +113,7 @@ def _extend(of: Survey, growth: Growth, config: Config) -> Growth:
         best = max(found, key=lambda view: (found[view].share, -view))
         problem = placement.with_pose(growth.problem, best, found[best].rotation, found[best].translation)
         larger = replace(growth, problem=problem, registered=(*growth.registered, best))
-        growth = _quickly_adjusted(of, larger, 3.0, config)
+        growth = quickly_adjusted(of, larger, 3.0, config)
         failed.clear()  # A new view brings new points, from which others may now be found.
     return growth
 
@@ -149,10 +150,10 @@ def _repair(of: Survey, growth: Growth, config: Config) -> Growth:
         rest = tuple(view for view in growth.registered if view not in group)
         if not group or len(rest) < 3:
             continue
-        without = _quickly_adjusted(of, replace(growth, registered=rest), 2.0, config)
+        without = quickly_adjusted(of, replace(growth, registered=rest), 2.0, config)
         if len(without.problem.points) < config.min_points:
             continue
-        again = _extend(of, without, config)
+        again = extend(of, without, config)
         limit = config.triangulation.max_error_px
         if score(of, again, limit) > 1.05 * score(of, growth, limit):
             growth = again

@@ -88,7 +88,7 @@ def build_map(
     best = max(attempts, key=_score)
     rivals = [score for score, grown in attempts if survey.difference(best[1], grown)[0] > config.rival_rotation_deg]
     finished = finishing.finish(of, best[1], pictures, config.finishing)
-    return None if finished is None else _map(of, finished, max(rivals, default=0.0) / max(best[0], 1e-9), config)
+    return None if finished is None else as_map(of, finished, max(rivals, default=0.0) / max(best[0], 1e-9), config)
 
 
 def _score(attempt: tuple[float, Growth]) -> float:
@@ -122,7 +122,8 @@ def _first_pairs(pairs: Pairs) -> list[tuple[int, int]]:
     return sorted(pairs, key=lambda key: (-strength(key), key))
 
 
-def _map(of: Survey, finished: finishing.Finished, rival: float, config: Config) -> Map:
+def as_map(of: Survey, finished: finishing.Finished, rival: float, config: Config) -> Map:
+    """The finished growth with what is known of it."""
     grown, problem = finished.growth, finished.growth.problem
     centres = -np.einsum("cji,cj->ci", problem.rotations, problem.translations)
     angles = triangulation.largest_angles(centres, problem.points, problem.camera_of, problem.point_of)

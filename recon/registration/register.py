@@ -164,7 +164,7 @@ def register(
     found, grouping = built
     place = np.argsort(order)
     enlarged = [grouping.enlarged[i] for i in place]
-    return _in_first_camera(found.renumbered(order), keyframes, enlarged)
+    return in_first_camera(found.renumbered(order), keyframes, enlarged)
 
 
 def _renumbered(pairs: Mapping[tuple[int, int], TwoView], place: Index) -> dict[tuple[int, int], TwoView]:
@@ -194,22 +194,31 @@ def _map(
     keyframes: Sequence[Keyframe], pairs: Mapping[tuple[int, int], TwoView], grouping: Grouping, config: Config
 ) -> mapper.Map | None:
     enlarged = grouping.enlarged
-    views = [
-        View(
-            points=enlarged[i] * (keyframe.features.points - principal_point(keyframe.frame)),
-            lens=grouping.lens_of[i],
-            longer_side=grouping.longer_sides[grouping.lens_of[i]],
-        )
-        for i, keyframe in enumerate(keyframes)
-    ]
     of_refinement = config.mapper.finishing.refinement
     pictures = [
         refinement.picture(keyframe.frame.image, principal_point(keyframe.frame), of_refinement).enlarged(enlarged[i])
         for i, keyframe in enumerate(keyframes)
     ]
     known = lenses.lenses(keyframes, grouping, pairs, config.lenses)
-    in_lens = {(i, j): pair.enlarged(enlarged[i], enlarged[j]) for (i, j), pair in pairs.items()}
+    views, in_lens = views_of(keyframes, grouping), in_pixels_of_lens(pairs, grouping)
     return mapper.build_map(views, known, in_lens, config.mapper, pictures)
+
+
+def views_of(keyframes: Sequence[Keyframe], grouping: Grouping) -> list[View]:
+    """The keyframes as the mapper sees them, in the pixels of their lenses."""
+    return [
+        View(
+            points=grouping.enlarged[i] * (keyframe.features.points - principal_point(keyframe.frame)),
+            lens=grouping.lens_of[i],
+            longer_side=grouping.longer_sides[grouping.lens_of[i]],
+        )
+        for i, keyframe in enumerate(keyframes)
+    ]
+
+
+def in_pixels_of_lens(pairs: Mapping[tuple[int, int], TwoView], grouping: Grouping) -> dict[tuple[int, int], TwoView]:
+    """The pairs in the pixels of their frames' lenses."""
+    return {(i, j): pair.enlarged(grouping.enlarged[i], grouping.enlarged[j]) for (i, j), pair in pairs.items()}
 
 
 def _longer_side(frame: Frame) -> int:
@@ -223,7 +232,7 @@ def principal_point(frame: Frame) -> Array:
     return np.array([frame.width / 2.0, frame.height / 2.0])
 
 
-def _in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe], enlarged: Sequence[float]) -> Registration:
+def in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe], enlarged: Sequence[float]) -> Registration:
     """The map with the first registered keyframe as the world's frame and a median point depth of 1.
 
     Its pixels are those of the frames `enlarged` to the size of their lens.

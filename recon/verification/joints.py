@@ -35,13 +35,19 @@ def weakest(
     pictures: Mapping[int, photometric.Picture],
     config: photometric.Config,
 ) -> Joint:
-    """The joint that is left last when cameras are put together in the order of the points that they share."""
+    """The joint that is left last when cameras are put together in the order of the points that they share.
+
+    Patches across it are looked for in what there is of `pictures`.
+    """
     indices = [camera.index for camera in registration.cameras]
     shared = shared_points(registration)
     one, other = _two_parts(indices, shared)
     across = sorted(((i, j) for i in one for j in other), key=lambda pair: (-shared[pair], pair))
     scores = [
-        photometric.score(pictures[a], pictures[b], config) for i, j in across[:TRIED] for a, b in ((i, j), (j, i))
+        photometric.score(pictures[a], pictures[b], config)
+        for i, j in across[:TRIED]
+        for a, b in ((i, j), (j, i))
+        if i in pictures and j in pictures
     ]
     verified = [key for i, j in across if (key := (min(i, j), max(i, j))) in registration.agreement]
     return Joint(

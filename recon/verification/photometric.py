@@ -8,7 +8,7 @@ texture nor exposure nor the size of the search decides.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -68,12 +68,17 @@ class Score:
 
 def in_partners(index: int, pictures: Mapping[int, Picture], registration: Registration, config: Config) -> Score:
     """Patches of the picture `index` in the pictures that share most points with it."""
+    found_in = partners(index, pictures, registration, config)
+    return pooled([score(pictures[index], pictures[other], config) for other in found_in], config)
+
+
+def partners(index: int, among: Collection[int], registration: Registration, config: Config) -> list[int]:
+    """The views of `among` that share most points with the view `index`."""
     mine = registration.observed_point[registration.observed_by == index]
-    shared = np.bincount(
-        registration.observed_by[np.isin(registration.observed_point, mine)], minlength=max(pictures) + 1
-    )
-    partners = sorted((other for other in pictures if other != index), key=lambda other: (-shared[other], other))
-    return pooled([score(pictures[index], pictures[other], config) for other in partners[: config.partners]], config)
+    shared = np.bincount(registration.observed_by[np.isin(registration.observed_point, mine)], minlength=max(among) + 1)
+    return sorted((other for other in among if other != index), key=lambda other: (-shared[other], other))[
+        : config.partners
+    ]
 
 
 def pooled(scores: Sequence[Score], config: Config) -> Score:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 
 import cv2
 import msgspec
@@ -39,9 +40,10 @@ def verify(graph: ViewGraph, registration: Registration | None, config: Config) 
     if registration is None or len(registration.cameras) < 3:
         return None
     fit = refit.fit(graph.keyframes, registration, config.tracks_per_camera)
-    views = pictures(graph, registration, config.photometric)
+    registered = [camera.index for camera in registration.cameras]
+    views = pictures(graph, registration, config.photometric, registered)
     return Evidence(
-        cameras=_of_cameras(graph, registration, views, config),
+        cameras=_of_cameras(graph, registration, views, config, views),
         agreement=_agreement(graph, registration, None),
         joint=joints.weakest(registration, graph.pairs, views, config.photometric),
         loose=tuple(graph.keyframes[index].name for index in joints.loose(registration, graph.pairs)),
@@ -58,9 +60,57 @@ def verify(graph: ViewGraph, registration: Registration | None, config: Config) 
     )
 
 
+def verify_further(graph: ViewGraph, registration: Registration, known: Evidence, config: Config) -> Evidence:
+    """Evidence for `registration`, which continues the one that `known` is about: for now, and quick.
+
+    Measured are the cameras that `known` does not have, and what the matches say of all. Taken over is what hardly
+    changes while cameras are added: patches of the known cameras, and what left-out regions, mirroring and freed lenses
+    do. Without aligned patches sigmas are too large: they are reduced by as much as those of the known cameras.
+    """
+    before = {camera.name: camera for camera in known.cameras}
+    names = {camera.index: graph.keyframes[camera.index].name for camera in registration.cameras}
+    further = {index for index, name in names.items() if name not in before}
+    partners = (photometric.partners(index, names, registration, config.photometric) for index in further)
+    views = pictures(graph, registration, config.photometric, further.union(*partners))
+    measured = {camera.name: camera for camera in _of_cameras(graph, registration, views, config, further)}
+    sharper = [
+        (
+            before[names[camera.index]].rotation_sigma_deg / max(camera.rotation_sigma_deg, 1e-9),
+            before[names[camera.index]].centre_sigma_rel / max(camera.centre_sigma_rel, 1e-9),
+        )
+        for camera in registration.cameras
+        if names[camera.index] in before
+    ]
+    sharper_rotation, sharper_centre = np.minimum(1.0, np.median(sharper, axis=0))
+    return replace(
+        known,
+        cameras=tuple(
+            replace(
+                measured.get(names[camera.index]) or before[names[camera.index]],
+                agreement=_agreement(graph, registration, camera.index),
+                rotation_sigma_deg=float(sharper_rotation * camera.rotation_sigma_deg),
+                centre_sigma_rel=float(sharper_centre * camera.centre_sigma_rel),
+            )
+            for camera in registration.cameras
+        ),
+        agreement=_agreement(graph, registration, None),
+        joint=joints.weakest(registration, graph.pairs, views, config.photometric),
+        loose=tuple(graph.keyframes[index].name for index in joints.loose(registration, graph.pairs)),
+        flatness=flatness.share_on_plane(registration.points),
+        median_angle_deg=registration.median_angle_deg,
+        rms_px=registration.rms_px,
+        focal_sigma=min(known.focal_sigma, registration.focal_sigma),
+    )
+
+
 def _of_cameras(
-    graph: ViewGraph, registration: Registration, views: Mapping[int, Picture], config: Config
+    graph: ViewGraph,
+    registration: Registration,
+    views: Mapping[int, Picture],
+    config: Config,
+    asked: Collection[int],
 ) -> tuple[CameraEvidence, ...]:
+    """Of the cameras of the keyframes `asked`."""
     times_seen = np.bincount(registration.observed_point, minlength=len(registration.points))
     by_third = times_seen[registration.observed_point] >= 3
     confirmed = np.bincount(registration.observed_by[by_third], minlength=len(graph.keyframes))
@@ -77,6 +127,7 @@ def _of_cameras(
             centre_sigma_rel=camera.centre_sigma_rel,
         )
         for camera in registration.cameras
+        if camera.index in asked
     )
 
 
@@ -93,11 +144,11 @@ def _agreement(graph: ViewGraph, registration: Registration, index: int | None) 
 
 
 def pictures(
-    graph: ViewGraph, registration: Registration, config: photometric.Config
+    graph: ViewGraph, registration: Registration, config: photometric.Config, asked: Collection[int]
 ) -> dict[int, photometric.Picture]:
-    """The registered views at modelled size, by keyframe."""
+    """The registered views among the keyframes `asked`, at modelled size, by keyframe."""
     views = {}
-    for camera in registration.cameras:
+    for camera in (camera for camera in registration.cameras if camera.index in asked):
         keyframe = graph.keyframes[camera.index]
         scale = np.array(keyframe.scale)
         (fx, fy), (cx, cy) = camera.focal * scale, camera.principal * scale

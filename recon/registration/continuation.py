@@ -1,0 +1,95 @@
+"""Cameras of further keyframes beside those that are known: quick, for the moment until all can be done anew.
+
+The known cameras are where the map begins; what is new is placed by the points that it shares with them, and everything
+is adjusted. No other first pairs or focal lengths are tried and no patches aligned, so that errors of the start remain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from recon.keyframe import Keyframe
+from recon.registration import bundle, finishing, growth, lenses, mapper, register, survey
+from recon.registration.lenses import Grouping
+from recon.registration.register import Config, RegisteredCamera, Registration
+from recon.registration.survey import Growth, Lens
+from recon.registration.two_view import TwoView
+
+Array = npt.NDArray[np.float64]
+
+
+def extended(
+    keyframes: Sequence[Keyframe],
+    pairs: Mapping[tuple[int, int], TwoView],
+    start: Sequence[RegisteredCamera],
+    config: Config,
+) -> Registration | None:
+    """The cameras `start` and those of all keyframes that find their place beside them; None where it fails.
+
+    `start` and `pairs` (i < j) number the keyframes by their positions. The world is as `register` has it.
+    """
+    grouping = _grouping(keyframes, start)
+    if grouping is None:
+        return None
+    known = lenses.lenses(keyframes, grouping, pairs, config.lenses)
+    views, in_lens = register.views_of(keyframes, grouping), register.in_pixels_of_lens(pairs, grouping)
+    tracks = config.mapper.growing_tracks
+    of = survey.survey(views, known, in_lens, tracks, tracks)
+    begun = growth.quickly_adjusted(of, _begun(keyframes, grouping, known, start), 2.0, config.mapper.growth)
+    if len(begun.problem.points) < config.mapper.growth.min_points:
+        return None
+    grown = growth.extend(of, begun, config.mapper.growth)
+    finished = finishing.finish(of, grown, (), config.mapper.finishing)
+    if finished is None:
+        return None
+    built = mapper.as_map(of, finished, 0.0, config.mapper)
+    return register.in_first_camera(built, keyframes, grouping.enlarged)
+
+
+def _grouping(keyframes: Sequence[Keyframe], start: Sequence[RegisteredCamera]) -> Grouping | None:
+    """The frames by the lenses of `start`; None where one of them has no camera in it, or it has them otherwise."""
+    for across_sizes in (True, False):
+        grouping = lenses.group(keyframes, across_sizes)
+        lens_of = {(grouping.lens_of[camera.index], camera.lens) for camera in start}
+        if len(lens_of) == len({now for now, _ in lens_of}) == len({then for _, then in lens_of}):
+            return grouping if len(lens_of) == len(grouping.longer_sides) else None
+    return None
+
+
+def _begun(
+    keyframes: Sequence[Keyframe], grouping: Grouping, known: Sequence[Lens], start: Sequence[RegisteredCamera]
+) -> Growth:
+    """The known cameras in the pixels of their lenses, without points."""
+    count, num_lenses = len(keyframes), len(known)
+    rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
+    log_focals, radials, shifts = np.zeros(num_lenses), np.zeros(num_lenses), np.zeros((num_lenses, 2))
+    for camera in start:
+        index, lens = camera.index, grouping.lens_of[camera.index]
+        rotations[index] = camera.T_world_camera[:3, :3].T
+        translations[index] = -rotations[index] @ camera.T_world_camera[:3, 3]
+        log_focals[lens] = np.log(grouping.enlarged[index] * camera.focal)
+        radials[lens] = camera.radial
+        nominal = register.principal_point(keyframes[index].frame)
+        shifts[lens] = grouping.enlarged[index] * (camera.principal - nominal)
+    problem = bundle.Problem(
+        rotations=rotations,
+        translations=translations,
+        lens_of_camera=np.array(grouping.lens_of),
+        log_focals=log_focals,
+        radials=radials,
+        shifts=shifts,
+        points=np.zeros((0, 3)),
+        camera_of=np.zeros(0, np.int64),
+        point_of=np.zeros(0, np.int64),
+        pixels=np.zeros((0, 2)),
+    )
+    prior = bundle.FocalPrior(
+        log_focals=log_focals,
+        sigmas=np.array([lens.sigma for lens in known]),
+        radial_sigmas=np.zeros(num_lenses),
+        shift_sigmas=np.zeros(num_lenses),
+    )
+    return Growth(tuple(camera.index for camera in start), problem, prior, np.zeros(0, np.int64))
