@@ -11,8 +11,8 @@ import pytest
 from recon.evaluate.protocol import Row, Settings
 from recon.evaluate.records import Bench, bench_files, merged, read_bench
 from recon.evaluate.report import redraw
-from recon.evaluate.summary import points
-from recon.evaluate.tables import PSNR, paired, tables
+from recon.evaluate.summary import points, shared
+from recon.evaluate.tables import PSNR, by_views, paired, tables
 
 pytest.importorskip("matplotlib", reason="charts need matplotlib (pip install 'splatnode[bench]')")
 
@@ -52,6 +52,14 @@ def test_means_are_over_the_same_runs_at_every_point():
     assert (found["slow", None].solved, found["slow", None].runs) == (1, 2)
     assert found["slow", None].seconds == 10.0
     assert found["slow", None].lpips_vgg is None and found["slow", None].focal_error_pct is None
+
+
+def test_methods_are_compared_on_the_runs_that_all_were_put_to():
+    rows = [*ROWS, row("slow", None, 10.0, 1.0, scene="hard"), row("slow", None, 30.0, 1.0, views=6)]
+    assert {r.scene for r in shared(rows) if r.views == 3} == {"a", "b"}
+    assert [r.views for r in shared(rows)].count(6) == 1
+    apart = [row("fast", None, 20.0, 1.0), row("slow", None, 30.0, 1.0, scene="b")]
+    assert shared(apart) == apart
 
 
 def test_pareto_front_keeps_what_nothing_beats():
@@ -115,16 +123,15 @@ def test_the_papers_tables():
         row("fast", None, 25.0, 1.0, ssim=0.95, views=6),
         row("slow", None, 21.0, 1.0, ssim=0.7),
     ]
-    told = {table.title.split(" (")[0]: table for table in tables(rows)}
-    by_views = told["By number of views"]
-    assert by_views.head[:3] == ("method", "SSIM 3", "SSIM 6")
-    cells = dict(zip(by_views.head, by_views.body[0], strict=True))
+    told = by_views(rows)
+    assert told.head[:3] == ("method", "SSIM 3", "SSIM 6")
+    cells = dict(zip(told.head, told.body[0], strict=True))
     assert cells["SSIM 3"] == "0.8000 ± 0.1414" and cells["SSIM 6"] == "0.9500"
     assert cells["PSNR 3"] == "22.00 ± 1.41" and cells["ATE 3"] == "0.0300"
-    by_scene = told["Scene by scene, 3 views"]
-    assert by_scene.head == ("measure", "method", "a", "b")
-    assert ("PSNR", "fast", "21.50 ± 2.12", "22.00") in by_scene.body
-    assert ("PSNR", "slow", "21.00", "–") in by_scene.body
+    by_place = {table.title: table for table in tables(rows)}["Scene by scene, 3 views"]
+    assert by_place.head == ("measure", "method", "a", "b")
+    assert ("PSNR", "fast", "21.50 ± 2.12", "22.00") in by_place.body
+    assert ("PSNR", "slow", "21.00", "–") in by_place.body
 
 
 def test_report_has_a_table_and_says_what_was_not_measured(tmp_path):

@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from recon.evaluate.ablation import is_variant, variants
 from recon.evaluate.protocol import Row, mean
-from recon.evaluate.summary import Point, points
+from recon.evaluate.summary import Point, points, shared
 from recon.evaluate.tables import PSNR, SSIM, Measure, lpips, paired
 
 # Okabe and Ito's colours, which people with any colour vision tell apart, and a marker each for print without colour.
@@ -47,7 +47,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     Methods that were made for the ablation are drawn there alone.
     """
     files = {}
-    measured = [p for p in points([row for row in rows if not is_variant(row.method)]) if p.psnr is not None]
+    measured = [p for p in points(shared([row for row in rows if not is_variant(row.method)])) if p.psnr is not None]
     if measured:
         files |= {"speed_accuracy.png": _png(speed_accuracy(measured)), "parsimony.png": _png(parsimony(measured))}
     scored = [row for row in rows if row.final and row.psnr is not None]

@@ -55,7 +55,8 @@ def _introduction(bench: Bench) -> str:
         f"Machine: {machine.get('processor')}, {machine.get('threads')} threads. Held-out views are scored after their "
         f"pose was found in the finished scene ({settings.alignment_steps} steps, equation 18), at "
         f"{settings.longer_side} px. Seconds are wall time of the reconstruction alone, with the cameras and points "
-        "that methods of one prior share. Means are over the runs that published a scene; `±`: standard deviation "
+        "that methods of one prior share. Means are over the runs that every method was put to "
+        "and, of these, the method's that published a scene; `±`: standard deviation "
         "between seeds; `–`: not measured."
     )
 

@@ -31,6 +31,18 @@ class Point:
     peak_rss_mb: float | None
 
 
+def shared(rows: Sequence[Row]) -> list[Row]:
+    """Of each number of views the runs (scene, seed) that every method was put to; all, where there are none such.
+
+    Means over different scenes say more about the scenes than about the methods.
+    """
+    runs: dict[int, dict[str, set[tuple[str, int]]]] = {}
+    for row in rows:
+        runs.setdefault(row.views, {}).setdefault(row.method, set()).add((row.scene, row.seed))
+    common = {views: set.intersection(*methods.values()) for views, methods in runs.items()}
+    return [row for row in rows if not common[row.views] or (row.scene, row.seed) in common[row.views]]
+
+
 def points(rows: Sequence[Row]) -> list[Point]:
     """One Point for each (views, method, checkpoint), in the order of the benchmark; ends come after checkpoints.
 

@@ -8,7 +8,7 @@ from statistics import stdev
 
 from recon.evaluate import ablation
 from recon.evaluate.protocol import Row, mean
-from recon.evaluate.summary import Point, points
+from recon.evaluate.summary import Point, points, shared
 
 
 @dataclass(frozen=True)
@@ -44,13 +44,13 @@ def lpips(rows: Sequence[Row]) -> Measure | None:
 def tables(rows: Sequence[Row]) -> list[Table]:
     """All that a report shows."""
     ends = [row for row in rows if row.final]
-    counts = sorted({row.views for row in ends})
     compared = [row for row in ends if not ablation.is_variant(row.method)]
-    overview = [point for point in points(rows) if point.checkpoint is None]
+    counts = sorted({row.views for row in compared})
+    overview = points(shared(compared))
     return [
         *(Table(f"{n} views", _HEAD, tuple(_cells(p) for p in overview if p.views == n)) for n in counts),
-        *([by_views(compared)] if compared else []),
-        *(by_scene([row for row in compared if row.views == n], n) for n in sorted({row.views for row in compared})),
+        *([by_views(shared(compared))] if compared else []),
+        *(by_scene([row for row in compared if row.views == n], n) for n in counts),
         *([ablated(ends)] if len(compared) < len(ends) else []),
         Table("Runs", _RUN_HEAD, tuple(_run_cells(row) for row in ends)),
     ]
