@@ -214,7 +214,7 @@ class _Fit:
         )
         learnt = self._gaussians.map(lambda tensor: tensor.detach().clone())
         served_by = {} if self._terms is None else self._terms.served_by
-        return Scene(views, learnt, self._iterations, served_by)
+        return Scene(views, learnt, self._iterations, served_by=served_by)
 
 
 def _leaves(gaussians: Gaussians) -> dict[str, Tensor]:

@@ -16,6 +16,8 @@ from recon.evaluate.tables import PSNR, by_views, paired, tables
 
 pytest.importorskip("matplotlib", reason="charts need matplotlib (pip install 'splatnode[bench]')")
 
+from matplotlib.patches import Rectangle
+
 from recon.evaluate.charts import ablation, draw, pareto_front, speed_accuracy
 
 
@@ -109,7 +111,7 @@ def test_ablation_compares_run_by_run():
         "paper  vs. instantsplat-xl",
         "paper-depth  vs. paper",
     ]
-    assert [bar.get_bbox().width for bar in chart.patches] == pytest.approx([-0.25, 1.0, -0.2])
+    assert [bar.get_width() for bar in chart.patches if isinstance(bar, Rectangle)] == pytest.approx([-0.25, 1.0, -0.2])
     told = {table.title: table.body for table in tables(ABLATION)}["Ablation"]
     assert ("instantsplat-xl+depth", "instantsplat-xl", "20.75", "-0.25", "0.8000", "+0.0000", "2") in told
 
