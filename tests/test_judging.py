@@ -21,7 +21,7 @@ REGISTRATION = register.Config()
 
 @pytest.fixture(scope="module")
 def graph() -> ViewGraph:
-    return view_graph(photographs()[:5])
+    return view_graph(photographs()[:4])
 
 
 @pytest.fixture
@@ -37,19 +37,19 @@ def test_cameras_of_further_keyframes_are_those_that_a_registration_of_all_finds
     known = register.register(*_of(first(graph, 3)), REGISTRATION)
     extended = continuation.extended(*_of(graph), known.cameras, REGISTRATION)
     anew = register.register(*_of(graph), REGISTRATION)
-    assert [camera.index for camera in extended.cameras] == [camera.index for camera in anew.cameras] == [0, 1, 2, 3, 4]
+    assert [camera.index for camera in extended.cameras] == [camera.index for camera in anew.cameras] == [0, 1, 2, 3]
     Ts, expected = (np.stack([camera.T_world_camera for camera in found.cameras]) for found in (extended, anew))
     similarity = align_cameras(Ts, expected)
     moved = np.stack([similarity.camera(T) for T in Ts])
     spread = np.linalg.norm(expected[:, :3, 3] - expected[:, :3, 3].mean(0), axis=1).max()
     assert np.linalg.norm(moved[:, :3, 3] - expected[:, :3, 3], axis=1).max() < 0.02 * spread
     assert np.abs(moved[:, :3, :3] - expected[:, :3, :3]).max() < np.radians(0.5)
-    assert abs(np.log(extended.cameras[4].focal / anew.cameras[4].focal)) < 0.02
+    assert abs(np.log(extended.cameras[3].focal / anew.cameras[3].focal)) < 0.02
 
 
 def test_a_lens_of_which_nothing_is_known_has_to_be_registered(graph):
-    other = replace(graph.keyframes[4].frame, image=np.ascontiguousarray(graph.keyframes[4].frame.image[:, :150]))
-    keyframes = [*graph.keyframes[:4], replace(graph.keyframes[4], frame=other)]
+    other = replace(graph.keyframes[3].frame, image=np.ascontiguousarray(graph.keyframes[3].frame.image[:, :150]))
+    keyframes = [*graph.keyframes[:3], replace(graph.keyframes[3], frame=other)]
     known = register.register(*_of(first(graph, 3)), REGISTRATION)
     assert continuation.extended(keyframes, graph.pairs, known.cameras, REGISTRATION) is None
 

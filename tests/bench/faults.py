@@ -37,9 +37,16 @@ from tests.node import PATIENCE_S, Node, Viewer, finished, memory_mb, running
 from tests.synthetic import photographs
 
 VIEWS = 6
+# All that costs time and tells nothing about faults is small: a whole replay takes 5 seconds of a processor.
 RECON = {
     "reconstruction": {
         "size": 160,
+        "prior": {
+            "registration": {
+                "features": {"num_features": 1500, "shortest_longer_side": 320},
+                "mapper": {"max_attempts": 2},
+            }
+        },
         "preview": {"iterations": 2, "half_resolution_share": 1.0},
         "optimize": {"iterations": 20, "checkpoints": [10]},
     },
@@ -63,7 +70,7 @@ class Trial:
             cv2.imwrite(str(self.images / frame.name), cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR))
 
     def node(self, camera: dict[str, Any] | None = None, network: dict[str, Any] | None = None, **recon: Any) -> Node:
-        replayed = {"kind": "folder", "folder": str(self.images), "frames_per_second": 2.0, "pace": "recorded"}
+        replayed = {"kind": "folder", "folder": str(self.images), "frames_per_second": 4.0, "pace": "recorded"}
         config = {"camera": camera or replayed, "selection": {"every_frame": True}}
         return Node(self.folder / "node", config, RECON | recon, network)
 
@@ -114,7 +121,7 @@ def kill_recon(trial: Trial) -> None:
     with running(trial.node()) as node:
         node.start("recon")
         node.start("capture")
-        trial.some_time(25.0)
+        trial.some_time(15.0)
         node.end("recon", signal.SIGKILL)
         node.start("recon")
         expect_whole(node)
@@ -124,7 +131,7 @@ def kill_capture(trial: Trial) -> None:
     """kill -9 of capture: what it had spooled is delivered, once, by the next one."""
     with running(trial.node()) as node:
         node.start("capture")
-        trial.some_time(8.0)
+        trial.some_time(5.0)
         node.end("capture", signal.SIGKILL)
         spooled = {tuple(path.stem.split("-")[1:]) for path in (node.folder / "spool").glob("*.frame")}
         node.start("recon")
@@ -225,7 +232,7 @@ def clock_jump(trial: Trial) -> None:
     with running(trial.node()) as node:
         node.start("recon")
         node.start("capture")
-        trial.some_time(15.0)
+        trial.some_time(10.0)
         node.end("recon", signal.SIGKILL)
         node.start("recon", before=("unshare", "-T", "--monotonic", str(trial.chance.randrange(10**6))))
         expect_whole(node)
