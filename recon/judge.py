@@ -13,6 +13,7 @@ import numpy as np
 
 from capture import quality
 from recon import refusals
+from recon.acceptances import accepted
 from recon.registration.register import Registration
 from recon.registration.two_view import TwoView
 from recon.screening import Rejected
@@ -59,8 +60,8 @@ def judge(graph: ViewGraph, registration: Registration | None, evidence: Evidenc
     """
     if registration is None or evidence is None or len(registration.cameras) < config.min_cameras:
         return _not_placed(graph, registration, config)
-    return _refused(graph, registration, evidence, weigh(evidence), config) or _accepted(
-        graph, registration, evidence, config
+    return _refused(graph, registration, evidence, weigh(evidence), config) or accepted(
+        graph, registration, evidence, config.exposure_ratio
     )
 
 
@@ -211,58 +212,6 @@ def _through_other_lenses(graph: ViewGraph, registration: Registration) -> list[
     common = max(sorted(set(lenses)), key=lenses.count)
     others = [graph.keyframes[camera.index] for camera in registration.cameras if camera.lens != common]
     return [keyframe.name for keyframe in others if keyframe.frame.intrinsics is None]
-
-
-def _accepted(graph: ViewGraph, registration: Registration, evidence: Evidence, config: Config) -> Verdict:
-    names = [keyframe.name for keyframe in graph.keyframes]
-    placed = {camera.index for camera in registration.cameras}
-    missing = [i for i in range(len(names)) if i not in placed]
-    if not missing:
-        return _all_placed(evidence, config)
-    left_out = tuple(names[i] for i in missing)
-    summary = f"{len(placed)} of {len(names)} frames were placed"
-    apart = [part for part in graph.components() if not placed & set(part)]
-    if any(len(part) > 1 for part in apart):
-        return Verdict(
-            Code.SPLIT,
-            f"{summary}; others show a place of their own: "
-            + "; ".join(", ".join(names[i] for i in part) for part in apart)
-            + ".",
-            "Add photographs that connect the places, or take them one after the other.",
-            left_out,
-            publishable=True,
-        )
-    if len(apart) == len(missing) == 1 and len(placed) > 3:
-        return Verdict(
-            Code.OUTLIER_VIEW,
-            f"{summary}; {left_out[0]} shows nothing of what the others show.",
-            "Leave it out, or add a photograph between it and the others.",
-            left_out,
-            publishable=True,
-        )
-    return Verdict(
-        Code.OK_PARTIAL,
-        f"{summary}; {len(missing)} share too little with them.",
-        f"Add a photograph between the others and {left_out[0]}.",
-        left_out,
-        publishable=True,
-    )
-
-
-def _all_placed(evidence: Evidence, config: Config) -> Verdict:
-    count = len(evidence.cameras)
-    gains = {camera.name: camera.gain for camera in evidence.cameras}
-    ratio = max(gains.values()) / min(gains.values())
-    if ratio <= config.exposure_ratio:
-        return Verdict(Code.OK, f"All {count} frames were placed.", "", (), publishable=True)
-    limit = config.exposure_ratio**0.5
-    return Verdict(
-        Code.EXPOSURE_SHIFT,
-        f"All {count} frames were placed; the brightest is exposed {ratio:.1f} times as much as the darkest.",
-        "Lock exposure and white balance.",
-        tuple(name for name, gain in gains.items() if not 1 / limit < gain < limit),
-        publishable=True,
-    )
 
 
 def _turned(graph: ViewGraph) -> list[Pair]:
