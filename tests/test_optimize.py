@@ -236,6 +236,7 @@ class Brighter:
         camera = pointmaps[1]
         self.view = PseudoView(camera.T_world_camera, camera.K, 64, 48, nearest=1)
         self.shapes = []
+        self.served_by = {"depth": "a wish"}
         Brighter.made = self
 
     def channels(self, progress):
@@ -257,6 +258,7 @@ def test_further_losses_count_on_training_views_and_pseudo_views(truth, monkeypa
     config = Config(iterations=8, checkpoints=(), half_resolution_share=0.5)
     plain = last(start, config)
     brighter = last(start, structs.replace(config, regularise=regularise.Config(depth=regularise.Term(1.0))))
+    assert brighter.served_by == {"depth": "a wish"} and plain.served_by == {}
     assert Brighter.made.names == ["0.png", "1.png", "2.png"]
     assert Brighter.made.shapes == [(True, (24, 32))] * 4 + [(True, (48, 64))] * 2 + [(False, (48, 64))] * 2
     for shown in truth.views:
