@@ -107,7 +107,7 @@ class _Fit:
         self._control: Control | None = None
         if config.control is not None:
             self._control = config.control.module.load(config.control.config, seed)
-        self._dropout = dropout.Dropout(config.dropout, seed)
+        self._dropout = dropout.Dropout(config.dropout, gaussians, scene.views, seed)
         self._Ts_world_camera = [view.T_world_camera.clone() for view in scene.views]
         self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
         self._pose_moments = [(torch.zeros(6), torch.zeros(6), 0) for _ in scene.views]
@@ -163,6 +163,7 @@ class _Fit:
         if change is not None:
             self._gaussians = change.gaussians
             self._adam.follow(_leaves(change.gaussians), change.origin)
+            self._dropout.follow(change.gaussians)
 
     def _render(
         self,
