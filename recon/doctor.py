@@ -18,6 +18,7 @@ from capture.messaging import spool
 from capture.messaging.network import Network, runtime_directory
 from recon import core
 from recon.core.compile import find_compiler
+from recon.learned import PARTS, Part, obstacle
 
 _UDEV_RULES = Path("/etc/udev/rules.d")
 
@@ -57,7 +58,7 @@ def doctor(args: argparse.Namespace) -> int:
         print(json.dumps([asdict(finding) for finding in found], indent=1))
     else:
         for finding in found:
-            print(f"{finding.state:9}{finding.name:12}{finding.detail}")
+            print(f"{finding.state:9}{finding.name:14}{finding.detail}")
     return 2 if any(finding.state == "missing" for finding in found) else 0
 
 
@@ -69,6 +70,7 @@ def findings() -> list[Finding]:
         *(_required(module, distribution) for module, distribution in REQUIRED.items()),
         *(_optional(module, *about) for module, about in OPTIONAL.items()),
         *(_lpips(network) for network in ("alex", "vgg")),
+        *map(_learned, PARTS),
         _cameras(),
         *_oak_rights(),
         _network(),
@@ -158,6 +160,13 @@ def _version(distribution: str) -> str:
         return metadata.version(distribution)
     except metadata.PackageNotFoundError:
         return f"installed, though not from {distribution}"
+
+
+def _learned(part: Part) -> Finding:
+    """Whether a learned part is ready; one that is not costs nothing but itself."""
+    hindered = obstacle(part)
+    detail = f"{part.purpose}; weights: {part.licence}"
+    return Finding(part.name, "optional" if hindered else "ok", f"{hindered or 'ready'}; {detail}")
 
 
 def _lpips(network: str) -> Finding:
