@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import msgspec
+from msgspec.structs import replace
 
 from capture.config import Plugin, merged, typed
-from recon import background, completion, density, judge, metric, optimize, pixelwise, screening
+from recon import background, completion, density, dropout, judge, metric, optimize, pixelwise, screening
 from recon.control import prune
 from recon.control.control import ControlChoice
 from recon.export.ply import most_in_ply
@@ -25,6 +26,7 @@ class PriorChoice(Plugin):
 
 
 PRUNING = ControlChoice("prune", prune.Config())
+FITTING = optimize.Config(control=PRUNING, dropout=dropout.Config(share=0.4))
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -39,7 +41,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     background: background.Config = background.Config()
     pixelwise: pixelwise.Config | None = None  # in place of completion, density and background, for comparison
     preview: optimize.Config = optimize.Config(iterations=20, half_resolution_share=1.0)  # after each keyframe
-    optimize: optimize.Config = optimize.Config(control=PRUNING)  # after the last one
+    optimize: optimize.Config = FITTING  # after the last one
     metric: metric.Config = metric.Config()  # of what is published
     max_gaussians: int | None = None  # None: as many as the scene calls for
     max_mb: float | None = None  # of scene.ply, in 10^6 bytes; None: as large as it gets
@@ -61,10 +63,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 PRESETS: dict[str, Config] = {
-    "preview": Config(size=384, optimize=optimize.Config(iterations=150, control=PRUNING)),
-    "fast": Config(optimize=optimize.Config(iterations=250, control=PRUNING)),
+    "preview": Config(size=384, optimize=replace(FITTING, iterations=150)),
+    "fast": Config(optimize=replace(FITTING, iterations=250)),
     "balanced": Config(),
-    "quality": Config(optimize=optimize.Config(iterations=1500, checkpoints=(150, 500), control=PRUNING)),
+    "quality": Config(optimize=replace(FITTING, iterations=1500, checkpoints=(150, 500))),
 }
 
 
