@@ -11,7 +11,7 @@ from msgspec import structs
 
 from recon.background import SOURCE_FRAME
 from recon.control.control import ControlChoice, Step
-from recon.control.prune import Config, changes_without, load, most_worth
+from recon.control.prune import Config, Sight, between, changes_without, load, most_worth
 from recon.gaussians import Gaussians, concatenate
 from recon.optimize import Config as Optimising
 from recon.optimize import refine
@@ -24,10 +24,13 @@ def targets_of(scene: Scene, scale: float = 1.0) -> list[Target]:
     return [target(view, np.ones(view.image.shape[:2], bool), scale, 0.2) for view in scene.views]
 
 
+def sights_of(scene: Scene, scale: float = 1.0) -> list[Sight]:
+    targets = zip(scene.views, targets_of(scene, scale), strict=True)
+    return [Sight(view.T_world_camera, each.K, each.width, each.height) for view, each in targets]
+
+
 def worth(scene: Scene, probes: int, scale: float = 1.0) -> torch.Tensor:
-    Ts_world_camera = [view.T_world_camera for view in scene.views]
-    generator = torch.Generator().manual_seed(0)
-    return changes_without(scene.gaussians, Ts_world_camera, targets_of(scene, scale), probes, generator)
+    return changes_without(scene.gaussians, sights_of(scene, scale), probes, torch.Generator().manual_seed(0))
 
 
 def left_out(gaussians: Gaussians, view: View, index: int) -> float:
@@ -74,6 +77,17 @@ def test_what_no_photograph_shows_goes_and_the_far_shell_stays(truth):  # noqa: 
     assert not (found == 77).any()
     assert (found == SOURCE_FRAME).sum() == len(shell)
     assert ((found != 77) & (found != SOURCE_FRAME)).sum() > len(truth.gaussians) / 2
+
+
+def test_views_between_lie_near_the_path_and_are_no_photographs(truth):  # noqa: F811
+    sights = sights_of(truth)
+    centres = torch.stack([sight.T_world_camera[:3, 3] for sight in sights])
+    found = between(sights, 6, 0.0, np.random.default_rng(0))
+    assert len(found) == 6
+    for sight in found:
+        away = (centres - sight.T_world_camera[:3, 3]).norm(dim=1)
+        assert 0 < away.min() < 0.6 * torch.pdist(centres).max()
+    assert between(sights[:1], 3, 0.0, np.random.default_rng(0)) == []
 
 
 @pytest.mark.parametrize("limit", [1, 7])

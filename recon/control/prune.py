@@ -1,10 +1,12 @@
-"""Takes away Gaussians without which the photographs would look the same: those that explain less than they cost."""
+"""Takes away what explains less than it costs: Gaussians without which no view, photographed or not, would differ."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import msgspec
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,14 +14,26 @@ from recon.background import SOURCE_FRAME as SHELL
 from recon.control.control import Change, Step
 from recon.density import REFERENCE_PX
 from recon.gaussians import Gaussians
+from recon.pseudo_views import pseudo_views
 from recon.rasterize.cpu import rasterize
-from recon.target import Target
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    at: tuple[float, ...] = (0.5,)  # when this part of the refinement is done, rising
-    least_change: float = 0.06  # squared difference of colours in [0, 1], summed over all pixels, channels and views
+    at: tuple[float, ...] = (0.3,)  # when this part of the refinement is done, rising
+    least_change: float = 0.03  # squared difference of colours in [0, 1], summed over all pixels, channels and views
+    between: int = 1  # views between the photographs, for each of these, that count as they do
+    off_path: float = 0.3  # how far these may lie beside the path from photograph to photograph, in its steps
     probes: int = 4  # random images a view from which the differences are estimated
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A camera."""
+
+    T_world_camera: Tensor  # (4, 4)
+    K: Tensor  # (3, 3)
+    width: int
+    height: int
 
 
 def load(config: Config, seed: int) -> Pruning:
@@ -30,6 +44,7 @@ class Pruning:
     def __init__(self, config: Config, seed: int) -> None:
         self._config = config
         self._generator = torch.Generator().manual_seed(seed)
+        self._rng = np.random.default_rng(seed)
         self._due = list(config.at)
 
     def after_step(self, step: Step) -> Change | None:
@@ -38,7 +53,9 @@ class Pruning:
         while self._due and step.progress >= self._due[0]:
             self._due.pop(0)
         gaussians = step.gaussians.map(Tensor.detach)
-        worth = changes_without(gaussians, step.Ts_world_camera, step.targets, self._config.probes, self._generator)
+        sights = [Sight(T, t.K, t.width, t.height) for T, t in zip(step.Ts_world_camera, step.targets, strict=True)]
+        sights += between(sights, self._config.between * len(sights), self._config.off_path, self._rng)
+        worth = changes_without(gaussians, sights, self._config.probes, self._generator)
         # What the photographs do not show is what the far shell is for.
         worth[gaussians.source_frame == SHELL] = torch.inf
         kept = most_worth(worth, self._config.least_change, step.max_gaussians)
@@ -53,33 +70,41 @@ def most_worth(worth: Tensor, least: float, limit: int | None) -> Tensor:
     return kept
 
 
-def changes_without(
-    gaussians: Gaussians,
-    Ts_world_camera: Sequence[Tensor],
-    targets: Sequence[Target],
-    probes: int,
-    generator: torch.Generator,
-) -> Tensor:
-    """(N,) the squared difference that it makes to all photographs together if one Gaussian is left out: an estimate.
+def between(sights: Sequence[Sight], count: int, off_path: float, rng: np.random.Generator) -> list[Sight]:
+    """`count` views where no photograph was taken: what hides behind something in all photographs shows there."""
+    if len(sights) < 2:
+        return []
+    Ts_world_camera = [sight.T_world_camera.double().numpy() for sight in sights]
+    Ks = [sight.K.double().numpy() for sight in sights]
+    sizes = [(sight.width, sight.height) for sight in sights]
+    views = pseudo_views(Ts_world_camera, Ks, sizes, count, off_path=off_path, rng=rng)
+    return [
+        Sight(torch.from_numpy(view.T_world_camera).float(), torch.from_numpy(view.K).float(), view.width, view.height)
+        for view in views
+    ]
+
+
+def changes_without(gaussians: Gaussians, sights: Sequence[Sight], probes: int, generator: torch.Generator) -> Tensor:
+    """(N,) the squared difference that it makes to all images together if one Gaussian is left out: an estimate.
 
     What a pixel shows is linear in each opacity, so that leaving a Gaussian out changes it by opacity * derivative.
     The sum over pixels of these squares is the mean square of their sum with random signs (Hutchinson 1990), which
-    costs no more than a gradient. Pixels count as if the photographs were REFERENCE_PX wide.
+    costs no more than a gradient. Pixels count as if the images were REFERENCE_PX wide.
     """
     opacities = gaussians.opacities.requires_grad_(True)
     total = torch.zeros(len(gaussians))
-    for T_world_camera, target in zip(Ts_world_camera, targets, strict=True):
-        size = (REFERENCE_PX / max(target.width, target.height)) ** 2
+    for sight in sights:
+        size = (REFERENCE_PX / max(sight.width, sight.height)) ** 2
         rgb = rasterize(
             gaussians.means,
             gaussians.quats,
             gaussians.scales,
             opacities,
             gaussians.sh,
-            T_world_camera,
-            target.K,
-            target.width,
-            target.height,
+            sight.T_world_camera,
+            sight.K,
+            sight.width,
+            sight.height,
             channels=("rgb",),
         ).rgb
         assert rgb is not None  # it was asked for
