@@ -92,12 +92,15 @@ def test_a_row_a_checkpoint_and_what_was_measured_is_kept(scene_folder, tmp_path
         assert f'src="renders/blobs-3/01/{picture}"' in page
 
 
-def test_an_interrupted_benchmark_goes_on(scene_folder, tmp_path, in_this_process):
+def test_an_interrupted_benchmark_goes_on(scene_folder, tmp_path, in_this_process, monkeypatch):
     plan = Plan((scene_folder,), (3,), ("exact",))
     first = bench(plan, tmp_path)
     rows = bench(replace(plan, methods=("exact", "refuses")), tmp_path, resume=True)
     assert rows[:1] == first  # not run again: its seconds are the same
     assert [(row.method, row.verdict, row.psnr) for row in rows[1:]] == [("refuses", "NO_OVERLAP", None)]
+    with monkeypatch.context() as patch:
+        patch.setattr("recon.evaluate.bench._run", None)  # nothing is left to run
+        assert bench(replace(plan, methods=("refuses", "exact")), tmp_path, resume=True) == rows
     with pytest.raises(ValueError, match="resume into another folder"):
         bench(plan, tmp_path, resume=True, settings=replace(QUICK, alignment_steps=1))
     assert bench(plan, tmp_path) != first  # without it everything is measured

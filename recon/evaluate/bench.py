@@ -85,6 +85,8 @@ def run_bench(
     known = read_bench(out_dir / "bench.json") if resume and (out_dir / "bench.json").exists() else None
     if known is not None and known.settings != scoring.settings:
         raise ValueError(f"{out_dir} holds views that were scored with {known.settings}: resume into another folder")
+    if known is not None and command not in known.command:
+        command = f"{known.command}; {command}"
     bench = Bench(() if known is None else known.rows, scoring.settings, this_machine(), command)
     finished, started = bench.done(), time.monotonic()
     jobs = [
@@ -92,7 +94,7 @@ def run_bench(
         for (scene, split), seed in itertools.product(sets, plan.seeds)
     ]
     total, number = sum(len(methods) for *_, methods in jobs), 0
-    for scene, split, seed, methods in jobs:
+    for scene, split, seed, methods in (job for job in jobs if job[-1]):
         starts = _Starts(entrants.start_of, scene.frames(split.train), seed, plan.timeout_s)
         for method in methods:
             number += 1
