@@ -34,6 +34,7 @@ _TURN_PER_PIXEL = 0.006  # radians
 _ZOOM_PER_NOTCH = 0.88
 _CLICK_PX = 4  # a pointer that moves less between press and release clicks
 _SMOOTH_S = 0.04  # a picture that takes longer is painted at half the resolution while the pointer drags it
+_REDRAWS = 2  # of Open3D's picture after a change
 _PANEL_EMS = 22  # the panel's width, in letter widths of the theme
 _KEYS = {
     gui.KeyName.SPACE: "space",
@@ -102,6 +103,7 @@ class _Window:
         self._shown: tuple[object, ...] = ()  # what the scene widget shows
         self._analysed: object = None
         self._words_at = 0.0
+        self._redraws = 0
         self._stopped_by = 0  # a signal
         self._notice = ""
 
@@ -137,7 +139,7 @@ class _Window:
         if time.monotonic() - self._words_at > 0.5:
             self._say()
         if not self._dirty:
-            return False
+            return self._redraw_again()
         self._dirty = False
         self._draw()
         self._say()
@@ -170,6 +172,15 @@ class _Window:
         self._scene.show_shapes(session.shapes())
         look_from(self._scene_widget, view, width, height)
         self._scene_widget.force_redraw()
+        self._redraws = _REDRAWS
+
+    def _redraw_again(self) -> bool:
+        """Whether Open3D's picture is drawn once more: its splats appear one drawing later than they were asked for."""
+        if not self._redraws:
+            return False
+        self._redraws -= 1
+        self._scene_widget.force_redraw()
+        return True
 
     def _say(self) -> None:
         self._words_at = time.monotonic()

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import ctypes
-import ctypes.util
 import json
 import os
 import subprocess
@@ -34,6 +32,7 @@ from recon.daemon.scene_message import to_message
 from recon.export.prepare import SH_C0, take
 from recon.picture import take_picture
 from tests.bench.rasterize import processor_name
+from tests.screen import Screen
 from viewer.moment import Moment
 from viewer.session import Session
 from viewer.sources import Finished, load_result
@@ -187,29 +186,6 @@ def agreement(result: Path) -> dict:
 
 
 # ---- From the node to the screen ----------------------------------------------------------------------------------
-
-
-class Screen:
-    """Single pixels of the X display, as a person sees them."""
-
-    def __init__(self) -> None:
-        self._x11 = ctypes.CDLL(ctypes.util.find_library("X11") or "libX11.so.6")
-        self._x11.XOpenDisplay.restype = ctypes.c_void_p
-        self._x11.XDefaultRootWindow.restype = ctypes.c_ulong
-        self._x11.XGetImage.restype = ctypes.c_void_p
-        self._x11.XGetPixel.restype = ctypes.c_ulong
-        display = self._x11.XOpenDisplay(None)
-        if not display:
-            raise SystemExit("needs a display: run it under xvfb-run")
-        self._display = ctypes.c_void_p(display)
-        self._root = ctypes.c_ulong(self._x11.XDefaultRootWindow(self._display))
-
-    def pixel(self, x: int, y: int) -> tuple[int, int, int]:
-        everything, z_pixmap = ctypes.c_ulong(2**32 - 1), 2
-        image = ctypes.c_void_p(self._x11.XGetImage(self._display, self._root, x, y, 1, 1, everything, z_pixmap))
-        value = self._x11.XGetPixel(image, 0, 0)
-        self._x11.XDestroyImage(image)
-        return (value >> 16) & 255, (value >> 8) & 255, value & 255
 
 
 def watch(result: Path, minutes: float, period_s: float) -> dict:

@@ -1,0 +1,177 @@
+"""The viewer driven by mouse and keys, as a person would, with a picture of each step to be looked at:
+`xvfb-run -s "-screen 0 1280x800x24" python -m tests.bench drive RESULT FOLDER`. It needs xdotool.
+
+The viewer starts late, at a node whose scene is there already; then the scene grows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from capture.frame import DroppedFrame
+from capture.messaging.network import Network
+from capture.messaging.services import RECON_SCENE
+from capture.messaging.state import StateServer
+from capture.messaging.wire import Numbering
+from recon.daemon.scene_message import to_message
+from recon.export.prepare import take
+from recon.snapshot import Snapshot
+from recon.verdict import Code, Verdict
+from tests.screen import Screen
+from viewer.analysis import analyse
+from viewer.canvas import project
+from viewer.moment import Moment
+from viewer.sources import load_result
+from viewer.viewpoint import overview
+
+WINDOW = 1280, 800
+PICTURE = 928, 800  # the part of it that is not the panel
+SETTLE_S = 0.7  # after an action
+REASONS = (DroppedFrame("blurred.jpg", "too blurred"), DroppedFrame("elsewhere.jpg", "it overlaps with no other frame"))
+
+
+@dataclass(frozen=True)
+class Step:
+    name: str
+    actions: tuple[str, ...]  # what xdotool is asked for
+
+
+def click(x: float, y: float, button: int = 1) -> str:
+    return f"mousemove {round(x)} {round(y)} sleep 0.1 mousedown {button} sleep 0.1 mouseup {button}"
+
+
+def drag(button: int) -> str:
+    path = " sleep 0.05 ".join(f"mousemove {400 + 15 * step} {350 + 5 * step}" for step in range(1, 9))
+    return f"mousemove 400 350 sleep 0.1 mousedown {button} sleep 0.1 {path} mouseup {button}"
+
+
+def steps(camera: npt.NDArray[np.floating]) -> list[Step]:
+    """What a person would try; `camera` (2,) is where one is seen. Rows of the panel are where its theme puts them."""
+    switches = ("gaussians", "as_points", "cameras", "photographs", "path", "tracked", "advice")
+    places = [(947, 40), (1069, 40), (947, 67), (1069, 67), (947, 94), (1069, 94), (947, 121)]
+    toggled = [
+        Step(f"switch_{name}_{turn}", (click(*place),))
+        for name, place in zip(switches, places, strict=True)
+        for turn in ("changed", "back")
+    ]
+    colours = [Step(f"colour_{name}", ("key c",)) for name in ("depth", "normal", "support", "source", "photograph")]
+    return [
+        Step("started", ()),
+        Step("help", ("key h",)),
+        Step("help_closed", ("key h",)),
+        *toggled,
+        *colours,
+        Step("points", ("key g",)),
+        Step("points_larger", ("key bracketright", "key bracketright")),
+        Step("points_off", ("key g",)),
+        Step("orbit", (drag(1),)),
+        Step("pan", (drag(3),)),
+        Step("zoom", ("mousemove 460 400 click 4 click 4 click 4",)),
+        Step("whole", ("key r",)),
+        Step("camera_clicked", (click(*camera),)),
+        Step("blend_half", ("key period", "key period")),
+        Step("blend_full", ("key period", "key period")),
+        Step("blend_none", ("key comma", "key comma", "key comma", "key comma")),
+        Step("next_camera", ("key n",)),
+        Step("follow", ("key f",)),
+        Step("free_again", ("key r",)),
+        Step("past", ("key Left", "key Left")),
+        Step("present", ("key Right", "key Right")),
+        Step("paused", ("key space",)),
+        Step("unpaused", ("key space",)),
+        Step("saved", ("key s",)),
+        Step("open3d", ("key e",)),
+        Step("open3d_points", ("key g",)),
+        Step("own_again", ("key e", "key g")),
+        Step("resized", ("search --name ^splatnode$ windowsize 900 600",)),
+    ]
+
+
+def growing(whole: Snapshot) -> list[Snapshot]:
+    """The result as it might have grown: more cameras and Gaussians each time."""
+    count = len(whole.cameras)
+    parts = []
+    for number, cameras in enumerate((3, max(3, count // 2), count)):
+        share = cameras / count
+        gaussians = take(whole.gaussians, np.random.default_rng(0).random(len(whole.gaussians)) < share)
+        verdict = whole.verdict
+        if cameras < count:
+            verdict = Verdict(Code.OK_PARTIAL, f"{cameras} of {count} frames were placed.", "Go on.", (), True)
+        parts.append(
+            replace(
+                whole,
+                sequence=number,
+                cameras=whole.cameras[:cameras],
+                gaussians=gaussians,
+                verdict=verdict,
+                dropped=REASONS[:number],
+                final=False,
+            )
+        )
+    return parts
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m tests.bench drive", description=__doc__)
+    parser.add_argument("result", type=Path, help="a result's folder with its photographs")
+    parser.add_argument("out", type=Path, help="where the pictures go")
+    arguments = parser.parse_args()
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    moment = load_result(arguments.result)
+    with tempfile.TemporaryDirectory(prefix="splatnode-") as folder:
+        config = Path(folder, "node.yaml")
+        config.write_text(f"network: {{directory: {folder}}}\n")
+        with StateServer(RECON_SCENE, Network(directory=Path(folder))) as server:
+            server.publish(*to_message(growing(moment.snapshot)[0], "place", Numbering().next()))
+            command = [sys.executable, "-m", "splatnode", "view", str(config), "--out", str(arguments.out)]
+            viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            try:
+                drive(moment, server, viewer, arguments.out)
+            finally:
+                viewer.terminate()
+                print("exit status", viewer.wait())
+
+
+def drive(moment: Moment, server: StateServer, viewer: subprocess.Popen, out: Path) -> None:
+    """Takes all the steps. Raises SystemExit where the viewer ends before."""
+    screen, numbering = Screen(), Numbering()
+
+    def settle(seconds: float) -> None:
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            server.serve(0.02)
+
+    while viewer.poll() is None and screen.picture(*PICTURE).std() < 8:
+        settle(0.2)
+    for snapshot in growing(moment.snapshot):
+        server.publish(*to_message(snapshot, "place", numbering.next(), tracked=snapshot.cameras[-1]))
+        settle(2 * SETTLE_S)
+    view = overview(moment, analyse(moment).advice.arrow or ())
+    camera = project(moment.snapshot.cameras[1].T_world_camera[None, :3, 3], view, *PICTURE)[0, :2]
+    before = screen.picture(*WINDOW)
+    for number, step in enumerate(steps(camera)):
+        for action in step.actions:
+            subprocess.run(["xdotool", *action.split()], check=True)
+            settle(0.15)
+        settle(SETTLE_S)
+        after = screen.picture(*WINDOW)
+        changed = float((np.abs(after.astype(int) - before) > 8).any(2).mean())
+        print(f"{number:02d} {step.name}: {changed:.1%} of the screen changed", flush=True)
+        cv2.imwrite(str(out / f"{number:02d}_{step.name}.png"), after)
+        before = after
+        if viewer.poll() is not None:
+            raise SystemExit(f"the viewer ended with {viewer.returncode} at {step.name}")
+
+
+if __name__ == "__main__":
+    main()
