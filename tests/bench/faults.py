@@ -286,6 +286,7 @@ def unauthorised(trial: Trial) -> None:
     with running(trial.node(network=network)) as node:
         node.start("recon")
         node.start("capture")
+        wait_for(lambda: "event=ready" in node.log("recon"), "recon that runs")
         outsider = StateClient(RECON_SCENE, typed(network | {"keys": str(stranger)}, Network), SceneHeader)
         refused = False
         deadline = time.monotonic() + 15
