@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from capture.config import typed
-from recon import background, completion, density, pixelwise
+from recon import background, completion, density, pixelwise, rim
 from recon.config import Config
 from recon.priors.pointmap import Pointmap
 from recon.registration.register import RegisteredCamera
@@ -64,6 +64,18 @@ def test_depths_that_stereo_does_not_believe_in_move_neither_surfaces_nor_the_sh
         pointmap.confidence[:8] = 0.05
     doubtful[1].depth[:8] = 50.0
     assert torch.equal(scene_of(sure).gaussians.means, scene_of(doubtful).gaussians.means)
+
+
+@pytest.mark.parametrize("by_pixel", [None, pixelwise.Config()])
+def test_nothing_begins_where_photographs_do_not_show_the_scene(by_pixel, monkeypatch):
+    right = np.broadcast_to(np.arange(WIDTH) >= 8, (HEIGHT, WIDTH))
+    monkeypatch.setattr(rim, "shown", lambda images: [right] * len(images))
+    scene = begun(by_pixel=by_pixel)
+    for view in scene.views:
+        assert view.pointmap is not None and not view.pointmap.depth[~right].any()
+        own = scene.gaussians.means[scene.gaussians.source_frame == view.frame_id]
+        x, _, z = ((own - view.T_world_camera[:3, 3]) @ view.K.T).unbind(1)
+        assert len(own) > 0 and bool((x / z > 7.9).all())
 
 
 @pytest.mark.parametrize("most", [None, 100])
