@@ -1,0 +1,165 @@
+"""What Gaussians buy: `python -m tests.bench parsimony [SCENE:VIEWS ...] --out parsimony.json [--chart parsimony.png]`.
+
+Each set of photographs is registered once, and scenes are made from the same cameras and points: of the size that
+splatnode chooses; of eighths to four times of it; with a Gaussian a pixel; and, of the size that was chosen, by Markov
+chain Monte Carlo from an even choice of the pixels. All are refined for as many iterations and scored alike. Rows that
+the file holds already are not measured again, so it can be filled in parts.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pickle
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from recon import pixelwise
+from recon.config import Config, preset
+from recon.control import prune, relocate
+from recon.control.control import ControlChoice
+from recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
+from recon.evaluate.splits import Split, load_split
+from recon.evaluate.start import Start, continued, find_start
+from recon.evaluate.truth import EvaluationScene, load_scene
+from recon.export.prepare import viewer_safe
+from recon.export.spz import encode_spz
+from recon.rasterize.cpu import rasterize
+from recon.report import peak_rss_mb
+from tests.bench.parsimony_chart import PIXEL, RIVAL, SELF, draw, summary
+
+CASES = (
+    *(f"{scene}:{views}" for scene in ("fountain_p11", "llff_fern", "llff_flower", "sceaux") for views in (3, 6)),
+    *("fox:6", "tum_fr3_office:6", "castle_p30:6", "llff_flower:12"),
+)
+FACTORS = (1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0)  # of the size that was chosen
+ITERATIONS = 500
+
+
+@dataclass(frozen=True)
+class Row:
+    scene: str
+    views: int
+    method: str  # SELF, PIXEL, RIVAL, or "x2" for twice the chosen size
+    num_gaussians: int
+    psnr: float | None
+    ssim: float | None
+    lpips: float | None
+    ply_bytes: int | None
+    spz_bytes: int
+    seconds: float  # of the processor, from the points on
+    peak_rss_mb: float | None  # of the process so far, cameras and points included where it found them itself
+
+
+def configurations(chosen: int) -> dict[str, Config]:
+    """By method, with `chosen` the size that splatnode chose."""
+    ours = preset("balanced")
+    ours = replace(ours, optimize=replace(ours.optimize, iterations=ITERATIONS, checkpoints=()))
+    fine = replace(ours.density, most_error=1e-3, smallest_px=1.0)
+    by_size = replace(ours.optimize, control=ControlChoice("prune", prune.Config(least_change=0.0)))
+    by_pixel = replace(ours, pixelwise=pixelwise.Config(), optimize=replace(ours.optimize, control=None))
+    relocating = replace(ours.optimize, control=ControlChoice("relocate", relocate.Config()))
+    forced = {
+        f"x{factor:g}": replace(ours, density=fine, optimize=by_size, max_gaussians=round(factor * chosen))
+        for factor in FACTORS
+    }
+    rival = replace(by_pixel, optimize=relocating, max_gaussians=chosen, surplus=1.0)
+    return {SELF: ours, **forced, PIXEL: by_pixel, RIVAL: rival}
+
+
+def measure(scene: EvaluationScene, split: Split, start: Start, method: str, config: Config, scoring: Scoring) -> Row:
+    """One scene from the points to its scores. `start` is used up."""
+    started = time.process_time()
+    *_, snapshot = continued(start, config)
+    seconds = time.process_time() - started
+    peak = peak_rss_mb()
+    run = Run(method, 0, None, {}, None)
+    networks, settings = scoring.networks, scoring.settings
+    scored = evaluate(snapshot, scene, split, run, rasterize=rasterize, networks=networks, settings=settings)
+    return Row(
+        scene=scene.name,
+        views=len(split.train),
+        method=method,
+        num_gaussians=len(snapshot.gaussians),
+        psnr=scored.psnr,
+        ssim=scored.ssim,
+        lpips=scored.lpips_alex,
+        ply_bytes=scored.scene_bytes,
+        spz_bytes=len(encode_spz(viewer_safe(snapshot.gaussians))),
+        seconds=seconds,
+        peak_rss_mb=peak,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Scoring:
+    networks: Networks
+    settings: Settings
+
+
+@dataclass(frozen=True, eq=False)
+class Folders:
+    scenes: Path
+    starts: Path  # cameras and points that were found before
+
+
+def found_start(folders: Folders, scene: EvaluationScene, split: Split) -> bytes:
+    """Cameras and points of the photographs, pickled: every method gets a copy of its own."""
+    path = folders.starts / f"{scene.name}_{len(split.train)}.start"
+    if not path.exists():
+        folders.starts.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(pickle.dumps(find_start(scene.frames(split.train), preset("balanced"))))
+    return path.read_bytes()
+
+
+def fill(case: str, rows: list[Row], folders: Folders, scoring: Scoring, out: Path, only: tuple[str, ...]) -> None:
+    """Adds to `rows`, and to the file, what `case` lacks of the methods in `only`; of all, if that is empty."""
+    name, _, views = case.partition(":")
+    scene = load_scene(folders.scenes / name)
+    split = load_split(folders.scenes / name, list(scene.paths), int(views))
+    known = {row.method: row for row in rows if (row.scene, row.views) == (name, len(split.train))}
+    for method in configurations(1):
+        if method in known or (only and method not in only and method != SELF):
+            continue
+        config = configurations(known[SELF].num_gaussians if known else 1)[method]
+        start = pickle.loads(found_start(folders, scene, split))
+        row = known[method] = measure(scene, split, start, method, config, scoring)
+        rows.append(row)
+        write(rows, scoring.settings, out)
+        print(json.dumps(asdict(row)), flush=True)
+
+
+def write(rows: list[Row], settings: Settings, out: Path) -> None:
+    records = [asdict(row) for row in rows]
+    content = {"summary": summary(records), "settings": asdict(settings), "iterations": ITERATIONS, "rows": records}
+    out.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", nargs="*", help=f"default: {' '.join(CASES)}")
+    parser.add_argument("--methods", nargs="+", default=(), help="of these only, besides the chosen size")
+    parser.add_argument("--alignment-steps", type=int, default=Settings.alignment_steps, help="of each test camera")
+    parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
+    parser.add_argument("--starts", type=Path, required=True, help="folder for cameras and points")
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to fill")
+    parser.add_argument("--chart", type=Path, help="PNG file to draw from it")
+    arguments = parser.parse_args()
+    rows = [Row(**row) for row in json.loads(arguments.out.read_text())["rows"]] if arguments.out.exists() else []
+    networks = Networks(load_networks(arguments.shared / "weights").alex, None)
+    if networks.alex is None:
+        parser.error(f"{arguments.shared}/weights must hold LPIPS's weights for AlexNet. Run: splatnode weights")
+    scoring = Scoring(networks, Settings(alignment_steps=arguments.alignment_steps))
+    folders = Folders(arguments.shared / "scenes", arguments.starts)
+    for case in arguments.cases or CASES:
+        fill(case, rows, folders, scoring, arguments.out, tuple(arguments.methods))
+    print(json.dumps(summary([asdict(row) for row in rows]), indent=1))
+    if arguments.chart:
+        arguments.chart.write_bytes(draw([asdict(row) for row in rows]))
+
+
+if __name__ == "__main__":
+    main()
