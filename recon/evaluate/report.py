@@ -54,9 +54,10 @@ def _introduction(bench: Bench) -> str:
     return (
         f"Machine: {machine.get('processor')}, {machine.get('threads')} threads. Held-out views are scored after their "
         f"pose was found in the finished scene ({settings.alignment_steps} steps, equation 18), at "
-        f"{settings.longer_side} px. Seconds are wall time of the reconstruction alone, with the cameras and points "
-        "that methods of one prior share. Means are over the runs that every method was put to "
-        "and, of these, the method's that published a scene; `±`: standard deviation "
+        f"{settings.longer_side} px, without the black rim that undistortion left (`with rim`: PSNR of the whole "
+        "photograph). Seconds are wall time of the reconstruction alone, with the cameras and points that methods of "
+        "one prior share. Means are over the runs that every method was put to and, of these, the method's that "
+        "published a scene; `±`: standard deviation "
         "between seeds; `–`: not measured."
     )
 
