@@ -172,4 +172,4 @@ def test_nope_nerf_learns_a_place_from_its_depths():
     once, final = nope_nerf.reconstruct(frames, 0, config)
     assert not once.final and final.final and final.verdict.publishable
     assert [camera.name for camera in final.cameras] == [frame.name for frame in frames]
-    assert final.seconds["points"] > 0
+    assert final.seconds["points"] > 0 and final.served_by == {"depth": "multi-view depth"}

@@ -4,10 +4,10 @@ For each frame Gaussians are made from its depth and fitted to it alone; the rig
 next frame, with all else frozen, is its pose. The scene starts from the first frame and is refined with all frames so
 far after each new one, with adaptive density control.
 
-As published: this order, the losses, and the step sizes of 3DGS. Compact: 100 iterations for a frame alone, 200 for a
-motion, 100 after each frame and 600 at the end, where the publication has several hundred each and grows with the
-length of a film; photographs of 512 pixels; a Gaussian for every fourth pixel. A monocular network's place takes
-`known_depth`, which also gives the focal length.
+As published: this order, the losses, and the step sizes of 3DGS. Compact: 60 iterations for a frame alone, 200 for a
+motion, 60 after each frame and 500 at the end, where the publication has several hundred each and grows with the length
+of a film; photographs of 512 pixels; a Gaussian for every ninth pixel. A monocular network's place takes `known_depth`,
+which also gives the focal length.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 import torch
+from torch import Tensor
 
 from capture.frame import Frame
 from recon import optimize
@@ -33,17 +34,18 @@ from recon.points import gaussians_at
 from recon.priors.pointmap import world_points
 from recon.rasterize.cpu import rasterize
 from recon.rivals import colmap_3dgs, outcome
-from recon.rivals.known_depth import Sight, sights
+from recon.rivals.known_depth import SERVED_BY, Sight, sights
 from recon.scene import Scene, View
 from recon.snapshot import Snapshot
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    alone: int = 100  # iterations of a frame's own Gaussians
+    alone: int = 60  # iterations of a frame's own Gaussians
     motion: int = 200  # steps to the next frame's pose
-    growing: int = 100  # iterations with all frames so far
-    final: int = 600  # with all frames
-    stride: int = 2  # between the pixels that get a Gaussian
+    motion_rate: float = 0.01  # their size at the start, in radians and in parts of the depth
+    growing: int = 60  # iterations with all frames so far
+    final: int = 500  # with all frames
+    stride: int = 3  # between the pixels that get a Gaussian
     opacity: float = 0.5  # of a Gaussian that starts from a pixel
 
 
@@ -71,7 +73,7 @@ def reconstruct(frames: Sequence[Frame], seed: int, config: Config | None = None
     clock.lap("poses")
     together = msgspec.structs.replace(_TOGETHER, iterations=config.final, checkpoints=(config.final // 3,))
     refined = optimize.refine(scene, colmap_3dgs.in_extent(together, scene), seed=seed)
-    yield from outcome.told((outcome.of_scene(frames, each) for each in refined), clock)
+    yield from outcome.told((outcome.of_scene(frames, each) for each in refined), clock, SERVED_BY)
 
 
 def _next_pose(sight: Sight, view: View, following: Sight, seed: int, config: Config) -> np.ndarray:
@@ -80,8 +82,22 @@ def _next_pose(sight: Sight, view: View, following: Sight, seed: int, config: Co
     alone = Scene((view,), _from_depth(sight, T_world_camera, config))
     fitted = _refined(alone, _ALONE, config.alone, seed)
     image = torch.from_numpy(following.image).float() / 255.0
-    look = Splats(fitted.arrays(), rasterize)
-    return align_test_pose(look, image, T_world_camera, following.K, steps=config.motion, levels=3).T_world_camera
+    look = _Alone(fitted.arrays(), rasterize)
+    aligned = align_test_pose(
+        look, image, T_world_camera, following.K, steps=config.motion, levels=3, learning_rate=config.motion_rate
+    )
+    return aligned.T_world_camera
+
+
+class _Alone(Splats):
+    """Gaussians of a single frame: another one is compared with them where they are, and not beside its border."""
+
+    def difference(self, image: Tensor, T_world_camera: Tensor, K: Tensor) -> Tensor:
+        height, width = image.shape[:2]
+        render = self._rasterize(*self._tensors, T_world_camera, K, width, height, channels=("rgb", "alpha"))
+        assert render.rgb is not None and render.alpha is not None  # they were asked for
+        covered = (render.alpha.detach() > 0.5)[..., None]
+        return ((render.rgb - image).abs() * covered).sum() / (3 * covered.sum().clamp_min(1))
 
 
 def _refined(scene: Scene, config: optimize.Config, iterations: int, seed: int) -> Scene:

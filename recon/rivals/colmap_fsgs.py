@@ -1,10 +1,10 @@
 """COLMAP's cameras and points, then FSGS (Zhu et al. 2024): Gaussians are grown into the gaps between few points.
 
 As published: the weight of the correlation with a known depth, on training and on pseudo views, the threshold of
-adaptive density control, three neighbours, and Gaussians added from a twentieth of the run on to its end. Compact: 1500
-iterations for 10 000. Where FSGS asks a monocular network, our multi-view depth serves, with COLMAP's cameras; a pseudo
-view's is that of its points. How far apart points must be is given without units, so that ours is in parts of the
-scene's extent.
+adaptive density control, three neighbours, and Gaussians added from a twentieth of the run on until shortly before its
+end. Compact: 1500 iterations for 10 000, and no resets of opacities. Where FSGS asks a monocular network, our
+multi-view depth serves, with COLMAP's cameras; a pseudo view's is that of its points. How far apart points must be is
+given without units, so that ours is in parts of the scene's extent.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _WHOLE = 1_000_000  # pixels of a patch: all of an image is one, as FSGS correla
 _DEPTH = regularise.Config(
     depth=regularise.Term(0.05, 0.2, 0.95), depth_patch=_WHOLE, depth_share=1.0, min_confidence=0.1
 )
-_CONTROL = proximity.Config(adaptive.Config(gradient=5e-4, start=0.05, end=1.0, reset_every=0.3))
+_CONTROL = proximity.Config(adaptive.Config(gradient=5e-4, start=0.05, end=0.95, reset_every=adaptive.NEVER))
 OPTIMIZE = msgspec.structs.replace(
     colmap_3dgs.OPTIMIZE, regularise=_DEPTH, control=ControlChoice("proximity", _CONTROL)
 )

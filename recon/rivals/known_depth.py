@@ -19,7 +19,7 @@ from recon.config import Config
 from recon.pipeline import Reconstruction
 from recon.priors.pointmap import Pointmap
 
-SERVED_BY = "multi-view depth"
+SERVED_BY = {"depth": "multi-view depth"}
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from capture.frame import Frame
 from recon.clock import Clock
 from recon.keyframe import modelled_image
 from recon.rivals import outcome
-from recon.rivals.known_depth import Sight, sights
+from recon.rivals.known_depth import SERVED_BY, Sight, sights
 from recon.rivals.nerf import fit
 from recon.rivals.nerf.cameras import Focal
 from recon.rivals.nerf.look import lattice, of_field
@@ -48,7 +48,7 @@ def reconstruct(frames: Sequence[Frame], seed: int, config: fit.Config = OPTIMIZ
     learnt = fit.learn(
         [view.image for view in views], focal, config, seed=seed, further=terms, beside=(terms.scales, terms.offsets)
     )
-    yield from outcome.told((of_field(frames, placed, each) for each in learnt), clock)
+    yield from outcome.told((of_field(frames, placed, each) for each in learnt), clock, SERVED_BY)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 from capture.frame import Frame
 from recon.clock import Clock
@@ -48,15 +49,21 @@ def of_scene(frames: Sequence[Frame], scene: Scene) -> Snapshot:
         images={},
         dropped=(),
         iterations=scene.iterations,
+        served_by=scene.served_by,
     )
 
 
-def told(snapshots: Iterable[Snapshot], clock: Clock) -> Iterator[Snapshot]:
-    """The snapshots that an optimisation gives, numbered and timed as "optimise", and the last one again as final."""
+def told(
+    snapshots: Iterable[Snapshot], clock: Clock, served_by: Mapping[str, str] = MappingProxyType({})
+) -> Iterator[Snapshot]:
+    """The snapshots that an optimisation gives, numbered and timed as "optimise", and the last one again as final.
+
+    `served_by` names what took the place of networks that the publication has.
+    """
     last = None
     for sequence, snapshot in enumerate(snapshots, 1):
         clock.lap("optimise")
-        last = replace(snapshot, sequence=sequence, seconds=clock.booked)
+        last = replace(snapshot, sequence=sequence, seconds=clock.booked, served_by={**snapshot.served_by, **served_by})
         yield last
         clock.lap("wait")
     assert last is not None  # an optimisation gives its end

@@ -20,8 +20,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     iterations: int = 1500
     checkpoints: tuple[int, ...] = (400,)
     rays: int = 384  # of one photograph, in each iteration
-    field_rate: float = 1e-3  # Adam's step sizes at the start
-    camera_rate: float = 1e-3  # of rotations, centres, focal length and whatever a method learns beside them
+    field_rate: float = 5e-3  # Adam's step sizes at the start
+    camera_rate: float = 3e-3  # of rotations, centres, focal length and whatever a method learns beside them
     field_final: float = 0.1  # to which part they have fallen at the end, exponentially
     camera_final: float = 0.1
 
