@@ -179,6 +179,8 @@ def test_a_photograph_covers_the_render_pixel_by_pixel():
     assert np.abs(half - (picture / 2 + 50)).max() <= 0.5
     wide = blended(np.full((80, 200, 3), 7, np.uint8), picture, one, view.K(200, 80), 1.0)
     assert np.array_equal(wide[:, 50:150], picture) and (wide[:, :49] == 7).all()
+    grey = np.full((8, 10, 3), 100, np.uint8)  # a small one has soft edges: they must not be dark
+    assert (np.abs(blended(render, grey, one, view.K(100, 80), 1.0).astype(int) - 100) <= 1).all()
 
 
 def test_captions_stand_below():

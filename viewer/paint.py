@@ -57,7 +57,7 @@ def blended(image: Image, photograph: Image, camera: CameraEstimate, K: Array, w
     homography = K @ np.linalg.inv(camera.K) @ np.diag(size)
     corner = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])  # OpenCV's top-left pixel has its centre at (0, 0)
     homography = np.linalg.inv(corner) @ homography @ corner
-    over = cv2.warpPerspective(photograph, homography, (width, height), flags=cv2.INTER_LINEAR)
+    over = cv2.warpPerspective(photograph, homography, (width, height), borderMode=cv2.BORDER_REPLICATE)
     inside = cv2.warpPerspective(np.full(photograph.shape[:2], 255, np.uint8), homography, (width, height))
     share = (weight / 255.0 * inside).astype(np.float32)
     return np.asarray(cv2.blendLinear(over, image, share, 1.0 - share), np.uint8)
