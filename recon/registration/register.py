@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from capture.frame import Frame
 from recon.keyframe import Features, Keyframe
-from recon.registration import bundle, features, lenses, mapper, matching, refinement, two_view, uncertainty
+from recon.registration import bundle, features, lenses, looks, mapper, matching, refinement, two_view, uncertainty
 from recon.registration.lenses import Grouping
 from recon.registration.survey import View
 from recon.registration.two_view import TwoView
@@ -97,7 +97,12 @@ def compare_squeezed(keyframe1: Keyframe, keyframe2: Keyframe, plain: Compared, 
 
 
 def compare_further(keyframe1: Keyframe, keyframe2: Keyframe, known: Compared, more: Index, config: Config) -> Compared:
-    """The same with `more` matches (M, 2) of the keyframes' points, most distinct first, beside the `known` ones."""
+    """The same with `more` matches (M, 2) of the keyframes' points, most distinct first, beside the `known` ones.
+
+    They come from a prior, which may invent: what does not look alike is not taken.
+    """
+    if not looks.alike(keyframe1, keyframe2, more):
+        return known
     return _examine(keyframe1, keyframe2, _merged([known.matches, more]), config)
 
 
