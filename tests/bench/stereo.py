@@ -117,8 +117,8 @@ def _mutual_matches(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> t
     return rows[keep], best[keep]
 
 
-def stereo_view(photo: Photo, depths: Float64) -> View:
-    image = modelled_image(photo.image, LONGER_SIDE)
+def stereo_view(photo: Photo, depths: Float64, longer_side: int) -> View:
+    image = modelled_image(photo.image, longer_side)
     scale = np.diag([image.shape[1] / photo.image.shape[1], image.shape[0] / photo.image.shape[0], 1.0])
     return View(image, scale @ photo.K, photo.T_world_camera, depth_range(depths))
 
@@ -179,12 +179,14 @@ class Case:
     seen_twice_close: list[npt.NDArray[np.bool_]]  # (h, w) each, of these the ones close to a reference point
 
 
-def make_case(scene: Path, names: list[str], reference_names: list[str]) -> Case:
+def make_case(scene: Path, names: list[str], reference_names: list[str], longer_side: int = LONGER_SIDE) -> Case:
     photos = {photo.name: photo for photo in read_photos(scene, reference_names)}
     references = [
         reference_depths(photos[name], [photo for photo in photos.values() if photo.name != name]) for name in names
     ]
-    views = [stereo_view(photos[name], depths) for name, (_, depths) in zip(names, references, strict=True)]
+    views = [
+        stereo_view(photos[name], depths, longer_side) for name, (_, depths) in zip(names, references, strict=True)
+    ]
     points = [
         points * np.array(view.image.shape[1::-1]) / np.array(photos[name].image.shape[1::-1])
         for name, view, (points, _) in zip(names, views, references, strict=True)
