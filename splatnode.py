@@ -15,6 +15,7 @@ import math
 import os
 import signal
 import sys
+import threading
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -53,12 +54,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     logging.basicConfig(format="%(message)s", stream=sys.stderr)
     for room in ("capture", "recon", "viewer"):
         logging.getLogger(room).setLevel(logging.INFO)
-    signal.signal(signal.SIGTERM, _stop)
+    stopping = threading.Event()
+
+    def stop(_signal: int, _frame: object) -> None:
+        stopping.set()
+        sys.exit(0)
+
+    signal.signal(signal.SIGTERM, stop)
     try:
         code = args.run(args)
         sys.stdout.flush()
         return code
     except (Exception, KeyboardInterrupt) as error:
+        if stopping.is_set():  # a package that was being imported makes an ImportError of the exit
+            return 0
         if args.debug:
             traceback.print_exc()
         code = exit_code(error)
@@ -120,10 +129,6 @@ def _is_write_error(error: OSError) -> bool:
     """ResultWriteError can only have been raised by a room that has been imported."""
     staged = sys.modules.get("recon.export.staged")
     return staged is not None and isinstance(error, staged.ResultWriteError)
-
-
-def _stop(_signal: int, _frame: object) -> None:
-    sys.exit(0)
 
 
 def _lazily(module: str, function: str) -> Command:

@@ -104,6 +104,21 @@ def test_signals_end_a_verb_cleanly(number, code):
     assert "Traceback" not in err
 
 
+def test_a_stop_that_an_import_turns_into_its_own_error_is_a_stop(monkeypatch, capsys):
+    def interrupted_import(_args):
+        try:
+            signal.raise_signal(signal.SIGTERM)
+        except SystemExit as error:
+            raise ImportError("cannot import name 'gui' from partially initialized module") from error
+
+    before = signal.getsignal(signal.SIGTERM)
+    try:
+        assert run_verb(monkeypatch, interrupted_import) == 0
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert capsys.readouterr().err == ""
+
+
 @pytest.mark.parametrize(
     "argv, said",
     [
