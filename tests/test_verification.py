@@ -74,7 +74,7 @@ def test_pixels_tell_a_wrong_pose(degrees):
     """Patches of a camera that stands elsewhere are found on the predicted lines no more often than beside them."""
     graph, _ = placed()
     wrong = turned(degrees)
-    pictures = verify.pictures(graph, wrong, CONFIG.photometric)
+    pictures = verify.pictures(graph, wrong, CONFIG.photometric, [camera.index for camera in wrong.cameras])
     index = wrong.cameras[1].index
     share = photometric.in_partners(index, pictures, wrong, CONFIG.photometric)
     assert share.tried > 40
@@ -99,7 +99,7 @@ def test_two_places_that_share_no_points_are_found_as_two_parts():
         observed_point=found.observed_point[kept],
         observed_pixels=found.observed_pixels[kept],
     )
-    pictures = verify.pictures(graph, found, CONFIG.photometric)
+    pictures = verify.pictures(graph, found, CONFIG.photometric, [camera.index for camera in found.cameras])
     joint = joints.weakest(apart, graph.pairs, pictures, CONFIG.photometric)
     assert joint.points == 0 and joint.group in ((0, 1), (2, 3))
 
