@@ -26,6 +26,7 @@ PARTS = (
     Part("da3", "prior", ("da3/da3-small.safetensors",), "safetensors"),
     Part("patchmatchnet", "prior", ("patchmatchnet/patchmatchnet_dtu.pth",)),
     Part("xfeat", "prior", ("xfeat/xfeat_640x640.onnx", "xfeat/lighterglue_L3.onnx"), "onnxruntime"),
+    Part("aliked", "prior", ("aliked/aliked-n16.pth",)),
     Part("mono depth", "depth and normal losses", ("depth_anything_v2/depth_anything_v2_vits.pth",)),
     Part("dinov2", "semantic loss", ("dinov2/dinov2_vits14_pretrain.pth",)),
     Part("metric", "metres indoors", ("depth_anything_v2/depth_anything_v2_metric_hypersim_vits.pth",)),

@@ -23,7 +23,7 @@ def loaded(kind: str):
 
 
 def test_the_priors_are_found():
-    assert set(PriorChoice.kinds()) >= {"classical", "mast3r", "patchmatchnet", "xfeat"}
+    assert set(PriorChoice.kinds()) >= {"aliked", "classical", "mast3r", "patchmatchnet", "xfeat"}
     assert "stereo" not in PriorChoice.kinds() and "pointmap" not in PriorChoice.kinds()
 
 
