@@ -20,7 +20,7 @@ from recon.rasterize.cpu import rasterize
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     at: tuple[float, ...] = (0.3,)  # when this part of the refinement is done, rising
-    least_change: float = 0.06  # squared difference of colours in [0, 1], summed over all pixels, channels and views
+    least_change: float = 0.035  # squared difference of colours in [0, 1], summed over all pixels, channels and views
     between: int = 1  # views between the photographs, for each of these, that count as they do
     off_path: float = 0.3  # how far these may lie beside the path from photograph to photograph, in its steps
     probes: int = 4  # random images a view from which the differences are estimated
