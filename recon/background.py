@@ -18,7 +18,7 @@ from recon.priors.pointmap import Pointmap
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     spacing_deg: float = 5.0  # between neighbouring Gaussians of the shell; 0 leaves it out
     margin: float = 0.5  # how far beyond the images' borders it reaches, in units of their size
-    distance: float = 4.0  # from the cameras, in units of the farthest known depth
+    distance: float = 1.3  # from the cameras, in units of the farthest known depth
     opacity: float = 0.95
 
 
