@@ -76,7 +76,7 @@ def _detect(image: Image, squeeze: float, config: Config) -> tuple[npt.NDArray[n
         return np.zeros((0, 2)), np.zeros((0, 128), np.uint8)
     order = np.argsort([-keypoint.response for keypoint in keypoints], kind="stable")
     points = (np.array([keypoint.pt for keypoint in keypoints])[order] + 0.5) * (width / size[0], height / size[1])
-    return points, root_sift(raw[order])
+    return points, root_sift(np.asarray(raw, np.float32)[order])
 
 
 def root_sift(raw: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
