@@ -11,6 +11,7 @@ from statistics import mean
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 
 from recon.evaluate.charts import pareto_front
 
@@ -112,6 +113,7 @@ def _chart(chart: Any, methods: Mapping[str, Record], key: str, cost: str) -> No
             row = methods[name]
             chart.scatter(row[cost], row[key], s=size, marker=marker, c=colour, zorder=3, label=names[name])
     chart.set_xscale("log")
+    chart.xaxis.set_minor_formatter(NullFormatter())  # its numbers would lie on each other
     if MEASURES[key] < 0:
         chart.invert_yaxis()
     chart.tick_params(labelsize=7)
