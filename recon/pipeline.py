@@ -145,8 +145,9 @@ class Reconstruction:
         self.graph.add(keyframe, soon=True)
         newest = len(self.graph.keyframes) - 1
         overlapping = sum(newest in pair for pair in self.graph.pairs)
+        compared = newest - sum(newest in pair for pair in self.graph.pending)
         num_features = len(keyframe.features.points)
-        log.info("%s: %d features, overlaps %d of %d frames", keyframe.name, num_features, overlapping, newest)
+        log.info("%s: %d features, overlaps %d of %d frames tried", keyframe.name, num_features, overlapping, compared)
         self.clock.lap("poses")
 
     def retract(self, names: Collection[str]) -> None:

@@ -16,10 +16,12 @@ from capture.cameras import synthetic
 from capture.diorama.cast import Camera, cast
 from capture.diorama.layout import BRICK_WALL, place
 from capture.frame import Frame
+from recon.evaluate.alignment import CameraErrors, camera_errors
 from recon.gaussians import Gaussians
 from recon.keyframe import Keyframe, modelled_image
 from recon.priors.pointmap import Pointmap
 from recon.registration import features, register
+from recon.snapshot import Snapshot
 from recon.view_graph import Matcher, ViewGraph
 
 SMALL = synthetic.Config(views=6, width=320, height=240)
@@ -29,6 +31,17 @@ SMALL = synthetic.Config(views=6, width=320, height=240)
 def photographs(config: synthetic.Config = SMALL) -> tuple[Frame, ...]:
     """The stream of `config`, made once for all tests."""
     return tuple(synthetic.stream(config))
+
+
+def errors(snapshot: Snapshot, config: synthetic.Config = SMALL) -> CameraErrors:
+    """The snapshot's cameras against those that took the photographs of `config`."""
+    true = synthetic.scene_cameras(config)
+    return camera_errors(
+        np.stack([camera.T_world_camera for camera in snapshot.cameras]),
+        np.stack([true[camera.frame_id][0] for camera in snapshot.cameras]),
+        np.stack([camera.K for camera in snapshot.cameras]),
+        np.stack([true[camera.frame_id][1] for camera in snapshot.cameras]),
+    )
 
 
 def renumbered(images: Iterable[np.ndarray]) -> list[Frame]:

@@ -21,15 +21,6 @@ from recon.rasterize.cpu import rasterize
 from recon.snapshot import GaussianArrays
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    """Tiny images: threads would only wait for each other, for long where the machine has other work."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 def motion(seed: int, size: float = 1.0) -> np.ndarray:
     return exp_se3(size * torch.randn(6, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))).numpy()
 

@@ -39,7 +39,7 @@ def scene_folder(tmp_path_factory) -> Path:
 @pytest.fixture
 def in_this_process(monkeypatch):
     """Starting a process takes seconds; what is tested with this is not."""
-    monkeypatch.setattr("recon.evaluate.process.in_own_process", lambda run, given, folder, timeout_s: run(*given))
+    monkeypatch.setattr("recon.evaluate.process.in_own_process", lambda run, given, *_: run(*given))
 
 
 def reconstruct(frames: Sequence[Frame], method: str, seed: int, start: Start | None = None) -> Iterator[Snapshot]:

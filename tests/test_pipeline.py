@@ -34,7 +34,7 @@ from recon.snapshot import Snapshot
 from recon.verdict import Code, Verdict
 from recon.verification.verify import verify
 from recon.view_graph import ViewGraph
-from tests.synthetic import SMALL, photographs, places, pure_rotation, view_graph
+from tests.synthetic import SMALL, errors, photographs, places, pure_rotation, view_graph
 
 CONFIG = Config(
     size=320,
@@ -78,17 +78,6 @@ def last(frames: Sequence[Frame | DroppedFrame], config: Config) -> Snapshot:
 
 def by_name(snapshot: Snapshot) -> dict[str, np.ndarray]:
     return {camera.name: camera.T_world_camera for camera in snapshot.cameras}
-
-
-def errors(snapshot: Snapshot) -> CameraErrors:
-    """The snapshot's cameras against those that took the photographs."""
-    true = synthetic.scene_cameras(SMALL)
-    return camera_errors(
-        np.stack([camera.T_world_camera for camera in snapshot.cameras]),
-        np.stack([true[camera.frame_id][0] for camera in snapshot.cameras]),
-        np.stack([camera.K for camera in snapshot.cameras]),
-        np.stack([true[camera.frame_id][1] for camera in snapshot.cameras]),
-    )
 
 
 def held_out_psnr(snapshot: Snapshot, index: int) -> float:

@@ -22,14 +22,6 @@ from tests.synthetic import photographs
 K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
-
-
 class Wall(nn.Module):
     """Opaque from z = 2 on, coloured by x and y."""
 

@@ -16,13 +16,13 @@ from capture.frame import Frame
 from recon import optimize
 from recon.control import adaptive, proximity
 from recon.control.control import ControlChoice
-from recon.evaluate.alignment import camera_errors
 from recon.evaluate.metrics import psnr
 from recon.keyframe import modelled_image
 from recon.preview import render_rgb
 from recon.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs
 from recon.rivals.colmap import mapped
 from recon.snapshot import Snapshot
+from tests.synthetic import errors
 
 PLACE = synthetic.Config(views=3, width=240, height=180)
 
@@ -69,16 +69,6 @@ def last(snapshots: Iterator[Snapshot]) -> Snapshot:
     return final
 
 
-def errors(snapshot: Snapshot, place: synthetic.Config = PLACE):
-    true = synthetic.scene_cameras(place)
-    return camera_errors(
-        np.stack([c.T_world_camera for c in snapshot.cameras]),
-        np.stack([true[c.frame_id][0] for c in snapshot.cameras]),
-        np.stack([c.K for c in snapshot.cameras]),
-        np.stack([true[c.frame_id][1] for c in snapshot.cameras]),
-    )
-
-
 def test_a_model_s_world_is_its_first_camera_at_a_depth_of_1(model):
     assert np.allclose(model.placed[0].T_world_camera, np.eye(4))
     depths = [
@@ -113,7 +103,7 @@ def test_fsgs_knows_the_depth_of_colmap_s_points(model):
 def test_colmap_3dgs_and_fsgs_look_like_the_photographs(frames):
     for method in (colmap_3dgs, colmap_fsgs):
         start, end = (last(method.reconstruct(frames, 0, short(method.OPTIMIZE, iterations))) for iterations in (1, 80))
-        assert errors(end).rotation_deg < 1.0
+        assert errors(end, PLACE).rotation_deg < 1.0
         assert end.served_by == ({"depth": "multi-view depth"} if method is colmap_fsgs else {})
         assert training_psnr(end, frames) > training_psnr(start, frames) + 1.0
         assert len(end.gaussians) != len(start.gaussians)

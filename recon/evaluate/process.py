@@ -9,6 +9,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from multiprocessing.context import ForkServerContext, SpawnContext
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,6 +19,7 @@ from recon.report import peak_rss_mb
 from recon.snapshot import Snapshot
 
 T = TypeVar("T")
+Context = SpawnContext | ForkServerContext
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,18 +54,27 @@ def run_alone(
     return Outcome(moments, error)
 
 
-def call_alone(function: Callable[[], T], timeout_s: float) -> T:
-    """What a function returns. Raises RuntimeError with the reason where it does not."""
-    with tempfile.TemporaryDirectory(prefix="splatnode-bench-") as folder:
-        error = in_own_process(_call_and_save, (function, folder), folder, timeout_s)
+def call_alone(function: Callable[[], T], timeout_s: float, context: Context | None = None) -> T:
+    """What a function returns. Raises RuntimeError with the reason where it does not.
+
+    `context` starts the process; usually it is a fresh one.
+    """
+    with tempfile.TemporaryDirectory(prefix="splatnode-alone-") as folder:
+        result = Path(folder, "result")
+        error = in_own_process(_call_and_save, (function, result), folder, timeout_s, context)
+        if error is None and not result.exists():
+            error = "the process ended without an answer"
         if error is not None:
             raise RuntimeError(error)
-        return pickle.loads(Path(folder, "result").read_bytes())
+        return pickle.loads(result.read_bytes())
 
 
-def in_own_process(target: Callable[..., None], arguments: tuple, folder: str, timeout_s: float) -> str | None:
+def in_own_process(
+    target: Callable[..., None], arguments: tuple, folder: str, timeout_s: float, context: Context | None = None
+) -> str | None:
     """Why it failed, or None. What it saves in `folder` is read once it has ended: nothing else works meanwhile."""
-    process = multiprocessing.get_context("spawn").Process(target=_reported, args=(target, arguments, folder))
+    context = context or multiprocessing.get_context("spawn")
+    process = context.Process(target=_reported, args=(target, arguments, folder))
     process.start()
     try:
         process.join(timeout_s)
@@ -89,8 +100,8 @@ def _reported(target: Callable[..., None], arguments: tuple, folder: str) -> Non
         write_file(Path(folder, "error.txt"), traceback.format_exc().encode())
 
 
-def _call_and_save(function: Callable[[], object], folder: str) -> None:
-    write_file(Path(folder, "result"), pickle.dumps(function()))
+def _call_and_save(function: Callable[[], object], result: Path) -> None:
+    write_file(result, pickle.dumps(function()))
 
 
 def _run_and_save(

@@ -5,19 +5,16 @@ from __future__ import annotations
 import dataclasses
 import multiprocessing
 import os
-import pickle
-import tempfile
 import time
-import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.context import ForkServerContext
-from pathlib import Path
 
+from recon.evaluate.process import call_alone
 from recon.evaluate.stability.case import Case, Measured
 from recon.evaluate.stability.methods import by_name
 from recon.evaluate.stability.outcome import Outcome, compare, outcome
-from recon.export.staged import write_file
 from recon.report import peak_rss_mb
 from recon.snapshot import CameraEstimate
 from recon.verdict import Verdict
@@ -103,23 +100,11 @@ def run_trial(case: Case, row: int, name: str, seed: int, method: str, timeout_s
 
 def _answer(case: Case, method: str, timeout_s: float) -> Answer | str:
     """The answer, or why there is none."""
-    with tempfile.TemporaryDirectory(prefix="splatnode-stability-") as folder:
-        path = Path(folder) / "answer"
-        job = dataclasses.replace(case, worlds=())  # the truth stays here
-        process = _context().Process(target=_work, args=(job, method, path))
-        process.start()
-        try:
-            process.join(timeout_s)
-            hangs = process.is_alive()
-        finally:
-            if process.is_alive():
-                process.kill()
-                process.join()
-        if hangs:
-            return f"stopped after {timeout_s:g} s"
-        if not path.exists():
-            return f"the process ended with code {process.exitcode}; -9 mostly means that the memory was used up"
-        return pickle.loads(path.read_bytes())
+    job = dataclasses.replace(case, worlds=())  # the truth stays here
+    try:
+        return call_alone(partial(_work, job, method), timeout_s, _context())
+    except RuntimeError as error:
+        return str(error)
 
 
 def _context() -> ForkServerContext:
@@ -129,17 +114,9 @@ def _context() -> ForkServerContext:
     return context
 
 
-def _work(case: Case, method: str, path: Path) -> None:
+def _work(case: Case, method: str) -> Answer:
     """The other process, in a session of its own: who interrupts a campaign must not make a trial fail."""
     os.setsid()
-    try:
-        answer: Answer | str = _answer_here(case, method)
-    except Exception:
-        answer = traceback.format_exc()
-    write_file(path, pickle.dumps(answer))
-
-
-def _answer_here(case: Case, method: str) -> Answer:
     reconstruct = by_name(method)
     started, worked = time.perf_counter(), time.process_time()
     snapshot = reconstruct(case.source(), case.config)
