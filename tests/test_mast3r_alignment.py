@@ -94,6 +94,14 @@ def test_perfect_pairs_give_perfect_cameras():
     assert views[2].focal == pytest.approx(FOCAL, rel=1e-4)
 
 
+def test_wrong_pairs_leave_no_trace():
+    Ts = cameras(8)
+    views = align(predictions(Ts, 0.0, 0.2, np.random.default_rng(1)))
+    estimated = np.stack([view.T_world_camera for view in views])
+    errors = camera_errors(estimated, Ts, intrinsics([v.focal for v in views]), intrinsics([FOCAL] * 8))
+    assert errors.centre_pct is not None and errors.centre_pct < 0.01
+
+
 def test_views_that_no_pair_connects_are_refused():
     pairs = predictions(cameras(4), 0.0, 0.0, np.random.default_rng(0))
     apart = {pair: pairs[pair] for pair in ((0, 1), (1, 0), (2, 3), (3, 2))}

@@ -23,7 +23,7 @@ Map = npt.NDArray[np.float32]
 _SAMPLES = 400  # points of a pair that take part
 _TREES = 60  # random spanning trees that are tried as a start
 _AGREE = 0.1  # of the depth: a pair and a start agree where the pair's median point is that near
-_ROBUST = 0.02  # of the depth: scale of the Cauchy weights
+_ROBUST = 0.02  # of the depth: scale of the robust weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +215,11 @@ def _error(edge: _Edge, first: _Similarity, second: _Similarity) -> float:
 
 
 def _refined(similarities: list[_Similarity], edges: Sequence[_Edge], iterations: int = 15) -> list[_Similarity]:
-    """All views together, by Gauss-Newton on the reweighted gaps of all pairs; view 0 stays."""
+    """All views together, by Gauss-Newton on the reweighted gaps of all pairs; view 0 stays.
+
+    Geman-McClure weights: a wrong pair has hundreds of gaps far out, and Cauchy's would add up their pull to most of
+    the error.
+    """
     count = len(similarities)
     for _ in range(iterations):
         normal, gradient = np.zeros((7 * count, 7 * count)), np.zeros(7 * count)
@@ -224,7 +228,7 @@ def _refined(similarities: list[_Similarity], edges: Sequence[_Edge], iterations
             there, here = first(edge.seen), second(edge.own)
             length = np.maximum(second.scale * np.linalg.norm(edge.own, axis=1), 1e-12)
             gap = (there - here) / length[:, None]
-            weights = edge.weights / (1.0 + (gap**2).sum(1) / _ROBUST**2) / edge.weights.sum()
+            weights = edge.weights / (1.0 + (gap**2).sum(1) / _ROBUST**2) ** 2 / edge.weights.sum()
             jacobian = np.concatenate([_motion(there, first), -_motion(here, second)], axis=2) / length[:, None, None]
             index = np.concatenate([7 * edge.first + np.arange(7), 7 * edge.second + np.arange(7)])
             weighted = weights[:, None, None] * jacobian
