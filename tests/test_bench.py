@@ -76,7 +76,12 @@ def test_a_row_a_checkpoint_and_what_was_measured_is_kept(scene_folder, tmp_path
     ]
     content = json.loads((tmp_path / "bench.json").read_text())
     assert content["command"] == "bench" and content["machine"]["threads"] >= 1
-    assert content["settings"] == {"longer_side": 512, "alignment_steps": 20, "alignment_levels": 1}
+    assert content["settings"] == {
+        "longer_side": 512,
+        "alignment_steps": 20,
+        "alignment_levels": 1,
+        "continued_steps": 60,
+    }
     exact, broken = content["rows"][2], content["rows"][3]
     assert exact["psnr"] > 50 and exact["seconds"]["total"] > 0 and exact["peak_rss_mb"] > 10
     assert exact["seconds"]["poses"] == -1.0 and exact["seconds"]["points"] is None

@@ -87,6 +87,8 @@ def test_every_curve_has_every_moment_and_lpips_only_where_measured():
     measured = [replace(r, lpips_vgg=0.2) for r in ROWS]
     axes = speed_accuracy(points(measured)[:2]).axes
     assert axes[2].get_ylabel() == "LPIPS VGG (axis turned)" and axes[2].yaxis_inverted()
+    ends_alone = [replace(r, lpips_alex=0.1, lpips_vgg=0.2 if r.final else None) for r in ROWS]
+    assert speed_accuracy(points(ends_alone)).axes[2].get_ylabel() == "LPIPS Alex (axis turned)"
 
 
 ABLATION = [

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from recon import rim
+from recon.evaluate.alignment import align_test_pose
 from recon.evaluate.protocol import Run, evaluate, mean_intrinsics
 from recon.evaluate.truth import load_scene
 from recon.export import write_result
@@ -47,7 +48,7 @@ def scene_folder(tmp_path_factory) -> Path:
     return folder
 
 
-def score(snapshot: Snapshot, folder: Path, **settings):
+def score(snapshot: Snapshot, folder: Path, found: dict[str, np.ndarray] | None = None, **settings):
     return evaluate(
         snapshot,
         load_scene(folder),
@@ -56,6 +57,7 @@ def score(snapshot: Snapshot, folder: Path, **settings):
         rasterize=rasterize,
         networks=NO_NETWORKS,
         settings=replace(QUICK, **settings),
+        found=found,
     )
 
 
@@ -131,6 +133,21 @@ def test_worse_scene_scores_worse_by_what_is_wrong(scene_folder):
     assert good.psnr is not None and bad.psnr is not None and bad.psnr < good.psnr - 15
     zoomed = replace(perfect, cameras=tuple(replace(c, K=c.K * [[1.04], [1.04], [1]]) for c in perfect.cameras))
     assert score(zoomed, scene_folder).focal_error_pct == pytest.approx(4.0)
+
+
+def test_another_moment_of_a_run_goes_on_from_the_poses_that_were_found(scene_folder, monkeypatch):
+    searched = []
+
+    def align(appearance, truth, start, K, *, steps, levels):
+        searched.append((steps, levels))
+        return align_test_pose(appearance, truth, start, K, steps=steps, levels=levels)
+
+    monkeypatch.setattr("recon.evaluate.protocol.align_test_pose", align)
+    poses: dict[str, np.ndarray] = {}
+    end, earlier = (score(perfect_snapshot(), scene_folder, found=poses, continued_steps=2) for _ in range(2))
+    assert searched == [(QUICK.alignment_steps, 1)] * 2 + [(2, 1)] * 2
+    assert poses.keys() == set(SPLIT.test)
+    assert end.psnr is not None and earlier.psnr is not None and earlier.psnr > 50
 
 
 def test_what_photographs_do_not_show_is_not_scored(scene_folder, tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from capture.frame import Frame
 from recon.config import Config
 from recon.evaluate.appearance import Rasterize
 from recon.evaluate.process import call_alone, run_alone
-from recon.evaluate.protocol import STAGES, Networks, Row, Run, Settings, evaluate
+from recon.evaluate.protocol import STAGES, Networks, Poses, Row, Run, Settings, evaluate, shown_to_nobody
 from recon.evaluate.records import Bench, bench_files, read_bench, run_of, this_machine
 from recon.evaluate.renders import Renders
 from recon.evaluate.report import report_files
@@ -149,23 +149,26 @@ def _run(
     work = partial(reconstruct, starts.frames, method, seed, start)
     outcome = run_alone(work, plan.checkpoints, plan.timeout_s, 0.0 if start is None else start.seconds)
     kept = Renders(out_dir, scene.name, views, method, seed, split.test[:: max(1, len(split.test) // _SHOWN)][:_SHOWN])
-    rows = []
-    for moment in outcome.moments:
+    poses: Poses = {}
+    rows: list[Row] = []
+    for moment in reversed(outcome.moments):  # the end first: from its test poses the search goes on for the others
         peaks = [peak for peak in (moment.peak_rss_mb, start and start.peak_rss_mb) if peak is not None]
         run = Run(method, seed, moment.checkpoint, moment.seconds, max(peaks, default=None))
-        shown = {"show": kept.keep} if moment.checkpoint is None else {}
-        rows.append(
-            evaluate(
-                moment.snapshot,
-                scene,
-                split,
-                run,
-                rasterize=scoring.rasterize,
-                networks=scoring.networks,
-                settings=scoring.settings,
-                **shown,
-            )
+        shown, networks = kept.keep, scoring.networks
+        if moment.checkpoint is not None:
+            shown, networks = shown_to_nobody, networks.quickest
+        row = evaluate(
+            moment.snapshot,
+            scene,
+            split,
+            run,
+            rasterize=scoring.rasterize,
+            networks=networks,
+            settings=scoring.settings,
+            show=shown,
+            found=poses,
         )
+        rows.insert(0, row)
     return rows if outcome.error is None else [*rows, _failed_row(scene, views, method, seed, outcome.error)]
 
 

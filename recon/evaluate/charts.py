@@ -189,9 +189,10 @@ def _plain(chart: Axes) -> None:
 
 
 def _qualities(measured: Sequence[Point]) -> list[Quality]:
-    """PSNR, SSIM and whichever LPIPS was measured, VGG's before AlexNet's."""
-    lpips = [q for q in (_LPIPS_VGG, _LPIPS_ALEX) if any(q.value(p) is not None for p in measured)]
-    return [_PSNR, _SSIM, *lpips[:1]]
+    """PSNR, SSIM and the LPIPS that was measured at most points, VGG's rather than AlexNet's: checkpoints lack it."""
+    counts = {quality: sum(quality.value(p) is not None for p in measured) for quality in (_LPIPS_VGG, _LPIPS_ALEX)}
+    most = max(counts, key=lambda quality: counts[quality])
+    return [_PSNR, _SSIM, *([most] if counts[most] else [])]
 
 
 def _style(index: int) -> tuple[str, str]:

@@ -20,6 +20,8 @@ from recon.evaluate.start import Start, continued, foundation
 from recon.pipeline import reconstruct
 from recon.snapshot import Snapshot
 
+CHECKPOINTS = (50, 150, 500)  # iterations at which a configuration shows its scene, besides its end
+
 # InstantSplat's released settings (2025): a Gaussian a pixel, nothing added or taken away; colours, scales and turns
 # ten times as fast as in 3DGS; steps that do not fall, but for the poses', which fall to a hundredth.
 _INSTANTSPLAT_RATES = optimize.Rates(
@@ -41,7 +43,6 @@ def _instantsplat(iterations: int, terms: regularise.Config) -> Config:
         pixelwise=pixelwise.Config(),
         optimize=optimize.Config(
             iterations=iterations,
-            checkpoints=tuple(count for count in (50, 200, 500) if count < iterations),
             half_resolution_share=0.0,
             rates=_INSTANTSPLAT_RATES,
             regularise=terms,
@@ -49,16 +50,24 @@ def _instantsplat(iterations: int, terms: regularise.Config) -> Config:
     )
 
 
+def _watched(config: Config) -> Config:
+    """The same, shown on its way at iterations that are the same for all methods."""
+    watched = msgspec.structs.replace(config.optimize, checkpoints=CHECKPOINTS)
+    return msgspec.structs.replace(config, optimize=watched)
+
+
 _NO_TERMS = regularise.Config()
 _PAPER = _instantsplat(1000, regularise.PAPER)
 CONFIGS: dict[str, Config] = {
-    **PRESETS,
-    "instantsplat-s": _instantsplat(200, _NO_TERMS),
-    ablation.BASE: _instantsplat(1000, _NO_TERMS),
-    ablation.WHOLE: _PAPER,
-    **ablation.configs(_PAPER),
+    name: _watched(config)
+    for name, config in {
+        **PRESETS,
+        "instantsplat-s": _instantsplat(200, _NO_TERMS),
+        ablation.BASE: _instantsplat(1000, _NO_TERMS),
+        ablation.WHOLE: _PAPER,
+        **ablation.configs(_PAPER),
+    }.items()
 }
-
 
 Method = Callable[[Sequence[Frame], int], Iterator[Snapshot]]  # photographs and a seed in, the scene as it grows out
 

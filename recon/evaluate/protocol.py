@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -32,6 +32,7 @@ class Settings:
     longer_side: int = 512  # pixels
     alignment_steps: int = 500
     alignment_levels: int = 3
+    continued_steps: int = 60  # from the pose that was found in another moment of the same run, at full size
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,14 @@ class Networks:
     alex: Lpips | None
     vgg: Lpips | None
 
+    @property
+    def quickest(self) -> Networks:
+        """Without VGG, which takes twenty times as long as AlexNet, where the other serves."""
+        return self if self.alex is None else Networks(self.alex, None)
+
 
 Show = Callable[[str, Tensor, Tensor], None]  # name of a test view, photograph, render; both (H, W, 3) in [0, 1]
+Poses = MutableMapping[str, npt.NDArray[np.float64]]  # T_world_camera (4, 4) by the name of a test view
 
 
 def shown_to_nobody(name: str, truth: Tensor, image: Tensor) -> None:
@@ -104,10 +111,13 @@ def evaluate(
     networks: Networks,
     settings: Settings,
     show: Show = shown_to_nobody,
+    found: Poses | None = None,
 ) -> Row:
     """Scores a snapshot on the scene's test views. The truth is used here and nowhere earlier.
 
-    `show` gets the name of each test view, its photograph and what the scene looks like from there.
+    `show` gets the name of each test view, its photograph and what the scene looks like from there. `found` holds the
+    test views' poses that another moment of the same run was given, from which the search then goes on; where it lacks
+    one, it gets it.
 
     A snapshot whose verdict forbids publishing it has no scene and is scored on nothing; its cameras are compared all
     the same, which tells whether the refusal was needed.
@@ -115,7 +125,8 @@ def evaluate(
     estimated = [camera for camera in snapshot.cameras if camera.name in scene.cameras]
     errors = _camera_errors(estimated, scene)
     appearance = appearance_of(snapshot, rasterize)
-    views = _score_test_views(appearance, snapshot.cameras, estimated, scene, split, networks, settings, show)
+    found = {} if found is None else found
+    views = _score_test_views(appearance, snapshot.cameras, estimated, scene, split, networks, settings, show, found)
     return Row(
         scene=scene.name,
         views=len(split.train),
@@ -161,12 +172,13 @@ def _score_test_views(
     networks: Networks,
     settings: Settings,
     show: Show,
+    found: Poses,
 ) -> list[_ViewScore]:
     """Renders each test view from the pose that equation 18 finds, with the intrinsics of the training cameras.
 
-    The search starts from the true pose, carried into the estimated world by the similarity that aligns the training
-    cameras. No view can be scored with fewer than two of them. Photographs are compared where they show the scene: a
-    black rim that undistortion left is cut off, for the search too.
+    The search starts from the pose that was `found` before, or else from the true one, carried into the estimated world
+    by the similarity that aligns the training cameras. No view can be scored with fewer than two of them. Photographs
+    are compared where they show the scene: a black rim that undistortion left is cut off, for the search too.
     """
     if appearance is None or len(estimated) < 2:
         return []
@@ -182,20 +194,16 @@ def _score_test_views(
         whole_K = mean_intrinsics(cameras, photograph.shape[1], photograph.shape[0])
         rows, columns = rim.rectangle(shown)
         truth = whole[rows, columns]
-        height, width = truth.shape[:2]
         K = whole_K - np.array([[0.0, 0.0, columns.start], [0.0, 0.0, rows.start], [0.0, 0.0, 0.0]])
-        aligned = align_test_pose(
-            appearance,
-            truth,
-            true_to_estimated.camera(scene.cameras[name].T_world_camera),
-            K,
-            steps=settings.alignment_steps,
-            levels=settings.alignment_levels,
-        )
-        image = appearance.picture(aligned.T_world_camera, K, width, height)
-        with_rim = image
-        if truth.shape != whole.shape:
-            with_rim = appearance.picture(aligned.T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
+        if name in found:
+            start, steps, levels = found[name], settings.continued_steps, 1
+        else:
+            start = true_to_estimated.camera(scene.cameras[name].T_world_camera)
+            steps, levels = settings.alignment_steps, settings.alignment_levels
+        T_world_camera = align_test_pose(appearance, truth, start, K, steps=steps, levels=levels).T_world_camera
+        found.setdefault(name, T_world_camera)
+        with_rim = appearance.picture(T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
+        image = with_rim[rows, columns]
         show(name, truth, image)
         scores.append(
             _ViewScore(

@@ -11,7 +11,7 @@ from recon.evaluate.protocol import Row, mean
 
 @dataclass(frozen=True)
 class Point:
-    """One method at one moment: means over the runs in which a value was measured, None where it never was."""
+    """One method at one moment: means over its published runs, None where one of them was not measured."""
 
     views: int
     method: str
@@ -74,7 +74,11 @@ def _row_at(run: Sequence[Row], moment: float) -> Row:
 def _point(views: int, method: str, checkpoint: int | None, rows: Sequence[Row]) -> Point:
     """Seconds, Gaussians and bytes are those of the published runs, like the quality that they bought."""
     solved = [row for row in rows if row.psnr is not None]
-    scene_bytes = mean([row.scene_bytes for row in solved])
+
+    def over_all(values: Sequence[float | None]) -> float | None:
+        return None if None in values else mean(values)
+
+    scene_bytes = over_all([row.scene_bytes for row in solved])
     names = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "num_gaussians", "peak_rss_mb")
     poses = ("rotation_error_deg", "centre_error_pct", "focal_error_pct")
     return Point(
@@ -83,8 +87,7 @@ def _point(views: int, method: str, checkpoint: int | None, rows: Sequence[Row])
         checkpoint,
         runs=len(rows),
         solved=len(solved),
-        seconds=mean([row.seconds.get("total") for row in solved]),
+        seconds=over_all([row.seconds.get("total") for row in solved]),
         scene_megabytes=None if scene_bytes is None else scene_bytes / 1e6,
-        **{name: mean([getattr(row, name) for row in solved]) for name in names},
-        **{name: mean([getattr(row, name) for row in solved]) for name in poses},
+        **{name: over_all([getattr(row, name) for row in solved]) for name in (*names, *poses)},
     )
