@@ -1,9 +1,10 @@
 """What Gaussians buy: `python -m tests.bench parsimony [SCENE:VIEWS ...] --out parsimony.json [--chart parsimony.png]`.
 
 Each set of photographs is registered once, and scenes are made from the same cameras and points: of the size that
-splatnode chooses; of eighths to four times of it; with a Gaussian a pixel; and, of the size that was chosen, by Markov
-chain Monte Carlo from an even choice of the pixels. All are refined for as many iterations and scored alike. Rows that
-the file holds already are not measured again, so it can be filled in parts.
+splatnode chooses; of a quarter to four times of it; with a Gaussian a pixel; and, of the size that was chosen, by
+Markov chain Monte Carlo from an even choice of the pixels. All are refined for as many iterations and scored alike. Rows
+that the file holds already are not measured again, so it can be filled in parts: about 4 minutes of a core a case. Of a
+set that is refused there is one row, without scores.
 """
 
 from __future__ import annotations
@@ -31,11 +32,12 @@ from recon.rasterize.cpu import rasterize
 from recon.report import peak_rss_mb
 from tests.bench.parsimony_chart import PIXEL, RIVAL, SELF, draw, summary
 
-CASES = (
-    *(f"{scene}:{views}" for scene in ("fountain_p11", "llff_fern", "llff_flower", "sceaux") for views in (3, 6)),
-    *("fox:6", "tum_fr3_office:6", "castle_p30:6", "llff_flower:12"),
+CASES = (  # of which cameras are found
+    *(f"{scene}:{views}" for scene in ("fountain_p11", "llff_flower", "sceaux") for views in (3, 6)),
+    *(f"{scene}:6" for scene in ("llff_fern", "fox", "tum_fr3_office", "castle_p30")),
 )
-FACTORS = (1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0)  # of the size that was chosen
+FACTORS = (1 / 4, 1 / 2, 2.0, 4.0)  # of the size that was chosen
+ALIGNMENT_STEPS = 100  # of each test camera, which has hardly moved where cameras are right
 ITERATIONS = 500
 
 
@@ -124,6 +126,8 @@ def fill(case: str, rows: list[Row], folders: Folders, scoring: Scoring, out: Pa
     for method in configurations(1):
         if method in known or (only and method not in only and method != SELF):
             continue
+        if known and known[SELF].psnr is None:
+            return
         config = configurations(known[SELF].num_gaussians if known else 1)[method]
         start = pickle.loads(found_start(folders, scene, split))
         row = known[method] = measure(scene, split, start, method, config, scoring)
@@ -142,7 +146,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="*", help=f"default: {' '.join(CASES)}")
     parser.add_argument("--methods", nargs="+", default=(), help="of these only, besides the chosen size")
-    parser.add_argument("--alignment-steps", type=int, default=Settings.alignment_steps, help="of each test camera")
+    parser.add_argument("--alignment-steps", type=int, default=ALIGNMENT_STEPS, help="of each test camera")
     parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
     parser.add_argument("--starts", type=Path, required=True, help="folder for cameras and points")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to fill")

@@ -1,0 +1,150 @@
+"""What more buys: `python -m tests.bench budgets [SCENE:VIEWS ...] --starts FOLDER --out budgets.json`.
+
+From the same cameras and points, scenes within rising limits of each kind, and the one without limits at each of its
+checkpoints. Told: whether quality ever falls when a limit rises, and what the scene was worth at every moment.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import pickle
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from itertools import pairwise
+from pathlib import Path
+
+from msgspec.structs import replace
+
+from recon.config import Config, preset
+from recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
+from recon.evaluate.splits import Split, load_split
+from recon.evaluate.start import continued
+from recon.evaluate.truth import EvaluationScene, load_scene
+from recon.rasterize.cpu import rasterize
+from recon.snapshot import Snapshot
+from tests.bench.parsimony import ALIGNMENT_STEPS, Folders, Scoring, found_start
+
+CASES = ("fountain_p11:6", "llff_flower:6")
+LIMITS: dict[str, tuple[float, ...]] = {
+    "max_gaussians": (2_000, 6_000, 18_000, 54_000),
+    "max_mb": (0.125, 0.4, 1.2, 3.6),
+    "budget_s": (1.0, 3.0, 9.0, 27.0),  # after the points
+}
+CHECKPOINTS = (25, 50, 100, 200)  # iterations
+ANYTIME = "iterations"
+WORSE = {"psnr": 0.1, "ssim": 0.005, "lpips": 0.002}  # a fall within which quality counts as equal
+
+
+@dataclass(frozen=True)
+class Row:
+    scene: str
+    views: int
+    limit: str  # one of LIMITS, or ANYTIME: a moment of the scene without limits
+    value: float
+    num_gaussians: int
+    seconds: float  # after the points
+    hit: bool  # the report says that the limit bound the scene
+    psnr: float | None
+    ssim: float | None
+    lpips: float | None
+
+
+def snapshots(start: bytes, limit: str, value: float) -> Iterator[Snapshot]:
+    """A reconstruction from the points on, within one limit; for ANYTIME without any."""
+    begun = pickle.loads(start)
+    config = preset("balanced")
+    if limit == ANYTIME:
+        config = replace(config, optimize=replace(config.optimize, checkpoints=CHECKPOINTS))
+    else:
+        config = within(config, limit, value, begun.seconds)
+    return continued(begun, config)
+
+
+def within(config: Config, limit: str, value: float, spent: float) -> Config:
+    """`config` with a limit; one of time is counted from the points on, which took `spent` seconds."""
+    if limit == "budget_s":
+        return replace(config, budget_s=spent + value)
+    return replace(config, **{limit: round(value) if limit == "max_gaussians" else value})
+
+
+def measured(case: str, folders: Folders, scoring: Scoring) -> Iterator[Row]:
+    """All rows of a set of photographs."""
+    name, _, views = case.partition(":")
+    scene = load_scene(folders.scenes / name)
+    split = load_split(folders.scenes / name, list(scene.paths), int(views))
+    start = found_start(folders, scene, split)
+    spent = pickle.loads(start).seconds
+    *moments, _ = snapshots(start, ANYTIME, 0)  # the last is the one before, declared final
+    for snapshot in moments:
+        yield scored(snapshot, ANYTIME, snapshot.iterations, spent, scene, split, scoring)
+    for limit, values in LIMITS.items():
+        for value in values:
+            *_, snapshot = snapshots(start, limit, value)
+            yield scored(snapshot, limit, value, spent, scene, split, scoring)
+
+
+def scored(
+    snapshot: Snapshot,
+    limit: str,
+    value: float,
+    spent: float,
+    scene: EvaluationScene,
+    split: Split,
+    scoring: Scoring,
+) -> Row:
+    run = Run(limit, 0, None, {}, None)
+    networks, settings = scoring.networks, scoring.settings
+    row = evaluate(snapshot, scene, split, run, rasterize=rasterize, networks=networks, settings=settings)
+    return Row(
+        scene=scene.name,
+        views=len(split.train),
+        limit=limit,
+        value=value,
+        num_gaussians=len(snapshot.gaussians),
+        seconds=snapshot.seconds["total"] - spent,
+        hit=any(hit["limit"] == limit for hit in snapshot.budget),
+        psnr=row.psnr,
+        ssim=row.ssim,
+        lpips=row.lpips_alex,
+    )
+
+
+def falls(rows: Sequence[Row]) -> list[str]:
+    """Where more bought less: each step to the next higher limit of a kind after which a measure is clearly worse."""
+    found = []
+    for earlier, later in pairwise(rows):
+        if (earlier.scene, earlier.views, earlier.limit) != (later.scene, later.views, later.limit):
+            continue
+        for measure, tolerance in WORSE.items():
+            before, after = getattr(earlier, measure), getattr(later, measure)
+            loss = after - before if measure == "lpips" else before - after
+            if loss > tolerance:
+                step = f"{earlier.limit} {earlier.value:g} to {later.value:g}"
+                found.append(f"{later.scene} {later.views}, {step}: {measure} {before:.3f} to {after:.3f}")
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", nargs="*", help=f"default: {' '.join(CASES)}")
+    parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
+    parser.add_argument("--starts", type=Path, required=True, help="folder for cameras and points")
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    arguments = parser.parse_args()
+    networks = Networks(load_networks(arguments.shared / "weights").alex, None)
+    if networks.alex is None:
+        parser.error(f"{arguments.shared}/weights must hold LPIPS's weights for AlexNet. Run: splatnode weights")
+    scoring = Scoring(networks, Settings(alignment_steps=ALIGNMENT_STEPS))
+    folders = Folders(arguments.shared / "scenes", arguments.starts)
+    rows: list[Row] = []
+    for case in arguments.cases or CASES:
+        for row in measured(case, folders, scoring):
+            rows.append(row)
+            print(json.dumps(asdict(row)), flush=True)
+            content = {"falls": falls(rows), "rows": [asdict(each) for each in rows]}
+            arguments.out.write_text(json.dumps(content, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
