@@ -2,9 +2,9 @@
 
 Each set of photographs is registered once, and scenes are made from the same cameras and points: of the size that
 splatnode chooses; of a quarter to four times of it; with a Gaussian a pixel; and, of the size that was chosen, by
-Markov chain Monte Carlo from an even choice of the pixels. All are refined for as many iterations and scored alike. Rows
-that the file holds already are not measured again, so it can be filled in parts: about 4 minutes of a core a case. Of a
-set that is refused there is one row, without scores.
+Markov chain Monte Carlo from an even choice of the pixels. All are refined for as many iterations and scored alike.
+Rows that the file holds already are not measured again, so it can be filled in parts: about 4 minutes of a core a case.
+Of a set that is refused there is one row, without scores.
 """
 
 from __future__ import annotations
