@@ -5,14 +5,15 @@ from __future__ import annotations
 import importlib.util
 from dataclasses import dataclass
 
-from recon.weights import CATALOGUE, complaint, located
+from recon.catalogue import CATALOGUE
+from recon.weights import complaint, located
 
 
 @dataclass(frozen=True)
 class Part:
     name: str
     purpose: str
-    files: tuple[str, ...]  # of recon.weights.CATALOGUE
+    files: tuple[str, ...]  # of recon.catalogue.CATALOGUE
     package: str | None = None  # import name of what it needs beside torch
 
     @property

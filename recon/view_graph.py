@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.keyframe import Keyframe
-from recon.registration import features, register
-from recon.registration.register import Compared
+from recon.registration import comparison, features, register
+from recon.registration.comparison import Compared
 from recon.registration.two_view import TwoView
 
 T = TypeVar("T")
@@ -79,7 +79,7 @@ class ViewGraph:
     def _compare(self, index: int, new: int) -> None:
         """Compares two keyframes by their plain features, for now."""
         first, second = self._in_order(index, new)
-        compared = register.compare(self.keyframes[first], self.keyframes[second], self._config)
+        compared = comparison.compare(self.keyframes[first], self.keyframes[second], self._config)
         self._plain[first, second] = compared
         self.pending.discard((index, new))
         if compared.pair is not None:
@@ -167,13 +167,13 @@ class ViewGraph:
             )
             self.keyframes[index] = replace(keyframe, features=widened)
         keyframes = self.keyframes[first], self.keyframes[second]
-        squeezed = register.compare_squeezed(*keyframes, self._plain[first, second], self._config)
+        squeezed = comparison.compare_squeezed(*keyframes, self._plain[first, second], self._config)
         if self._matcher is None:
             return squeezed
         for index in (first, second):
             self.keyframes[index] = self._matcher.with_points(self.keyframes[index])
         keyframes = self.keyframes[first], self.keyframes[second]
-        return register.compare_further(*keyframes, squeezed, self._matcher.match(*keyframes), self._config)
+        return comparison.compare_further(*keyframes, squeezed, self._matcher.match(*keyframes), self._config)
 
     def _in_order(self, *indices: int) -> tuple[int, ...]:
         """The keyframes' numbers in the order of their content."""

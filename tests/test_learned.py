@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from recon.catalogue import CATALOGUE
 from recon.config import PriorChoice
 from recon.doctor import findings
 from recon.learned import PARTS, Part, obstacle
-from recon.weights import CATALOGUE
 
 PATCHMATCHNET = next(part for part in PARTS if part.name == "patchmatchnet")
 

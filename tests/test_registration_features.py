@@ -8,7 +8,7 @@ import pytest
 
 from capture.frame import Frame
 from recon.keyframe import Keyframe
-from recon.registration import features, matching, register
+from recon.registration import comparison, features, matching, register
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +85,6 @@ def test_frames_without_features_are_compared_without_a_pair():
     keyframes = [
         Keyframe(Frame(i, f"{i}.png", i, flat, None), flat, features.extract(flat, config.features)) for i in range(2)
     ]
-    plain = register.compare(keyframes[0], keyframes[1], config)
+    plain = comparison.compare(keyframes[0], keyframes[1], config)
     assert plain.pair is None and plain.log10_nfa == 0.0 and plain.matches.shape == (0, 2)
-    assert register.compare_squeezed(keyframes[0], keyframes[1], plain, config).pair is None
+    assert comparison.compare_squeezed(keyframes[0], keyframes[1], plain, config).pair is None

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from recon.keyframe import Keyframe
-from recon.registration import features, register
-from recon.registration.register import Compared
+from recon.registration import comparison, features, register
+from recon.registration.comparison import Compared
 from recon.view_graph import AT_FIRST, ViewGraph
 from tests.synthetic import photographs, places, view_graph
 
@@ -52,8 +52,8 @@ def compared(monkeypatch) -> list[tuple[str, ...]]:
         weak = Verified(range(30), (first.name, second.name)) if plain.log10_nfa < 0.0 else None
         return Compared(NO_MATCHES, weak, -20.0 if weak else 0.0)
 
-    monkeypatch.setattr(register, "compare", compare)
-    monkeypatch.setattr(register, "compare_squeezed", compare_squeezed)
+    monkeypatch.setattr(comparison, "compare", compare)
+    monkeypatch.setattr(comparison, "compare_squeezed", compare_squeezed)
     monkeypatch.setattr(register, "place_in_order", lambda keyframe: keyframe.name)
     monkeypatch.setattr(features, "add_squeezed", lambda found, *others: found)
     monkeypatch.setattr("recon.view_graph.replace", lambda keyframe, **changes: keyframe)
@@ -91,14 +91,14 @@ def test_squeezed_features_find_what_the_plain_ones_hint_at(compared):
 
 
 def test_squeezed_features_are_not_tried_between_frames_that_firm_pairs_connect(compared, monkeypatch):
-    plain = register.compare
+    plain = comparison.compare
 
     def chained(first, second, config):
         apart = abs(int(first.name[1]) - int(second.name[1])) > 1
         found = plain(first, second, config)
         return Compared(NO_MATCHES, None, 0.0) if apart else found
 
-    monkeypatch.setattr(register, "compare", chained)
+    monkeypatch.setattr(comparison, "compare", chained)
     graph_of("a1", "a2", "a3", "a4")
     # Two steps away along the chain they may still overlap, three steps away no more.
     assert squeezed(compared) == {("a1", "a3"), ("a2", "a4")}

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from recon import weights
-from recon.weights import CATALOGUE, Weights, WeightsError, complaint, fetch, find
+from recon.catalogue import CATALOGUE, Weights
+from recon.weights import WeightsError, complaint, fetch, find
 
 CONTENT = bytes(range(256)) * 4000
 GOOD = Weights("net/tiny.pth", "a test", "CC0", "", hashlib.sha256(CONTENT).hexdigest(), len(CONTENT))

@@ -13,8 +13,9 @@ import numpy.typing as npt
 
 from recon.keyframe import Keyframe
 from recon.registration import bundle, finishing, growth, lenses, mapper, register, survey
+from recon.registration.config import Config
 from recon.registration.lenses import Grouping
-from recon.registration.register import Config, RegisteredCamera, Registration
+from recon.registration.register import RegisteredCamera, Registration
 from recon.registration.survey import Growth, Lens
 from recon.registration.two_view import TwoView
 
@@ -72,7 +73,7 @@ def _begun(
         translations[index] = -rotations[index] @ camera.T_world_camera[:3, 3]
         log_focals[lens] = np.log(grouping.enlarged[index] * camera.focal)
         radials[lens] = camera.radial
-        nominal = register.principal_point(keyframes[index].frame)
+        nominal = lenses.principal_point(keyframes[index].frame)
         shifts[lens] = grouping.enlarged[index] * (camera.principal - nominal)
     problem = bundle.Problem(
         rotations=rotations,

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from capture.frame import Frame
 from recon.keyframe import Keyframe
 from recon.registration import bundle, focal
 from recon.registration.survey import Lens
@@ -40,6 +41,17 @@ class Grouping:
     enlarged: tuple[float, ...]  # of each frame: pixels of its lens over pixels of its own
 
 
+def longer_side(frame: Frame) -> int:
+    return max(frame.width, frame.height)
+
+
+def principal_point(frame: Frame) -> Array:
+    """(2,) pixels: as given, else the middle of the image."""
+    if frame.intrinsics is not None:
+        return np.array([frame.intrinsics.cx, frame.intrinsics.cy])
+    return np.array([frame.width / 2.0, frame.height / 2.0])
+
+
 def group(keyframes: Sequence[Keyframe], across_sizes: bool) -> Grouping:
     """Frames of one size (turned or not) and one nominal focal length share a lens; `across_sizes` those of one shape.
 
@@ -53,7 +65,7 @@ def group(keyframes: Sequence[Keyframe], across_sizes: bool) -> Grouping:
         if lens == len(first):
             first.append(keyframe)
         lens_of.append(lens)
-    sides = [_longer_side(keyframe) for keyframe in keyframes]
+    sides = [longer_side(keyframe.frame) for keyframe in keyframes]
     longer = [max(side for side, lens in zip(sides, lens_of, strict=True) if lens == g) for g in range(len(first))]
     enlarged = (longer[lens] / side for side, lens in zip(sides, lens_of, strict=True))
     return Grouping(tuple(lens_of), tuple(longer), tuple(enlarged))
@@ -70,11 +82,9 @@ def _alike(one: Keyframe, other: Keyframe, across_sizes: bool) -> bool:
 
 def _nominal(keyframe: Keyframe) -> tuple[str, int] | None:
     given = keyframe.frame.intrinsics
-    return None if given is None else (given.source, round(float(np.log(given.fx / _longer_side(keyframe))) / 0.01))
-
-
-def _longer_side(keyframe: Keyframe) -> int:
-    return max(keyframe.frame.width, keyframe.frame.height)
+    return (
+        None if given is None else (given.source, round(float(np.log(given.fx / longer_side(keyframe.frame))) / 0.01))
+    )
 
 
 def lenses(
