@@ -141,7 +141,7 @@ def follow(
     guess: Points,  # where they were a moment ago
 ) -> tuple[Points, npt.NDArray[np.bool_]]:
     """Where the corners are now, and which of them were found: those that are in the picture and come home."""
-    window = {"winSize": (15, 15), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW, "criteria": FOLLOWING}
+    window = {"winSize": (11, 11), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW, "criteria": FOLLOWING}
     there, found, _ = cv2.calcOpticalFlowPyrLK(start, now, corners, guess.copy(), **window)
     back, returned, _ = cv2.calcOpticalFlowPyrLK(now, start, there, corners.copy(), **window)
     home = np.linalg.norm(back - corners, axis=2).ravel() < ROUND_TRIP_PX

@@ -120,3 +120,8 @@ def test_assessing_leaves_the_image_alone():
     novelty(image, image)
     assert np.array_equal(image, SHARP.image)
     assert assess(cv2.resize(image, (40, 30), interpolation=cv2.INTER_AREA)).blur_px is not None
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (2, 2)])
+def test_the_thinnest_images_have_no_edges(shape):
+    assert assess(np.zeros((*shape, 3), np.uint8)).blur_px is None
