@@ -141,7 +141,7 @@ def make_wall(num_gaussians: int = 600) -> GaussianArrays:
     )
 
 
-@pytest.mark.parametrize(("levels", "steps"), [(1, 150), (3, 150)])
+@pytest.mark.parametrize(("levels", "steps"), [(1, 150), (3, 250)])
 def test_test_pose_is_found_again(levels, steps):
     gaussians, true = make_wall(), motion(5, 0.05)
     image = torch.from_numpy(render_rgb(gaussians, true, K, WIDTH, HEIGHT))

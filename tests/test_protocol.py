@@ -138,9 +138,9 @@ def test_worse_scene_scores_worse_by_what_is_wrong(scene_folder):
 def test_another_moment_of_a_run_goes_on_from_the_poses_that_were_found(scene_folder, monkeypatch):
     searched = []
 
-    def align(appearance, truth, start, K, *, steps, levels):
+    def align(*scene_and_view, steps, levels, **rate):
         searched.append((steps, levels))
-        return align_test_pose(appearance, truth, start, K, steps=steps, levels=levels)
+        return align_test_pose(*scene_and_view, steps=steps, levels=levels, **rate)
 
     monkeypatch.setattr("recon.evaluate.protocol.align_test_pose", align)
     poses: dict[str, np.ndarray] = {}

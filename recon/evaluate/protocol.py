@@ -23,6 +23,7 @@ from recon.losses.lpips import Lpips, load_lpips
 from recon.snapshot import CameraEstimate, Snapshot
 
 STAGES = ("poses", "points", "optimise")
+_FIRST_RATE, _CONTINUED_RATE = 3e-3, 5e-4  # of the search for a test view's pose, in radians and parts of the depth
 
 
 @dataclass(frozen=True)
@@ -30,8 +31,8 @@ class Settings:
     """How held-out views are scored; part of every benchmark's record."""
 
     longer_side: int = 512  # pixels
-    alignment_steps: int = 500
-    alignment_levels: int = 3
+    alignment_steps: int = 120
+    alignment_levels: int = 1
     continued_steps: int = 60  # from the pose that was found in another moment of the same run, at full size
 
 
@@ -196,11 +197,12 @@ def _score_test_views(
         truth = whole[rows, columns]
         K = whole_K - np.array([[0.0, 0.0, columns.start], [0.0, 0.0, rows.start], [0.0, 0.0, 0.0]])
         if name in found:
-            start, steps, levels = found[name], settings.continued_steps, 1
+            start, steps, levels, rate = found[name], settings.continued_steps, 1, _CONTINUED_RATE
         else:
             start = true_to_estimated.camera(scene.cameras[name].T_world_camera)
-            steps, levels = settings.alignment_steps, settings.alignment_levels
-        T_world_camera = align_test_pose(appearance, truth, start, K, steps=steps, levels=levels).T_world_camera
+            steps, levels, rate = settings.alignment_steps, settings.alignment_levels, _FIRST_RATE
+        aligned = align_test_pose(appearance, truth, start, K, steps=steps, levels=levels, learning_rate=rate)
+        T_world_camera = aligned.T_world_camera
         found.setdefault(name, T_world_camera)
         with_rim = appearance.picture(T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
         image = with_rim[rows, columns]
