@@ -17,9 +17,10 @@ import torch
 from torch import Tensor
 
 from recon.losses.depth import local_depth_loss
+from recon.losses.dino import load_dino
 from recon.losses.normal import normal_loss
-from recon.losses.perceptual import Distance, load_perceptual
-from recon.losses.semantic import load_encoder, semantic_loss
+from recon.losses.perceptual import Distance, Perceptual, load_perceptual
+from recon.losses.semantic import Encoder, semantic_loss
 from recon.networks.depth_anything import load_relative
 from recon.point_render import PointRender, render_points
 from recon.priors.monocular import with_monocular
@@ -92,35 +93,18 @@ class Regularisation:
         self, pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config, *, seed: int
     ) -> None:
         """`pointmaps` and `images` (h, w, 3) of the training views, in the order in which they are asked for."""
-        self._config = config
         self._rng = np.random.default_rng(seed)
         self._draws = torch.Generator().manual_seed(seed)
-        full, self._depth_from = _depth_everywhere(
-            pointmaps, images if config.depth.weight or config.normal.weight else ()
-        )
+        full, depth_from = _depth_everywhere(pointmaps, images if config.depth.weight or config.normal.weight else ())
         self._training = [_known_from(pointmap, config.min_confidence) for pointmap in full]
         self._perceptual = load_perceptual() if config.point_render.weight else None
-        self._encode = load_encoder() if config.semantic.weight else None
+        self._encode: Encoder | None = load_dino() if config.semantic.weight else None
+        self.served_by = _served_by(config, self._perceptual, depth_from, self._encode)
+        self._config = config if self._encode is not None else msgspec.structs.replace(config, semantic=Term())
         with torch.no_grad():
             self._embeddings = [] if self._encode is None else [self._encode(_unit(image)) for image in images]
-        self._pseudo = (
-            self._imagine(pointmaps, images) if len(pointmaps) > 1 and any(term.weight for term in config.terms) else []
-        )
-
-    @property
-    def served_by(self) -> dict[str, str]:
-        """Which network or measure each active term used, for the report."""
-        config = self._config
-        served = {}
-        if self._perceptual is not None:
-            served["point_render"] = self._perceptual.name
-        if config.depth.weight:
-            served["depth"] = self._depth_from
-        if config.normal.weight:
-            served["normal"] = f"normals of the {self._depth_from}"
-        if config.semantic.weight:
-            served["semantic"] = "nothing: no weights" if self._encode is None else self._encode.name
-        return served
+        imagining = len(pointmaps) > 1 and any(term.weight for term in self._config.terms)
+        self._pseudo = self._imagine(pointmaps, images) if imagining else []
 
     def channels(self, progress: float) -> tuple[str, ...]:
         """What has to be rendered at this progress in [0, 1], beside the colours."""
@@ -184,6 +168,22 @@ class Regularisation:
             seen = torch.from_numpy(shown.seen)[..., None]
             imagined.append(_Imagined(view, _known_from_points(shown), looks, seen))
         return imagined
+
+
+def _served_by(
+    config: Config, perceptual: Perceptual | None, depth_from: str, encode: Encoder | None
+) -> dict[str, str]:
+    """Which network or measure each active term used, for the report."""
+    served = {}
+    if perceptual is not None:
+        served["point_render"] = perceptual.name
+    if config.depth.weight:
+        served["depth"] = depth_from
+    if config.normal.weight:
+        served["normal"] = f"normals of the {depth_from}"
+    if config.semantic.weight:
+        served["semantic"] = "nothing: no weights" if encode is None else encode.name
+    return served
 
 
 def _lenses(pointmaps: Sequence[Pointmap], scale: float) -> tuple[list[npt.NDArray[np.float64]], list[tuple[int, int]]]:

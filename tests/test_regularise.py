@@ -131,6 +131,8 @@ def test_which_network_served_is_told(without_networks):
         "semantic": "nothing: no weights",
     }
     assert regularisation(Config()).served_by == {}
+    nothing = regularisation(Config(semantic=Term(1.0)))
+    assert nothing.pseudo_loss(lambda view, _: truth_at(view), 0.5) is None  # no view is rendered for it
 
 
 def test_terms_of_weight_zero_ask_for_nothing(without_networks):
@@ -158,7 +160,7 @@ def test_networks_serve_where_their_weights_are(monkeypatch):
             return torch.nn.functional.normalize(image.mean((0, 1)), dim=0)
 
     monkeypatch.setattr("recon.regularise.load_relative", Seer)
-    monkeypatch.setattr("recon.regularise.load_encoder", Encoder)
+    monkeypatch.setattr("recon.regularise.load_dino", Encoder)
     pointmaps, images = zip(*(wall(x, i) for i, x in enumerate((0.0, 0.4))), strict=True)
     for pointmap in pointmaps:
         pointmap.depth[:, ::3] = 0  # several views know only a part

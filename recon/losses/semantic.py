@@ -1,16 +1,16 @@
-"""Semantic regularisation: what is seen from a new viewpoint is still the same place (equation 12)."""
+"""Semantic regularisation: what is seen from a new viewpoint is still the same place (equation 12).
+
+Only a network that was taught what a place is serves. Features of LPIPS, averaged over the image, were measured in its
+stead: neighbouring photographs are .2 apart in them, their gradient with respect to the pixels was 30 times the
+photographs', and sceaux lost .03 SSIM and .1 LPIPS.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 from torch import Tensor
-from torch.nn import functional
-
-from recon.losses.dino import load_dino
-from recon.losses.lpips import Lpips, load_lpips
 
 
 class Encoder(Protocol):
@@ -20,26 +20,6 @@ class Encoder(Protocol):
     def __call__(self, image: Tensor) -> Tensor:
         """(D,) embedding of unit length of an image (H, W, 3) in [0, 1], with gradients."""
         ...
-
-
-@dataclass(frozen=True, eq=False)
-class PooledFeatures:
-    """The deepest features of the LPIPS network, averaged over the image: what is seen, not where."""
-
-    network: Lpips
-    name: str = "LPIPS AlexNet features, pooled"
-
-    def __call__(self, image: Tensor) -> Tensor:
-        return functional.normalize(self.network.features(image)[-1].mean((0, 2, 3)), dim=0)
-
-
-def load_encoder() -> Encoder | None:
-    """DINOv2, as in the paper, else the features of LPIPS; None without weights of either."""
-    dino = load_dino()
-    if dino is not None:
-        return dino
-    network = load_lpips("alex")
-    return None if network is None else PooledFeatures(network)
 
 
 def semantic_loss(embedding: Tensor, truth: Tensor) -> Tensor:
