@@ -1,8 +1,8 @@
 """Where Gaussians start: the paper's confidence-ranked down-sampling, then one Gaussian per piece of equal colour.
 
-A piece is as large as what it leaves unexplained allows (`recon.partition`): the same error everywhere is the best use
-of a number of Gaussians. What a Gaussian has to explain to be worth having is told in photographs of a fixed size, so
-that the number follows from what there is to see and not from how many pixels show it.
+A piece is as large as what it leaves unexplained allows (`recon.partition`): the same visible error everywhere is the
+best use of a number of Gaussians (`recon.masking`). What a Gaussian has to explain to be worth having is told in
+photographs of a fixed size, so that the number follows from what there is to see and not from how many pixels show it.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import torch
 
 from recon.gaussians import SH_C0, Gaussians, concatenate
 from recon.geometry import quat_from_matrix
+from recon.masking import visibility
 from recon.partition import partition
 from recon.priors import reprojection
 from recon.priors.pointmap import Pointmap
@@ -32,8 +33,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_confidence: float = 0.05  # pixels below get no Gaussian
     largest_px: int = 64  # side of a square beyond which no piece reaches
     smallest_px: float = 3.0  # area of a piece that is not divided
-    most_error: float = 0.015  # squared deviation of colours in [0, 1], summed over a piece's pixels and channels
-    depth_weight: float = 2.0  # a relative difference of depth counts as this many times the difference of colour
+    most_error: float = 0.0021  # squared visible deviation of colours in [0, 1], over a piece's pixels and channels
+    depth_weight: float = 1.0  # a relative difference of depth counts as this many times the difference of colour
     noise: float = 0.01  # standard deviation of colours in [0, 1] that is not worth a Gaussian
     footprint: float = 1.2  # standard deviations of a new Gaussian in units of its piece's
     thickness: float = 0.15  # standard deviation along the normal, in units of the smaller across
@@ -117,11 +118,13 @@ def _cut(
     """The pieces of an image at `scale` of the reference's size."""
     log_depth = np.log(np.maximum(depth, 1e-9))
     middle = np.float32(np.median(log_depth[wanted])) if wanted.any() else np.float32(0)
+    colour = np.asarray(image / np.float32(255), np.float32)
     features = np.empty((*wanted.shape, 4), np.float32)
-    features[..., :3] = image / np.float32(255) - np.float32(0.5)
+    features[..., :3] = colour - np.float32(0.5)
     features[..., 3] = config.depth_weight * (log_depth - middle)
     return partition(
         features,
+        visibility(colour, scale) ** 2,
         wanted,
         tile_px=max(1, round(config.largest_px * scale)),
         smallest_px=max(1, round(config.smallest_px * scale**2)),

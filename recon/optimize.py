@@ -32,13 +32,13 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     means: float = 8e-4
     quats: float = 2e-2
-    log_scales: float = 3e-2
+    log_scales: float = 5e-2
     logit_opacities: float = 1e-1
-    sh: float = 2e-2
+    sh: float = 3e-2
     translation: float = 2e-4
     rotation: float = 2e-4  # radians
     final_means: float = 0.1  # those of the means have fallen to this part at the end, exponentially
-    final: float = 0.1  # the Gaussians' others to this
+    final: float = 0.3  # the Gaussians' others to this
     final_pose: float = 0.1  # and those of the cameras to this
 
 

@@ -9,9 +9,17 @@ from recon.core import default_threads, set_threads
 from recon.partition import partition
 
 
-def cut(features: np.ndarray, wanted: np.ndarray | None = None, **changed) -> tuple[np.ndarray, int]:
+def cut(
+    features: np.ndarray, wanted: np.ndarray | None = None, weights: np.ndarray | None = None, **changed
+) -> tuple[np.ndarray, int]:
     settings = {"tile_px": 64, "smallest_px": 1, "most_error": 0.1, "noise": 0.0} | changed
-    return partition(features, np.ones(features.shape[:2], bool) if wanted is None else wanted, **settings)
+    everywhere = np.ones(features.shape[:2], np.float32)
+    return partition(
+        features,
+        everywhere if weights is None else weights,
+        everywhere > 0 if wanted is None else wanted,
+        **settings,
+    )
 
 
 def grey(values: np.ndarray) -> np.ndarray:
@@ -73,6 +81,16 @@ def test_noise_that_is_allowed_for_is_not_cut():
     features = np.random.default_rng(0).normal(0, 0.02, (64, 64, 4)).astype(np.float32)
     assert cut(features, most_error=0.1)[1] > 20
     assert cut(features, most_error=0.1, noise=4 * 0.02**2 * 1.1)[1] == 1
+
+
+def test_what_weighs_little_is_cut_as_if_it_differed_less():
+    values = np.random.default_rng(0).random((32, 32))
+    _, fine = cut(grey(values))
+    _, coarse = cut(grey(values), weights=np.full((32, 32), 0.04, np.float32))
+    assert coarse == cut(grey(0.2 * values))[1] < 0.5 * fine
+    left = np.where(np.arange(32) < 16, 1.0, 1e-6).astype(np.float32)
+    labels, _ = cut(grey(values), weights=np.tile(left, (32, 1)))
+    assert len(np.unique(labels[:, :16])) > 10 * len(np.unique(labels[:, 18:]))
 
 
 def test_unwanted_pixels_belong_to_no_piece_and_have_no_say():

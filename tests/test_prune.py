@@ -13,6 +13,7 @@ from recon.background import SOURCE_FRAME
 from recon.control.control import ControlChoice, Step
 from recon.control.prune import Config, Sight, between, changes_without, load, most_worth
 from recon.gaussians import Gaussians, concatenate
+from recon.masking import visibility
 from recon.optimize import Config as Optimising
 from recon.optimize import refine
 from recon.scene import Scene, View
@@ -34,10 +35,12 @@ def worth(scene: Scene, probes: int, scale: float = 1.0) -> torch.Tensor:
 
 
 def left_out(gaussians: Gaussians, view: View, index: int) -> float:
-    """The squared difference to the picture without Gaussian `index`, as worth is counted."""
+    """The squared visible difference to the picture without Gaussian `index`, as worth is counted."""
     others = gaussians.subset(torch.arange(len(gaussians)) != index)
-    difference = render(gaussians, view) - render(others, view)
-    return float((difference**2).sum()) * (512 / max(view.width, view.height)) ** 2
+    whole = render(gaussians, view)
+    scale = max(view.width, view.height) / 512
+    visible = torch.from_numpy(visibility(whole.numpy(), scale))[..., None]
+    return float(((visible * (whole - render(others, view))) ** 2).sum()) / scale**2
 
 
 def test_the_worth_of_a_gaussian_is_what_leaving_it_out_changes(truth):  # noqa: F811

@@ -14,13 +14,14 @@ from recon.background import SOURCE_FRAME as SHELL
 from recon.control.control import Change, Step
 from recon.density import REFERENCE_PX
 from recon.gaussians import Gaussians
+from recon.masking import visibility
 from recon.pseudo_views import pseudo_views
 from recon.rasterize.cpu import rasterize
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     at: tuple[float, ...] = (0.3,)  # when this part of the refinement is done, rising
-    least_change: float = 0.035  # squared difference of colours in [0, 1], summed over all pixels, channels and views
+    least_change: float = 0.005  # squared visible difference of colours in [0, 1], over all pixels, channels, views
     between: int = 1  # views between the photographs, for each of these, that count as they do
     off_path: float = 0.3  # how far these may lie beside the path from photograph to photograph, in its steps
     probes: int = 4  # random images a view from which the differences are estimated
@@ -85,7 +86,7 @@ def between(sights: Sequence[Sight], count: int, off_path: float, rng: np.random
 
 
 def changes_without(gaussians: Gaussians, sights: Sequence[Sight], probes: int, generator: torch.Generator) -> Tensor:
-    """(N,) the squared difference that it makes to all images together if one Gaussian is left out: an estimate.
+    """(N,) the squared visible difference to all images together if one Gaussian is left out: an estimate.
 
     What a pixel shows is linear in each opacity, so that leaving a Gaussian out changes it by opacity * derivative.
     The sum over pixels of these squares is the mean square of their sum with random signs (Hutchinson 1990), which
@@ -94,7 +95,7 @@ def changes_without(gaussians: Gaussians, sights: Sequence[Sight], probes: int, 
     opacities = gaussians.opacities.requires_grad_(True)
     total = torch.zeros(len(gaussians))
     for sight in sights:
-        size = (REFERENCE_PX / max(sight.width, sight.height)) ** 2
+        scale = max(sight.width, sight.height) / REFERENCE_PX
         rgb = rasterize(
             gaussians.means,
             gaussians.quats,
@@ -108,8 +109,9 @@ def changes_without(gaussians: Gaussians, sights: Sequence[Sight], probes: int, 
             channels=("rgb",),
         ).rgb
         assert rgb is not None  # it was asked for
+        visible = torch.from_numpy(visibility(rgb.detach().numpy(), scale))
         for _ in range(probes):
             signs = torch.randint(0, 2, rgb.shape, generator=generator) * 2.0 - 1.0
-            (gradient,) = torch.autograd.grad(rgb, opacities, signs, retain_graph=True)
-            total += size * (gradient * opacities.detach()) ** 2
+            (gradient,) = torch.autograd.grad(rgb, opacities, signs * visible[..., None], retain_graph=True)
+            total += (gradient * opacities.detach() / scale) ** 2
     return total / probes

@@ -18,12 +18,13 @@ constexpr int kChannels = 4;
 
 struct Partition {
     const float* features;  // (height, width, kChannels)
+    const float* weights;   // (height, width), by which squared deviations count
     const uint8_t* wanted;  // (height, width), 0 for pixels that belong to no piece
     int32_t width, height;
     int32_t tile;         // pixels: no piece reaches beyond a square of a grid of this spacing
     int32_t smallest;     // pixels of a piece that is not cut any more
     float most_error;     // sum of squared deviations, over pixels and channels, that a piece may keep
-    float noise;          // variance of all channels together that every pixel has and no cut explains
+    float noise;          // variance of all channels together that every pixel has and no cut explains: it counts alike
 };
 
 struct Pixel {
@@ -32,22 +33,22 @@ struct Pixel {
 };
 
 struct Sums {
-    int count = 0;
-    float total[kChannels] = {};
+    float weight = 0;
+    float total[kChannels] = {};  // of weighted values
 
-    void add(const float* f) {
-        ++count;
-        for (int c = 0; c < kChannels; ++c) total[c] += f[c];
+    void add(const float* f, float w) {
+        weight += w;
+        for (int c = 0; c < kChannels; ++c) total[c] += w * f[c];
     }
     void add(const Sums& other) {
-        count += other.count;
+        weight += other.weight;
         for (int c = 0; c < kChannels; ++c) total[c] += other.total[c];
     }
-    // Sum over channels of (sum of values)^2 / count: what the mean explains of the sum of squares.
+    // Sum over channels of (sum of values)^2 / weight: what the mean explains of the sum of squares.
     float explained() const {
         float squares = 0;
         for (int c = 0; c < kChannels; ++c) squares += total[c] * total[c];
-        return count ? squares / count : 0.0f;
+        return weight > 0 ? squares / weight : 0.0f;
     }
 };
 
@@ -100,6 +101,7 @@ private:
     };
 
     const float* feature(const Pixel& pixel) const { return task_.features + size_t(kChannels) * pixel.index; }
+    float weight(const Pixel& pixel) const { return task_.weights[pixel.index]; }
 
     // From 0 to below 2 * tile.
     int place(const Pixel& p, int direction) const {
@@ -116,10 +118,11 @@ private:
         float squares = 0;
         for (int i = piece.begin; i < piece.end; ++i) {
             const float* f = feature(pixels_[i]);
-            whole.add(f);
-            for (int c = 0; c < kChannels; ++c) squares += f[c] * f[c];
+            const float w = weight(pixels_[i]);
+            whole.add(f, w);
+            for (int c = 0; c < kChannels; ++c) squares += w * f[c] * f[c];
         }
-        const float error = squares - whole.explained() - task_.noise * count;
+        const float error = squares - whole.explained() - task_.noise * whole.weight;
         if (error <= task_.most_error) return best;
         for (int direction = 0; direction < 4; ++direction) try_direction(piece, whole, error, direction, best);
         return best;
@@ -134,15 +137,15 @@ private:
         }
         std::fill(bins_.begin() + low, bins_.begin() + high + 1, Sums());
         for (int i = piece.begin; i < piece.end; ++i)
-            bins_[place(pixels_[i], direction)].add(feature(pixels_[i]));
+            bins_[place(pixels_[i], direction)].add(feature(pixels_[i]), weight(pixels_[i]));
         Sums before;
         for (int at = low; at < high; ++at) {
             before.add(bins_[at]);
             Sums behind;
-            behind.count = whole.count - before.count;
+            behind.weight = whole.weight - before.weight;
             for (int c = 0; c < kChannels; ++c) behind.total[c] = whole.total[c] - before.total[c];
             // Of cuts that explain the same, the one through the middle: nothing is left to chance in plain texture.
-            const float balance = 4.0f * before.count * behind.count / (float(whole.count) * whole.count);
+            const float balance = 4.0f * before.weight * behind.weight / (whole.weight * whole.weight);
             const float gain = before.explained() + behind.explained() - whole.explained() + kBalance * error * balance;
             if (gain > best.gain) best = {direction, at + 1, gain};
         }
