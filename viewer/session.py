@@ -105,7 +105,8 @@ class Session:
 
     def move(self, view: Viewpoint) -> None:
         """The person takes another viewpoint, and leaves the camera's if it was one."""
-        self.state = replace(self.state, camera=None, follow=False)
+        if self.state.follow or self.state.camera is not None:
+            self.state = replace(self.state, camera=None, follow=False)
         self._view, self._touched = view, True
 
     def grasped(self) -> Viewpoint | None:

@@ -23,18 +23,16 @@ from recon.export import write_file
 from viewer.canvas import BACKGROUND
 from viewer.help_sheet import HelpSheet
 from viewer.panel import Panel
+from viewer.pointer import Pointer
 from viewer.scene3d import Scene3D, image3d, look_from
 from viewer.session import Session
 from viewer.state import Engine
-from viewer.viewpoint import orbited, panned, zoomed
 
 Image = npt.NDArray[np.uint8]
 
-_TURN_PER_PIXEL = 0.006  # radians
-_ZOOM_PER_NOTCH = 0.88
-_CLICK_PX = 4  # a pointer that moves less between press and release clicks
 _SMOOTH_S = 0.04  # a picture that takes longer is painted at half the resolution while the pointer drags it
 _REDRAWS = 2  # of Open3D's picture after a change
+_WORDS_S = 0.5  # after which words that nobody has changed are looked at again: how long pictures take, and the age
 _PANEL_EMS = 22  # the panel's width, in letter widths of the theme
 _KEYS = {
     gui.KeyName.SPACE: "space",
@@ -96,13 +94,12 @@ class _Window:
         self._window.set_on_tick_event(self._guarded(self._tick, False))
         self._dirty = True
         self._size = (1, 1)  # of the picture, pixels
-        self._pressed: tuple[float, float] | None = None  # where the pointer went down, None: it is up
-        self._pointer = (0.0, 0.0)
-        self._dragging = False
+        self._pointer = Pointer(session)
         self._painted_s = 0.0  # how long the last full picture took
         self._shown: tuple[object, ...] = ()  # what the scene widget shows
         self._analysed: object = None
         self._words_at = 0.0
+        self._said: tuple[object, ...] = ()  # what the panel shows
         self._redraws = 0
         self._stopped_by = 0  # a signal
         self._notice = ""
@@ -136,13 +133,12 @@ class _Window:
         analysis = self._session.analysis()
         if analysis is not self._analysed:
             self._analysed, self._dirty = analysis, True
-        if time.monotonic() - self._words_at > 0.5:
+        if self._words_are_old():
             self._say()
         if not self._dirty:
             return self._redraw_again()
         self._dirty = False
         self._draw()
-        self._say()
         return True
 
     def _draw(self) -> None:
@@ -157,7 +153,7 @@ class _Window:
             self._scene.set_drawing(not own)
         started = time.perf_counter()
         if own:
-            half = self._dragging and self._painted_s > _SMOOTH_S
+            half = self._pointer.dragging and self._painted_s > _SMOOTH_S
             image = session.paint(*((width // 2, height // 2) if half else (width, height)))
             if image is not None:
                 self._picture.update_image(image3d(image))
@@ -182,8 +178,15 @@ class _Window:
         self._scene_widget.force_redraw()
         return True
 
+    def _words_are_old(self) -> bool:
+        """Not at each picture: other words lay the panel out anew, and Open3D then draws the whole window twice."""
+        return self._said != self._to_say() or time.monotonic() - self._words_at > _WORDS_S
+
+    def _to_say(self) -> tuple[object, ...]:
+        return self._session.state, self._session.moment, self._analysed, self._notice
+
     def _say(self) -> None:
-        self._words_at = time.monotonic()
+        self._words_at, self._said = time.monotonic(), self._to_say()
         seconds = self._painted_s if self._session.state.engine is Engine.CORE else None
         self._panel.show(self._session, seconds, self._notice)
         self._help.show(self._session.state.help)
@@ -224,37 +227,9 @@ class _Window:
         return bool(key)
 
     def _mouse(self, event: gui.MouseEvent):
-        """Orbits, pans, zooms, or goes to the camera that was clicked."""
         frame = self._picture.frame
-        x, y = float(event.x - frame.x), float(event.y - frame.y)
-        if event.type == gui.MouseEvent.Type.BUTTON_DOWN:
-            self._pressed = self._pointer = (x, y)
-        elif event.type == gui.MouseEvent.Type.DRAG and self._pressed is not None:
-            self._drag(event, x, y)
-        elif event.type == gui.MouseEvent.Type.BUTTON_UP and self._pressed is not None:
-            if not self._dragging:
-                self._session.click(x, y, *self._size)
-            self._pressed, self._dragging, self._dirty = None, False, True
-        elif event.type == gui.MouseEvent.Type.WHEEL:
-            view = self._session.grasped()
-            if view is not None:
-                self._session.move(zoomed(view, _ZOOM_PER_NOTCH**event.wheel_dy))
-                self._dirty = True
+        self._dirty |= self._pointer.moved(event, float(event.x - frame.x), float(event.y - frame.y), self._size)
         return gui.Widget.EventCallbackResult.CONSUMED
-
-    def _drag(self, event: gui.MouseEvent, x: float, y: float) -> None:
-        start = self._pressed or (x, y)
-        if not self._dragging and max(abs(x - start[0]), abs(y - start[1])) < _CLICK_PX:
-            return
-        view = self._session.grasped()
-        right, down = x - self._pointer[0], y - self._pointer[1]
-        self._pointer, self._dragging, self._dirty = (x, y), True, True
-        if view is None:
-            return
-        if event.is_button_down(gui.MouseButton.LEFT):
-            self._session.move(orbited(view, -_TURN_PER_PIXEL * right, _TURN_PER_PIXEL * down))
-        else:
-            self._session.move(panned(view, right, down, float(view.K(*self._size)[0, 0])))
 
     def _screenshot(self) -> None:
         path = self._screenshots / time.strftime("splatnode_%Y%m%d_%H%M%S.png")

@@ -28,6 +28,7 @@ from capture.messaging.network import Network
 from capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
 from capture.preview import PreviewHeader
 from capture.status import CaptureStatus
+from tests.node import processor_s
 
 RATE, WIDTH, HEIGHT = 30, 1280, 720
 FRAMES = 480  # so that the wall goes by at an eighth of the picture a second
@@ -114,11 +115,6 @@ def observe(pid: int, network: Network, photographs: list[Path], seconds: float)
         "rss_mb": newest.header.rss_mb,
         "load_average": os.getloadavg()[0],
     }
-
-
-def processor_s(pid: int) -> float:
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def decoding_s(photographs: list[Path], pause_s: float) -> float:
