@@ -23,7 +23,7 @@ from recon.evaluate.start import continued
 from recon.evaluate.truth import EvaluationScene, load_scene
 from recon.rasterize.cpu import rasterize
 from recon.snapshot import Snapshot
-from tests.bench.parsimony import ALIGNMENT_STEPS, Folders, Scoring, found_start
+from tests.bench.parsimony import Folders, Scoring, found_start
 
 CASES = ("fountain_p11:6", "llff_flower:6")
 LIMITS: dict[str, tuple[float, ...]] = {
@@ -135,7 +135,7 @@ def main() -> None:
     networks = Networks(load_networks(arguments.shared / "weights").alex, None)
     if networks.alex is None:
         parser.error(f"{arguments.shared}/weights must hold LPIPS's weights for AlexNet. Run: splatnode weights")
-    scoring = Scoring(networks, Settings(alignment_steps=ALIGNMENT_STEPS))
+    scoring = Scoring(networks, Settings())
     folders = Folders(arguments.shared / "scenes", arguments.starts)
     rows: list[Row] = []
     for case in arguments.cases or CASES:

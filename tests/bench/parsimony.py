@@ -37,7 +37,6 @@ CASES = (  # of which cameras are found
     *(f"{scene}:6" for scene in ("llff_fern", "fox", "tum_fr3_office", "castle_p30")),
 )
 FACTORS = (1 / 4, 1 / 2, 2.0, 4.0)  # of the size that was chosen
-ALIGNMENT_STEPS = 100  # of each test camera, which has hardly moved where cameras are right
 ITERATIONS = 500
 
 
@@ -146,17 +145,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("cases", nargs="*", help=f"default: {' '.join(CASES)}")
     parser.add_argument("--methods", nargs="+", default=(), help="of these only, besides the chosen size")
-    parser.add_argument("--alignment-steps", type=int, default=ALIGNMENT_STEPS, help="of each test camera")
     parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
     parser.add_argument("--starts", type=Path, required=True, help="folder for cameras and points")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to fill")
     parser.add_argument("--chart", type=Path, help="PNG file to draw from it")
     arguments = parser.parse_args()
-    rows = [Row(**row) for row in json.loads(arguments.out.read_text())["rows"]] if arguments.out.exists() else []
     networks = Networks(load_networks(arguments.shared / "weights").alex, None)
     if networks.alex is None:
         parser.error(f"{arguments.shared}/weights must hold LPIPS's weights for AlexNet. Run: splatnode weights")
-    scoring = Scoring(networks, Settings(alignment_steps=arguments.alignment_steps))
+    scoring = Scoring(networks, Settings())
+    known = json.loads(arguments.out.read_text()) if arguments.out.exists() else {"rows": []}
+    if known["rows"] and known["settings"] != asdict(scoring.settings):
+        parser.error(f"{arguments.out} was scored with other settings: {known['settings']}. Name another file")
+    rows = [Row(**row) for row in known["rows"]]
     folders = Folders(arguments.shared / "scenes", arguments.starts)
     for case in arguments.cases or CASES:
         fill(case, rows, folders, scoring, arguments.out, tuple(arguments.methods))
