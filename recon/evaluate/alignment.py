@@ -17,7 +17,6 @@ from recon.geometry import Similarity, align_cameras, exp_se3, twist_gradient
 Array = npt.NDArray[np.float64]
 
 _BETA1, _BETA2 = 0.9, 0.999  # of Adam (Kingma and Ba 2015)
-_LAST_RATE = 0.01  # to which part the learning rate has fallen at the end
 
 
 def umeyama(source: Array, target: Array) -> Similarity:
@@ -141,11 +140,12 @@ def align_test_pose(
     steps: int,
     levels: int = 1,
     learning_rate: float = 0.003,
+    final: float = 0.01,  # to which part of it the learning rate falls
 ) -> AlignedPose:
     """Equation 18: the pose from which the frozen scene looks most like the image, in mean absolute difference.
 
-    Adam moves a twist at the current pose, with a learning rate that falls exponentially to a hundredth: 120 steps then
-    find what 500 find along the cosine that InstantSplat has. The best pose seen is returned, never one worse than the
+    Adam moves a twist at the current pose, with a learning rate that falls exponentially: with a hundredth at the end
+    120 steps find what 500 find along the cosine that InstantSplat has. The best pose seen is returned, never one worse than the
     start. `learning_rate` is in radians, and for the translation in parts of the scene's depth, so that both move the
     image by similar amounts in a world without scale. With `levels` > 1 the steps are shared between resolutions that
     double up to the image's own, which widens the basin and needs more of them.
@@ -168,7 +168,7 @@ def align_test_pose(
         first = _BETA1 * first + (1 - _BETA1) * slope
         second = _BETA2 * second + (1 - _BETA2) * slope**2
         unbiased = first / (1 - _BETA1 ** (step + 1)), second / (1 - _BETA2 ** (step + 1))
-        rate = learning_rate * _LAST_RATE ** (step / steps)
+        rate = learning_rate * final ** (step / steps)
         # The moments live in the camera's own frame, which turns with it: each step is a twist at the current pose.
         T = T @ exp_se3(-rate * unbiased[0] / (unbiased[1].sqrt() + 1e-12) * units)
     for candidate in (T, start):

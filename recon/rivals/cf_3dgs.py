@@ -49,6 +49,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     opacity: float = 0.5  # of a Gaussian that starts from a pixel
 
 
+_MOTION_FINAL = 0.1  # part of the steps' size at their end: the next frame may be far away
 _ALONE = msgspec.structs.replace(colmap_3dgs.OPTIMIZE, checkpoints=(), control=None)
 _TOGETHER = msgspec.structs.replace(
     _ALONE,
@@ -84,7 +85,14 @@ def _next_pose(sight: Sight, view: View, following: Sight, seed: int, config: Co
     image = torch.from_numpy(following.image).float() / 255.0
     look = _Alone(fitted.arrays(), rasterize)
     aligned = align_test_pose(
-        look, image, T_world_camera, following.K, steps=config.motion, levels=3, learning_rate=config.motion_rate
+        look,
+        image,
+        T_world_camera,
+        following.K,
+        steps=config.motion,
+        levels=3,
+        learning_rate=config.motion_rate,
+        final=_MOTION_FINAL,
     )
     return aligned.T_world_camera
 
