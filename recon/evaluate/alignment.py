@@ -145,10 +145,10 @@ def align_test_pose(
     """Equation 18: the pose from which the frozen scene looks most like the image, in mean absolute difference.
 
     Adam moves a twist at the current pose, with a learning rate that falls exponentially: with a hundredth at the end
-    120 steps find what 500 find along the cosine that InstantSplat has. The best pose seen is returned, never one worse than the
-    start. `learning_rate` is in radians, and for the translation in parts of the scene's depth, so that both move the
-    image by similar amounts in a world without scale. With `levels` > 1 the steps are shared between resolutions that
-    double up to the image's own, which widens the basin and needs more of them.
+    120 steps find what 500 find along the cosine that InstantSplat has. The best pose seen is returned, never one worse
+    than the start. `learning_rate` is in radians, and for the translation in parts of the scene's depth, so that both
+    move the image by similar amounts in a world without scale. With `levels` > 1 the steps are shared between
+    resolutions that double up to the image's own, which widens the basin and needs more of them.
     """
     if steps < 1 or levels < 1:
         raise ValueError(f"steps and levels must be at least 1, got {steps} and {levels}")

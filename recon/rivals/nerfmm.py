@@ -3,7 +3,8 @@
 As published: all cameras start at the origin and look ahead, the focal length starts as the image's size, samples are
 spaced as in normalised device coordinates, without a hierarchy. Compact: 1500 iterations of 384 rays, where 10 000
 epochs take 1024 rays of every photograph, and step sizes of 5e-3 and 3e-3 for 1e-3 in their stead; 32 samples a ray for
-128; three layers of 64 for eight of 128; photographs of 256 pixels. Our first camera stays at the origin.
+128; three layers of 64 for eight of 128; photographs of 256 pixels. Our first camera stays at the origin. Twice as many
+iterations change nothing: on llff_fern the cameras stand after 600, where their focal length and turns are wrong.
 """
 
 from __future__ import annotations
