@@ -31,7 +31,7 @@ from viewer.state import Engine
 Image = npt.NDArray[np.uint8]
 
 _SMOOTH_S = 0.04  # a picture that takes longer is painted at half the resolution while the pointer drags it
-_REDRAWS = 2  # of Open3D's picture after a change
+_REDRAWS = 2  # of the window after the last change
 _WORDS_S = 0.5  # after which words that nobody has changed are looked at again: how long pictures take, and the age
 _PANEL_EMS = 22  # the panel's width, in letter widths of the theme
 _KEYS = {
@@ -151,6 +151,7 @@ class _Window:
         if self._picture.visible != own or self._scene_widget.visible == own:
             self._picture.visible, self._scene_widget.visible = own, not own
             self._scene.set_drawing(not own)
+        self._redraws = _REDRAWS
         started = time.perf_counter()
         if own:
             half = self._pointer.dragging and self._painted_s > _SMOOTH_S
@@ -168,10 +169,9 @@ class _Window:
         self._scene.show_shapes(session.shapes())
         look_from(self._scene_widget, view, width, height)
         self._scene_widget.force_redraw()
-        self._redraws = _REDRAWS
 
     def _redraw_again(self) -> bool:
-        """Whether Open3D's picture is drawn once more: its splats appear one drawing later than they were asked for."""
+        """Whether the window is drawn once more: pictures and splats appear a drawing later than they were given."""
         if not self._redraws:
             return False
         self._redraws -= 1

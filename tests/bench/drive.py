@@ -89,11 +89,29 @@ def steps(camera: npt.NDArray[np.floating]) -> list[Step]:
         Step("present", ("key Right", "key Right")),
         Step("paused", ("key space",)),
         Step("unpaused", ("key space",)),
+        *lists_and_sliders(),
         Step("saved", ("key s",)),
         Step("open3d", ("key e",)),
         Step("open3d_points", ("key g",)),
         Step("own_again", ("key e", "key g")),
         Step("resized", ("search --name ^splatnode$ windowsize 900 600",)),
+    ]
+
+
+def lists_and_sliders() -> list[Step]:
+    """The panel's drop-down lists and sliders by mouse, and back to how it was."""
+    return [
+        Step("colour_list", (click(1269, 158),)),
+        Step("colour_chosen", (click(1050, 206),)),
+        Step("camera_list", (click(1269, 212),)),
+        Step("camera_chosen", (click(1050, 260),)),
+        Step("blend_slider", (click(1230, 320),)),
+        Step("blend_slider_back", (click(940, 320),)),
+        Step("points_again", ("key g",)),
+        Step("points_slider", (click(1230, 266),)),
+        Step("time_slider", (click(1000, 374),)),
+        Step("time_slider_back", (click(1260, 374),)),
+        Step("as_before", ("key g", "key r", "key c", "key c", "key c", "key c")),
     ]
 
 
