@@ -44,15 +44,9 @@ def truth(x: float) -> Render:
 
 
 def truth_at(view: PseudoView, shift: float = 0.0) -> Render:
-    """What a right scene renders from a pseudo view, which is half as large; a wrong one is shifted."""
-    full = truth(view.T_world_camera[0, 3] + shift)
-    assert full.rgb is not None and full.depth is not None and full.normal is not None
-    assert (view.width, view.height) == (WIDTH // 2, HEIGHT // 2)
-    return Render(half(full.rgb), half(full.depth[..., None])[..., 0], half(full.normal), None)
-
-
-def half(image: torch.Tensor) -> torch.Tensor:
-    return torch.nn.functional.avg_pool2d(image.permute(2, 0, 1), 2).permute(1, 2, 0)
+    """What a right scene renders from a pseudo view; a wrong one is shifted."""
+    assert (view.width, view.height) == (WIDTH, HEIGHT)
+    return truth(view.T_world_camera[0, 3] + shift)
 
 
 def mirrored(render: Render) -> Render:
