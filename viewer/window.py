@@ -32,7 +32,6 @@ Image = npt.NDArray[np.uint8]
 
 _SMOOTH_S = 0.04  # a picture that takes longer is painted at half the resolution while the pointer drags it
 _REDRAWS = 2  # of the window after the last change
-_WORDS_S = 0.5  # after which words that nobody has changed are looked at again: how long pictures take, and the age
 _PANEL_EMS = 22  # the panel's width, in letter widths of the theme
 _KEYS = {
     gui.KeyName.SPACE: "space",
@@ -99,7 +98,6 @@ class _Window:
         self._shown: tuple[object, ...] = ()  # what the scene widget shows
         self._analysed: object = None
         self._words_at = 0.0
-        self._said: tuple[object, ...] = ()  # what the panel shows
         self._redraws = 0
         self._stopped_by = 0  # a signal
         self._notice = ""
@@ -133,12 +131,13 @@ class _Window:
         analysis = self._session.analysis()
         if analysis is not self._analysed:
             self._analysed, self._dirty = analysis, True
-        if self._words_are_old():
+        if time.monotonic() - self._words_at > 0.5:
             self._say()
         if not self._dirty:
             return self._redraw_again()
         self._dirty = False
         self._draw()
+        self._say()
         return True
 
     def _draw(self) -> None:
@@ -178,15 +177,8 @@ class _Window:
         self._scene_widget.force_redraw()
         return True
 
-    def _words_are_old(self) -> bool:
-        """Not at each picture: other words lay the panel out anew, and Open3D then draws the whole window twice."""
-        return self._said != self._to_say() or time.monotonic() - self._words_at > _WORDS_S
-
-    def _to_say(self) -> tuple[object, ...]:
-        return self._session.state, self._session.moment, self._analysed, self._notice
-
     def _say(self) -> None:
-        self._words_at, self._said = time.monotonic(), self._to_say()
+        self._words_at = time.monotonic()
         seconds = self._painted_s if self._session.state.engine is Engine.CORE else None
         self._panel.show(self._session, seconds, self._notice)
         self._help.show(self._session.state.help)
