@@ -30,7 +30,7 @@ from recon.export.prepare import viewer_safe
 from recon.export.spz import encode_spz
 from recon.rasterize.cpu import rasterize
 from recon.report import peak_rss_mb
-from tests.bench.parsimony_chart import PIXEL, RIVAL, SELF, draw, summary
+from tests.bench.parts.parsimony_chart import PIXEL, RIVAL, SELF, draw, summary
 
 CASES = (  # of which cameras are found
     *(f"{scene}:{views}" for scene in ("fountain_p11", "llff_flower", "sceaux") for views in (3, 6)),

@@ -22,9 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.bench.parts.viewer_agreement import agreement
+from tests.bench.parts.viewer_live import thinned, watch
 from tests.bench.rasterize import processor_name
-from tests.bench.viewer_agreement import agreement
-from tests.bench.viewer_live import thinned, watch
 from viewer.moment import Moment
 from viewer.session import Session
 from viewer.sources import Finished, load_result
