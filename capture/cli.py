@@ -112,7 +112,7 @@ def status(args: argparse.Namespace) -> int:
 def _described(room: str, fields: dict[str, object] | None) -> list[str]:
     if fields is None:
         return [f"{room}: silent; is splatnode {room} running, with the same network?"]
-    hidden = {"session", "sequence", "mono_ns", "type", "state"}
+    hidden = {"session", "sequence", "mono_ns", "type", "state", "tracked"}
     lines = [f"{room}: {fields.get('state', 'running')}"]
     for key, value in fields.items():
         if key not in hidden and value not in ("", None):

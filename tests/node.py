@@ -18,7 +18,10 @@ from capture.config import typed
 from capture.messaging.network import Network
 from capture.messaging.services import RECON_SCENE
 from capture.messaging.state import StateClient
-from recon.daemon.scene_message import LiveScene, SceneHeader, from_message
+from capture.messaging.wire import Numbering
+from recon.daemon.scene_message import LiveScene, SceneHeader, camera_record, from_message
+from recon.daemon.status import ReconStatus, State
+from recon.snapshot import CameraEstimate
 from tests.conftest import ROOT
 
 PATIENCE_S = 300.0
@@ -137,3 +140,13 @@ def descriptors(pid: int) -> int:
 def finished(views: int) -> Callable[[LiveScene], bool]:
     """Whether a scene of at least so many views is as good as it gets."""
     return lambda scene: scene.snapshot.final and len(scene.snapshot.cameras) >= views
+
+
+def heartbeat(numbering: Numbering, tracked: CameraEstimate | None) -> ReconStatus:
+    """Of a daemon whose scene is finished, with the live camera `tracked`."""
+    return ReconStatus(
+        **numbering.next(), state=State.IDLE, uptime_s=1.0, scene_id="place", keyframe=2, queue=0, keyframes=2,
+        num_gaussians=225, iterations=500, final=True, verdict="OK", message="", keyframe_s=None, refused=0,
+        duplicates=0, rss_mb=100.0, camera_moved=None, moved="", problem="",
+        tracked=camera_record(tracked) if tracked else None,
+    )  # fmt: skip

@@ -45,20 +45,20 @@ def snapshot(cameras: int = 3, count: int = 10) -> Snapshot:
     )
 
 
-def sent(scene: Snapshot, tracked: CameraEstimate | None = None) -> Message[SceneHeader]:
-    header, arrays = to_message(scene, "scene-0002", NUMBERED, tracked)
+def sent(scene: Snapshot) -> Message[SceneHeader]:
+    header, arrays = to_message(scene, "scene-0002", NUMBERED)
     return decode([bytes(part) for part in encode(header, arrays)], SceneHeader)
 
 
 def test_a_scene_comes_out_as_it_went_in():
-    scene, tracked = snapshot(), camera(9)
-    live = from_message(sent(scene, tracked))
+    scene = snapshot()
+    live = from_message(sent(scene))
     assert (live.scene_id, live.session) == ("scene-0002", NUMBERED["session"])
     assert live.snapshot.verdict == scene.verdict and live.snapshot.dropped == scene.dropped
     assert (live.snapshot.sequence, live.snapshot.iterations, live.snapshot.final) == (7, 50, True)
     for name in GaussianArrays.__dataclass_fields__:
         assert np.array_equal(getattr(live.snapshot.gaussians, name), getattr(scene.gaussians, name)), name
-    for one, other in zip((*live.snapshot.cameras, live.tracked), (*scene.cameras, tracked), strict=True):
+    for one, other in zip(live.snapshot.cameras, scene.cameras, strict=True):
         assert np.array_equal(one.T_world_camera, other.T_world_camera) and np.array_equal(one.K, other.K)
         assert (one.name, one.frame_id, one.width, one.height) == (
             other.name,
@@ -80,7 +80,7 @@ def test_thumbnails_are_small_and_look_like_the_photograph():
 def test_a_scene_that_may_not_be_shown_is_a_message_too():
     refused = Snapshot(1, Verdict(Code.TOO_FEW_VIEWS, "One.", "More."), (), GaussianArrays.empty(), {}, (), 0)
     live = from_message(sent(refused))
-    assert live.tracked is None and len(live.snapshot.gaussians) == 0 and not live.snapshot.verdict.publishable
+    assert len(live.snapshot.gaussians) == 0 and not live.snapshot.verdict.publishable
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 import splatnode
+from capture.messaging.broadcast import Publisher
 from capture.messaging.network import Network
-from capture.messaging.services import RECON_SCENE
+from capture.messaging.services import RECON_SCENE, RECON_STATUS
 from capture.messaging.state import StateServer
 from capture.messaging.wire import Numbering
 from recon.daemon.scene_message import to_message
@@ -24,6 +25,7 @@ from recon.report import build_report
 from recon.snapshot import GaussianArrays, Snapshot
 from recon.verdict import Code, Verdict
 from tests.conftest import ROOT
+from tests.node import heartbeat
 from tests.test_viewer_scene import camera, moment, wall
 from viewer import cli
 from viewer.probe import Probe, probe_window
@@ -192,13 +194,34 @@ def test_a_viewer_that_comes_late_sees_the_newest_scene(node):
     server, network = node
     numbering = Numbering()
     for _ in range(3):
-        server.publish(*to_message(snapshot(), "place", numbering.next(), tracked=camera(0.5, frame_id=7)))
+        server.publish(*to_message(snapshot(), "place", numbering.next()))
     source = Live(network)
     there = wait_for(source)
-    assert there.snapshot.sequence == 2 and there.scene_id == "place" and there.tracked.name == "7.png"
+    assert there.snapshot.sequence == 2 and there.scene_id == "place"
     assert len(there.snapshot.gaussians) == 225 and list(there.snapshot.images) == ["0.png", "1.png"]
     assert source.take() is None and source.age_s is not None and source.age_s < 10
     source.close()
+
+
+def test_a_viewer_is_told_between_scenes_where_the_live_camera_is(node):
+    _, network = node
+    numbering = Numbering()
+    nowhere = camera(0.1, frame_id=8)
+    nowhere.T_world_camera[0, 0] += 0.5
+    with Publisher(RECON_STATUS, network) as publisher:
+        source = Live(network)
+        for tracked, seen in (
+            (camera(0.5, frame_id=7), "7.png"),
+            (nowhere, None),
+            (camera(0.2), "0.png"),
+            (None, None),
+        ):
+            deadline = time.monotonic() + 10
+            while (source.tracked.name if source.tracked else None) != seen and time.monotonic() < deadline:
+                publisher.send(heartbeat(numbering, tracked))
+                time.sleep(0.02)
+            assert (source.tracked.name if source.tracked else None) == seen
+        source.close()
 
 
 def test_a_node_is_watched_without_a_display(node, tmp_path, monkeypatch, capsys):

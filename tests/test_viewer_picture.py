@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from recon.snapshot import GaussianArrays
+from recon.snapshot import CameraEstimate, GaussianArrays
 from tests.test_viewer_scene import K, camera, moment, wall
 from viewer.analysis import Analyst, analyse
 from viewer.canvas import BACKGROUND, project
@@ -215,13 +215,13 @@ def test_the_path_follows_the_frames_and_the_arrow_ends_where_it_points():
 def test_switches_decide_what_stands_in_the_scene():
     cameras = camera(0.0), camera(0.5, frame_id=1)
     images = {"0.png": np.zeros((8, 10, 3), np.uint8)}
-    there = replace(moment(wall(), *cameras, images=images), tracked=camera(0.25, frame_id=9))
+    there, tracked = moment(wall(), *cameras, images=images), camera(0.25, frame_id=9)
     advice = analyse(there).advice
     assert advice.arrow is not None
-    every = shapes(there, State(), advice)
+    every = shapes(there, State(), advice, tracked)
     assert len(every.lines) == 1 + 2 + 1 + 1 and [one.name for one in every.photographs] == ["0.png"]
     for switch, left in (("path", 4), ("cameras", 3), ("tracked", 4), ("advice", 4)):
-        assert len(shapes(there, State(**{switch: False}), advice).lines) == left, switch
+        assert len(shapes(there, State(**{switch: False}), advice, tracked).lines) == left, switch
     assert not shapes(there, State(photographs=False), advice).photographs
     assert len(shapes(there, State(), advice, eye=np.zeros(3)).photographs) == 0  # it would fill the window
 
@@ -279,6 +279,7 @@ class Feed:
     """A source that the test fills."""
 
     age_s = 0.5
+    tracked: CameraEstimate | None = None
 
     def __init__(self) -> None:
         self.waiting: list[Moment] = []
@@ -318,6 +319,22 @@ def test_a_session_from_the_first_moment_to_a_click():
     assert np.array_equal(session.viewpoint().T_world_camera, first.snapshot.cameras[2].T_world_camera)
     session.whole_scene()
     assert not session.state.follow
+    session.close()
+
+
+def test_the_live_camera_moves_between_moments():
+    feed = Feed()
+    session = Session(feed, State())
+    feed.waiting.append(moments(1)[0])
+    session.receive()
+    lines = len(session.shapes().lines)
+    feed.tracked = camera(0.4, frame_id=9)
+    assert session.receive() and not session.receive()
+    assert len(session.shapes().lines) == lines + 1 and len(session.history) == 1
+    session.press("f")
+    assert np.array_equal(session.viewpoint().T_world_camera, feed.tracked.T_world_camera)
+    feed.tracked = None
+    assert session.receive() and session.camera().name == "2.png"  # lost: the newest photograph's camera
     session.close()
 
 

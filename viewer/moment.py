@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon.snapshot import CameraEstimate, Snapshot
+from recon.snapshot import Snapshot
 
 MEMORY_BYTES = 256_000_000
 _SMALLEST = 16  # pixels: a photograph that is drawn smaller is a spot
@@ -21,7 +21,6 @@ class Moment:
 
     snapshot: Snapshot
     received_s: float  # monotonic clock of the viewer
-    tracked: CameraEstimate | None = None  # where the live camera is just now; None: not known
     scene_id: str = ""  # another one is another place: a viewpoint does not carry over
 
     @cached_property

@@ -31,6 +31,7 @@ class Session:
         self._analyst = Analyst()
         self._analysis: Analysis | None = None
         self._view: Viewpoint | None = None
+        self._tracked: CameraEstimate | None = None  # the live camera
         self._touched = False  # whether the person has chosen a viewpoint
         self._coloured: tuple[tuple[object, ...], GaussianArrays] | None = None
 
@@ -40,9 +41,10 @@ class Session:
 
     def receive(self) -> bool:
         """Takes what the source has; whether that was something."""
-        moment = self.source.take()
+        moment, before = self.source.take(), self._tracked
+        self._tracked = self.source.tracked
         if moment is None:
-            return False
+            return self._tracked is not before
         elsewhere = bool(self.history) and self.history[-1].scene_id != moment.scene_id
         self.history = remembered(self.history, moment)
         if elsewhere:
@@ -93,7 +95,7 @@ class Session:
         if moment is None:
             return None
         if self.state.follow:
-            return live_camera(moment)
+            return live_camera(moment, self._tracked)
         return next((camera for camera in moment.snapshot.cameras if camera.name == self.state.camera), None)
 
     def viewpoint(self) -> Viewpoint | None:
@@ -122,7 +124,8 @@ class Session:
         moment, analysis, view = self.moment, self.analysis(), self.viewpoint()
         if moment is None or view is None:
             return Shapes((), ())
-        return shapes(moment, self.state, analysis.advice if analysis else None, view.T_world_camera[:3, 3])
+        advice = analysis.advice if analysis else None
+        return shapes(moment, self.state, advice, self._tracked, view.T_world_camera[:3, 3])
 
     def gaussians(self) -> GaussianArrays:
         """The Gaussians of the shown moment in the colours that are asked for, as soon as those are known."""

@@ -46,8 +46,13 @@ class Shapes:
     photographs: tuple[Photograph, ...]
 
 
-def shapes(moment: Moment, state: State, advice: Advice | None, eye: Array | None = None) -> Shapes:
-    """All shapes that `state` shows. A camera right at the `eye` (3,) has none: it would fill the window."""
+def shapes(
+    moment: Moment, state: State, advice: Advice | None, tracked: CameraEstimate | None = None, eye: Array | None = None
+) -> Shapes:
+    """All shapes that `state` shows, with the `tracked` live camera where it is known.
+
+    A camera right at the `eye` (3,) has no shape: it would fill the window.
+    """
     snapshot = moment.snapshot
     depth = frustum_depth(snapshot.cameras)
     others = [
@@ -64,19 +69,18 @@ def shapes(moment: Moment, state: State, advice: Advice | None, eye: Array | Non
             lines.append(Lines(frustum(camera.T_world_camera, corners), source_colour(index), 2))
             if state.photographs and camera.name in moment.photographs:
                 photographs.append(Photograph(camera.name, corners, moment.photographs[camera.name]))
-    live = moment.tracked
-    if state.tracked and live is not None and not state.follow:
-        corners = image_corners(live, live.T_world_camera, 1.2 * depth)
-        lines.append(Lines(frustum(live.T_world_camera, corners), TRACKED_COLOUR, 3))
+    if state.tracked and tracked is not None and not state.follow:
+        corners = image_corners(tracked, tracked.T_world_camera, 1.2 * depth)
+        lines.append(Lines(frustum(tracked.T_world_camera, corners), TRACKED_COLOUR, 3))
     if state.advice and advice is not None and advice.arrow is not None and advice.target is not None:
         lines.append(Lines(arrow(*advice.arrow, advice.target), ADVICE_COLOUR, 3))
     return Shapes(tuple(lines), tuple(photographs))
 
 
-def live_camera(moment: Moment) -> CameraEstimate | None:
+def live_camera(moment: Moment, tracked: CameraEstimate | None) -> CameraEstimate | None:
     """The camera to follow: the tracked one, or else the one whose frame came last; None where there is none."""
-    if moment.tracked is not None:
-        return moment.tracked
+    if tracked is not None:
+        return tracked
     return max(moment.snapshot.cameras, key=lambda camera: camera.frame_id, default=None)
 
 

@@ -17,11 +17,13 @@ import numpy.typing as npt
 
 from capture.frame import DroppedFrame
 from capture.image_file import UnusableImage, decode_image
+from capture.messaging.broadcast import Subscriber
 from capture.messaging.network import Network
-from capture.messaging.services import RECON_SCENE
+from capture.messaging.services import RECON_SCENE, RECON_STATUS
 from capture.messaging.state import StateClient
 from capture.messaging.wire import WireError
-from recon.daemon.scene_message import SceneHeader, from_message
+from recon.daemon.scene_message import SceneHeader, camera_from, from_message
+from recon.daemon.status import ReconStatus
 from recon.export import read_cameras, read_gaussians, viewer_safe
 from recon.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from recon.verdict import Code, Verdict
@@ -42,6 +44,10 @@ class Source(Protocol):
     def age_s(self) -> float | None:
         """Seconds since something came; None where nothing more will."""
 
+    @property
+    def tracked(self) -> CameraEstimate | None:
+        """Where the live camera is just now in the newest scene; None: not known."""
+
     def close(self) -> None: ...
 
 
@@ -49,6 +55,7 @@ class Finished:
     """One moment that is there from the start."""
 
     age_s = None
+    tracked = None
 
     def __init__(self, moment: Moment) -> None:
         self._moment: Moment | None = moment
@@ -67,7 +74,9 @@ class Live:
     def __init__(self, network: Network) -> None:
         """Raises what opening the network raises: NetworkError, KeyFileError."""
         self._client = StateClient(RECON_SCENE, network, SceneHeader)
+        self._heartbeats = Subscriber(RECON_STATUS, network, ReconStatus)
         self._newest: Moment | None = None
+        self._tracked: CameraEstimate | None = None
         self._lock = threading.Lock()
         self._error: BaseException | None = None
         self._closing = threading.Event()
@@ -77,6 +86,10 @@ class Live:
     @property
     def age_s(self) -> float | None:
         return self._client.age_s
+
+    @property
+    def tracked(self) -> CameraEstimate | None:
+        return self._tracked
 
     def take(self) -> Moment | None:
         """Raises what the connection failed with, for example NotAllowed."""
@@ -90,11 +103,16 @@ class Live:
         self._closing.set()
         self._thread.join()
         self._client.close()
+        self._heartbeats.close()
 
     def _listen(self) -> None:
         try:
             while not self._closing.is_set():
                 message = self._client.poll(_POLL_S)
+                heartbeat = self._heartbeats.latest(0)
+                if heartbeat is not None:
+                    tracked = heartbeat.header.tracked and camera_from(heartbeat.header.tracked)
+                    self._tracked = tracked if tracked and is_camera(tracked) else None
                 if message is None:
                     continue
                 try:
@@ -102,7 +120,7 @@ class Live:
                 except WireError as error:
                     log.warning("a scene of the node was refused: %s", error)
                     continue
-                moment = Moment(_safe(live.snapshot), time.monotonic(), live.tracked, live.scene_id)
+                moment = Moment(_safe(live.snapshot), time.monotonic(), live.scene_id)
                 with self._lock:
                     self._newest = moment
         except Exception as error:

@@ -32,7 +32,7 @@ from recon.daemon.config import Config
 from recon.daemon.control import Answer, Retract
 from recon.daemon.inbox import Inbox, LeftOut
 from recon.daemon.intake import Intake
-from recon.daemon.scene_message import to_message
+from recon.daemon.scene_message import camera_record, to_message
 from recon.daemon.status import ReconStatus, State
 from recon.daemon.store import Store, default_directory
 from recon.daemon.watcher import Watcher
@@ -141,8 +141,7 @@ class Daemon:
         if shown is None:
             return
         self._shown = shown
-        tracked = self._watcher.tracked()
-        header, arrays = to_message(shown.snapshot, shown.scene_id, self._numbering.next(), tracked)
+        header, arrays = to_message(shown.snapshot, shown.scene_id, self._numbering.next())
         self._scenes.publish(header, arrays)
 
     def _answer(self, command: Retract) -> Answer:
@@ -155,7 +154,7 @@ class Daemon:
 
     def _status(self) -> ReconStatus:
         snapshot = self._shown.snapshot if self._shown else None
-        intake, worker, motion = self._intake, self._worker, self._watcher.motion
+        intake, worker, motion, tracked = self._intake, self._worker, self._watcher.motion, self._watcher.tracked()
         return ReconStatus(
             **self._numbering.next(),
             state=State.FULL if intake.problem else worker.state,
@@ -175,6 +174,7 @@ class Daemon:
             rss_mb=own_rss_mb(),
             camera_moved=motion.moved if motion else None,
             moved=str(motion) if motion and motion.moved else "",
+            tracked=camera_record(tracked) if tracked else None,
             problem=intake.problem or worker.problem,
         )
 

@@ -55,7 +55,6 @@ class SceneHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     iterations: int
     seconds: dict[str, float]
     final: bool
-    tracked: CameraRecord | None  # where the live camera is now, if that is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +65,10 @@ class LiveScene:
     scene_id: str
     session: str
     mono_ns: int  # of the sender
-    tracked: CameraEstimate | None
 
 
 def to_message(
-    snapshot: Snapshot, scene_id: str, numbering: Mapping[str, object], tracked: CameraEstimate | None = None
+    snapshot: Snapshot, scene_id: str, numbering: Mapping[str, object]
 ) -> tuple[SceneHeader, list[npt.NDArray]]:
     """The header and the arrays of a snapshot; `numbering` is session, sequence and mono_ns."""
     verdict = snapshot.verdict
@@ -83,12 +81,11 @@ def to_message(
         frames=verdict.frames,
         publishable=verdict.publishable,
         provisional=verdict.provisional,
-        cameras=tuple(_record(camera) for camera in snapshot.cameras),
+        cameras=tuple(camera_record(camera) for camera in snapshot.cameras),
         dropped=tuple((frame.name, frame.reason) for frame in snapshot.dropped),
         iterations=snapshot.iterations,
         seconds=snapshot.seconds,
         final=snapshot.final,
-        tracked=None if tracked is None else _record(tracked),
     )
     thumbnails = [thumbnail(snapshot.images[camera.name]) for camera in snapshot.cameras]
     return header, [*(getattr(snapshot.gaussians, name) for name in FIELDS), *thumbnails]
@@ -116,7 +113,7 @@ def from_message(message: Message[SceneHeader]) -> LiveScene:
             publishable=header.publishable,
             provisional=header.provisional,
         ),
-        cameras=tuple(_camera(record) for record in header.cameras),
+        cameras=tuple(camera_from(record) for record in header.cameras),
         gaussians=gaussians,
         images={record.name: image for record, image in zip(header.cameras, thumbnails, strict=True)},
         dropped=tuple(DroppedFrame(name, reason) for name, reason in header.dropped),
@@ -124,8 +121,7 @@ def from_message(message: Message[SceneHeader]) -> LiveScene:
         seconds=header.seconds,
         final=header.final,
     )
-    tracked = None if header.tracked is None else _camera(header.tracked)
-    return LiveScene(snapshot, header.scene_id, header.session, header.mono_ns, tracked)
+    return LiveScene(snapshot, header.scene_id, header.session, header.mono_ns)
 
 
 def thumbnail(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
@@ -135,7 +131,7 @@ def thumbnail(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _record(camera: CameraEstimate) -> CameraRecord:
+def camera_record(camera: CameraEstimate) -> CameraRecord:
     return CameraRecord(
         name=camera.name,
         frame_id=camera.frame_id,
@@ -148,7 +144,7 @@ def _record(camera: CameraEstimate) -> CameraRecord:
     )
 
 
-def _camera(record: CameraRecord) -> CameraEstimate:
+def camera_from(record: CameraRecord) -> CameraEstimate:
     return CameraEstimate(
         name=record.name,
         frame_id=record.frame_id,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 
 from capture.messaging.wire import Header
+from recon.daemon.scene_message import CameraRecord
 
 
 class State(enum.Enum):
@@ -34,4 +35,5 @@ class ReconStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     rss_mb: float
     camera_moved: bool | None  # None: not watched
     moved: str  # by how much and with what certainty; empty while it stands
+    tracked: CameraRecord | None  # where the live camera is in the finished scene, if that is known
     problem: str  # what keeps the node from working as it should; empty where nothing does

@@ -19,14 +19,16 @@ import numpy as np
 import numpy.typing as npt
 
 from capture.frame import DroppedFrame
+from capture.messaging.broadcast import Publisher
 from capture.messaging.network import Network
-from capture.messaging.services import RECON_SCENE
+from capture.messaging.services import RECON_SCENE, RECON_STATUS
 from capture.messaging.state import StateServer
 from capture.messaging.wire import Numbering
 from recon.daemon.scene_message import to_message
 from recon.export.prepare import take
 from recon.snapshot import Snapshot
 from recon.verdict import Code, Verdict
+from tests.node import heartbeat
 from tests.screen import Screen
 from viewer.analysis import analyse
 from viewer.canvas import project
@@ -149,18 +151,19 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="splatnode-") as folder:
         config = Path(folder, "node.yaml")
         config.write_text(f"network: {{directory: {folder}}}\n")
-        with StateServer(RECON_SCENE, Network(directory=Path(folder))) as server:
+        network = Network(directory=Path(folder))
+        with StateServer(RECON_SCENE, network) as server, Publisher(RECON_STATUS, network) as heartbeats:
             server.publish(*to_message(growing(moment.snapshot)[0], "place", Numbering().next()))
             command = [sys.executable, "-m", "splatnode", "view", str(config), "--out", str(arguments.out)]
             viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             try:
-                drive(moment, server, viewer, arguments.out)
+                drive(moment, server, heartbeats, viewer, arguments.out)
             finally:
                 viewer.terminate()
                 print("exit status", viewer.wait())
 
 
-def drive(moment: Moment, server: StateServer, viewer: subprocess.Popen, out: Path) -> None:
+def drive(moment: Moment, server: StateServer, heartbeats: Publisher, viewer: subprocess.Popen, out: Path) -> None:
     """Takes all the steps. Raises SystemExit where the viewer ends before."""
     screen, numbering = Screen(), Numbering()
 
@@ -172,8 +175,10 @@ def drive(moment: Moment, server: StateServer, viewer: subprocess.Popen, out: Pa
     while viewer.poll() is None and screen.picture(*PICTURE).std() < 8:
         settle(0.2)
     for snapshot in growing(moment.snapshot):
-        server.publish(*to_message(snapshot, "place", numbering.next(), tracked=snapshot.cameras[-1]))
+        server.publish(*to_message(snapshot, "place", numbering.next()))
         settle(2 * SETTLE_S)
+    heartbeats.send(heartbeat(numbering, moment.snapshot.cameras[-1]))
+    settle(SETTLE_S)
     view = overview(moment, analyse(moment).advice.arrow or ())
     camera = project(moment.snapshot.cameras[1].T_world_camera[None, :3, 3], view, *PICTURE)[0, :2]
     before = screen.picture(*WINDOW)
