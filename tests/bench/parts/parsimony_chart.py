@@ -1,4 +1,4 @@
-"""What tests/bench/parsimony.py measured, told and drawn: `python -m tests.bench parsimony_chart JSON PNG`."""
+"""What tests/bench/parsimony.py measured, told and drawn: `python -m tests.bench.parts.parsimony_chart JSON PNG`."""
 
 from __future__ import annotations
 
