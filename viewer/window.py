@@ -31,7 +31,7 @@ from viewer.state import Engine
 Image = npt.NDArray[np.uint8]
 
 _SMOOTH_S = 0.04  # a picture that takes longer is painted at half the resolution while the pointer drags it
-_REDRAWS = 2  # of the window after the last change
+_REDRAWN_S = (0.0, 0.0, 0.3, 1.0)  # after the last change the window is drawn again: Open3D may skip a drawing
 _PANEL_EMS = 22  # the panel's width, in letter widths of the theme
 _KEYS = {
     gui.KeyName.SPACE: "space",
@@ -98,7 +98,7 @@ class _Window:
         self._shown: tuple[object, ...] = ()  # what the scene widget shows
         self._analysed: object = None
         self._words_at = 0.0
-        self._redraws = 0
+        self._redraw_at: list[float] = []  # times to come
         self._stopped_by = 0  # a signal
         self._notice = ""
 
@@ -150,7 +150,7 @@ class _Window:
         if self._picture.visible != own or self._scene_widget.visible == own:
             self._picture.visible, self._scene_widget.visible = own, not own
             self._scene.set_drawing(not own)
-        self._redraws = _REDRAWS
+        self._redraw_at = [time.monotonic() + after for after in _REDRAWN_S]
         started = time.perf_counter()
         if own:
             half = self._pointer.dragging and self._painted_s > _SMOOTH_S
@@ -171,9 +171,9 @@ class _Window:
 
     def _redraw_again(self) -> bool:
         """Whether the window is drawn once more: pictures and splats appear a drawing later than they were given."""
-        if not self._redraws:
+        if not self._redraw_at or time.monotonic() < self._redraw_at[0]:
             return False
-        self._redraws -= 1
+        del self._redraw_at[0]
         self._scene_widget.force_redraw()
         return True
 
