@@ -221,6 +221,10 @@ def test_a_viewer_is_told_between_scenes_where_the_live_camera_is(node):
                 publisher.send(heartbeat(numbering, tracked))
                 time.sleep(0.02)
             assert (source.tracked.name if source.tracked else None) == seen
+            there = source.tracked
+            publisher.send(heartbeat(numbering, tracked))
+            time.sleep(0.3)
+            assert source.tracked is there  # the same again is no news, for which a window would be drawn
         source.close()
 
 

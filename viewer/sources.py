@@ -22,7 +22,7 @@ from capture.messaging.network import Network
 from capture.messaging.services import RECON_SCENE, RECON_STATUS
 from capture.messaging.state import StateClient
 from capture.messaging.wire import WireError
-from recon.daemon.scene_message import SceneHeader, camera_from, from_message
+from recon.daemon.scene_message import CameraRecord, SceneHeader, camera_from, from_message
 from recon.daemon.status import ReconStatus
 from recon.export import read_cameras, read_gaussians, viewer_safe
 from recon.snapshot import CameraEstimate, GaussianArrays, Snapshot
@@ -106,12 +106,14 @@ class Live:
         self._heartbeats.close()
 
     def _listen(self) -> None:
+        told: CameraRecord | None = None  # by the last heartbeat: what has not changed is not drawn again
         try:
             while not self._closing.is_set():
                 message = self._client.poll(_POLL_S)
                 heartbeat = self._heartbeats.latest(0)
-                if heartbeat is not None:
-                    tracked = heartbeat.header.tracked and camera_from(heartbeat.header.tracked)
+                if heartbeat is not None and heartbeat.header.tracked != told:
+                    told = heartbeat.header.tracked
+                    tracked = told and camera_from(told)
                     self._tracked = tracked if tracked and is_camera(tracked) else None
                 if message is None:
                     continue

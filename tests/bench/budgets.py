@@ -6,24 +6,18 @@ checkpoints. Told: whether quality ever falls when a limit rises, and what the s
 
 from __future__ import annotations
 
-import argparse
 import json
 import pickle
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
-from pathlib import Path
 
 from msgspec.structs import replace
 
 from recon.config import Config, preset
-from recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
-from recon.evaluate.splits import Split, load_split
 from recon.evaluate.start import continued
-from recon.evaluate.truth import EvaluationScene, load_scene
-from recon.rasterize.cpu import rasterize
 from recon.snapshot import Snapshot
-from tests.bench.parsimony import Folders, Scoring, found_start
+from tests.bench.parts.held_out import Case, Scoring, load_case, parsed, parser_of
 
 CASES = ("fountain_p11:6", "llff_flower:6")
 LIMITS: dict[str, tuple[float, ...]] = {
@@ -68,37 +62,23 @@ def within(config: Config, limit: str, value: float, spent: float) -> Config:
     return replace(config, **{limit: round(value) if limit == "max_gaussians" else value})
 
 
-def measured(case: str, folders: Folders, scoring: Scoring) -> Iterator[Row]:
+def measured(case: Case, start: bytes, scoring: Scoring) -> Iterator[Row]:
     """All rows of a set of photographs."""
-    name, _, views = case.partition(":")
-    scene = load_scene(folders.scenes / name)
-    split = load_split(folders.scenes / name, list(scene.paths), int(views))
-    start = found_start(folders, scene, split)
     spent = pickle.loads(start).seconds
     *moments, _ = snapshots(start, ANYTIME, 0)  # the last is the one before, declared final
     for snapshot in moments:
-        yield scored(snapshot, ANYTIME, snapshot.iterations, spent, scene, split, scoring)
+        yield scored(snapshot, ANYTIME, snapshot.iterations, spent, case, scoring)
     for limit, values in LIMITS.items():
         for value in values:
             *_, snapshot = snapshots(start, limit, value)
-            yield scored(snapshot, limit, value, spent, scene, split, scoring)
+            yield scored(snapshot, limit, value, spent, case, scoring)
 
 
-def scored(
-    snapshot: Snapshot,
-    limit: str,
-    value: float,
-    spent: float,
-    scene: EvaluationScene,
-    split: Split,
-    scoring: Scoring,
-) -> Row:
-    run = Run(limit, 0, None, {}, None)
-    networks, settings = scoring.networks, scoring.settings
-    row = evaluate(snapshot, scene, split, run, rasterize=rasterize, networks=networks, settings=settings)
+def scored(snapshot: Snapshot, limit: str, value: float, spent: float, case: Case, scoring: Scoring) -> Row:
+    row = case.score(snapshot, limit, scoring)
     return Row(
-        scene=scene.name,
-        views=len(split.train),
+        scene=case.scene.name,
+        views=len(case.split.train),
         limit=limit,
         value=value,
         num_gaussians=len(snapshot.gaussians),
@@ -126,20 +106,11 @@ def falls(rows: Sequence[Row]) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("cases", nargs="*", help=f"default: {' '.join(CASES)}")
-    parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
-    parser.add_argument("--starts", type=Path, required=True, help="folder for cameras and points")
-    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
-    arguments = parser.parse_args()
-    networks = Networks(load_networks(arguments.shared / "weights").alex, None)
-    if networks.alex is None:
-        parser.error(f"{arguments.shared}/weights must hold LPIPS's weights for AlexNet. Run: splatnode weights")
-    scoring = Scoring(networks, Settings())
-    folders = Folders(arguments.shared / "scenes", arguments.starts)
+    arguments, folders, scoring = parsed(parser_of(__doc__, CASES))
     rows: list[Row] = []
-    for case in arguments.cases or CASES:
-        for row in measured(case, folders, scoring):
+    for name in arguments.cases or CASES:
+        case = load_case(name, folders)
+        for row in measured(case, case.start(folders), scoring):
             rows.append(row)
             print(json.dumps(asdict(row)), flush=True)
             content = {"falls": falls(rows), "rows": [asdict(each) for each in rows]}

@@ -9,7 +9,6 @@ Of a set that is refused there is one row, without scores.
 
 from __future__ import annotations
 
-import argparse
 import json
 import pickle
 import time
@@ -22,14 +21,12 @@ from recon import pixelwise
 from recon.config import Config, preset
 from recon.control import prune, relocate
 from recon.control.control import ControlChoice
-from recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
-from recon.evaluate.splits import Split, load_split
-from recon.evaluate.start import Start, continued, find_start
-from recon.evaluate.truth import EvaluationScene, load_scene
+from recon.evaluate.protocol import Settings
+from recon.evaluate.start import Start, continued
 from recon.export.prepare import viewer_safe
 from recon.export.spz import encode_spz
-from recon.rasterize.cpu import rasterize
 from recon.report import peak_rss_mb
+from tests.bench.parts.held_out import Case, Folders, Scoring, load_case, parsed, parser_of
 from tests.bench.parts.parsimony_chart import PIXEL, RIVAL, SELF, draw, summary
 
 CASES = (  # of which cameras are found
@@ -71,18 +68,16 @@ def configurations(chosen: int) -> dict[str, Config]:
     return {SELF: ours, **forced, PIXEL: by_pixel, RIVAL: rival}
 
 
-def measure(scene: EvaluationScene, split: Split, start: Start, method: str, config: Config, scoring: Scoring) -> Row:
+def measure(case: Case, start: Start, method: str, config: Config, scoring: Scoring) -> Row:
     """One scene from the points to its scores. `start` is used up."""
     started = time.process_time()
     *_, snapshot = continued(start, config)
     seconds = time.process_time() - started
     peak = peak_rss_mb()
-    run = Run(method, 0, None, {}, None)
-    networks, settings = scoring.networks, scoring.settings
-    scored = evaluate(snapshot, scene, split, run, rasterize=rasterize, networks=networks, settings=settings)
+    scored = case.score(snapshot, method, scoring)
     return Row(
-        scene=scene.name,
-        views=len(split.train),
+        scene=case.scene.name,
+        views=len(case.split.train),
         method=method,
         num_gaussians=len(snapshot.gaussians),
         psnr=scored.psnr,
@@ -95,41 +90,17 @@ def measure(scene: EvaluationScene, split: Split, start: Start, method: str, con
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Scoring:
-    networks: Networks
-    settings: Settings
-
-
-@dataclass(frozen=True, eq=False)
-class Folders:
-    scenes: Path
-    starts: Path  # cameras and points that were found before
-
-
-def found_start(folders: Folders, scene: EvaluationScene, split: Split) -> bytes:
-    """Cameras and points of the photographs, pickled: every method gets a copy of its own."""
-    path = folders.starts / f"{scene.name}_{len(split.train)}.start"
-    if not path.exists():
-        folders.starts.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(pickle.dumps(find_start(scene.frames(split.train), preset("balanced"))))
-    return path.read_bytes()
-
-
-def fill(case: str, rows: list[Row], folders: Folders, scoring: Scoring, out: Path, only: tuple[str, ...]) -> None:
+def fill(case: Case, rows: list[Row], folders: Folders, scoring: Scoring, out: Path, only: tuple[str, ...]) -> None:
     """Adds to `rows`, and to the file, what `case` lacks of the methods in `only`; of all, if that is empty."""
-    name, _, views = case.partition(":")
-    scene = load_scene(folders.scenes / name)
-    split = load_split(folders.scenes / name, list(scene.paths), int(views))
-    known = {row.method: row for row in rows if (row.scene, row.views) == (name, len(split.train))}
+    mine = case.scene.name, len(case.split.train)
+    known = {row.method: row for row in rows if (row.scene, row.views) == mine}
     for method in configurations(1):
         if method in known or (only and method not in only and method != SELF):
             continue
         if known and known[SELF].psnr is None:
             return
         config = configurations(known[SELF].num_gaussians if known else 1)[method]
-        start = pickle.loads(found_start(folders, scene, split))
-        row = known[method] = measure(scene, split, start, method, config, scoring)
+        row = known[method] = measure(case, pickle.loads(case.start(folders)), method, config, scoring)
         rows.append(row)
         write(rows, scoring.settings, out)
         print(json.dumps(asdict(row)), flush=True)
@@ -142,25 +113,16 @@ def write(rows: list[Row], settings: Settings, out: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("cases", nargs="*", help=f"default: {' '.join(CASES)}")
+    parser = parser_of(__doc__, CASES)
     parser.add_argument("--methods", nargs="+", default=(), help="of these only, besides the chosen size")
-    parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
-    parser.add_argument("--starts", type=Path, required=True, help="folder for cameras and points")
-    parser.add_argument("--out", type=Path, required=True, help="JSON file to fill")
     parser.add_argument("--chart", type=Path, help="PNG file to draw from it")
-    arguments = parser.parse_args()
-    networks = Networks(load_networks(arguments.shared / "weights").alex, None)
-    if networks.alex is None:
-        parser.error(f"{arguments.shared}/weights must hold LPIPS's weights for AlexNet. Run: splatnode weights")
-    scoring = Scoring(networks, Settings())
+    arguments, folders, scoring = parsed(parser)
     known = json.loads(arguments.out.read_text()) if arguments.out.exists() else {"rows": []}
     if known["rows"] and known["settings"] != asdict(scoring.settings):
         parser.error(f"{arguments.out} was scored with other settings: {known['settings']}. Name another file")
     rows = [Row(**row) for row in known["rows"]]
-    folders = Folders(arguments.shared / "scenes", arguments.starts)
     for case in arguments.cases or CASES:
-        fill(case, rows, folders, scoring, arguments.out, tuple(arguments.methods))
+        fill(load_case(case, folders), rows, folders, scoring, arguments.out, tuple(arguments.methods))
     print(json.dumps(summary([asdict(row) for row in rows]), indent=1))
     if arguments.chart:
         arguments.chart.write_bytes(draw([asdict(row) for row in rows]))
