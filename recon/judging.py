@@ -17,6 +17,7 @@ from recon.verification.verify import verify, verify_further
 from recon.view_graph import ViewGraph
 
 REMEMBERED = 3  # judgements: a keyframe may be tried, and taken back
+REMEMBERED_REFUSED = 100  # sets of keyframes of which nothing came: they need not be tried again
 BEYOND_DOUBT = 50  # points of a further camera that two others see; another place, taken for this one, had up to 20
 FOR_NOW = "For now: all evidence is weighed when no key frame waits."
 
@@ -36,6 +37,7 @@ class Judging:
     def __init__(self, prior: Prior, config: Config) -> None:
         self._prior, self._config = prior, config
         self._judged: dict[Known, Judgement] = {}
+        self._refused: dict[frozenset[str], None] = {}  # sets of keyframes, the latest last
         self.proven: frozenset[str] = frozenset()  # keyframes of the last thorough judgement that was publishable
 
     def thorough(
@@ -43,7 +45,7 @@ class Judging:
     ) -> Judgement:
         """From all pairs, made anew; at once for keyframes that were judged so a moment ago.
 
-        `pause` is called in between and may raise to abandon the work.
+        `pause` is called about once a second and may raise to abandon the work.
         """
         known = _known(graph, rejected)
         judgement = self._judged.get(known)
@@ -51,26 +53,36 @@ class Judging:
             judgement = self._remember(known, self._made_anew(graph, rejected, pause))
             if judgement.verdict.publishable:
                 self.proven = frozenset(known[0])
+            else:
+                latest = list(self._refused)[1 - REMEMBERED_REFUSED :]
+                self._refused = dict.fromkeys([*latest, frozenset(known[0])])
         return judgement
 
+    def refused(self, names: Collection[str]) -> bool:
+        """Whether a thorough judgement of these keyframes is known, and forbade a scene."""
+        return frozenset(names) in self._refused
+
     def soon(self, graph: ViewGraph, rejected: Sequence[Rejected]) -> Judgement:
-        """What was judged a moment ago, or what continues it and speaks for all its keyframes; else `thorough`."""
+        """As `quickly`, else as `thorough`."""
+        return self.quickly(graph, rejected) or self.thorough(graph, rejected)
+
+    def quickly(self, graph: ViewGraph, rejected: Sequence[Rejected]) -> Judgement | None:
+        """What was judged a moment ago, or what continues it and speaks for all its keyframes; None without either."""
         known = _known(graph, rejected)
         if known in self._judged:
             return self._judged[known]
         continued = self._continued(graph)
-        return self._remember(known, continued) if continued else self.thorough(graph, rejected)
+        return self._remember(known, continued) if continued else None
 
     def _made_anew(self, graph: ViewGraph, rejected: Sequence[Rejected], pause: Callable[[], None]) -> Judgement:
         """A registration of the keyframes, judged by its evidence; none where it would be of no use."""
-        graph.complete()
-        pause()
+        graph.complete(pause)
         refusal = hopeless(graph, rejected, self._config.judge)
         if refusal is not None:
             return Judgement(None, None, refusal)
-        registration = self._prior.register(graph)
+        registration = self._prior.register(graph, pause)
         pause()
-        evidence = verify(graph, registration, self._config.verification)
+        evidence = verify(graph, registration, self._config.verification, pause)
         return Judgement(registration, evidence, judge(graph, registration, evidence, self._config.judge))
 
     def _continued(self, graph: ViewGraph) -> Judgement | None:

@@ -90,6 +90,7 @@ class Reconstruction:
         settings = config.prior.config
         self._prior: Prior = config.prior.module.load(msgspec.structs.replace(settings, seed=config.seed))
         self.graph = ViewGraph(settings.registration, self._prior.matcher)
+        self._beside = self.graph.without(())  # what is known of keyframes that were set aside, and of others
         self.dropped: list[DroppedFrame] = []
         self.rejected: list[Rejected] = []  # those of `dropped` that the screening left out
         self.begun: Scene | None = None  # from the last estimate of all frames, not optimised
@@ -107,6 +108,12 @@ class Reconstruction:
     def names(self) -> list[str]:
         """Of the keyframes, in their order."""
         return [keyframe.name for keyframe in self.graph.keyframes]
+
+    @property
+    def aside(self) -> list[Keyframe]:
+        """Keyframes that are known and do not belong to the scene, in the order in which their frames came."""
+        found = [keyframe for keyframe in self._beside.keyframes if keyframe.name not in set(self.names)]
+        return sorted(found, key=lambda keyframe: keyframe.frame.frame_id)
 
     def drop(self, frame: DroppedFrame) -> None:
         """Keeps in mind that there was a frame that was left out."""
@@ -152,12 +159,29 @@ class Reconstruction:
 
     def retract(self, names: Collection[str]) -> None:
         """Forgets keyframes and what the scene has from them alone. What is shown waits for the next estimate."""
+        self._beside = self._beside.without(names)
+        self._looks = {name: seen for name, seen in self._looks.items() if name not in names}
+        self._leave_out(names)
+
+    def set_aside(self, names: Collection[str]) -> None:
+        """Takes keyframes out of the scene as `retract` does, and remembers them and what their pairs say."""
+        self._beside = self.graph.joined(self._beside)
+        self._leave_out(names)
+
+    def bring_back(self, names: Collection[str]) -> None:
+        """The keyframes among these that were set aside are keyframes as before."""
+        others = {keyframe.name for keyframe in self.aside}.difference(names)
+        self.graph = self.graph.joined(self._beside.without(others))
+
+    def _leave_out(self, names: Collection[str]) -> None:
+        if set(self.names).isdisjoint(names):
+            return
         self.graph = self.graph.without(names)
         self.begun = None
-        self._looks = {name: seen for name, seen in self._looks.items() if name not in names}
         self._pointmaps = {name: pointmap for name, pointmap in self._pointmaps.items() if name not in names}
-        if self.scene is not None:
-            self.scene = growth.without(self.scene, names) if len(self.scene.views) > len(names) else None
+        if self.scene is not None and not {view.name for view in self.scene.views}.isdisjoint(names):
+            rest = growth.without(self.scene, names)
+            self.scene = rest if rest.views else None
 
     def restore(
         self,
@@ -178,6 +202,17 @@ class Reconstruction:
         judgement = self._judging.soon(self.graph, self.rejected)
         self.clock.lap("poses")
         return judgement
+
+    def judge_quickly(self) -> Judgement | None:
+        """The same if it is known or continues what is known; None where that cannot be said quickly."""
+        self.clock.lap("wait")
+        judgement = self._judging.quickly(self.graph, self.rejected)
+        self.clock.lap("poses")
+        return judgement
+
+    def refused(self, names: Collection[str]) -> bool:
+        """Whether a thorough judgement of these keyframes, just these, is known to forbid a scene."""
+        return self._judging.refused(names)
 
     @property
     def proven(self) -> frozenset[str]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping
+import itertools
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol, TypeVar
 
@@ -70,11 +71,12 @@ class ViewGraph:
         if len(self._partners(new)) < CONNECTED:
             self.complete()
 
-    def complete(self) -> None:
-        """Makes all comparisons that have not been made."""
+    def complete(self, pause: Callable[[], None] = lambda: None) -> None:
+        """Makes all comparisons that have not been made. `pause` may raise: what was compared by then is kept."""
         for pair in sorted(self.pending):
+            pause()
             self._compare(*pair)
-        self._settle()
+        self._settle(pause)
 
     def _compare(self, index: int, new: int) -> None:
         """Compares two keyframes by their plain features, for now."""
@@ -119,7 +121,32 @@ class ViewGraph:
             rest._settle()
         return rest
 
-    def _settle(self) -> None:
+    def joined(self, other: ViewGraph) -> ViewGraph:
+        """A view graph of the keyframes of both, as their frames came, with what either knows of their pairs."""
+        both = ViewGraph(self._config, self._matcher)
+        keyframes = {keyframe.name: keyframe for keyframe in (*other.keyframes, *self.keyframes)}
+        both.keyframes = sorted(keyframes.values(), key=lambda keyframe: keyframe.frame.frame_id)
+        place = {keyframe.name: index for index, keyframe in enumerate(both.keyframes)}
+        both.pending = set(itertools.combinations(range(len(both.keyframes)), 2))
+        for graph in (other, self):
+            both._take_over(graph, [place[keyframe.name] for keyframe in graph.keyframes])
+        return both
+
+    def _take_over(self, graph: ViewGraph, number: Sequence[int]) -> None:
+        """What `graph` knows, whose keyframe i is keyframe `number[i]` here."""
+        for index, keyframe in zip(number, graph.keyframes, strict=True):
+            if len(keyframe.features.points) > len(self.keyframes[index].features.points):  # squeezed ones, too
+                self.keyframes[index] = keyframe
+        for (i, j), pair in graph.pairs.items():
+            first, second = number[i], number[j]
+            self.pairs[min(first, second), max(first, second)] = pair if first < second else pair.swapped()
+        self._plain |= {(number[i], number[j]): found for (i, j), found in graph._plain.items()}
+        self._squeezed |= {(number[i], number[j]): found for (i, j), found in graph._squeezed.items()}
+        for i, j in itertools.combinations(range(len(number)), 2):
+            if (i, j) not in graph.pending:
+                self.pending.discard((min(number[i], number[j]), max(number[i], number[j])))
+
+    def _settle(self, pause: Callable[[], None] = lambda: None) -> None:
         """Chooses for each compared pair what its plain or its squeezed features say.
 
         Pairs that came from elsewhere, restored by a process that compared them, stay as they are.
@@ -127,6 +154,7 @@ class ViewGraph:
         wanted = self._wanted()
         for pair, plain in self._plain.items():
             if pair in wanted and pair not in self._squeezed:
+                pause()
                 self._squeezed[pair] = self._compare_squeezed(*pair)
             found = (self._squeezed[pair].pair if pair in wanted else None) or plain.pair
             first, second = pair

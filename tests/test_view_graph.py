@@ -208,3 +208,14 @@ def test_what_is_pending_stays_so_without_another_keyframe(compared):
     (later,) = {i for i, _ in graph.pending} & {0}
     rest = graph.without({"a6"})
     assert (later, 6) in rest.pending and len(rest.keyframes) == 7
+
+
+def test_a_joined_graph_knows_what_either_knew_and_what_is_left_to_compare():
+    graph = view_graph(photographs()[3::-1])  # the last came first
+    names = [keyframe.name for keyframe in graph.keyframes]
+    joined = graph.without({names[0]}).joined(graph.without({names[3]}))
+    assert [keyframe.name for keyframe in joined.keyframes] == names[::-1]
+    assert joined.pending == {(0, 3)} and set(joined.pairs) == set(itertools.combinations(range(4), 2)) - {(0, 3)}
+    assert np.array_equal(joined.pairs[0, 1].points1, graph.pairs[2, 3].points2)  # swapped with their keyframes
+    joined.complete()
+    assert len(joined.pairs[0, 3].matches) == len(graph.pairs[0, 3].matches)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import msgspec
 
@@ -27,6 +29,8 @@ log = logging.getLogger(__name__)
 
 STEP = 10  # iterations between looks at the inbox
 IDLE_S = 0.5  # between looks at whether to stop
+PATIENCE_S = 3.0  # that a thorough judgement of a key frame that does not fit may keep others waiting
+MOST_ASIDE = 8  # key frames that may still find their place
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +59,6 @@ class Worker:
         self._config, self._store, self._inbox, self._publish = config, store, inbox, publish
         self._stopping = stopping
         self._work = Reconstruction(self._recipe)
-        self._aside: list[Keyframe] = []  # the last ones in a row that did not fit
         self._settled = True  # nothing can be made better before the next key frame
         self.state = State.WAITING
         self.problem = ""
@@ -123,11 +126,16 @@ class Worker:
         self.state, self.problem = State.GROWING, ""
         self._settled, self.finished = False, None
         self._make_room(len(arrived))
-        for keyframe in self._tried(self._screened([each.keyframe for each in arrived])):
-            self._tell_stranger(keyframe)
-        if len(self._aside) >= self._config.lost_after:
-            self._begin_place()
-        self.state = State.LOST if self._aside else State.GROWING
+        keyframes = self._screened([each.keyframe for each in arrived])
+        strangers = self._added(keyframes)
+        if not strangers or len(strangers) < len(keyframes):
+            self._show_grown(arrived)
+        if strangers and self._receive(strangers):
+            self._show_grown(arrived)
+        self.state = State.LOST if place.strangers(self._work) else State.GROWING
+
+    def _show_grown(self, arrived: Sequence[Arrived]) -> None:
+        """The scene with the key frames that have come to belong to it."""
         self._work.work_in()
         snapshot = self._show()
         if arrived:
@@ -149,43 +157,53 @@ class Worker:
                 self._forget(name, reason)
         return kept
 
-    def _tell_stranger(self, keyframe: Keyframe) -> None:
-        event(log, logging.WARNING, "does_not_fit", frame=keyframe.name, scene=self._store.scene_id)
-
-    def _tried(self, keyframes: list[Keyframe]) -> list[Keyframe]:
-        """Adds keyframes to the view graph; returns those that do not fit, of which the last in a row are kept."""
-        if not keyframes:
-            return []
+    def _added(self, keyframes: list[Keyframe]) -> set[str]:
+        """Adds keyframes to the view graph; names those that do not fit at once, which are set aside."""
         try:
-            strangers = place.add(self._work, keyframes)
+            return place.add(self._work, keyframes)
         except Exception as error:  # one bad frame must not keep others out
             if len(keyframes) > 1:
-                return [stranger for keyframe in keyframes for stranger in self._tried([keyframe])]
+                return set().union(*(self._added([keyframe]) for keyframe in keyframes))
             log.exception("%s cannot be worked in", keyframes[0].name)
             self._forget(keyframes[0].name, f"cannot be worked in: {error}")
-            return []
-        for keyframe in keyframes:
-            if keyframe.name in strangers:
-                self._aside.append(keyframe)
-                continue
-            for stranger in self._aside:
-                if stranger.name not in self._work.names:
-                    self._forget(stranger.name, "it contradicts the scene")
-            self._aside = []
-        return [keyframe for keyframe in keyframes if keyframe.name in strangers]
+            return set()
 
-    def _begin_place(self) -> None:
-        """The scene that was is exported as it is, and another begins with the frames that did not belong to it."""
+    def _receive(self, newest: set[str]) -> bool:
+        """Whether the scene changes by key frames that did not fit at once. Raises _Abandoned.
+
+        They are judged thoroughly with all others, as long as what waits can wait; if they are too many, in any case.
+        If that does not help them, another place begins with them.
+        """
+        lost = len(place.strangers(self._work)) >= self._config.lost_after
+        pause = partial(self._pause, math.inf if lost else time.monotonic() + PATIENCE_S)
+        aside = [keyframe.name for keyframe in self._work.aside]
+        joined = place.connected(self._work, pause) and (
+            place.join(self._work, aside, pause) or (not lost and place.join(self._work, newest, pause))
+        )
+        for name in aside[:-MOST_ASIDE]:
+            self._forget(name, "it does not fit the scene")
+        return self._lost() or joined
+
+    def _lost(self) -> bool:
+        """Says which key frames do not fit; another place begins, if there are too many of them in a row."""
+        strangers = place.strangers(self._work)
+        for keyframe in strangers:
+            event(log, logging.WARNING, "does_not_fit", frame=keyframe.name, scene=self._store.scene_id)
+        if len(strangers) < self._config.lost_after:
+            return False
+        self._begin_place(strangers)
+        return True
+
+    def _begin_place(self, strangers: Sequence[Keyframe]) -> None:
+        """The scene that was is exported as it is, and another begins with the frames that do not belong to it."""
         self.state = State.LOST
-        snapshot = self._show()
-        self._export(snapshot)
+        self._export(self._show())
         before = self._store.scene_id
-        self._store.begin_place(self._aside[0].frame.frame_id)
+        self._store.begin_place(strangers[0].frame.frame_id)
         event(log, logging.WARNING, "another_place", before=before, now=self._store.scene_id)
         self._work = Reconstruction(self._recipe)
-        for keyframe in self._aside:
+        for keyframe in strangers:
             self._work.add(keyframe)
-        self._aside = []
 
     def _make_room(self, coming: int) -> None:
         """Gives up views that can be spared, so that there are not more than configured."""
@@ -200,8 +218,8 @@ class Worker:
         """The checkpoint no longer has these frames; the scene forgets them, too."""
         known = [name for name in names if name in self._work.names]
         self._work.dropped = self._store.dropped
+        self._work.retract(names)
         if known:
-            self._work.retract(known)
             self._settled, self.finished, self.state = False, None, State.GROWING
         self._show(final=self._settled and self._work.scene is not None)
         if known:
@@ -209,8 +227,7 @@ class Worker:
 
     def _forget(self, name: str, reason: str) -> None:
         self._store.forget(name, reason)
-        if name in self._work.names:
-            self._work.retract([name])
+        self._work.retract([name])
         self._work.dropped = self._store.dropped
 
     def _settle(self) -> None:
@@ -218,11 +235,10 @@ class Worker:
         self.state = State.REFINING
         config = self._recipe.optimize
         steps = msgspec.structs.replace(config, checkpoints=tuple(range(STEP, config.iterations, STEP)))
-        for keyframe in place.prove(self._work, self._pause):
-            self._tell_stranger(keyframe)
-            self._aside.append(keyframe)
-        if len(self._aside) >= self._config.lost_after:
-            self._begin_place()
+        place.prove(self._work, self._pause)
+        for keyframe in place.contradicting(self._work):
+            self._forget(keyframe.name, "it contradicts the scene")
+        self._lost()
         self._work.estimate(self._pause)
         refined = None
         for refined in self._work.refine(self._work.begun, steps):
@@ -236,11 +252,12 @@ class Worker:
         if refined is not None:
             self._save(final=True)
             self._export(snapshot)
-        self.state = State.WAITING if refined is None else State.LOST if self._aside else State.IDLE
+        self.state = State.WAITING if refined is None else State.LOST if place.strangers(self._work) else State.IDLE
 
-    def _pause(self) -> None:
+    def _pause(self, until_s: float = 0.0) -> None:
+        """Raises _Abandoned if the daemon stops, and from `until_s` (monotonic) on if something has come."""
         self.moved_s = time.monotonic()
-        if self._stopping.is_set() or len(self._inbox):
+        if self._stopping.is_set() or (len(self._inbox) and self.moved_s > until_s):
             raise _Abandoned
 
     def _show(self, final: bool = False) -> Snapshot:

@@ -51,8 +51,8 @@ class ClassicalPrior:
     ) -> None:
         self._config, self._depth_maps, self.matcher = config, depth_maps, matcher
 
-    def register(self, graph: ViewGraph) -> Registration | None:
-        return register.register(graph.keyframes, graph.pairs, self._config.registration)
+    def register(self, graph: ViewGraph, pause: Callable[[], None] = lambda: None) -> Registration | None:
+        return register.register(graph.keyframes, graph.pairs, self._config.registration, pause)
 
     def pointmaps(
         self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None

@@ -21,8 +21,11 @@ class Prior(Protocol):
         """What the view graph shall ask where plain features find few matches."""
         ...
 
-    def register(self, graph: ViewGraph) -> Registration | None:
-        """Cameras of the keyframes that hang together, with the evidence for them; None when no two do."""
+    def register(self, graph: ViewGraph, pause: Callable[[], None] = ...) -> Registration | None:
+        """Cameras of the keyframes that hang together, with the evidence for them; None when no two do.
+
+        `pause` is called about once a second; it may raise to abandon the work.
+        """
         ...
 
     def pointmaps(

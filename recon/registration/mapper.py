@@ -7,7 +7,7 @@ map was not built from.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -67,15 +67,21 @@ class Map:
 
 
 def build_map(
-    views: Sequence[View], lenses: Sequence[Lens], pairs: Pairs, config: Config, pictures: Sequence[Picture] = ()
+    views: Sequence[View],
+    lenses: Sequence[Lens],
+    pairs: Pairs,
+    config: Config,
+    pictures: Sequence[Picture] = (),
+    pause: Callable[[], None] = lambda: None,
 ) -> Map | None:
     """The best map over several starts, or None when no two views can be connected.
 
-    `pictures`, one a view, make its observations exact.
+    `pictures`, one a view, make its observations exact. `pause` is called between attempts and may raise.
     """
     of = survey.survey(views, lenses, pairs, config.growing_tracks, config.final_tracks)
     attempts: list[tuple[float, Growth]] = []
     for pair, focals in _attempts(lenses, pairs, config.max_attempts):
+        pause()
         grown = growth.grow(of, focals, pair, config.growth)
         if grown is None:
             continue
@@ -85,6 +91,7 @@ def build_map(
             break
     if not attempts:
         return None
+    pause()
     best = max(attempts, key=_score)
     rivals = [score for score, grown in attempts if survey.difference(best[1], grown)[0] > config.rival_rotation_deg]
     finished = finishing.finish(of, best[1], pictures, config.finishing)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,17 +55,21 @@ def place_in_order(keyframe: Keyframe) -> bytes:
 
 
 def register(
-    keyframes: Sequence[Keyframe], pairs: Mapping[tuple[int, int], TwoView], config: Config
+    keyframes: Sequence[Keyframe],
+    pairs: Mapping[tuple[int, int], TwoView],
+    config: Config,
+    pause: Callable[[], None] = lambda: None,
 ) -> Registration | None:
     """Cameras of as many keyframes as hang together, or None when no two do.
 
     `pairs` holds the verified pairs by position (i < j). The answer is the same in whatever order the keyframes come.
+    `pause` may raise to abandon the work.
     """
     if not pairs:
         return None
     order = sorted(range(len(keyframes)), key=lambda index: place_in_order(keyframes[index]))
     ordered = [keyframes[index] for index in order]
-    built = _build(ordered, _renumbered(pairs, np.argsort(order)), config)
+    built = _build(ordered, _renumbered(pairs, np.argsort(order)), config, pause)
     if built is None:
         return None
     found, grouping = built
@@ -84,21 +88,28 @@ def _renumbered(pairs: Mapping[tuple[int, int], TwoView], place: Index) -> dict[
 
 
 def _build(
-    keyframes: Sequence[Keyframe], pairs: Mapping[tuple[int, int], TwoView], config: Config
+    keyframes: Sequence[Keyframe],
+    pairs: Mapping[tuple[int, int], TwoView],
+    config: Config,
+    pause: Callable[[], None],
 ) -> tuple[mapper.Map, Grouping] | None:
     """The map, in the pixels of its lenses, and these: one for all sizes unless the map contradicts that."""
     together, apart = (lenses.group(keyframes, across_sizes) for across_sizes in (True, False))
-    built = _map(keyframes, pairs, together, config)
+    built = _map(keyframes, pairs, together, config, pause)
     if built is None or together == apart:
         return None if built is None else (built, together)
     if not lenses.contradicted(built.problem, built.prior, built.loss, built.views[0], together, config.lenses):
         return built, together
-    built = _map(keyframes, pairs, apart, config)
+    built = _map(keyframes, pairs, apart, config, pause)
     return None if built is None else (built, apart)
 
 
 def _map(
-    keyframes: Sequence[Keyframe], pairs: Mapping[tuple[int, int], TwoView], grouping: Grouping, config: Config
+    keyframes: Sequence[Keyframe],
+    pairs: Mapping[tuple[int, int], TwoView],
+    grouping: Grouping,
+    config: Config,
+    pause: Callable[[], None],
 ) -> mapper.Map | None:
     enlarged = grouping.enlarged
     of_refinement = config.mapper.finishing.refinement
@@ -108,7 +119,7 @@ def _map(
     ]
     known = lenses.lenses(keyframes, grouping, pairs, config.lenses)
     views, in_lens = views_of(keyframes, grouping), in_pixels_of_lens(pairs, grouping)
-    return mapper.build_map(views, known, in_lens, config.mapper, pictures)
+    return mapper.build_map(views, known, in_lens, config.mapper, pictures, pause)
 
 
 def views_of(keyframes: Sequence[Keyframe], grouping: Grouping) -> list[View]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 
 import cv2
@@ -35,15 +35,22 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     reflection: reflection.Config = reflection.Config()
 
 
-def verify(graph: ViewGraph, registration: Registration | None, config: Config) -> Evidence | None:
-    """Numbers for and against `registration`; None where it has fewer than three cameras, which confirm nothing."""
+def verify(
+    graph: ViewGraph, registration: Registration | None, config: Config, pause: Callable[[], None] = lambda: None
+) -> Evidence | None:
+    """Numbers for and against `registration`; None where it has fewer than three cameras, which confirm nothing.
+
+    `pause` is called between the sources of evidence; it may raise to abandon the work.
+    """
     if registration is None or len(registration.cameras) < 3:
         return None
     fit = refit.fit(graph.keyframes, registration, config.tracks_per_camera)
     registered = [camera.index for camera in registration.cameras]
     views = pictures(graph, registration, config.photometric, registered)
+    cameras = _of_cameras(graph, registration, views, config, views)
+    pause()
     return Evidence(
-        cameras=_of_cameras(graph, registration, views, config, views),
+        cameras=cameras,
         agreement=_agreement(graph, registration, None),
         joint=joints.weakest(registration, graph.pairs, views, config.photometric),
         loose=tuple(graph.keyframes[index].name for index in joints.loose(registration, graph.pairs)),

@@ -39,8 +39,8 @@ class Da3Prior:
         self._network, self._config = network, config
         self.matcher = WarpMatcher(network, config.longer_side)
 
-    def register(self, graph: ViewGraph) -> Registration | None:
-        return register.register(graph.keyframes, graph.pairs, self._config.registration)
+    def register(self, graph: ViewGraph, pause: Callable[[], None] = lambda: None) -> Registration | None:
+        return register.register(graph.keyframes, graph.pairs, self._config.registration, pause)
 
     def pointmaps(
         self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None

@@ -52,8 +52,8 @@ class Mast3rPrior:
         self._asked = Asked(network, config.longer_side)
         self.matcher = DescriptorMatcher(self._asked)
 
-    def register(self, graph: ViewGraph) -> Registration | None:
-        return register.register(graph.keyframes, graph.pairs, self._config.registration)
+    def register(self, graph: ViewGraph, pause: Callable[[], None] = lambda: None) -> Registration | None:
+        return register.register(graph.keyframes, graph.pairs, self._config.registration, pause)
 
     def pointmaps(
         self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
