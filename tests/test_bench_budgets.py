@@ -11,8 +11,8 @@ def row(value: float, psnr: float, lpips: float = 0.1, limit: str = "max_mb") ->
 
 
 def test_a_fall_is_told_where_more_bought_clearly_less():
-    rising = [row(1.0, 20.0), row(2.0, 21.0), row(4.0, 20.95), row(8.0, 20.8)]
-    assert falls(rising) == ["s 6, max_mb 4 to 8: psnr 20.950 to 20.800"]
+    rising = [row(1.0, 20.0), row(2.0, 21.0), row(4.0, 20.96), row(8.0, 20.8)]
+    assert falls(rising) == ["s 6, max_mb 4 to 8: psnr 20.960 to 20.800"]
     assert falls([row(1.0, 20.0, 0.1), row(2.0, 20.0, 0.11)]) == ["s 6, max_mb 1 to 2: lpips 0.100 to 0.110"]
 
 

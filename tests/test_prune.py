@@ -100,13 +100,22 @@ def test_a_limit_is_kept_to_the_one(truth, limit):  # noqa: F811
 
 def test_it_is_done_once_when_it_is_due_however_fast_time_goes(truth):  # noqa: F811
     control = load(Config(at=(0.3, 0.6), least_change=0.0), seed=0)
-    step = Step(1, 9, 0.0, 0, truth.gaussians, [v.T_world_camera for v in truth.views], targets_of(truth), None)
+    step = Step(9, 9, 0.0, 0, truth.gaussians, [v.T_world_camera for v in truth.views], targets_of(truth), None)
     changed = [
         control.after_step(replace(step, progress=progress)) is not None for progress in (0.2, 0.4, 0.5, 0.9, 0.95)
     ]
     assert changed == [False, True, False, True, False]
     late = load(Config(at=(0.3, 0.6)), seed=0)
     assert [late.after_step(replace(step, progress=progress)) is not None for progress in (0.9, 0.95)] == [True, False]
+
+
+def test_in_a_hurry_it_waits_until_the_gaussians_are_fitted_unless_there_are_too_many(truth):  # noqa: F811
+    def happens(iteration: int, limit: int | None) -> bool:
+        scene = truth.gaussians, [v.T_world_camera for v in truth.views], targets_of(truth), limit
+        return load(Config(), seed=0).after_step(Step(iteration, 500, 0.5, 0, *scene)) is not None
+
+    assert not happens(30, None) and happens(31, None)
+    assert not happens(3, len(truth.gaussians)) and happens(3, len(truth.gaussians) - 1)
 
 
 def test_the_same_seed_prunes_the_same(truth):  # noqa: F811

@@ -24,7 +24,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     least_change: float = 0.005  # squared visible difference of colours in [0, 1], over all pixels, channels, views
     between: int = 1  # views between the photographs, for each of these, that count as they do
     off_path: float = 0.3  # how far these may lie beside the path from photograph to photograph, in its steps
-    probes: int = 4  # random images a view from which the differences are estimated
+    probes: int = 2  # random images a view from which the differences are estimated
+    settled: int = 30  # iterations after which it is told, in less time than was planned, what a Gaussian is worth
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ class Pruning:
         self._due = list(config.at)
 
     def after_step(self, step: Step) -> Change | None:
-        if not self._due or step.progress < self._due[0]:
+        if not self._due or step.progress < self._due[0] or not self._settled(step):
             return None
         while self._due and step.progress >= self._due[0]:
             self._due.pop(0)
@@ -61,6 +62,12 @@ class Pruning:
         worth[gaussians.source_frame == SHELL] = torch.inf
         kept = most_worth(worth, self._config.least_change, step.max_gaussians)
         return Change(gaussians.subset(kept), kept)
+
+    def _settled(self, step: Step) -> bool:
+        """Whether the Gaussians have been fitted for long enough, or must become fewer all the same."""
+        enough = min(self._config.settled, self._due[0] * step.iterations)
+        too_many = step.max_gaussians is not None and len(step.gaussians) > step.max_gaussians
+        return step.iteration > enough or too_many
 
 
 def most_worth(worth: Tensor, least: float, limit: int | None) -> Tensor:
