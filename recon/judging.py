@@ -58,6 +58,11 @@ class Judging:
                 self._refused = dict.fromkeys([*latest, frozenset(known[0])])
         return judgement
 
+    def restore(self, graph: ViewGraph, judgement: Judgement, proven: Collection[str]) -> None:
+        """Takes over what an earlier process had judged of the keyframes of `graph`, and had proven."""
+        self._remember(_known(graph, ()), judgement)
+        self.proven = frozenset(proven)
+
     def refused(self, names: Collection[str]) -> bool:
         """Whether a thorough judgement of these keyframes is known, and forbade a scene."""
         return frozenset(names) in self._refused

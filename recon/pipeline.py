@@ -98,7 +98,7 @@ class Reconstruction:
         self.sequence = 0
         self._looks: dict[str, Look] = {}  # of the frames that were taken
         self._judging = Judging(self._prior, config)
-        self._pointmaps: dict[str, Pointmap] = {}  # by keyframe, as they were last computed
+        self.pointmaps: dict[str, Pointmap] = {}  # by keyframe, as they were last computed
 
     @property
     def deadline(self) -> float | None:
@@ -178,7 +178,7 @@ class Reconstruction:
             return
         self.graph = self.graph.without(names)
         self.begun = None
-        self._pointmaps = {name: pointmap for name, pointmap in self._pointmaps.items() if name not in names}
+        self.pointmaps = {name: pointmap for name, pointmap in self.pointmaps.items() if name not in names}
         if self.scene is not None and not {view.name for view in self.scene.views}.isdisjoint(names):
             rest = growth.without(self.scene, names)
             self.scene = rest if rest.views else None
@@ -195,6 +195,10 @@ class Reconstruction:
         self.graph.pairs = {(place[i], place[j]): pair for (i, j), pair in pairs.items() if i in place and j in place}
         self.graph.pending = {(place[i], place[j]) for i, j in pending if i in place and j in place}
         self._looks |= {keyframe.name: look(keyframe.frame) for keyframe in keyframes}
+
+    def restore_judgement(self, judgement: Judgement, proven: Collection[str]) -> None:
+        """Takes over what an earlier process had judged of just the keyframes that there are."""
+        self._judging.restore(self.graph, judgement, proven)
 
     def judge(self) -> Judgement:
         """Cameras of the keyframes and the verdict on them, as soon as possible: maybe for now only."""
@@ -240,13 +244,13 @@ class Reconstruction:
         if self.scene is None or judged.registration is None or not judged.verdict.publishable:
             return False
         placed = growth.in_world_of(self.scene, judged.registration, self.graph)
-        known = growth.carried(self._pointmaps, placed, self.graph) if placed else {}
-        moved = growth.moved(self.scene, self._pointmaps, known, FITS)
+        known = growth.carried(self.pointmaps, placed, self.graph) if placed else {}
+        moved = growth.moved(self.scene, self.pointmaps, known, FITS)
         if placed is None or moved is None:
             return False
         further = self._prior.further_pointmaps(self.graph, placed, known)
-        self._pointmaps = known | {pointmap.name: pointmap for pointmap in further}
-        self.show(growth.grow(moved, self._pointmaps, self.graph, placed, self.config))
+        self.pointmaps = known | {pointmap.name: pointmap for pointmap in further}
+        self.show(growth.grow(moved, self.pointmaps, self.graph, placed, self.config))
         self.clock.lap("points")
         return True
 
@@ -264,7 +268,7 @@ class Reconstruction:
         pause()
         if judged.registration is not None and judged.verdict.publishable:
             pointmaps = self._prior.pointmaps(self.graph, judged.registration, pause)
-            self._pointmaps = {pointmap.name: pointmap for pointmap in pointmaps}
+            self.pointmaps = {pointmap.name: pointmap for pointmap in pointmaps}
             self.clock.lap("points")
 
     def begin(self) -> None:
@@ -276,7 +280,7 @@ class Reconstruction:
             return
         config = self.config
         self.begun = begin(
-            tuple(self._pointmaps.values()),
+            tuple(self.pointmaps.values()),
             {keyframe.name: keyframe.image for keyframe in self.graph.keyframes},
             registration.cameras,
             config.completion,

@@ -46,8 +46,8 @@ class SceneRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
-    features = [_taken_apart(keyframe.features) for keyframe in graph.keyframes]
-    pairs = {key: _taken_apart(pair) for key, pair in graph.pairs.items()}
+    features = [taken_apart(keyframe.features) for keyframe in graph.keyframes]
+    pairs = {key: taken_apart(pair) for key, pair in graph.pairs.items()}
     header = GraphRecord(
         names=[keyframe.name for keyframe in graph.keyframes],
         features=[numbers for numbers, _ in features],
@@ -69,8 +69,8 @@ class SavedGraph:
 def graph_from(message: Message[GraphRecord]) -> SavedGraph:
     """What `graph_message` was given. Raises ValueError where another version wrote the message."""
     names, arrays = message.header.names, iter(message.arrays)
-    features = [_put_together(Features, numbers, arrays) for numbers in message.header.features]
-    pairs = {(names[i], names[j]): _put_together(TwoView, numbers, arrays) for i, j, numbers in message.header.pairs}
+    features = [put_together(Features, numbers, arrays) for numbers in message.header.features]
+    pairs = {(names[i], names[j]): put_together(TwoView, numbers, arrays) for i, j, numbers in message.header.pairs}
     pending = [(names[i], names[j]) for i, j in message.header.pending]
     return SavedGraph(dict(zip(names, features, strict=True)), pairs, pending)
 
@@ -105,7 +105,7 @@ def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe])
     return Scene(views, Gaussians(*gaussians), header.iterations)
 
 
-def _taken_apart(value: Any) -> tuple[Numbers, list[npt.NDArray]]:
+def taken_apart(value: Any) -> tuple[Numbers, list[npt.NDArray]]:
     """A flat dataclass as its numbers and its arrays."""
     content = {field.name: getattr(value, field.name) for field in fields(value)}
     arrays = [part for part in content.values() if isinstance(part, np.ndarray)]
@@ -116,7 +116,7 @@ def _plain(number: Any) -> bool | int | float | None:
     return number.item() if isinstance(number, np.generic) else number
 
 
-def _put_together(kind: type[T], numbers: Numbers, arrays: Any) -> T:
+def put_together(kind: type[T], numbers: Numbers, arrays: Any) -> T:
     names = [field.name for field in fields(kind)]  # pyright: ignore[reportArgumentType]
     if not set(numbers) <= set(names):
         raise ValueError(f"a {kind.__name__} with {', '.join(sorted(numbers))} is of another version")

@@ -2,10 +2,13 @@
 
     ledger              which frames there are to know about, and where the present place begins
     frames/<number>     a key frame as it came; the number is its position in all that ever came
-    graph               features and matches; made anew where it is missing
-    scene               cameras and Gaussians; made anew where they are missing
+    graph               features and matches
+    judgement           the cameras that they lead to, the evidence and the verdict
+    scene               cameras and Gaussians as they are shown
+    pointmaps           depths of its views, from which it grows
 
-A key frame is the daemon's as soon as its file is there. Every file is whole or not there, and has a checksum.
+The last four are made anew where they are missing. A key frame is the daemon's as soon as its file is there. Every file
+is whole or not there, and has a checksum.
 """
 
 from __future__ import annotations
@@ -30,6 +33,7 @@ from capture.messaging.wire import Limits, Message, WireError, decode, encode
 log = logging.getLogger(__name__)
 
 VERSION = 1
+MADE_ANEW = ("graph", "judgement", "scene", "pointmaps")
 REMEMBERED = 1000  # frames that are gone, in case their sender has not heard that they came
 REMEMBERED_DROPPED = 100  # names and reasons
 FILE = "{:012d}.frame"
@@ -156,7 +160,7 @@ class Store:
             place = self.ledger.place + 1
             self._write(Ledger(VERSION, place, first, self._next, gone[-REMEMBERED:]))
             self._unlink(before)
-            for name in ("graph", "scene"):
+            for name in MADE_ANEW:
                 (self.directory / name).unlink(missing_ok=True)
 
     def save(self, name: str, header: msgspec.Struct, arrays: list[Any]) -> None:

@@ -6,14 +6,14 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import msgspec
 
 from capture.logs import event
-from recon.daemon import place, saved
+from recon.daemon import checkpoint, place
 from recon.daemon.config import Config
 from recon.daemon.inbox import Arrived, Inbox, LeftOut
 from recon.daemon.status import State
@@ -21,7 +21,7 @@ from recon.daemon.store import Store
 from recon.daemon.watcher import Finished
 from recon.keyframe import Keyframe
 from recon.metric import in_metres
-from recon.pipeline import Reconstruction, prepare
+from recon.pipeline import Reconstruction
 from recon.result import finish
 from recon.snapshot import Snapshot
 
@@ -94,30 +94,14 @@ class Worker:
 
     def _restore(self) -> None:
         """Goes on where an earlier process was."""
-        graph, scene = saved.SavedGraph({}, {}, []), None
-        try:
-            if (record := self._store.load("graph", saved.GraphRecord)) is not None:
-                graph = saved.graph_from(record)
-            keyframes = {
-                stored.frame.name: prepare(stored.frame, self._recipe, graph.features.get(stored.frame.name))
-                for stored in self._store.frames()
-            }
-            if (found := self._store.load("scene", saved.SceneRecord)) is not None:
-                scene = saved.scene_from(found, keyframes)
-                self._settled = found.header.final and scene is not None
-        except ValueError as error:
-            log.warning("the checkpoint's scene is made anew: %s", error)
-            keyframes = {stored.frame.name: prepare(stored.frame, self._recipe) for stored in self._store.frames()}
-        self._work.dropped = self._store.dropped
-        known = [keyframe for name, keyframe in keyframes.items() if name in graph.features]
-        self._work.restore(known, graph.pairs, graph.pending)
-        self._work.show(scene)
-        new = [keyframe for name, keyframe in keyframes.items() if name not in graph.features]
-        if keyframes:
-            event(log, logging.INFO, "restored", scene=self._store.scene_id, keyframes=len(keyframes), new=len(new))
-        if new or (keyframes and scene is None):
-            self._take_in([Arrived(keyframe, time.monotonic()) for keyframe in new])
-        elif keyframes:
+        found = checkpoint.restore(self._store, self._work)
+        self._settled = found.final or not found.keyframes
+        if not found.keyframes:
+            return
+        event(log, logging.INFO, "restored", scene=self._store.scene_id, keyframes=found.keyframes, new=len(found.new))
+        if found.new or self._work.scene is None:
+            self._take_in([Arrived(keyframe, time.monotonic()) for keyframe in found.new])
+        else:
             self.state = State.IDLE if self._settled else State.GROWING
             self._show(final=self._settled)
 
@@ -182,13 +166,14 @@ class Worker:
         )
         for name in aside[:-MOST_ASIDE]:
             self._forget(name, "it does not fit the scene")
-        return self._lost() or joined
+        return self._lost(newest) or joined
 
-    def _lost(self) -> bool:
-        """Says which key frames do not fit; another place begins, if there are too many of them in a row."""
+    def _lost(self, newest: Collection[str]) -> bool:
+        """Says which of the newest key frames do not fit; where too many in a row do not, another place begins."""
         strangers = place.strangers(self._work)
         for keyframe in strangers:
-            event(log, logging.WARNING, "does_not_fit", frame=keyframe.name, scene=self._store.scene_id)
+            if keyframe.name in newest:
+                event(log, logging.WARNING, "does_not_fit", frame=keyframe.name, scene=self._store.scene_id)
         if len(strangers) < self._config.lost_after:
             return False
         self._begin_place(strangers)
@@ -235,10 +220,11 @@ class Worker:
         self.state = State.REFINING
         config = self._recipe.optimize
         steps = msgspec.structs.replace(config, checkpoints=tuple(range(STEP, config.iterations, STEP)))
+        fitted = set(self._work.names)
         place.prove(self._work, self._pause)
         for keyframe in place.contradicting(self._work):
             self._forget(keyframe.name, "it contradicts the scene")
-        self._lost()
+        self._lost(fitted)
         self._work.estimate(self._pause)
         refined = None
         for refined in self._work.refine(self._work.begun, steps):
@@ -269,9 +255,7 @@ class Worker:
     def _save(self, final: bool) -> None:
         """What could be made anew from the key frames; a full disk costs time after a restart and nothing else."""
         try:
-            self._store.save("graph", *saved.graph_message(self._work.graph))
-            if self._work.scene is not None:
-                self._store.save("scene", *saved.scene_message(self._work.scene, final))
+            checkpoint.save(self._store, self._work, final)
         except OSError as error:
             self._complain(f"the scene cannot be kept ({error.strerror}): make room on the disk")
 
