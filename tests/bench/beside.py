@@ -1,15 +1,18 @@
 """What a viewer costs the node: `xvfb-run -s "-screen 0 1280x800x24" python -m tests.bench beside IMAGES`.
 
-The real processes reconstruct a folder of photographs again and again: with no viewer, with one, and with one that was
-stopped (SIGSTOP) once its window was open, in turn, so that what else the machine does meets all three alike. Intake is
-key frames a second until all are placed, iterations a second are what recon itself says of its refinement. The ratios
-are to the run without a viewer in the same round. Wants a quiet machine.
+The real processes reconstruct a folder of photographs again and again, for some minutes: with no viewer, with one, and
+with one that was stopped (SIGSTOP) once its window was open, in turn and in rounds, so that what else the machine does
+meets all three alike. Intake is key frames a second until all are placed, iterations a second are what recon itself
+says of its refinement. Each run is compared with the one without a viewer in the same round; said are the median of
+these ratios and the rounds' range that holds the true median with at least 90 % confidence, whatever their
+distribution. `taken` is the part of the machine's processor time that the viewer took: recon can lose no more to it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import signal
 import statistics
@@ -23,6 +26,8 @@ from tests.node import Node, Viewer, processor_s, running
 from tests.screen import Screen
 
 CASES = ("alone", "viewer", "stopped viewer")
+RATES = ("intake_per_s", "iterations_per_s", "final_per_s")
+CONFIDENCE = 0.9
 LOADED_S = 6.0  # recon has imported what it needs by then
 OPENED_S = 90.0
 
@@ -31,34 +36,53 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.bench beside", description=__doc__)
     parser.add_argument("images", type=Path, help="a folder of photographs of one place")
     parser.add_argument("--views", type=int, default=6)
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--minutes", type=float, default=10.0, help="no round is begun after them (default: 10)")
     parser.add_argument("--out", type=Path, help="where the figures go, as JSON")
     arguments = parser.parse_args()
     names = sorted(path.name for path in arguments.images.iterdir())
     step = len(names) / arguments.views
     chosen = [names[int(step * number)] for number in range(arguments.views)]
-    rounds = []
-    for number in range(arguments.rounds):
-        order = CASES[number % 3 :] + CASES[: number % 3]
-        rounds.append({case: reconstruct(arguments.images, chosen, case) for case in order})
+    rounds: list[dict[str, dict[str, float]]] = []
+    deadline = time.monotonic() + 60.0 * arguments.minutes
+    while time.monotonic() < deadline:
+        first = len(rounds) % len(CASES)
+        rounds.append({case: reconstruct(arguments.images, chosen, case) for case in CASES[first:] + CASES[:first]})
         print(json.dumps(rounds[-1]), flush=True)
     report = {
         "command": f"python -m tests.bench beside {arguments.images.name} --views {arguments.views} "
-        f"--rounds {arguments.rounds}",
+        f"--minutes {arguments.minutes:g}",
         "processors": os.cpu_count(),
         "load_average": os.getloadavg()[0],
         "ratios": {
-            figure: {
-                case: round(statistics.median(one[case][figure] / one["alone"][figure] for one in rounds), 3)
-                for case in CASES[1:]
-            }
-            for figure in ("intake_per_s", "iterations_per_s")
+            rate: {case: paired([one[case][rate] / one["alone"][rate] for one in rounds]) for case in CASES[1:]}
+            for rate in RATES
         },
+        "taken": round(statistics.median(one["viewer"]["taken"] for one in rounds), 4),
         "rounds": rounds,
     }
-    print(json.dumps(report["ratios"], indent=1))
+    print(json.dumps({key: report[key] for key in ("ratios", "taken")}, indent=1))
     if arguments.out:
         arguments.out.write_text(json.dumps(report, indent=1) + "\n")
+
+
+def paired(ratios: list[float]) -> dict[str, object]:
+    """The median of the ratios, and between which of them the true one lies with how much confidence.
+
+    Each ratio is above the true median with a chance of one half. So the chance that it lies outside the ones ranked
+    `rank` from below and from above is twice that of fewer than `rank` heads in as many throws of a coin.
+    """
+    ordered, count = sorted(ratios), len(ratios)
+
+    def confidence(rank: int) -> float:
+        return 1.0 - 2.0 * sum(math.comb(count, heads) for heads in range(rank)) / 2.0**count
+
+    rank = max((rank for rank in range(1, count // 2 + 1) if confidence(rank) >= CONFIDENCE), default=1)
+    return {
+        "median": round(statistics.median(ordered), 3),
+        "range": [round(ordered[rank - 1], 3), round(ordered[-rank], 3)],
+        "confidence": round(confidence(rank), 3),
+        "rounds": count,
+    }
 
 
 def reconstruct(images: Path, names: list[str], case: str) -> dict[str, float]:
@@ -84,13 +108,15 @@ def reconstruct(images: Path, names: list[str], case: str) -> dict[str, float]:
             audience.close()
             if placed is None or final is None:
                 raise SystemExit(f"not all frames were placed:\n{node.log('recon')[-2000:]}")
-            snapshot = final.snapshot
+            snapshot, final_s = final.snapshot, time.monotonic() - begun
+            viewer_s = processor_s(shown.pid) - viewer_s if shown else 0.0
             return {
                 "intake_per_s": len(names) / placed_s,
                 "iterations_per_s": snapshot.iterations / snapshot.seconds["optimise"],
-                "final_s": time.monotonic() - begun,
+                "final_per_s": 1.0 / final_s,
                 "recon_processor_s": processor_s(recon.pid),
-                "viewer_processor_s": processor_s(shown.pid) - viewer_s if shown else 0.0,
+                "viewer_processor_s": viewer_s,
+                "taken": viewer_s / (final_s * (os.cpu_count() or 1)),
             }
         finally:
             if shown is not None:
