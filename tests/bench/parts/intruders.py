@@ -1,0 +1,65 @@
+"""Faults of `tests.bench faults` with keys: who is not allowed, and who meets another machine than expected."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from capture.config import typed
+from capture.messaging.keys import create_keys, expect_server
+from capture.messaging.network import Network, NotAllowed
+from capture.messaging.services import RECON_SCENE
+from capture.messaging.state import StateClient
+from recon.daemon.scene_message import SceneHeader
+from tests.bench.parts.trial import RECON, Trial, expect, expect_whole, wait_for
+from tests.node import Node, running
+
+
+def unauthorised(trial: Trial) -> None:
+    """A client whose key is not allowed hears nothing, and the node goes on."""
+    network, stranger = _over_tcp(trial)
+    with running(trial.node(network=network)) as node:
+        node.start("recon")
+        node.start("capture")
+        wait_for(lambda: "event=ready" in node.log("recon"), "recon that runs")
+        outsider = StateClient(RECON_SCENE, typed(network | {"keys": str(stranger)}, Network), SceneHeader)
+        refused = False
+        deadline = time.monotonic() + 15
+        while not refused and time.monotonic() < deadline:
+            try:
+                expect(outsider.poll(1.0) is None, "a stranger heard the scene")
+            except NotAllowed:
+                refused = True
+        outsider.close()
+        expect(refused, "the stranger was not told that it is not allowed")
+        expect_whole(node)
+
+
+def wrong_key(trial: Trial) -> None:
+    """recon that expects another machine than it meets ends with 77 and says so."""
+    network, stranger = _over_tcp(trial)
+    expect_server(stranger, (stranger / "public.key").read_bytes().strip())
+    with running(trial.node(network=network)) as node:
+        node.start("capture")
+        other = Node(
+            trial.folder / "other",
+            {"camera": {"kind": "folder", "folder": str(trial.images)}},
+            RECON,
+            network | {"keys": str(stranger), "directory": str(trial.folder / "other" / "run")},
+        )
+        with running(other):
+            code = other.start("recon").wait(120)
+            expect(code == 77, f"recon with the wrong key ended with {code}")
+        node.start("recon")
+        expect_whole(node)
+
+
+def _over_tcp(trial: Trial) -> tuple[dict[str, Any], Path]:
+    """A network over loopback with keys, and the keys of a machine that is not allowed."""
+    own, stranger = trial.folder / "keys", trial.folder / "stranger"
+    public = create_keys(own)
+    create_keys(stranger)
+    expect_server(own, public)
+    expect_server(stranger, public)
+    return {"tcp": "127.0.0.1", "keys": str(own), "first_port": trial.chance.randrange(20000, 30000)}, stranger
