@@ -166,3 +166,18 @@ def test_another_place_begins_another_scene_and_the_old_one_is_exported(config, 
     kept = read_cameras(config.out / "scene-0001" / "cameras.json")
     assert {camera.name for camera in kept} == {frame.name for frame in frames[:3]}
     assert len(list((config.checkpoint / "frames").glob("*.frame"))) == 3
+
+
+def test_key_frames_that_do_not_fit_at_once_join_the_scene_when_all_are_judged_together(config, peer, monkeypatch):
+    monkeypatch.setattr("recon.judging.BEYOND_DOUBT", 10**6)  # points: nothing fits at once
+    frames = photographs()
+    with running(replace(config, lost_after=3)):
+        for frame in frames[:3]:
+            peer.server.offer(frame)
+        peer.wait(lambda scene: len(scene.snapshot.cameras) == 3, "three cameras")
+        for frame in frames[3:]:
+            peer.server.offer(frame)
+        whole = peer.wait(lambda scene: len(scene.snapshot.cameras) == 6, "all cameras")
+        assert whole.scene_id == "scene-0001" and not whole.snapshot.verdict.provisional
+        peer.wait_for_acknowledgements()
+    assert len(list((config.checkpoint / "frames").glob("*.frame"))) == 6

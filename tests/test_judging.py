@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -81,6 +82,40 @@ def test_work_that_is_abandoned_leaves_what_was_known(graph, judging):
     with pytest.raises(InterruptedError):
         judging.thorough(graph, [], pause)
     assert judging.soon(graph, []).verdict.provisional
+
+
+def test_a_thorough_judgement_can_be_abandoned_at_any_of_its_stages(graph):
+    whole, calls = Judging(classical.load(classical.Config()), CONFIG), []
+    whole.thorough(_not_compared(graph), [], lambda: calls.append(None))
+    assert len(calls) > 6 + 3  # pairs, attempts at a map, what speaks for it
+    for moment in (1, len(calls) // 2, len(calls)):
+        left = iter(range(moment - 1))
+
+        def pause(left=left) -> None:
+            if next(left, None) is None:
+                raise InterruptedError
+
+        judging = Judging(classical.load(classical.Config()), CONFIG)
+        compared = _not_compared(graph)
+        with pytest.raises(InterruptedError):
+            judging.thorough(compared, [], pause)
+        assert judging.proven == frozenset() and judging.thorough(compared, []).verdict.publishable
+
+
+def test_what_was_refused_is_remembered_whatever_the_order(judging):
+    frames = places(seeds=(0, 1))
+    strange = view_graph([frames[0], frames[3]])
+    assert not judging.thorough(strange, []).verdict.publishable
+    names = [keyframe.name for keyframe in strange.keyframes]
+    assert judging.refused(names[::-1]) and not judging.refused(names[:1])
+
+
+def _not_compared(graph: ViewGraph) -> ViewGraph:
+    """The same keyframes, nothing known of their pairs."""
+    fresh = ViewGraph(REGISTRATION)
+    fresh.keyframes = list(graph.keyframes)
+    fresh.pending = set(itertools.combinations(range(len(fresh.keyframes)), 2))
+    return fresh
 
 
 def _of(graph: ViewGraph):
