@@ -14,10 +14,12 @@ from recon.gaussians import SH_C0, Gaussians
 from recon.geometry import quat_from_matrix
 from recon.priors.pointmap import Pointmap
 
+Array = npt.NDArray[np.float64]
+
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     spacing_deg: float = 5.0  # between neighbouring Gaussians of the shell; 0 leaves it out
-    margin: float = 0.5  # how far beyond the images' borders it reaches, in units of their size
+    margin: float = 2.0  # how far beyond the images' borders it reaches, in units of their size
     distance: float = 1.3  # from the cameras, in units of the farthest known depth
     opacity: float = 0.95
 
@@ -41,38 +43,20 @@ def background(
 
 
 def _shell(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config) -> Gaussians:
-    """The Gaussians `config.spacing_deg` apart.
-
-    Each has a view's colour at the nearest pixel, strongly blurred over what is far or unknown there: a wall that is
-    near says nothing about what lies behind it. Views that see far in that direction count, and of these the one that
-    the Gaussian lies deepest in.
-    """
+    """The Gaussians `config.spacing_deg` apart, with the colours that the images have there or suggest."""
     centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps])
     centre = centres.mean(0)
     farthest = max(float(pointmap.depth.max()) for pointmap in pointmaps)
     spread = float(np.linalg.norm(centres - centre, axis=1).max())
     radius = config.distance * max(farthest, spread)
     directions = _sphere(config.spacing_deg)
-    outside = np.full(len(directions), np.inf)
-    best = np.full(len(directions), -np.inf)
-    colours = np.zeros((len(directions), 3))
-    for pointmap, image in zip(pointmaps, images, strict=True):
-        height, width = image.shape[:2]
-        in_camera = (centre + radius * directions - pointmap.T_world_camera[:3, 3]) @ pointmap.T_world_camera[:3, :3]
-        ahead = in_camera[:, 2] > 0.05 * radius
-        pixels = in_camera[:, :2] / np.where(ahead, in_camera[:, 2], 1.0)[:, None] * np.diag(pointmap.K)[:2]
-        pixels += pointmap.K[:2, 2]
-        relative = pixels / (width, height) - 0.5
-        distance = np.where(ahead, np.abs(relative).max(1) - 0.5, np.inf)
-        blurred, sees_far = _far_colours(image, pointmap.depth / farthest, 0.04 * max(height, width))
-        size = np.array([blurred.shape[1], blurred.shape[0]])
-        column, row = np.clip(pixels * (size / (width, height)), 0, size - 1).astype(int).T
-        score = np.log(sees_far[row, column]) - 10.0 * distance
-        better = score > best
-        colours[better], best[better] = blurred[row, column][better], score[better]
-        outside = np.minimum(outside, distance)
+    outside, colours = _seen(centre + radius * directions, farthest, pointmaps, images)
     kept = outside < config.margin
-    directions, colours = directions[kept], colours[kept]
+    directions, outside, colours = directions[kept], outside[kept], colours[kept]
+    inside = outside <= 0
+    if inside.any():
+        upward = -np.sum([pointmap.T_world_camera[:3, 1] for pointmap in pointmaps], axis=0)
+        colours[~inside] = _continued(directions[~inside], directions[inside], colours[inside], upward)
     count = len(directions)
     extent = 0.7 * radius * np.radians(config.spacing_deg)
     scales = np.tile(extent * np.array([1.0, 1.0, 0.1]), (count, 1))
@@ -84,6 +68,48 @@ def _shell(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]
         sh=torch.from_numpy((colours - 0.5) / SH_C0).float()[:, None],
         source_frame=torch.full((count,), SOURCE_FRAME, dtype=torch.int32),
     )
+
+
+def _seen(
+    points: Array, farthest: float, pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]]
+) -> tuple[Array, Array]:
+    """How far outside all images the points (M, 3) lie, in units of the images' size, and their colours (M, 3) there.
+
+    A colour is strongly blurred over what is far or unknown: a wall that is near says nothing about what lies behind
+    it. Views that see far in that direction count, and of these the one that the point lies deepest in.
+    """
+    outside = np.full(len(points), np.inf)
+    best = np.full(len(points), -np.inf)
+    colours = np.zeros((len(points), 3))
+    for pointmap, image in zip(pointmaps, images, strict=True):
+        height, width = image.shape[:2]
+        in_camera = (points - pointmap.T_world_camera[:3, 3]) @ pointmap.T_world_camera[:3, :3]
+        ahead = in_camera[:, 2] > 0.05 * np.linalg.norm(in_camera, axis=1)
+        pixels = in_camera[:, :2] / np.where(ahead, in_camera[:, 2], 1.0)[:, None] * np.diag(pointmap.K)[:2]
+        pixels += pointmap.K[:2, 2]
+        relative = pixels / (width, height) - 0.5
+        distance = np.where(ahead, np.abs(relative).max(1) - 0.5, np.inf)
+        blurred, sees_far = _far_colours(image, pointmap.depth / farthest, 0.04 * max(height, width))
+        size = np.array([blurred.shape[1], blurred.shape[0]])
+        column, row = np.clip(pixels * (size / (width, height)), 0, size - 1).astype(int).T
+        score = np.log(sees_far[row, column]) - 10.0 * distance
+        better = score > best
+        colours[better], best[better] = blurred[row, column][better], score[better]
+        outside = np.minimum(outside, distance)
+    return outside, colours
+
+
+def _continued(directions: Array, seen: Array, colours: Array, upward: Array) -> Array:
+    """(M, 3) for unseen directions (M, 3) the mean of the colours (N, 3) of directions that are `seen` (N, 3).
+
+    Each counts by the fourth power of its nearness (Shepard, 1968). A difference of elevation counts fourfold: what
+    lies beside the images is more likely like them than what lies above or below.
+    """
+    upward = upward / max(float(np.linalg.norm(upward)), 1e-9)
+    stretched = np.eye(3) + 3.0 * np.outer(upward, upward)
+    squared = (((directions @ stretched)[:, None] - (seen @ stretched)[None]) ** 2).sum(2)
+    nearness = 1.0 / (squared + 1e-4) ** 2
+    return nearness @ colours / nearness.sum(1, keepdims=True)
 
 
 def _far_colours(
@@ -104,7 +130,7 @@ def _far_colours(
     return np.asarray(blurred / weight[..., None], np.float32), np.asarray(weight, np.float32)
 
 
-def _sphere(spacing_deg: float) -> npt.NDArray[np.float64]:
+def _sphere(spacing_deg: float) -> Array:
     """(M, 3) directions that cover the sphere evenly (Fibonacci lattice); none for a spacing of 0."""
     count = int(4 * np.pi / np.radians(spacing_deg) ** 2) if spacing_deg > 0 else 0
     step = np.arange(count) + 0.5
@@ -114,9 +140,9 @@ def _sphere(spacing_deg: float) -> npt.NDArray[np.float64]:
     return np.column_stack([across * np.cos(angle), across * np.sin(angle), z])
 
 
-def _frames(directions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def _frames(directions: Array) -> Array:
     """(M, 3, 3) rotations whose third axis points along each direction."""
     helper = np.where(np.abs(directions[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first: npt.NDArray[np.float64] = np.cross(helper, directions)
+    first: Array = np.cross(helper, directions)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(directions, first), directions], 2)

@@ -68,18 +68,29 @@ def test_it_reaches_beyond_the_image_by_its_margin_and_no_further():
             assert 1 + margin - 0.1 < share.max() <= 1 + margin + 0.01
 
 
-def test_it_has_the_colour_of_the_image_there_and_of_the_border_beyond():
-    shell = background([pointmap(np.eye(4))], [two_colours()], Config())
+def test_it_has_the_colour_of_the_image_there():
+    shell = background([pointmap(np.eye(4))], [two_colours()], Config(margin=0.0))
     ray = directions(shell)
     left, right = ray[:, 0] < -0.1, ray[:, 0] > 0.1
     torch.testing.assert_close(shell.rgb[left], torch.tensor([[1.0, 0, 0]]).expand(left.sum(), 3), rtol=0, atol=0.03)
     torch.testing.assert_close(shell.rgb[right], torch.tensor([[0, 0, 1.0]]).expand(right.sum(), 3), rtol=0, atol=0.03)
 
 
+def test_beside_the_images_it_has_their_colour_at_that_elevation():
+    sky_over_grass = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    sky_over_grass[: HEIGHT // 2, :, 2], sky_over_grass[HEIGHT // 2 :, :, 1] = 255, 255
+    ray = directions(shell := background([pointmap(np.eye(4))], [sky_over_grass], Config()))
+    beside = ray[:, 0] / ray[:, 2] > 0.8  # the image ends at 0.5
+    sky, grass = beside & (ray[:, 1] < -0.2), beside & (ray[:, 1] > 0.2)
+    assert sky.sum() > 20 and grass.sum() > 20
+    assert (shell.rgb[sky, 2] > 0.7).all() and (shell.rgb[sky, 1] < 0.3).all()
+    assert (shell.rgb[grass, 1] > 0.7).all() and (shell.rgb[grass, 2] < 0.3).all()
+
+
 def test_each_direction_has_the_colour_of_the_view_that_looks_there():
     green, white = np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     green[..., 1] = 255
-    shell = background([pointmap(turned(0)), pointmap(turned(180))], [green, white], Config())
+    shell = background([pointmap(turned(0)), pointmap(turned(180))], [green, white], Config(margin=0.0))
     ahead = directions(shell)[:, 2] > 0
     assert ahead.any() and (~ahead).any()
     torch.testing.assert_close(shell.rgb[ahead], torch.tensor([[0, 1.0, 0]]).expand(ahead.sum(), 3))
