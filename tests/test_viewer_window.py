@@ -18,7 +18,7 @@ DRIVE = """
 import os, signal, sys
 from dataclasses import replace
 from pathlib import Path
-from tests.test_viewer_picture import Feed
+from tests.test_viewer_session import Feed
 from tests.test_viewer_cli import snapshot
 from tests.test_viewer_scene import wall
 from viewer.moment import Moment
@@ -41,7 +41,7 @@ class Driver(Session):
         return super().receive()
 
 try:
-    show(Driver(Feed(), State()), open3d_may_draw=False, screenshots=Path(sys.argv[1]), size=(400, 300))
+    show(Driver(Feed(), State()), software=True, screenshots=Path(sys.argv[1]), size=(400, 300))
 except SystemExit as stopped:
     print("closed with", stopped.code, flush=True)
 """

@@ -47,7 +47,7 @@ def view(args: argparse.Namespace) -> int:
         from viewer.window import show  # brings Open3D
 
         background = (lambda: None) if finished is not None else _give_way
-        show(Session(source, State()), open3d_may_draw=not window.software, screenshots=folder, opened=background)
+        show(Session(source, State()), software=window.software, screenshots=folder, opened=background)
     elif finished is not None:
         print(write_series(finished, folder, width, height, args.pictures))
     else:

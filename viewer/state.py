@@ -57,6 +57,14 @@ class Binding:
     change: Change
 
 
+def open3d_draws(state: State, software: bool) -> bool:
+    """Whether Open3D is asked for the picture, and for one that it draws whole.
+
+    Its splat shader leaves tiles black, mostly whole rows of them, where Vulkan is `software` (Open3D 0.20, Mesa 22.3).
+    """
+    return state.engine is Engine.OPEN3D and (state.as_points or not software)
+
+
 def shown_moment(state: State, history: History) -> Moment | None:
     """The moment to show, None where nothing has come yet."""
     if state.held is not None:

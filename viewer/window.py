@@ -20,13 +20,14 @@ import open3d as o3d  # pyright: ignore[reportMissingImports]
 from open3d.visualization import gui, rendering  # pyright: ignore[reportMissingImports]
 
 from recon.export import write_file
+from viewer import words
 from viewer.canvas import BACKGROUND
 from viewer.help_sheet import HelpSheet
 from viewer.panel import Panel
 from viewer.pointer import Pointer
 from viewer.scene3d import Scene3D, image3d, look_from
 from viewer.session import Session
-from viewer.state import Engine
+from viewer.state import Engine, open3d_draws
 
 Image = npt.NDArray[np.uint8]
 
@@ -43,22 +44,23 @@ _KEYS = {
 def show(
     session: Session,
     *,
-    open3d_may_draw: bool,
+    software: bool,
     screenshots: Path,
     opened: Callable[[], None] = lambda: None,
     size: tuple[int, int] = (1280, 800),
 ) -> None:
     """Opens the window, calls `opened`, and returns when it is closed. Raises what went wrong while it was open.
 
-    `open3d_may_draw` is False where Vulkan is software; the key that asks for it works all the same.
+    `software`: Vulkan is played by the processor. There the project's own rasteriser draws, unless the person asks for
+    Open3D; its splat shader is not used even then, because it leaves whole rows of its tiles black.
     """
     # It would say, at each picture, which of the far shell's Gaussians are too wide for it.
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     app = gui.Application.instance
     app.initialize()
     state = session.state
-    session.state = replace(state, engine=Engine.OPEN3D if open3d_may_draw else Engine.CORE)
-    window = _Window(app, session, screenshots, size)
+    session.state = replace(state, engine=Engine.CORE if software else Engine.OPEN3D)
+    window = _Window(app, session, software, screenshots, size)
     # A handler that raises would do so where Open3D calls Python, before anything there can catch it.
     handlers = {number: signal.signal(number, window.stop) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
@@ -73,8 +75,11 @@ def show(
 
 
 class _Window:
-    def __init__(self, app: gui.Application, session: Session, screenshots: Path, size: tuple[int, int]) -> None:
+    def __init__(
+        self, app: gui.Application, session: Session, software: bool, screenshots: Path, size: tuple[int, int]
+    ) -> None:
         self.error: BaseException | None = None
+        self._software = software
         self._app, self._session, self._screenshots = app, session, screenshots
         self._window = app.create_window("splatnode", *size)
         self._picture = gui.ImageWidget(image3d(np.full((8, 8, 3), BACKGROUND, np.uint8)))
@@ -146,7 +151,7 @@ class _Window:
         if view is None or width < 2 or height < 2:
             return
         blends = session.state.blend > 0 and session.photograph() is not None
-        own = session.state.engine is Engine.CORE or blends
+        own = blends or not open3d_draws(session.state, self._software)
         if self._picture.visible != own or self._scene_widget.visible == own:
             self._picture.visible, self._scene_widget.visible = own, not own
             self._scene.set_drawing(not own)
@@ -179,8 +184,10 @@ class _Window:
 
     def _say(self) -> None:
         self._words_at = time.monotonic()
-        seconds = self._painted_s if self._session.state.engine is Engine.CORE else None
-        self._panel.show(self._session, seconds, self._notice)
+        seconds = self._painted_s if self._picture.visible else None
+        state = self._session.state
+        refused = state.engine is Engine.OPEN3D and not open3d_draws(state, self._software)
+        self._panel.show(self._session, seconds, words.NO_SPLATS if refused else self._notice)
         self._help.show(self._session.state.help)
 
     def _layout(self, context: gui.LayoutContext) -> None:

@@ -8,6 +8,10 @@ from viewer.state import State, moment_index
 
 _STALE_S = 5.0  # a node that is at work is heard from more often
 _MOST_DROPPED = 6
+NO_SPLATS = (
+    "Open3D's splat shader leaves parts of the picture black on software Vulkan: here Open3D draws points (g), "
+    "and Gaussians stay with splatnode's own rasteriser"
+)
 
 
 def verdict_lines(moment: Moment) -> list[str]:

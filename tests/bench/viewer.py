@@ -116,7 +116,7 @@ def time_pictures(result: Path, engine: Engine, as_points: bool) -> dict:
 
     tour = Tour(thinned(load_result(result), GAUSSIANS), State(as_points=as_points))
     with contextlib.suppress(TourOver):
-        show(tour, open3d_may_draw=engine is Engine.OPEN3D, screenshots=result, size=WINDOW)
+        show(tour, software=engine is Engine.CORE, screenshots=result, size=WINDOW)
     seconds = np.diff(tour.ticks)[2:]
     processor = (tour.processor[-1] - tour.processor[2]) / (len(tour.processor) - 3)
     return {
