@@ -32,11 +32,12 @@ from recon.daemon.config import Config
 from recon.daemon.control import Answer, Retract
 from recon.daemon.inbox import Inbox, LeftOut
 from recon.daemon.intake import Intake
+from recon.daemon.output import Shown
 from recon.daemon.scene_message import camera_record, to_message
 from recon.daemon.status import ReconStatus, State
 from recon.daemon.store import Store, default_directory
 from recon.daemon.watcher import Watcher
-from recon.daemon.worker import Shown, Worker
+from recon.daemon.worker import Worker
 
 log = logging.getLogger(__name__)
 

@@ -7,7 +7,6 @@ import math
 import threading
 import time
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import msgspec
@@ -16,13 +15,12 @@ from capture.logs import event
 from recon.daemon import checkpoint, place
 from recon.daemon.config import Config
 from recon.daemon.inbox import Arrived, Inbox, LeftOut
+from recon.daemon.output import Output, Shown
 from recon.daemon.status import State
 from recon.daemon.store import Store
 from recon.daemon.watcher import Finished
 from recon.keyframe import Keyframe
-from recon.metric import in_metres
 from recon.pipeline import Reconstruction
-from recon.result import finish
 from recon.snapshot import Snapshot
 
 log = logging.getLogger(__name__)
@@ -31,14 +29,6 @@ STEP = 10  # iterations between looks at the inbox
 IDLE_S = 0.5  # between looks at whether to stop
 PATIENCE_S = 3.0  # that a thorough judgement of a key frame that does not fit may keep others waiting
 MOST_ASIDE = 8  # key frames that may still find their place
-
-
-@dataclass(frozen=True, eq=False)
-class Shown:
-    """What the world may see."""
-
-    snapshot: Snapshot
-    scene_id: str
 
 
 class _Abandoned(Exception):
@@ -56,7 +46,8 @@ class Worker:
     ) -> None:
         limit = min(config.max_gaussians, config.reconstruction.max_gaussians or config.max_gaussians)
         self._recipe = msgspec.structs.replace(config.reconstruction, max_gaussians=limit, budget_s=None)
-        self._config, self._store, self._inbox, self._publish = config, store, inbox, publish
+        self._config, self._store, self._inbox = config, store, inbox
+        self._output = Output(config, store, publish, self._complain)
         self._stopping = stopping
         self._work = Reconstruction(self._recipe)
         self._settled = True  # nothing can be made better before the next key frame
@@ -128,7 +119,7 @@ class Worker:
             log, logging.INFO, "keyframes", names=",".join(each.keyframe.name for each in arrived),
             verdict=snapshot.verdict.code.value, gaussians=len(snapshot.gaussians), seconds=self.keyframe_s or 0.0,
         )  # fmt: skip
-        self._save(final=False)
+        self._output.save(self._work, final=False)
 
     def _screened(self, keyframes: Sequence[Keyframe]) -> list[Keyframe]:
         """Those of the keyframes that show something new, and sharply; what does not is given up."""
@@ -182,7 +173,7 @@ class Worker:
     def _begin_place(self, strangers: Sequence[Keyframe]) -> None:
         """The scene that was is exported as it is, and another begins with the frames that do not belong to it."""
         self.state = State.LOST
-        self._export(self._show())
+        self._output.export(self._show())
         before = self._store.scene_id
         self._store.begin_place(strangers[0].frame.frame_id)
         event(log, logging.WARNING, "another_place", before=before, now=self._store.scene_id)
@@ -208,7 +199,7 @@ class Worker:
             self._settled, self.finished, self.state = False, None, State.GROWING
         self._show(final=self._settled and self._work.scene is not None)
         if known:
-            self._save(final=False)
+            self._output.save(self._work, final=False)
 
     def _forget(self, name: str, reason: str) -> None:
         self._store.forget(name, reason)
@@ -236,8 +227,8 @@ class Worker:
         self._work.show(refined)
         snapshot = self._show(final=refined is not None)
         if refined is not None:
-            self._save(final=True)
-            self._export(snapshot)
+            self._output.save(self._work, final=True)
+            self._output.export(snapshot)
         self.state = State.WAITING if refined is None else State.LOST if place.strangers(self._work) else State.IDLE
 
     def _pause(self, until_s: float = 0.0) -> None:
@@ -247,27 +238,9 @@ class Worker:
             raise _Abandoned
 
     def _show(self, final: bool = False) -> Snapshot:
-        snapshot = self._work.snapshot(final)
-        self._publish(Shown(snapshot, self._store.scene_id))
+        snapshot = self._output.show(self._work, final)
         self.finished = Finished(snapshot, tuple(self._work.graph.keyframes)) if final else None
         return snapshot
-
-    def _save(self, final: bool) -> None:
-        """What could be made anew from the key frames; a full disk costs time after a restart and nothing else."""
-        try:
-            checkpoint.save(self._store, self._work, final)
-        except OSError as error:
-            self._complain(f"the scene cannot be kept ({error.strerror}): make room on the disk")
-
-    def _export(self, snapshot: Snapshot) -> None:
-        """The result folder, whole or not at all."""
-        folder = self._config.out / self._store.scene_id
-        try:
-            finish(in_metres(snapshot, self._recipe.metric), folder, seed=self._recipe.seed, preset_name="live")
-        except OSError as error:
-            self._complain(str(error))
-        else:
-            event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians))
 
     def _complain(self, problem: str) -> None:
         self.problem = problem

@@ -1,0 +1,56 @@
+"""Where a reconstruction goes: to those who look on, into the checkpoint, and as a result into a folder."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from capture.logs import event
+from recon.daemon import checkpoint
+from recon.daemon.config import Config
+from recon.daemon.store import Store
+from recon.metric import in_metres
+from recon.pipeline import Reconstruction
+from recon.result import finish
+from recon.snapshot import Snapshot
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What the world may see."""
+
+    snapshot: Snapshot
+    scene_id: str
+
+
+class Output:
+    def __init__(
+        self, config: Config, store: Store, publish: Callable[[Shown], None], complain: Callable[[str], None]
+    ) -> None:
+        """A disk that takes nothing costs time after a restart, or a result: `complain` is told, and all goes on."""
+        self._config, self._store, self._publish, self._complain = config, store, publish, complain
+
+    def show(self, work: Reconstruction, final: bool = False) -> Snapshot:
+        snapshot = work.snapshot(final)
+        self._publish(Shown(snapshot, self._store.scene_id))
+        return snapshot
+
+    def save(self, work: Reconstruction, final: bool) -> None:
+        """What could be made anew from the key frames."""
+        try:
+            checkpoint.save(self._store, work, final)
+        except OSError as error:
+            self._complain(f"the scene cannot be kept ({error.strerror}): make room on the disk")
+
+    def export(self, snapshot: Snapshot) -> None:
+        """The result folder, whole or not at all."""
+        recipe, folder = self._config.reconstruction, self._config.out / self._store.scene_id
+        try:
+            finish(in_metres(snapshot, recipe.metric), folder, seed=recipe.seed, preset_name="live")
+        except OSError as error:
+            self._complain(str(error))
+        else:
+            event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians))
