@@ -32,7 +32,7 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     means: float = 8e-4
     quats: float = 2e-2
-    log_scales: float = 5e-2
+    log_scales: float = 1e-1
     logit_opacities: float = 1e-1
     sh: float = 3e-2
     translation: float = 2e-4
