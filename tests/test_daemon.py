@@ -21,6 +21,7 @@ from capture.messaging.state import StateClient
 from capture.status import heartbeats
 from recon import optimize
 from recon.config import Config as Reconstruction
+from recon.daemon import place
 from recon.daemon.config import Config
 from recon.daemon.control import Answer, Retract
 from recon.daemon.daemon import Daemon
@@ -181,3 +182,24 @@ def test_key_frames_that_do_not_fit_at_once_join_the_scene_when_all_are_judged_t
         assert whole.scene_id == "scene-0001" and not whole.snapshot.verdict.provisional
         peer.wait_for_acknowledgements()
     assert len(list((config.checkpoint / "frames").glob("*.frame"))) == 6
+
+
+def test_a_key_frame_that_cannot_be_worked_in_keeps_no_other_out(config, peer, monkeypatch):
+    add = place.add
+
+    def failing(work, keyframes):
+        strangers = add(work, keyframes)
+        if any(keyframe.name == frames[1].name for keyframe in keyframes):
+            raise ArithmeticError("for the test")
+        return strangers
+
+    frames = photographs()[:4]
+    monkeypatch.setattr(place, "add", failing)
+    for frame in frames:
+        peer.server.offer(frame)
+    with running(config):
+        scene = peer.wait(finished(3), "the other three")
+        assert sorted(each.name for each in scene.snapshot.cameras) == [frames[i].name for i in (0, 2, 3)]
+        assert [(each.name, "for the test" in each.reason) for each in scene.snapshot.dropped] == [
+            (frames[1].name, True)
+        ]

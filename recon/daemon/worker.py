@@ -137,6 +137,7 @@ class Worker:
         try:
             return place.add(self._work, keyframes)
         except Exception as error:  # one bad frame must not keep others out
+            self._work.retract([keyframe.name for keyframe in keyframes])
             if len(keyframes) > 1:
                 return set().union(*(self._added([keyframe]) for keyframe in keyframes))
             log.exception("%s cannot be worked in", keyframes[0].name)
@@ -155,8 +156,8 @@ class Worker:
         joined = place.connected(self._work, pause) and (
             place.join(self._work, aside, pause) or (not lost and place.join(self._work, newest, pause))
         )
-        for name in aside[:-MOST_ASIDE]:
-            self._forget(name, "it does not fit the scene")
+        for keyframe in self._work.aside[: -max(MOST_ASIDE, self._config.lost_after)]:
+            self._forget(keyframe.name, "it does not fit the scene")
         return self._lost(newest) or joined
 
     def _lost(self, newest: Collection[str]) -> bool:
