@@ -16,7 +16,7 @@ class Engine(enum.Enum):
     """Who draws the Gaussians: the project's own rasteriser on the processor, or Open3D through Vulkan."""
 
     CORE = "splatnode's own rasteriser"
-    OPEN3D = "Open3D's splat shader"
+    OPEN3D = "Open3D's renderer"
 
 
 class Colouring(enum.Enum):

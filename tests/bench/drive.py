@@ -38,7 +38,9 @@ from viewer.viewpoint import overview
 
 WINDOW = 1280, 800
 PICTURE = 928, 800  # the part of it that is not the panel
-SETTLE_S = 0.7  # after an action
+SETTLE_S = 0.7  # after an action has begun to show
+PATIENCE_S = 4.0  # with what does not show
+SEEN = 5e-4  # part of the screen: more than a button that lights up under the pointer
 REASONS = (DroppedFrame("blurred.jpg", "too blurred"), DroppedFrame("elsewhere.jpg", "it overlaps with no other frame"))
 
 
@@ -186,14 +188,23 @@ def drive(moment: Moment, server: StateServer, heartbeats: Publisher, viewer: su
         for action in step.actions:
             subprocess.run(["xdotool", *action.split()], check=True)
             settle(0.15)
+        acted = time.monotonic()
+        while not (shows := changed(before, screen.picture(*WINDOW)) > SEEN) and time.monotonic() < acted + PATIENCE_S:
+            settle(0.05)
+        seconds = time.monotonic() - acted
         settle(SETTLE_S)
         after = screen.picture(*WINDOW)
-        changed = float((np.abs(after.astype(int) - before) > 8).any(2).mean())
-        print(f"{number:02d} {step.name}: {changed:.1%} of the screen changed", flush=True)
+        when = f"after {seconds:.1f} s" if shows else "NEVER"
+        print(f"{number:02d} {step.name}: {changed(before, after):.2%} of the screen changed, {when}", flush=True)
         cv2.imwrite(str(out / f"{number:02d}_{step.name}.png"), after)
         before = after
         if viewer.poll() is not None:
             raise SystemExit(f"the viewer ended with {viewer.returncode} at {step.name}")
+
+
+def changed(before: npt.NDArray[np.uint8], after: npt.NDArray[np.uint8]) -> float:
+    """The part of the pixels that are others."""
+    return float((np.abs(after.astype(int) - before) > 8).any(2).mean())
 
 
 if __name__ == "__main__":
