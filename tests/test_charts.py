@@ -77,6 +77,8 @@ def test_charts_are_drawn_from_the_rows_alone():
     for png in charts.values():
         assert png.startswith(b"\x89PNG") and len(png) > 10_000
     assert draw(ROWS[-1:]) == {}  # nothing was scored
+    field = row("nerfmm", None, 18.0, 60.0, num_gaussians=0)
+    assert list(draw([field])) == ["speed_accuracy.png"]
 
 
 def test_every_curve_has_every_moment_and_lpips_only_where_measured():

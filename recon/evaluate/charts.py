@@ -44,12 +44,14 @@ _LPIPS_ALEX = Quality("LPIPS Alex", lambda point: point.lpips_alex, False)
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """speed_accuracy.png and parsimony.png, and ablation.png where parts were measured; none where nothing was scored.
 
-    Methods that were made for the ablation are drawn there alone.
+    Methods that were made for the ablation are drawn there alone, and fields, which have no Gaussians, not in the second.
     """
     files = {}
     measured = [p for p in points(shared([row for row in rows if not is_variant(row.method)])) if p.psnr is not None]
     if measured:
-        files |= {"speed_accuracy.png": _png(speed_accuracy(measured)), "parsimony.png": _png(parsimony(measured))}
+        files["speed_accuracy.png"] = _png(speed_accuracy(measured))
+    if sized := [p for p in measured if p.num_gaussians]:
+        files["parsimony.png"] = _png(parsimony(sized))
     scored = [row for row in rows if row.final and row.psnr is not None]
     if any(is_variant(row.method) for row in scored):
         files["ablation.png"] = _png(ablation(scored))
