@@ -44,7 +44,7 @@ _LPIPS_ALEX = Quality("LPIPS Alex", lambda point: point.lpips_alex, False)
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """speed_accuracy.png and parsimony.png, and ablation.png where parts were measured; none where nothing was scored.
 
-    Methods that were made for the ablation are drawn there alone, and fields, which have no Gaussians, not in the second.
+    Methods that were made for the ablation are drawn there alone; fields, which have no Gaussians, not in the second.
     """
     files = {}
     measured = [p for p in points(shared([row for row in rows if not is_variant(row.method)])) if p.psnr is not None]
