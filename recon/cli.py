@@ -43,7 +43,9 @@ def replay(args: argparse.Namespace) -> int:
     with viewer(args.out / "view") if args.view else contextlib.nullcontext(_shown_to_nobody) as show:
         snapshot = run(frames, with_looks(config, LOOK_EVERY) if args.view else config, show)
         snapshot = in_metres(snapshot, config.metric)
-        report = finish(snapshot, args.out, seed=config.seed, preset_name=args.preset or "balanced")
+        where = str(args.folder.resolve())
+        preset_name = args.preset or "balanced"
+        report = finish(snapshot, args.out, seed=config.seed, preset_name=preset_name, photographs=where)
         _tell(snapshot, args.out, report, as_json=args.json)
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from capture.frame import DroppedFrame
+from capture.messaging.jpeg import to_jpeg
 from capture.messaging.wire import Message, Numbering, WireError, decode, encode
 from recon.daemon.scene_message import SceneHeader, from_message, to_message
 from recon.snapshot import CameraEstimate, GaussianArrays, Snapshot
@@ -37,7 +38,7 @@ def snapshot(cameras: int = 3, count: int = 10) -> Snapshot:
         verdict=Verdict(Code.OK_PARTIAL, "2 of 3.", "Add one.", ("2.png",), publishable=True),
         cameras=estimates,
         gaussians=GaussianArrays(**arrays, source_frame=np.arange(count, dtype=np.int32)),
-        images={c.name: RANDOM.integers(0, 255, (200, 320, 3), np.uint8) for c in estimates},
+        images={c.name: RANDOM.integers(0, 255, (400, 640, 3), np.uint8) for c in estimates},
         dropped=(DroppedFrame("blurred.png", "blurred"),),
         iterations=50,
         seconds={"poses": 1.5},
@@ -73,7 +74,7 @@ def test_thumbnails_are_small_and_look_like_the_photograph():
     images = from_message(sent(scene)).snapshot.images
     assert list(images) == list(scene.images)
     for name, image in images.items():
-        assert image.shape == (100, 160, 3)
+        assert image.shape == (200, 320, 3)
         assert abs(image.mean() - scene.images[name].mean()) < 1.5
 
 
@@ -91,7 +92,9 @@ def test_a_scene_that_may_not_be_shown_is_a_message_too():
         (lambda arrays: [arrays[0][:, :2], *arrays[1:]], "means"),
         (lambda arrays: [arrays[0], arrays[1][:-1], *arrays[2:]], "quats"),
         (lambda arrays: [*arrays[:5], arrays[5].astype(np.int64), *arrays[6:]], "source_frame"),
-        (lambda arrays: [*arrays[:-1], np.zeros((400, 400, 3), np.uint8)], "thumbnail"),
+        (lambda arrays: [*arrays[:-1], np.zeros((100, 100, 3), np.uint8)], "bytes of a JPEG"),
+        (lambda arrays: [*arrays[:-1], to_jpeg(np.zeros((321, 320, 3), np.uint8), 50)], "more than 102400 pixels"),
+        (lambda arrays: [*arrays[:-1], np.zeros(50, np.uint8)], "cannot be shown"),
     ],
 )
 def test_arrays_that_do_not_belong_to_the_header_are_refused(change, words):

@@ -62,6 +62,14 @@ def test_a_result_is_shown_with_what_is_known_of_it(result, caplog):
     assert len(alone.gaussians) == 225 and not alone.images and "without a report" in alone.verdict.message
 
 
+def test_photographs_are_found_where_the_report_says_that_they_were(result, tmp_path):
+    (result / "images").rename(tmp_path / "holiday")
+    assert not load_result(result).snapshot.images
+    report = json.loads((result / "report.json").read_text())
+    (result / "report.json").write_text(json.dumps(report | {"photographs": str(tmp_path / "holiday")}))
+    assert list(load_result(result).snapshot.images) == ["0.png"]
+
+
 def test_a_refused_result_says_why(tmp_path):
     refused = snapshot(REFUSAL)
     write_result(refused, tmp_path, build_report(refused, seed=0, preset="fast", peak_rss_mb=None))

@@ -132,7 +132,8 @@ class Live:
 def load_result(place: Path, photographs: Path | None = None) -> Moment:
     """The moment in a result's folder or a scene file, with the photographs that are found.
 
-    They are looked for in `photographs`, or else where a result of `splatnode demo` has them and beside the scene.
+    They are looked for in `photographs`, or else where the report says that they were, where a result of
+    `splatnode demo` has them, and beside the scene.
     A folder without a scene must have a report that says why. Raises SceneFileError, FileNotFoundError, ValueError.
     """
     folder = place if place.is_dir() else place.parent
@@ -145,13 +146,14 @@ def load_result(place: Path, photographs: Path | None = None) -> Moment:
         )
     gaussians = read_gaussians(scene) if scene.is_file() else GaussianArrays.empty()
     cameras = read_cameras(folder / "cameras.json") if (folder / "cameras.json").is_file() else ()
-    folders = [photographs] if photographs else [folder / "images", folder / "capture" / "images"]
+    beside = [folder / "images", folder / "capture" / "images"]
+    reported = [Path(there)] if isinstance(there := report.get("photographs"), str) else []
     snapshot = Snapshot(
         sequence=0,
         verdict=_verdict(report),
         cameras=cameras,
         gaussians=gaussians,
-        images=_photographs(cameras, folders),
+        images=_photographs(cameras, [photographs] if photographs else reported + beside),
         dropped=tuple(DroppedFrame(str(one["name"]), str(one["reason"])) for one in report.get("frames_dropped", ())),
         iterations=int(report.get("iterations", 0)),
         seconds={str(stage): float(seconds) for stage, seconds in report.get("seconds", {}).items()},

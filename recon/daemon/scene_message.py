@@ -1,6 +1,7 @@
 """A snapshot as a message, for viewers: without torch on either side.
 
-Arrays: means, quats, scales, opacities, sh, source_frame of the Gaussians, then one thumbnail a camera, in their order.
+Arrays: means, quats, scales, opacities, sh, source_frame of the Gaussians, then of each camera, in their order, a small
+photograph (JPEG).
 """
 
 from __future__ import annotations
@@ -15,11 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from capture.frame import DroppedFrame
+from capture.messaging.jpeg import from_jpeg, to_jpeg
 from capture.messaging.wire import Header, Message, WireError
 from recon.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from recon.verdict import Code, Verdict
 
-THUMBNAIL_SIDE = 160  # pixels
+THUMBNAIL_SIDE = 320  # pixels
+THUMBNAIL_QUALITY = 85  # of 100, as JPEG
 MAX_CAMERAS = 1000
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "source_frame")
 
@@ -87,7 +90,7 @@ def to_message(
         seconds=snapshot.seconds,
         final=snapshot.final,
     )
-    thumbnails = [thumbnail(snapshot.images[camera.name]) for camera in snapshot.cameras]
+    thumbnails = [to_jpeg(thumbnail(snapshot.images[camera.name]), THUMBNAIL_QUALITY) for camera in snapshot.cameras]
     return header, [*(getattr(snapshot.gaussians, name) for name in FIELDS), *thumbnails]
 
 
@@ -98,9 +101,6 @@ def from_message(message: Message[SceneHeader]) -> LiveScene:
     thumbnails = message.arrays[len(FIELDS) :]
     if len(thumbnails) != len(header.cameras):
         raise WireError(f"{len(header.cameras)} cameras with {len(thumbnails)} thumbnails")
-    for image in thumbnails:
-        if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or max(image.shape) > THUMBNAIL_SIDE:
-            raise WireError(f"a thumbnail must be (h, w, 3) uint8 of at most {THUMBNAIL_SIDE} px, got {image.shape}")
     if header.code not in Code.__members__:
         raise WireError(f"no verdict is called {header.code[:40]!r}")
     snapshot = Snapshot(
@@ -115,7 +115,10 @@ def from_message(message: Message[SceneHeader]) -> LiveScene:
         ),
         cameras=tuple(camera_from(record) for record in header.cameras),
         gaussians=gaussians,
-        images={record.name: image for record, image in zip(header.cameras, thumbnails, strict=True)},
+        images={
+            record.name: from_jpeg(jpeg, THUMBNAIL_SIDE)
+            for record, jpeg in zip(header.cameras, thumbnails, strict=True)
+        },
         dropped=tuple(DroppedFrame(name, reason) for name, reason in header.dropped),
         iterations=header.iterations,
         seconds=header.seconds,

@@ -1,0 +1,26 @@
+"""Photographs in messages: JPEG files, with a bound on what a sender may have the receiver decode."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from capture.image_file import UnusableImage, decode_image
+from capture.messaging.wire import WireError
+
+
+def to_jpeg(image: npt.NDArray[np.uint8], quality: int) -> npt.NDArray[np.uint8]:
+    """`image` (H, W, 3) RGB as the bytes (N,) of a JPEG file; `quality` is 1 to 100."""
+    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return np.asarray(jpeg, np.uint8).ravel()
+
+
+def from_jpeg(jpeg: npt.NDArray, largest_side: int) -> npt.NDArray[np.uint8]:
+    """(H, W, 3) RGB. Raises WireError where it is no JPEG, or one of more than `largest_side` squared pixels."""
+    if jpeg.dtype != np.uint8 or jpeg.ndim != 1 or jpeg.size == 0:
+        raise WireError(f"a photograph must be the bytes of a JPEG file, got {jpeg.dtype} {jpeg.shape}")
+    try:
+        return decode_image(jpeg.tobytes(), largest_side**2)[0]
+    except UnusableImage as error:
+        raise WireError(f"a photograph that cannot be shown: {error}") from error
