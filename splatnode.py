@@ -222,7 +222,7 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--headless", action="store_true", help="write pictures instead of opening a window")
     parser.add_argument("--export", type=Path, metavar="FILE.mp4", help="write a turntable, without a window")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where pictures go (default: view, beside the scene)")
-    parser.add_argument("--size", type=_size, default=(960, 720), metavar="WxH", help="of pictures (default: 960x720)")
+    parser.add_argument("--size", type=_size, metavar="WxH", help="of the window, or of pictures (960x720)")
     parser.add_argument("--pictures", type=_positive, default=100, metavar="N", help="of a turntable (default: 100)")
     parser.add_argument("--until-final", action="store_true", help="without a window: stop when a scene is finished")
 

@@ -165,6 +165,11 @@ def test_a_child_that_opens_a_window_names_its_device():
     assert not slow.window and "took more than" in slow.detail
 
 
+def test_a_window_is_opened_smaller_where_the_processor_draws_it():
+    played, card = Probe(True, True, "llvmpipe").size, Probe(True, False, "a card").size
+    assert played[0] * played[1] < 0.8 * card[0] * card[1]
+
+
 def test_cameras_that_nobody_can_look_through_are_told():
     one = camera(0.3)
     assert is_camera(one)

@@ -28,13 +28,15 @@ _NO_OPEN3D = (
     "Pictures need nothing more: splatnode view ... --headless, or --export turntable.mp4"
 )
 
+_PICTURE = 960, 720  # pixels, where no window is opened
+
 
 def view(args: argparse.Namespace) -> int:
     """Shows what `args.what` names. Raises what opening it raises."""
     finished = _finished(args)
     if args.export is not None and (finished is None or args.export.suffix.lower() != ".mp4"):
         raise ValueError("--export needs a finished result and a file that ends with .mp4")
-    width, height = args.size
+    width, height = args.size or _PICTURE
     if args.export is not None and finished is not None:
         print(write_movie(finished, args.export, width, height, args.pictures))
         return EXIT_GOOD
@@ -47,7 +49,8 @@ def view(args: argparse.Namespace) -> int:
         from viewer.window import show  # brings Open3D
 
         background = (lambda: None) if finished is not None else _give_way
-        show(Session(source, State()), software=window.software, screenshots=folder, opened=background)
+        session, size = Session(source, State()), args.size or window.size
+        show(session, software=window.software, screenshots=folder, opened=background, size=size)
     elif finished is not None:
         print(write_series(finished, folder, width, height, args.pictures))
     else:

@@ -37,6 +37,11 @@ class Probe:
     software: bool  # the processor plays the graphics card: Open3D's splats take a second a picture
     detail: str  # the device, or why there is no window and what to do
 
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height to open a window with: the processor pays for each pixel of every picture."""
+        return (1120, 700) if self.software else (1280, 800)
+
 
 def probe_window(command: tuple[str, ...] = (sys.executable, "-c", _TRIAL), timeout_s: float = TIMEOUT_S) -> Probe:
     """Tries to open a window in a child process. It never raises for what it finds."""

@@ -47,7 +47,7 @@ def show(
     software: bool,
     screenshots: Path,
     opened: Callable[[], None] = lambda: None,
-    size: tuple[int, int] = (1280, 800),
+    size: tuple[int, int],
 ) -> None:
     """Opens the window, calls `opened`, and returns when it is closed. Raises what went wrong while it was open.
 

@@ -156,7 +156,8 @@ def main() -> None:
         network = Network(directory=Path(folder))
         with StateServer(RECON_SCENE, network) as server, Publisher(RECON_STATUS, network) as heartbeats:
             server.publish(*to_message(growing(moment.snapshot)[0], "place", Numbering().next()))
-            command = [sys.executable, "-m", "splatnode", "view", str(config), "--out", str(arguments.out)]
+            command = [sys.executable, "-m", "splatnode", "view", str(config), "--size", "x".join(map(str, WINDOW))]
+            command += ["--out", str(arguments.out)]
             viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
             try:
                 drive(moment, server, heartbeats, viewer, arguments.out)

@@ -1,8 +1,8 @@
 """How the viewer does on this machine: `python -m tests.bench viewer RESULT` (a folder of `splatnode demo`).
 
 Needs a display; `xvfb-run -s "-screen 0 1280x800x24" python -m tests.bench viewer ...` makes one. Measured are
-- pictures per second of 30 000 Gaussians in a window of 1280 x 800, by each engine, as Gaussians and as points, and
-  the processor time of one, which other programs disturb less;
+- pictures per second of 30 000 Gaussians in a window of the size that it has here, by each engine, as Gaussians and as
+  points, and the processor time of one, which other programs disturb less;
 - how far apart the pictures of Open3D and of the project's own rasteriser are, at the cameras of the result;
 - the time from the publication of a scene until its colour is on the screen, read back from the X server, and the
   viewer's memory, while scenes grow and shrink at random for some minutes;
@@ -26,13 +26,13 @@ from tests.bench.parts.viewer_agreement import agreement
 from tests.bench.parts.viewer_live import thinned, watch
 from tests.bench.rasterize import processor_name
 from viewer.moment import Moment
+from viewer.probe import probe_window
 from viewer.session import Session
 from viewer.sources import Finished, load_result
 from viewer.state import Engine, State
 from viewer.viewpoint import orbited
 
 GAUSSIANS = 30_000
-WINDOW = 1280, 800
 VIEWS = 24  # pictures that are timed
 PARTS = ("pictures", "agreement", "live")
 CASES = [(engine, as_points) for engine in Engine for as_points in (False, True)]
@@ -60,7 +60,7 @@ def main() -> None:
         f"--period-s {arguments.period_s:g} --parts {' '.join(arguments.parts)}",
         "machine": {"processor": processor_name(), "processors": os.cpu_count(), "load_average": os.getloadavg()[0]},
         "gaussians": GAUSSIANS,
-        "window": WINDOW,
+        "window": probe_window().size,
     }
     if "pictures" in arguments.parts:
         report["pictures"] = {
@@ -116,7 +116,7 @@ def time_pictures(result: Path, engine: Engine, as_points: bool) -> dict:
 
     tour = Tour(thinned(load_result(result), GAUSSIANS), State(as_points=as_points))
     with contextlib.suppress(TourOver):
-        show(tour, software=engine is Engine.CORE, screenshots=result, size=WINDOW)
+        show(tour, software=engine is Engine.CORE, screenshots=result, size=probe_window().size)
     seconds = np.diff(tour.ticks)[2:]
     processor = (tour.processor[-1] - tour.processor[2]) / (len(tour.processor) - 3)
     return {
