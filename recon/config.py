@@ -27,7 +27,6 @@ class PriorChoice(Plugin):
 
 PRUNING = ControlChoice("prune", prune.Config())
 FITTING = optimize.Config(half_resolution_share=0.0, dssim=0.4, control=PRUNING, dropout=dropout.Config(share=0.4))
-HASTY = replace(FITTING, half_resolution_share=0.25)  # a little less sharp
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -64,8 +63,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 PRESETS: dict[str, Config] = {
-    "preview": Config(size=384, optimize=replace(HASTY, iterations=150)),
-    "fast": Config(optimize=replace(HASTY, iterations=250)),
+    "preview": Config(size=384, optimize=replace(FITTING, half_resolution_share=0.25, iterations=150)),
+    "fast": Config(optimize=replace(FITTING, iterations=200)),
     "balanced": Config(),
     "quality": Config(optimize=replace(FITTING, iterations=1500, checkpoints=(150, 500))),
 }
