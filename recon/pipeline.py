@@ -112,7 +112,8 @@ class Reconstruction:
     @property
     def aside(self) -> list[Keyframe]:
         """Keyframes that are known and do not belong to the scene, in the order in which their frames came."""
-        found = [keyframe for keyframe in self._beside.keyframes if keyframe.name not in set(self.names)]
+        belonging = set(self.names)
+        found = [keyframe for keyframe in self._beside.keyframes if keyframe.name not in belonging]
         return sorted(found, key=lambda keyframe: keyframe.frame.frame_id)
 
     def drop(self, frame: DroppedFrame) -> None:

@@ -153,14 +153,19 @@ def test_key_frames_become_a_scene_that_survives_the_process_and_forgets_what_it
         assert peer.heard[-1].snapshot.dropped == less.snapshot.dropped
 
 
+def offer_when_three_are_shown(peer, frames) -> None:
+    """The first three frames, and the others once there is a scene of those."""
+    for frame in frames[:3]:
+        peer.server.offer(frame)
+    peer.wait(lambda scene: len(scene.snapshot.cameras) == 3, "a scene of the first three")
+    for frame in frames[3:]:
+        peer.server.offer(frame)
+
+
 def test_another_place_begins_another_scene_and_the_old_one_is_exported(config, peer):
     frames = places(seeds=(0, 1))
     with running(replace(config, lost_after=3)):
-        for frame in frames[:3]:
-            peer.server.offer(frame)
-        peer.wait(lambda scene: len(scene.snapshot.cameras) == 3, "the first place")
-        for frame in frames[3:]:
-            peer.server.offer(frame)
+        offer_when_three_are_shown(peer, frames)
         other = peer.wait(lambda scene: scene.scene_id == "scene-0002", "another place")
         assert {camera.name for camera in other.snapshot.cameras} <= {frame.name for frame in frames[3:]}
         peer.wait_for_acknowledgements()
@@ -173,11 +178,7 @@ def test_key_frames_that_do_not_fit_at_once_join_the_scene_when_all_are_judged_t
     monkeypatch.setattr("recon.judging.BEYOND_DOUBT", 10**6)  # points: nothing fits at once
     frames = photographs()
     with running(replace(config, lost_after=3)):
-        for frame in frames[:3]:
-            peer.server.offer(frame)
-        peer.wait(lambda scene: len(scene.snapshot.cameras) == 3, "three cameras")
-        for frame in frames[3:]:
-            peer.server.offer(frame)
+        offer_when_three_are_shown(peer, frames)
         whole = peer.wait(lambda scene: len(scene.snapshot.cameras) == 6, "all cameras")
         assert whole.scene_id == "scene-0001" and not whole.snapshot.verdict.provisional
         peer.wait_for_acknowledgements()

@@ -94,6 +94,7 @@ def test_a_scene_that_may_not_be_shown_is_a_message_too():
         (lambda arrays: [*arrays[:5], arrays[5].astype(np.int64), *arrays[6:]], "source_frame"),
         (lambda arrays: [*arrays[:-1], np.zeros((100, 100, 3), np.uint8)], "bytes of a JPEG"),
         (lambda arrays: [*arrays[:-1], to_jpeg(np.zeros((321, 320, 3), np.uint8), 50)], "more than 102400 pixels"),
+        (lambda arrays: [*arrays[:-1], to_jpeg(np.zeros((321, 10, 3), np.uint8), 50)], "at most 320 pixels"),
         (lambda arrays: [*arrays[:-1], np.zeros(50, np.uint8)], "cannot be shown"),
     ],
 )

@@ -17,10 +17,13 @@ def to_jpeg(image: npt.NDArray[np.uint8], quality: int) -> npt.NDArray[np.uint8]
 
 
 def from_jpeg(jpeg: npt.NDArray, largest_side: int) -> npt.NDArray[np.uint8]:
-    """(H, W, 3) RGB. Raises WireError where it is no JPEG, or one of more than `largest_side` squared pixels."""
+    """(H, W, 3) RGB. Raises WireError where it is no JPEG, or one with a side of more than `largest_side` pixels."""
     if jpeg.dtype != np.uint8 or jpeg.ndim != 1 or jpeg.size == 0:
         raise WireError(f"a photograph must be the bytes of a JPEG file, got {jpeg.dtype} {jpeg.shape}")
     try:
-        return decode_image(jpeg.tobytes(), largest_side**2)[0]
+        image = decode_image(jpeg.tobytes(), largest_side**2)[0]
     except UnusableImage as error:
         raise WireError(f"a photograph that cannot be shown: {error}") from error
+    if max(image.shape) > largest_side:
+        raise WireError(f"a photograph must be at most {largest_side} pixels long, got {image.shape}")
+    return image

@@ -47,28 +47,32 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="where the figures go, as JSON")
     parser.add_argument("--child", choices=("pictures", "agreement"), help="used by this program itself")
     parser.add_argument("--case", type=int, default=0, help="used by this program itself")
+    parser.add_argument("--window", type=int, nargs=2, help="used by this program itself")
     arguments = parser.parse_args()
     if arguments.child == "pictures":
-        print(json.dumps(time_pictures(arguments.result, *CASES[arguments.case])), flush=True)
+        print(json.dumps(time_pictures(arguments.result, *CASES[arguments.case], arguments.window)), flush=True)
         os._exit(0)  # Open3D is not asked to take itself down
     if arguments.child == "agreement":
         print(json.dumps(agreement(arguments.result)), flush=True)
         os._exit(0)
 
+    window = probe_window().size
     report = {
         "command": f"python -m tests.bench viewer RESULT --minutes {arguments.minutes:g} "
         f"--period-s {arguments.period_s:g} --parts {' '.join(arguments.parts)}",
         "machine": {"processor": processor_name(), "processors": os.cpu_count(), "load_average": os.getloadavg()[0]},
         "gaussians": GAUSSIANS,
-        "window": probe_window().size,
+        "window": window,
     }
     if "pictures" in arguments.parts:
         report["pictures"] = {
-            f"{engine.name.lower()} {'points' if as_points else 'Gaussians'}": in_child(arguments.result, case)
+            f"{engine.name.lower()} {'points' if as_points else 'Gaussians'}": in_child(
+                arguments.result, "pictures", "--case", str(case), "--window", *map(str, window)
+            )
             for case, (engine, as_points) in enumerate(CASES)
         }
     if "agreement" in arguments.parts:
-        report["agreement"] = in_child(arguments.result, None)
+        report["agreement"] = in_child(arguments.result, "agreement")
     if "live" in arguments.parts:
         report["live"] = watch(arguments.result, arguments.minutes, arguments.period_s)
     report["machine"]["load_average_after"] = os.getloadavg()[0]
@@ -77,10 +81,9 @@ def main() -> None:
         arguments.out.write_text(json.dumps(report, indent=1) + "\n")
 
 
-def in_child(result: Path, case: int | None) -> dict:
+def in_child(result: Path, *what: str) -> dict:
     """What a process of its own measures: Open3D keeps what it has allocated, and may end the process."""
-    what = ["--child", "agreement"] if case is None else ["--child", "pictures", "--case", str(case)]
-    command = [sys.executable, "-m", "tests.bench", "viewer", str(result), *what]
+    command = [sys.executable, "-m", "tests.bench", "viewer", str(result), "--child", *what]
     done = subprocess.run(command, capture_output=True, text=True)
     lines = [line for line in done.stdout.splitlines() if line.startswith("{")]
     return json.loads(lines[-1]) if lines else {"failed": done.returncode, "said": done.stderr[-500:]}
@@ -110,13 +113,13 @@ class Tour(Session):
         return came or view is not None
 
 
-def time_pictures(result: Path, engine: Engine, as_points: bool) -> dict:
+def time_pictures(result: Path, engine: Engine, as_points: bool, window: tuple[int, int]) -> dict:
     """Seconds from picture to picture while the viewpoint moves, the first ones left out."""
     from viewer.window import show
 
     tour = Tour(thinned(load_result(result), GAUSSIANS), State(as_points=as_points))
     with contextlib.suppress(TourOver):
-        show(tour, software=engine is Engine.CORE, screenshots=result, size=probe_window().size)
+        show(tour, software=engine is Engine.CORE, screenshots=result, size=window)
     seconds = np.diff(tour.ticks)[2:]
     processor = (tour.processor[-1] - tour.processor[2]) / (len(tour.processor) - 3)
     return {
