@@ -61,7 +61,10 @@ class Recorder:
 
     def close(self) -> None:
         self._sync()
+        empty = not self._index.tell()
         self._index.close()
+        if empty:  # a camera that never came: the folder can be recorded into when it does
+            (self.folder / INDEX).unlink()
 
     def write(self, item: Frame | DroppedFrame) -> None:
         """Raises OSError; the frames before it stay."""

@@ -7,7 +7,7 @@ import contextlib
 import json
 import shlex
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -29,7 +29,7 @@ from recon.evaluate.truth import load_scene
 from recon.metric import in_metres
 from recon.pipeline import reconstruct
 from recon.rasterize.cpu import rasterize
-from recon.result import finish
+from recon.result import check_writable, finish
 from recon.snapshot import Snapshot
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
@@ -38,8 +38,10 @@ LOOK_EVERY = 50  # iterations between the snapshots that a viewer is shown
 
 def replay(args: argparse.Namespace) -> int:
     """Reconstructs a folder of photographs."""
-    frames = folder.stream(folder.Config(folder=args.folder, names=_chosen(args)))
     config = _config(args)
+    frames = list(folder.stream(folder.Config(folder=args.folder, names=_chosen(args))))
+    _check_baseline(config, [frame.name for frame in frames])
+    check_writable(args.out)
     with viewer(args.out / "view") if args.view else contextlib.nullcontext(_shown_to_nobody) as show:
         snapshot = run(frames, with_looks(config, LOOK_EVERY) if args.view else config, show)
         snapshot = in_metres(snapshot, config.metric)
@@ -48,6 +50,13 @@ def replay(args: argparse.Namespace) -> int:
         report = finish(snapshot, args.out, seed=config.seed, preset_name=preset_name, photographs=where)
         _tell(snapshot, args.out, report, as_json=args.json)
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
+
+
+def _check_baseline(config: Config, names: Sequence[str]) -> None:
+    """Raises ValueError before the work where a measured distance names a photograph that is not there."""
+    missing = [name for name in (config.metric.baseline or ())[:2] if name not in names]
+    if missing:
+        raise ValueError(f"the baseline's photograph {missing[0]!r} is not there; there are: {', '.join(names)}")
 
 
 def _shown_to_nobody(snapshot: Snapshot) -> None:
@@ -77,6 +86,7 @@ def run(
 def demo(args: argparse.Namespace) -> int:
     """Writes the built-in capture, reconstructs it, and measures the result on views that it has not seen."""
     seed = args.seed or 0
+    check_writable(args.out)
     capture = args.out / "capture"
     split = write_capture(capture, synthetic.Config(seed=seed))
     config = msgspec.structs.replace(preset("balanced"), seed=seed)

@@ -28,7 +28,6 @@ REQUIRED = {
     "msgspec": "msgspec",
     "numpy": "numpy",
     "poselib": "poselib",
-    "pycolmap": "pycolmap",
     "scipy": "scipy",
     "torch": "torch",
     "yaml": "pyyaml",
@@ -38,6 +37,7 @@ REQUIRED = {
 # Import name -> (distribution, the extra that brings it, what it is for).
 OPTIONAL = {
     "matplotlib": ("matplotlib", "bench", "charts of splatnode bench"),
+    "pycolmap": ("pycolmap", "bench", "true cameras in COLMAP's format, and COLMAP as a rival"),
     "open3d": ("open3d", "viewer", "the viewer"),
     "depthai": ("depthai", "oak", "Luxonis cameras"),
     "gsplat": ("gsplat", "cuda", "the rasteriser for NVIDIA processors"),

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
-from recon.export import write_result
+from recon.export import write_file, write_result
 from recon.preview import contact_sheet
 from recon.report import build_report, peak_rss_mb
 from recon.snapshot import Snapshot
+
+
+def check_writable(out: Path) -> None:
+    """Raises ResultWriteError where nothing could be written into the folder `out`: before the work, not after it."""
+    probe = out / f".writable-{os.getpid()}"
+    write_file(probe, b"")
+    probe.unlink()
 
 
 def finish(snapshot: Snapshot, out: Path, *, seed: int, preset_name: str, **extra: object) -> dict[str, object]:

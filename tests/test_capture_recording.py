@@ -106,6 +106,12 @@ def test_nothing_is_written_over(tmp_path):
         Recorder(tmp_path)
 
 
+def test_a_camera_that_never_came_leaves_a_folder_to_record_into(tmp_path):
+    sent = frames()
+    record(tmp_path, [])
+    assert seen(folder.stream(folder.Config(record(tmp_path, sent)))) == seen(sent)
+
+
 def test_a_full_disk_leaves_what_was_recorded(tmp_path, monkeypatch):
     first, second = frames()[:2]
     with Recorder(tmp_path / "walk") as recorder:

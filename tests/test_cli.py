@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import errno
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -192,6 +193,15 @@ def test_doctor_finds_the_core_and_what_it_needs(capsys):
     assert splatnode.main(["doctor", "--json"]) == 0
     states = {finding["name"]: finding["state"] for finding in json.loads(capsys.readouterr().out)}
     assert states["core"] == states["torch"] == states["numpy"] == "ok"
+
+
+def test_doctor_demands_what_an_installation_brings_and_no_more():
+    from importlib.metadata import requires
+
+    from recon import doctor
+
+    plain = [line for line in requires("splatnode") or () if "extra ==" not in line]
+    assert set(doctor.REQUIRED.values()) == {re.split(r"[<>=!~ ]", line)[0].lower() for line in plain}
 
 
 def test_doctor_fails_when_the_core_is_missing(monkeypatch, capsys):

@@ -1,4 +1,5 @@
 import math
+import os
 import struct
 
 import cv2
@@ -193,7 +194,6 @@ def test_a_damaged_png_chunk(tmp_path):
         ("text.png", b"hello, this is text", "not an image"),
         ("sound.webp", b"RIFF\x10\0\0\0WAVEfmt \0\0\0\0", "not an image"),
         ("headless.jpg", b"\xff\xd8\xff\xe0\0\x04ab\xff\xd9", "without an image"),
-        ("phone.heic", b"\0\0\0\x18ftypheic", "convert it to JPEG"),
         ("short.png", b"\x89PNG\r\n\x1a\n", "truncated"),
         ("short.tif", b"II*\0\xff\0\0\0", "truncated"),
         ("short.bmp", b"BM123", "truncated"),
@@ -203,6 +203,13 @@ def test_foreign_content_is_named_and_left_out(tmp_path, name, data, reason):
     dropped = read_one(tmp_path, name, data)
     assert isinstance(dropped, DroppedFrame)
     assert reason in dropped.reason
+
+
+def test_a_photograph_in_a_foreign_format_is_named_beside_others(tmp_path):
+    (tmp_path / "1.jpg").write_bytes(encoded())
+    (tmp_path / "2.heic").write_bytes(b"\0\0\0\x18ftypheic")
+    _, dropped = stream(Config(tmp_path))
+    assert dropped == DroppedFrame("2.heic", ".heic files cannot be read; convert it to JPEG or PNG")
 
 
 def test_too_many_pixels_are_refused_before_they_are_decoded(tmp_path):
@@ -238,8 +245,20 @@ def test_other_files_are_not_for_us(tmp_path):
     read_one(tmp_path, "a.jpg", encoded())
 
 
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.jpg")
+    read_one(tmp_path, "a.jpg", encoded())
+
+
+def test_names_become_text_of_one_line(tmp_path):
+    for name in (b"\xff\xfe1.jpg", b"2\n.jpg", "3 \u5199\u771f.jpg".encode()):
+        (tmp_path / os.fsdecode(name)).write_bytes(encoded())
+    names = {frame.name for frame in stream(Config(tmp_path))}
+    assert names == {"\\udcff\\udcfe1.jpg", "2\\n.jpg", "3 \u5199\u771f.jpg"}
+
+
 def test_nothing_to_stream_says_what_to_do(tmp_path):
-    with pytest.raises(FileNotFoundError, match="give a folder"):
+    with pytest.raises(FileNotFoundError, match="is not there; give a folder"):
         stream(Config(tmp_path / "nowhere"))
     with pytest.raises(ValueError, match="no photographs"):
         stream(Config(tmp_path))
@@ -247,5 +266,11 @@ def test_nothing_to_stream_says_what_to_do(tmp_path):
     (tmp_path / "images" / "a.jpg").write_bytes(encoded())
     with pytest.raises(ValueError, match="give one of its folders: images"):
         stream(Config(tmp_path))
+    with pytest.raises(FileNotFoundError, match="is a file, not a folder"):
+        stream(Config(tmp_path / "images" / "a.jpg"))
+    (tmp_path / "phone").mkdir()
+    (tmp_path / "phone" / "IMG_1.HEIC").write_bytes(b"\0\0\0\x18ftypheic")
+    with pytest.raises(ValueError, match="holds only .heic files; convert them"):
+        stream(Config(tmp_path / "phone"))
     with pytest.raises(ValueError, match="no photograph named b.jpg"):
         stream(Config(tmp_path / "images", names=("b.jpg",)))

@@ -69,32 +69,47 @@ def _looped(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: int) -> I
 def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]:
     frame_id = 0
     for path in paths:
+        name = frame_name(path)
         if path.suffix.lower() in FOREIGN_SUFFIXES:
-            yield DroppedFrame(path.name, f"{path.suffix.lower()} files cannot be read; convert it to JPEG or PNG")
+            yield DroppedFrame(name, f"{path.suffix.lower()} files cannot be read; convert it to JPEG or PNG")
             continue
         try:
             data = path.read_bytes()
             image, intrinsics = decode_image(data, config.max_pixels)
         except UnusableImage as error:
-            yield DroppedFrame(path.name, str(error))
+            yield DroppedFrame(name, str(error))
         except OSError as error:
-            yield DroppedFrame(path.name, f"cannot be read: {error.strerror}")
+            yield DroppedFrame(name, f"cannot be read: {error.strerror}")
         else:
             height, width = image.shape[:2]
             if config.intrinsics is not None and _same_aspect(config.intrinsics, width, height):
                 intrinsics = config.intrinsics.resized(width, height)
             stamp_ns = round(frame_id / config.frames_per_second * 1e9)
-            yield Frame(frame_id, path.name, stamp_ns, image, intrinsics, encoded=data)
+            yield Frame(frame_id, name, stamp_ns, image, intrinsics, encoded=data)
             frame_id += 1
 
 
+def frame_name(path: Path) -> str:
+    """The file's name as text of one line: bytes that are no UTF-8, and control characters, are written as escapes.
+
+    Names go into messages, JSON and lists of cameras, where a stray byte or a line break would end the reconstruction.
+    """
+    escaped = (char if char.isprintable() else char.encode("unicode_escape").decode() for char in path.name)
+    return "".join(escaped)
+
+
 def image_paths(folder: Path) -> list[Path]:
-    """The photographs that lie in `folder` itself, by their suffix, in natural order; hidden files are not for us."""
+    """The photographs that lie in `folder` itself, by their suffix, in natural order; hidden files are not for us.
+
+    Nor are folders, pipes and devices, which could be waited for for ever. A link to nothing is: it will be named.
+    """
     if not folder.is_dir():
-        raise FileNotFoundError(f"no folder {str(folder)!r}; give a folder that holds JPEG or PNG photographs")
+        found = "is a file, not" if folder.exists() else "is not there; give"
+        raise FileNotFoundError(f"{str(folder)!r} {found} a folder that holds JPEG or PNG photographs")
     suffixes = DECODED_SUFFIXES | FOREIGN_SUFFIXES
-    visible = [path for path in folder.iterdir() if not path.name.startswith(".") and not path.is_dir()]
-    return sorted((path for path in visible if path.suffix.lower() in suffixes), key=natural_order)
+    visible = [path for path in folder.iterdir() if not path.name.startswith(".")]
+    chosen = [path for path in visible if path.suffix.lower() in suffixes and (path.is_file() or not path.exists())]
+    return sorted(chosen, key=natural_order)
 
 
 def chosen_images(folder: Path, names: tuple[str, ...] = ()) -> list[Path]:
@@ -104,6 +119,9 @@ def chosen_images(folder: Path, names: tuple[str, ...] = ()) -> list[Path]:
         inside = sorted(child.name for child in folder.iterdir() if child.is_dir() and image_paths(child))
         advice = f"give one of its folders: {', '.join(inside)}" if inside else "give a folder of JPEGs or PNGs"
         raise ValueError(f"no photographs in {str(folder)!r}; {advice}")
+    foreign = sorted({path.suffix.lower() for path in paths})
+    if FOREIGN_SUFFIXES.issuperset(foreign):
+        raise ValueError(f"{str(folder)!r} holds only {', '.join(foreign)} files; convert them to JPEG or PNG")
     missing = [name for name in names if not any(name in (path.name, path.stem) for path in paths)]
     if missing:
         present = ", ".join(path.name for path in paths[:5]) + (", ..." if len(paths) > 5 else "")
