@@ -15,13 +15,15 @@ import numpy as np
 import pytest
 
 import splatnode
+from capture.verb import Verb
 from recon.export import FORMATS, ResultWriteError
 from recon.snapshot import GaussianArrays
+from recon.verbs import EXPORT_FILES
 from tests.conftest import ROOT
 
 
 def run_verb(monkeypatch, command, *arguments):
-    verb = splatnode.Verb("act", "for the test", lambda parser: None, command)
+    verb = Verb("act", "for the test", lambda parser: None, command)
     monkeypatch.setattr(splatnode, "VERBS", (verb,))
     return splatnode.main(["act", *arguments])
 
@@ -33,13 +35,16 @@ def raising(error):
     return command
 
 
-def test_help_loads_no_room():
+def test_help_loads_nothing_but_the_verbs():
     code = (
         "import sys, splatnode\n"
         "splatnode.build_parser().format_help()\n"
-        "print(sorted({'capture', 'recon', 'viewer', 'numpy', 'torch', 'cv2'} & set(sys.modules)))"
+        "print(*sorted(name for name in sys.modules if name.startswith(('capture.', 'recon.', 'viewer.'))))\n"
+        "print(sorted({'cv2', 'msgspec', 'numpy', 'torch', 'zmq'} & set(sys.modules)))"
     )
-    assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).strip() == "[]"
+    loaded, heavy = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).splitlines()
+    assert loaded == "capture.arguments capture.verb capture.verbs recon.verbs viewer.verbs"
+    assert heavy == "[]"
 
 
 def test_openmp_threads_sleep_while_they_wait():
@@ -85,13 +90,14 @@ def test_the_verb_decides_the_exit_code(monkeypatch, code):
 def test_signals_end_a_verb_cleanly(number, code):
     program = (
         "import sys, time, splatnode\n"
+        "from capture.verb import Verb\n"
         "def wait(args):\n"
         "    try:\n"
         "        print('ready', flush=True)\n"
         "        time.sleep(60)\n"
         "    finally:\n"
         "        print('tidied', flush=True)\n"
-        "splatnode.VERBS = (splatnode.Verb('wait', '', lambda parser: None, wait),)\n"
+        "splatnode.VERBS = (Verb('wait', '', lambda parser: None, wait),)\n"
         "sys.exit(splatnode.main(['wait']))"
     )
     process = subprocess.Popen(
@@ -166,7 +172,7 @@ def test_bench_lists_are_parsed():
 
 
 def test_export_offers_the_formats_that_there_are():
-    assert set(splatnode.EXPORT_FILES) == set(FORMATS)
+    assert set(EXPORT_FILES) == set(FORMATS)
 
 
 def test_export_writes_beside_the_scene_but_never_over_a_file(tmp_path, capsys):

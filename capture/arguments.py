@@ -1,0 +1,64 @@
+"""The kinds of values that arguments of the command line take. What is wrong with one is said in terms of the user."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+
+
+def _whole_number(least: int) -> Callable[[str], int]:
+    def convert(text: str) -> int:
+        if not text.strip().isdecimal() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"must be a whole number, {least} or more; got {text!r}")
+        return int(text)
+
+    return convert
+
+
+positive, natural = _whole_number(1), _whole_number(0)
+
+
+def seconds(text: str) -> float:
+    """A time in seconds, above 0."""
+    return _above_zero(text, "seconds")
+
+
+def megabytes(text: str) -> float:
+    """A size in 10^6 bytes, above 0."""
+    return _above_zero(text, "megabytes")
+
+
+def _above_zero(text: str, unit: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"must be a number of {unit} above 0; got {text!r}")
+    return number
+
+
+def names(text: str) -> tuple[str, ...]:
+    """Values with commas between them: a,b,c."""
+    names = tuple(name.strip() for name in text.split(","))
+    if not all(names):
+        raise argparse.ArgumentTypeError(f"must be values with commas between them; got {text!r}")
+    return names
+
+
+def size(text: str) -> tuple[int, int]:
+    """WIDTHxHEIGHT in pixels."""
+    sides = [int(side) for side in text.split("x") if side.isdecimal()]
+    if len(sides) != 2 or not 16 <= min(sides) <= max(sides) <= 4096:
+        raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT, from 16 to 4096 pixels; got {text!r}")
+    return sides[0], sides[1]
+
+
+def counts(text: str) -> tuple[int, ...]:
+    """Whole numbers above 0 with commas between them: 3,6,12."""
+    return tuple(positive(name) for name in names(text))
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print one JSON object for programs")

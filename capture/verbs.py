@@ -1,0 +1,43 @@
+"""The verbs of the command line that concern cameras and messages: their arguments, and what runs them."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from capture.arguments import add_json, seconds
+from capture.verb import Verb, lazily
+
+
+def _camera_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML that names the camera; see configs/")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="a change to it, such as camera.loops=2"
+    )
+
+
+def _record_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="a new folder for the recording")
+    parser.add_argument("--seconds", type=seconds, metavar="S", help="stop after so many seconds")
+    _camera_arguments(parser)
+
+
+def _keys_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="where this machine's keys are, or will be made")
+    change = parser.add_mutually_exclusive_group()
+    change.add_argument("--allow", nargs=2, metavar=("NAME", "KEY"), help="let the machine with this public key in")
+    change.add_argument("--server", metavar="KEY", help="connect to the machine with this public key")
+
+
+def _status_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--config", type=Path, metavar="FILE", help="where it says how to reach the processes: network")
+    add_json(parser)
+
+
+VERBS = (
+    Verb("capture", "run the camera's process", _camera_arguments, lazily("capture.cli", "capture")),
+    Verb("record", "write what a camera sees into a folder", _record_arguments, lazily("capture.cli", "record")),
+    Verb("find", "list the cameras that are connected", add_json, lazily("capture.cli", "find")),
+    Verb("keys", "make this machine's keys; say who may connect", _keys_arguments, lazily("capture.cli", "keys")),
+    Verb("status", "tell how the running processes are", _status_arguments, lazily("capture.cli", "status")),
+)

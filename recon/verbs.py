@@ -1,0 +1,144 @@
+"""The verbs of the command line that reconstruct, convert and measure: their arguments, and what runs them.
+
+A flag of the reconstruction that is not given is None, so that the configuration file, then the preset, decides.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from capture.arguments import add_json, counts, megabytes, names, natural, positive, seconds
+from capture.verb import Verb, lazily
+
+EXPORT_FILES = {  # where each format goes, beside the scene
+    "ply": "scene.ply",
+    "spz": "scene.spz",
+    "splat": "scene.splat",
+    "colmap": "colmap",
+    "nerfstudio": "transforms.json",
+    "tum": "trajectory.tum",
+}
+
+
+def _demo_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: out/demo")
+    parser.add_argument("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)")
+    add_json(parser)
+
+
+def _replay_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, metavar="FOLDER", help="photographs of one place, in any order")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with what differs from the defaults")
+    parser.add_argument("--preset", metavar="P", help="a named set of parameters (default: balanced)")
+    parser.add_argument("--prior", metavar="K", help="what gives poses and first points (default: classical)")
+    parser.add_argument("--size", type=positive, metavar="PIXELS", help="longer side as modelled (default: 512)")
+    parser.add_argument("--budget-s", type=seconds, metavar="S", help="the best scene within this many seconds")
+    parser.add_argument("--max-gaussians", type=positive, metavar="N", help="and with at most so many Gaussians")
+    parser.add_argument("--max-mb", type=megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes")
+    parser.add_argument(
+        "--baseline", nargs=3, metavar=("A", "B", "METRES"), help="how far apart photographs A and B were taken"
+    )
+    parser.add_argument("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)")
+    parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
+    chosen = parser.add_mutually_exclusive_group()
+    chosen.add_argument("--views", type=positive, metavar="N", help="use N frames, evenly spread")
+    chosen.add_argument("--frames", type=names, metavar="A,B,C", help="use these frames, by name")
+    add_json(parser)
+
+
+def _recon_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("config", type=Path, nargs="?", metavar="CONFIG", help="YAML: what differs from the defaults")
+    parser.add_argument("--checkpoint", type=Path, metavar="DIR", help="what a killed daemon goes on from")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where finished scenes go (default: out)")
+
+
+def _retract_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("name", metavar="NAME", help="of the key frame, as the viewer and the report show it")
+    parser.add_argument("--config", type=Path, metavar="CONFIG", help="of the daemon; default: the one on this machine")
+
+
+def _export_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="a result's folder, or a .ply, .spz or .splat file")
+    parser.add_argument("--to", required=True, choices=EXPORT_FILES, help="the format")
+    parser.add_argument("--out", type=Path, metavar="PATH", help="default: beside the scene")
+
+
+def _export(args: argparse.Namespace) -> int:
+    from recon.export import export_scene
+
+    beside = args.scene if args.scene.is_dir() else args.scene.parent
+    destination = args.out or beside / EXPORT_FILES[args.to]
+    if args.out is None and destination.exists():
+        raise ValueError(f"{destination} is there already: give another place with --out PATH")
+    print(export_scene(args.scene, args.to, destination))
+    return 0
+
+
+def _bench_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scenes", type=Path, nargs="*", metavar="SCENE", help="folders with images and true cameras")
+    parser.add_argument(
+        "--views", type=counts, default=(3, 6, 12), metavar="N,N,N", help="training views (default: 3,6,12)"
+    )
+    parser.add_argument(
+        "--methods",
+        type=names,
+        default=("balanced",),
+        metavar="A,B,C",
+        help="by name, or the sets presets, rivals, ablation (default: balanced)",
+    )
+    parser.add_argument("--checkpoints", type=counts, default=(), metavar="N,N", help="iterations scored on the way")
+    parser.add_argument("--seeds", type=positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--resume", action="store_true", help="go on: runs that --out holds are not run again")
+    parser.add_argument(
+        "--redraw", type=Path, nargs="+", metavar="BENCH.json", help="measure nothing: tables and charts of these"
+    )
+    parser.add_argument("--weights-dir", type=Path, metavar="DIR", help="LPIPS networks (default: $SPLATNODE_WEIGHTS)")
+
+
+def _stability_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "scenes", type=Path, nargs="*", metavar="SCENE", help="folders with images and true cameras (default: built in)"
+    )
+    parser.add_argument("--rows", type=counts, default=(), metavar="N,N", help="rows of the matrix (default: all)")
+    parser.add_argument("--seeds", type=positive, default=4, metavar="N", help="trials of each row (default: 4)")
+    parser.add_argument(
+        "--methods", type=names, default=("splatnode",), metavar="A,B,C", help="splatnode, colmap, glomap"
+    )
+    parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="trials at a time (default: 1)")
+    parser.add_argument("--timeout-s", type=seconds, default=120.0, metavar="S", help="of one trial (default: 120)")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="trials that it holds are not run again")
+
+
+def _weights_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("action", choices=("list", "fetch", "verify"))
+    parser.add_argument("names", nargs="*", metavar="NAME", help="which (list and verify: all, if none is named)")
+    parser.add_argument(
+        "--from", dest="source", type=Path, metavar="FOLDER", help="take them from a folder: no network"
+    )
+    add_json(parser)
+
+
+VERBS = (
+    Verb("demo", "reconstruct the built-in capture", _demo_arguments, lazily("recon.cli", "demo")),
+    Verb("replay", "reconstruct a folder of photographs", _replay_arguments, lazily("recon.cli", "replay")),
+    Verb("export", "write a scene in another format", _export_arguments, _export),
+    Verb("recon", "reconstruct what comes, for ever", _recon_arguments, lazily("recon.daemon.daemon", "recon")),
+    Verb("retract", "take a key frame back", _retract_arguments, lazily("recon.daemon.control", "retract")),
+    Verb("bench", "measure held-out quality, poses and seconds", _bench_arguments, lazily("recon.cli", "bench")),
+    Verb(
+        "stability",
+        "measure how often the answer is wrong",
+        _stability_arguments,
+        lazily("recon.evaluate.stability.command", "stability"),
+    ),
+    Verb(
+        "weights",
+        "get and check the weights of optional networks",
+        _weights_arguments,
+        lazily("recon.weights", "command"),
+    ),
+    Verb("doctor", "tell what is installed and what is missing", add_json, lazily("recon.doctor", "doctor")),
+)

@@ -1,0 +1,29 @@
+"""The verb of the command line that shows things: its arguments, and what runs it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from capture.arguments import positive, size
+from capture.verb import Verb, lazily
+
+
+def _view_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "what",
+        type=Path,
+        nargs="?",
+        metavar="SCENE|DIR|CONFIG",
+        help="a scene file, a result's folder, or a node's configuration (.yaml); default: the node on this machine",
+    )
+    parser.add_argument("--photographs", type=Path, metavar="DIR", help="where a finished result's photographs are")
+    parser.add_argument("--headless", action="store_true", help="write pictures instead of opening a window")
+    parser.add_argument("--export", type=Path, metavar="FILE.mp4", help="write a turntable, without a window")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where pictures go (default: view, beside the scene)")
+    parser.add_argument("--size", type=size, metavar="WxH", help="of the window, or of pictures (960x720)")
+    parser.add_argument("--pictures", type=positive, default=100, metavar="N", help="of a turntable (default: 100)")
+    parser.add_argument("--until-final", action="store_true", help="without a window: stop when a scene is finished")
+
+
+VERBS = (Verb("view", "show a result, a scene or a running node", _view_arguments, lazily("viewer.cli", "view")),)
