@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from capture.messaging.keyframes import ReceivedFrame
+from capture.messaging.keyframe_messages import ReceivedFrame
 from recon import optimize
 from recon.config import Config
 from recon.daemon import checkpoint

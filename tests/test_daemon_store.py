@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from capture.frame import DroppedFrame, Frame, Intrinsics
-from capture.messaging.keyframes import ReceivedFrame
+from capture.messaging.keyframe_messages import ReceivedFrame
 from recon.daemon import store as store_module
 from recon.daemon.store import REMEMBERED_DROPPED, CheckpointError, Ledger, Store
 

@@ -15,7 +15,8 @@ import zmq
 
 from capture.frame import DroppedFrame, Frame, Intrinsics
 from capture.lock import Held
-from capture.messaging.keyframes import FrameHeader, KeyframeClient, KeyframeServer
+from capture.messaging.keyframe_messages import FrameHeader
+from capture.messaging.keyframes import KeyframeClient, KeyframeServer
 from capture.messaging.network import AlreadyRunning, Network, runtime_directory
 from capture.messaging.services import CAPTURE_KEYFRAMES
 from capture.messaging.spool import Config, Key, Spool, SpoolFull, spool_directory

@@ -20,66 +20,29 @@ import time
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Annotated
 
-import msgspec
 import zmq
 
-from capture.frame import DroppedFrame, Frame, Intrinsics
+from capture.frame import DroppedFrame, Frame
+from capture.messaging.keyframe_messages import (
+    Acknowledge,
+    DroppedHeader,
+    FrameHeader,
+    Ready,
+    ReceivedFrame,
+    received,
+    to_message,
+)
 from capture.messaging.network import REQUEST_LIMITS, Endpoint, Network
 from capture.messaging.services import CAPTURE_KEYFRAMES
 from capture.messaging.spool import Key, Spool
-from capture.messaging.wire import (
-    Header,
-    Message,
-    Numbering,
-    Part,
-    Sequential,
-    SessionId,
-    WireError,
-    decode,
-    encode,
-)
+from capture.messaging.wire import Numbering, WireError, decode, encode
 
 log = logging.getLogger(__name__)
 
 READY_EVERY_S = 0.5
 FORGET_CLIENT_S = 20.0  # one that is silent so long is gone
 REMEMBERED = 10_000  # acknowledged frames that recon knows again
-_LONGEST_NAME = 255
-
-Name = Annotated[str, msgspec.Meta(min_length=1, max_length=_LONGEST_NAME)]
-Text = Annotated[str, msgspec.Meta(max_length=1000)]
-
-
-class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="frame"):
-    """A Frame; its image is the only array."""
-
-    frame_id: Sequential
-    name: Name
-    stamp_ns: Sequential
-    intrinsics: Intrinsics | None
-
-
-class DroppedHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="dropped"):
-    """A DroppedFrame: that an image was left out is told like an image."""
-
-    name: Name
-    reason: Text
-
-
-class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="ready"):
-    """The sender takes frames until it has `capacity` that are not acknowledged; `holding` it has received already."""
-
-    capacity: Annotated[int, msgspec.Meta(ge=0, le=64)]
-    holding: Annotated[list[tuple[SessionId, Sequential]], msgspec.Meta(max_length=64)]
-
-
-class Acknowledge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="acknowledge"):
-    """The sender keeps this frame from now on."""
-
-    session: SessionId
-    sequence: Sequential
 
 
 @dataclass
@@ -119,7 +82,7 @@ class KeyframeServer(Endpoint):
 
     def offer(self, frame: Frame | DroppedFrame) -> Key:
         """Takes the frame over: on the disk when this returns. Raises SpoolFull, OSError, WireError (too large)."""
-        message = _message(frame, self.numbering)
+        message = to_message(frame, self.numbering)
         size = sum(memoryview(part).nbytes for part in message)
         if size > self.network.limits.total_bytes:
             raise WireError(f"{frame.name}: {size >> 20} MB; network.max_message_mb allows less")
@@ -187,17 +150,6 @@ class KeyframeServer(Endpoint):
         return True
 
 
-@dataclass(frozen=True)
-class ReceivedFrame:
-    session: str
-    sequence: int
-    frame: Frame | DroppedFrame
-
-    @property
-    def key(self) -> Key:
-        return Key(self.session, self.sequence)
-
-
 class KeyframeClient(Endpoint):
     """Recon's end."""
 
@@ -227,13 +179,13 @@ class KeyframeClient(Endpoint):
                 return None
             self._dealer.poll(math.ceil(1000 * min(remaining, READY_EVERY_S)))
 
-    def acknowledge(self, received: ReceivedFrame) -> None:
+    def acknowledge(self, frame: ReceivedFrame) -> None:
         """To be called when the frame would survive the death of this process, and not before."""
-        self._held.pop(received.key, None)
-        self._seen[received.key] = None
+        self._held.pop(frame.key, None)
+        self._seen[frame.key] = None
         while len(self._seen) > REMEMBERED:
             del self._seen[next(iter(self._seen))]
-        self._say_acknowledged(received.key)
+        self._say_acknowledged(frame.key)
 
     def _take_in(self) -> None:
         for _ in range(self.capacity + 1):
@@ -242,17 +194,18 @@ class KeyframeClient(Endpoint):
             except zmq.Again:
                 return
             try:
-                received = _received(decode(parts, FrameHeader | DroppedHeader, self.network.limits))
+                frame = received(decode(parts, FrameHeader | DroppedHeader, self.network.limits))
             except WireError as error:
                 self.refused += 1
-                log.warning("refused a key frame: %s", error)
+                if self.refused.bit_count() == 1:  # at 1, 2, 4, 8, ...: who sends rubbish does not fill the journal
+                    log.warning("refused a key frame (%d so far): %s", self.refused, error)
                 continue
-            if received.key in self._seen:
+            if frame.key in self._seen:
                 self.duplicates += 1
-                self._say_acknowledged(received.key)
-            elif received.key not in self._held:
-                self._held[received.key] = None
-                self._received.append(received)
+                self._say_acknowledged(frame.key)
+            elif frame.key not in self._held:
+                self._held[frame.key] = None
+                self._received.append(frame)
 
     def _say_ready(self) -> None:
         if time.monotonic() - self._ready_said < READY_EVERY_S:
@@ -269,41 +222,3 @@ class KeyframeClient(Endpoint):
             self._dealer.send_multipart(encode(request), zmq.NOBLOCK)
         except zmq.Again:
             log.debug("capture is not there")
-
-
-def _message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
-    name = frame.name[-_LONGEST_NAME:]
-    if isinstance(frame, DroppedFrame):
-        return encode(DroppedHeader(**numbering.next(), name=name, reason=frame.reason[:1000]))
-    header = FrameHeader(
-        **numbering.next(),
-        frame_id=frame.frame_id,
-        name=name,
-        stamp_ns=frame.stamp_ns,
-        intrinsics=frame.intrinsics,
-    )
-    return encode(header, [frame.image])
-
-
-def _received(message: Message) -> ReceivedFrame:
-    header = message.header
-    if isinstance(header, DroppedHeader):
-        if message.arrays:
-            raise WireError("a dropped frame has no image")
-        return ReceivedFrame(header.session, header.sequence, DroppedFrame(header.name, header.reason))
-    if len(message.arrays) != 1 or min(message.arrays[0].shape, default=0) < 1:
-        raise WireError("a frame has one image")
-    _check_intrinsics(header.intrinsics)
-    try:
-        frame = Frame(header.frame_id, header.name, header.stamp_ns, message.arrays[0], header.intrinsics)
-    except ValueError as error:
-        raise WireError(str(error)) from error
-    return ReceivedFrame(header.session, header.sequence, frame)
-
-
-def _check_intrinsics(intrinsics: Intrinsics | None) -> None:
-    if intrinsics is None:
-        return
-    lens = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, *intrinsics.distortion)
-    if min(intrinsics.width, intrinsics.height, intrinsics.fx, intrinsics.fy) <= 0 or not all(map(math.isfinite, lens)):
-        raise WireError(f"these are no intrinsics: {intrinsics}")

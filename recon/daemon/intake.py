@@ -6,7 +6,8 @@ import logging
 import threading
 import time
 
-from capture.messaging.keyframes import KeyframeClient, ReceivedFrame
+from capture.messaging.keyframe_messages import ReceivedFrame
+from capture.messaging.keyframes import KeyframeClient
 from capture.messaging.network import Network
 from recon.config import Config
 from recon.daemon.inbox import Arrived, Inbox, LeftOut

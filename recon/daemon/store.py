@@ -26,7 +26,7 @@ from typing import Any
 import msgspec
 
 from capture.frame import DroppedFrame, Frame, Intrinsics
-from capture.messaging.keyframes import ReceivedFrame
+from capture.messaging.keyframe_messages import ReceivedFrame
 from capture.messaging.message_file import read_message, write_message
 from capture.messaging.wire import Limits, Message, WireError, decode, encode
 

@@ -17,7 +17,8 @@ from capture.frame import DroppedFrame
 from capture.messaging import keys
 from capture.messaging.broadcast import Publisher, Subscriber
 from capture.messaging.commands import CommandServer
-from capture.messaging.keyframes import DroppedHeader, KeyframeClient, KeyframeServer
+from capture.messaging.keyframe_messages import DroppedHeader
+from capture.messaging.keyframes import KeyframeClient, KeyframeServer
 from capture.messaging.network import Network, runtime_directory
 from capture.messaging.services import CAPTURE_KEYFRAMES, CAPTURE_PREVIEW, RECON_CONTROL, RECON_SCENE, Service
 from capture.messaging.spool import Config as SpoolConfig

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from capture.frame import Frame, Intrinsics
-from capture.messaging.keyframes import Acknowledge, DroppedHeader, FrameHeader, Ready
+from capture.messaging.keyframe_messages import Acknowledge, DroppedHeader, FrameHeader, Ready
 from capture.messaging.state import Want
 from capture.messaging.wire import Numbering, encode
 from capture.preview import Config as PreviewConfig

@@ -1,0 +1,99 @@
+"""What capture and recon say about key frames: frames one way, readiness and acknowledgements the other."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+
+from capture.frame import DroppedFrame, Frame, Intrinsics
+from capture.messaging.spool import Key
+from capture.messaging.wire import Header, Message, Numbering, Part, Sequential, SessionId, WireError, encode
+
+_LONGEST_NAME = 255
+
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=_LONGEST_NAME)]
+Text = Annotated[str, msgspec.Meta(max_length=1000)]
+
+
+class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="frame"):
+    """A Frame; its image is the only array."""
+
+    frame_id: Sequential
+    name: Name
+    stamp_ns: Sequential
+    intrinsics: Intrinsics | None
+
+
+class DroppedHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="dropped"):
+    """A DroppedFrame: that an image was left out is told like an image."""
+
+    name: Name
+    reason: Text
+
+
+class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="ready"):
+    """The sender takes frames until it has `capacity` that are not acknowledged; `holding` it has received already."""
+
+    capacity: Annotated[int, msgspec.Meta(ge=0, le=64)]
+    holding: Annotated[list[tuple[SessionId, Sequential]], msgspec.Meta(max_length=64)]
+
+
+class Acknowledge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="acknowledge"):
+    """The sender keeps this frame from now on."""
+
+    session: SessionId
+    sequence: Sequential
+
+
+@dataclass(frozen=True)
+class ReceivedFrame:
+    session: str
+    sequence: int
+    frame: Frame | DroppedFrame
+
+    @property
+    def key(self) -> Key:
+        return Key(self.session, self.sequence)
+
+
+def to_message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
+    """The parts of the message that carries `frame`, with the next number."""
+    name = frame.name[-_LONGEST_NAME:]
+    if isinstance(frame, DroppedFrame):
+        return encode(DroppedHeader(**numbering.next(), name=name, reason=frame.reason[:1000]))
+    header = FrameHeader(
+        **numbering.next(),
+        frame_id=frame.frame_id,
+        name=name,
+        stamp_ns=frame.stamp_ns,
+        intrinsics=frame.intrinsics,
+    )
+    return encode(header, [frame.image])
+
+
+def received(message: Message) -> ReceivedFrame:
+    """The frame in a decoded message. Raises WireError where what it says is not possible."""
+    header = message.header
+    if isinstance(header, DroppedHeader):
+        if message.arrays:
+            raise WireError("a dropped frame has no image")
+        return ReceivedFrame(header.session, header.sequence, DroppedFrame(header.name, header.reason))
+    if len(message.arrays) != 1 or min(message.arrays[0].shape, default=0) < 1:
+        raise WireError("a frame has one image")
+    _check_intrinsics(header.intrinsics)
+    try:
+        frame = Frame(header.frame_id, header.name, header.stamp_ns, message.arrays[0], header.intrinsics)
+    except ValueError as error:
+        raise WireError(str(error)) from error
+    return ReceivedFrame(header.session, header.sequence, frame)
+
+
+def _check_intrinsics(intrinsics: Intrinsics | None) -> None:
+    if intrinsics is None:
+        return
+    lens = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, *intrinsics.distortion)
+    if min(intrinsics.width, intrinsics.height, intrinsics.fx, intrinsics.fy) <= 0 or not all(map(math.isfinite, lens)):
+        raise WireError(f"these are no intrinsics: {intrinsics}")
