@@ -153,7 +153,7 @@ def test_one_process_offers_key_frames(tmp_path):
     open_spool(tmp_path / "other").close()  # the one that came too late has let go of its spool
 
 
-def test_what_is_no_key_frame_is_refused(tmp_path):
+def test_what_is_no_key_frame_is_refused(tmp_path, caplog):
     header = FrameHeader(
         session="0" * 32, sequence=0, mono_ns=0, frame_id=0, name="a.png", stamp_ns=0, intrinsics=INTRINSICS
     )
@@ -180,6 +180,8 @@ def test_what_is_no_key_frame_is_refused(tmp_path):
             impostor.send_multipart([identity, *parts])
         assert client.receive(2).frame.name == "a.png"
         assert client.refused == len(bad)
+    told = [record for record in caplog.records if "refused a key frame" in record.message]
+    assert len(told) == len(bad).bit_length()  # the 1st, 2nd, 4th, ...: the journal cannot be filled
 
 
 def test_too_large_is_said_before_it_is_spooled(tmp_path):
