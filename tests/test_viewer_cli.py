@@ -238,6 +238,7 @@ def test_a_viewer_is_told_between_scenes_where_the_live_camera_is(node):
             publisher.send(heartbeat(numbering, tracked))
             time.sleep(0.3)
             assert source.tracked is there  # the same again is no news, for which a window would be drawn
+            assert source.age_s is not None and source.age_s < 5  # no scene yet, but the node lives
         source.close()
 
 

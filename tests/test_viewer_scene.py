@@ -164,6 +164,8 @@ def test_words_are_plain():
     assert words.dropped_lines(there)[0] == "2 frames were left out before:"
     assert words.dropped_lines(there)[-1] == "left out 7.png: blurred"
     assert words.feed_line(None, True) == "a finished result"
+    assert "nothing has come" in words.waiting_line(float("inf")) and "is there" in words.waiting_line(1.0)
+    assert "STALE" in words.waiting_line(12.0)
     assert "STALE" in words.feed_line(12.0, False) and words.feed_line(1.0, False) == "live"
     assert words.advice_line(None, moment(wall(3), verdict=refusal)) == "Take a step to the side."
     assert words.time_line(State(), (there,)) == "snapshot 1 of 1, the newest"

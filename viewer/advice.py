@@ -85,18 +85,36 @@ def next_view(cameras: tuple[CameraEstimate, ...], points: Points) -> Advice:
     """
     if not cameras or not len(points.positions):
         return Advice("No camera is placed yet: take photographs that overlap, with a step to the side.", None, None, 0)
-    moves = [move for camera in cameras for move in _moves(camera, cameras, points)]
+    sight = _sight(cameras, points)
+    moves = [move for camera in cameras for move in _moves(camera, cameras, points, sight)]
     best = max(moves, key=lambda move: (round(move.gain, 3), move.base.frame_id), default=None)
     if best is None or best.gain < ENOUGH:
         return Advice("The scene is covered well: more photographs from around here would add little.", None, None, 0)
     pivot = _pivot(best.base, points, cameras)
-    return Advice(_sentence(best, cameras, points), (best.base.T_world_camera[:3, 3], best.centre), pivot, best.gain)
+    return Advice(_sentence(best, points, sight), (best.base.T_world_camera[:3, 3], best.centre), pivot, best.gain)
 
 
-def _moves(camera: CameraEstimate, cameras: tuple[CameraEstimate, ...], points: Points) -> list[_Move]:
+@dataclass(frozen=True, eq=False)
+class _Sight:
+    """How the cameras see the points."""
+
+    rays: Array  # (C, M, 3) unit, from each camera to each point
+    angles: Array  # (M,) the widest between two cameras that see the point; 0 where fewer than two do
+
+
+def _sight(cameras: tuple[CameraEstimate, ...], points: Points) -> _Sight:
+    rays = np.stack([_rays(points, camera.T_world_camera[:3, 3]) for camera in cameras])
+    angles = np.zeros(len(points.positions))
+    for index, ray in enumerate(rays):
+        to_others = _angles_to(ray, rays, points)
+        angles = np.maximum(angles, np.where(points.seen_by[:, index], to_others, 0.0))
+    return _Sight(rays, angles)
+
+
+def _moves(camera: CameraEstimate, cameras: tuple[CameraEstimate, ...], points: Points, sight: _Sight) -> list[_Move]:
     up = scene_up(cameras)
     pivot = _pivot(camera, points, cameras)
-    angles, views = _widest_angles(points, cameras), points.seen_by.sum(1)
+    angles, views = sight.angles, points.seen_by.sum(1)
     moves = []
     for turn, (right, upwards) in _TURNS.items():
         for step in _STEPS:
@@ -104,7 +122,7 @@ def _moves(camera: CameraEstimate, cameras: tuple[CameraEstimate, ...], points: 
             shown = _shows(camera, look_at(centre, pivot, up), points)
             if shown.sum() == 0 or (views[shown] > 0).mean() < LEAST_OVERLAP or shown.mean() < 0.2:
                 continue
-            wider = np.where(shown, np.maximum(angles, _angles_to(points, centre, cameras)), angles)
+            wider = np.where(shown, np.maximum(angles, _angles_to(_rays(points, centre), sight.rays, points)), angles)
             parallax = (np.minimum(wider, GOOD_ANGLE) - np.minimum(angles, GOOD_ANGLE)).mean() / GOOD_ANGLE
             coverage = (np.minimum(views + shown, GOOD_VIEWS) - np.minimum(views, GOOD_VIEWS)).mean() / GOOD_VIEWS
             moves.append(_Move(camera, centre, turn, step, float(parallax), float(coverage)))
@@ -146,30 +164,17 @@ def _rays(points: Points, centre: Array) -> Array:
     return offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
 
 
-def _angles_to(points: Points, centre: Array, cameras: tuple[CameraEstimate, ...]) -> Array:
-    """(M,) the widest angle between the ray from `centre` and one from a camera that sees the point; 0 where none."""
-    ray = _rays(points, centre)
-    widest = np.zeros(len(points.positions))
-    for index, camera in enumerate(cameras):
-        cosines = np.clip((ray * _rays(points, camera.T_world_camera[:3, 3])).sum(1), -1.0, 1.0)
-        widest = np.maximum(widest, np.where(points.seen_by[:, index], np.arccos(cosines), 0.0))
-    return widest
+def _angles_to(ray: Array, rays: Array, points: Points) -> Array:
+    """(M,) the widest angle between the point's `ray` (M, 3) and one of a camera that sees it; 0 where none does."""
+    cosines = np.einsum("cmi,mi->cm", rays, ray)
+    return np.arccos(np.clip(np.where(points.seen_by.T, cosines, 1.0).min(0), -1.0, 1.0))
 
 
-def _widest_angles(points: Points, cameras: tuple[CameraEstimate, ...]) -> Array:
-    """(M,) the widest angle between two cameras that see the point; 0 where fewer than two do."""
-    widest = np.zeros(len(points.positions))
-    for index, camera in enumerate(cameras):
-        to_others = _angles_to(points, camera.T_world_camera[:3, 3], cameras)
-        widest = np.maximum(widest, np.where(points.seen_by[:, index], to_others, 0.0))
-    return widest
-
-
-def _sentence(move: _Move, cameras: tuple[CameraEstimate, ...], points: Points) -> str:
+def _sentence(move: _Move, points: Points, sight: _Sight) -> str:
     distance = 2.0 * math.sin(move.angle / 2.0)
     where = f"From {move.base.name} move {move.turn} by {distance:.0%} of the distance to the scene"
     if move.parallax >= move.coverage:
-        narrow = float((_widest_angles(points, cameras) < GOOD_ANGLE).mean())
+        narrow = float((sight.angles < GOOD_ANGLE).mean())
         return (
             f"{where}, look at the same place: {narrow:.0%} of it is seen under less than {GOOD_ANGLE_DEG:.0f}° so far."
         )

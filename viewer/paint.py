@@ -26,9 +26,15 @@ _LETTER = 8  # pixels, the width of a wide letter of a caption
 def paint(gaussians: GaussianArrays, shapes: Shapes, view: Viewpoint, state: State, width: int, height: int) -> Image:
     """(H, W, 3) RGB of the Gaussians, in the colours that they have, with the shapes among them."""
     K = view.K(width, height)
-    canvas = paint_gaussians(gaussians, view.T_world_camera, K, state, width, height)
-    paint_shapes(canvas, shapes, np.linalg.inv(view.T_world_camera), K)
-    return canvas.image
+    return with_shapes(paint_gaussians(gaussians, view.T_world_camera, K, state, width, height), shapes, view)
+
+
+def with_shapes(canvas: Canvas, shapes: Shapes, view: Viewpoint) -> Image:
+    """(H, W, 3) RGB of what is on the canvas, with the shapes among it. The canvas stays as it is."""
+    height, width = canvas.depth.shape
+    copy = Canvas(canvas.image.copy(), canvas.depth.copy())
+    paint_shapes(copy, shapes, np.linalg.inv(view.T_world_camera), view.K(width, height))
+    return copy.image
 
 
 def paint_gaussians(

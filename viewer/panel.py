@@ -85,7 +85,7 @@ class Panel:
         self._engine.selected_index = list(Engine).index(state.engine)
         self._set("notice", [notice] if notice else [])
         if moment is None:
-            self._set("verdict", [feed])
+            self._set("verdict", [words.waiting_line(age)])
             return
         verdict = moment.snapshot.verdict
         self._labels["verdict"].text_color = _GOOD if verdict.code is Code.OK else _BAD

@@ -8,10 +8,10 @@ import numpy as np
 
 from recon.snapshot import CameraEstimate, GaussianArrays
 from viewer.analysis import Analysis, Analyst
-from viewer.canvas import Image, project
+from viewer.canvas import Canvas, Image, project
 from viewer.colours import coloured
 from viewer.moment import History, Moment, remembered
-from viewer.paint import blended, paint
+from viewer.paint import blended, paint_gaussians, with_shapes
 from viewer.shapes import Photograph, Shapes, live_camera, shapes
 from viewer.sources import Source
 from viewer.state import Colouring, State, go_to_camera, press, shown_moment
@@ -34,6 +34,7 @@ class Session:
         self._tracked: CameraEstimate | None = None  # the live camera
         self._touched = False  # whether the person has chosen a viewpoint
         self._coloured: tuple[tuple[object, ...], GaussianArrays] | None = None
+        self._painted: tuple[tuple[object, ...], Canvas] | None = None
 
     def close(self) -> None:
         self._analyst.close()
@@ -145,11 +146,20 @@ class Session:
         view = self.viewpoint()
         if view is None:
             return None
-        image = paint(self.gaussians(), self.shapes(), view, self.state, width, height)
+        image = with_shapes(self._canvas(view, width, height), self.shapes(), view)
         camera, photograph = self.camera(), self.photograph()
         if camera is None or photograph is None or self.state.blend == 0.0:
             return image
         return blended(image, photograph, camera, view.K(width, height), self.state.blend)
+
+    def _canvas(self, view: Viewpoint, width: int, height: int) -> Canvas:
+        """The Gaussians alone. They are painted once while nothing but shapes comes and goes."""
+        gaussians, state = self.gaussians(), self.state
+        key = (gaussians, view, state.gaussians, state.as_points, state.point_size, width, height)
+        if self._painted is None or self._painted[0] != key:
+            canvas = paint_gaussians(gaussians, view.T_world_camera, view.K(width, height), state, width, height)
+            self._painted = key, canvas
+        return self._painted[1]
 
     def photograph(self) -> Image | None:
         """What the camera whose viewpoint is taken saw; None where there is none."""

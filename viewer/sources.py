@@ -85,7 +85,8 @@ class Live:
 
     @property
     def age_s(self) -> float | None:
-        return self._client.age_s
+        """A scene that is being refined is silent for long: the node's heartbeats tell that it lives."""
+        return min(self._client.age_s, self._heartbeats.age_s)
 
     @property
     def tracked(self) -> CameraEstimate | None:

@@ -79,6 +79,13 @@ def feed_line(age_s: float | None, final: bool) -> str:
     return "live"
 
 
+def waiting_line(age_s: float | None) -> str:
+    """What there is to say before there is a scene."""
+    if age_s is not None and age_s <= _STALE_S:
+        return "the node is there: waiting for its first scene"
+    return feed_line(age_s, final=False)
+
+
 def thousands(number: int) -> str:
     """12345 as "12 345"."""
     return f"{number:,}".replace(",", " ")

@@ -1,0 +1,108 @@
+"""Where the picture is: by the project's own rasteriser in an image widget, or by Open3D in a scene widget.
+
+The scene widget is there in any case, because without one Open3D 0.20 keeps the memory of every image that it has
+shown.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+from open3d.visualization import gui, rendering  # pyright: ignore[reportMissingImports]
+
+from viewer.canvas import BACKGROUND
+from viewer.scene3d import Scene3D, image3d, look_from
+from viewer.session import Session
+from viewer.state import open3d_draws
+from viewer.viewpoint import Viewpoint
+
+Image = npt.NDArray[np.uint8]
+
+_SMOOTH_S = 0.04  # a picture that takes longer is painted at half the resolution while the pointer drags it
+# After the last change the window is drawn again: Open3D may skip a drawing while the one before is under way, and
+# shows what came into its scene a drawing later. On software Vulkan each one takes 60 ms of a processor.
+_REDRAWN_S = (0.3,)
+_SCENE_REDRAWN_S = (0.0, 0.0, 0.3, 1.0)
+
+
+class Stage:
+    """Two widgets in the same place, of which one is visible. `software`: Vulkan is played by the processor."""
+
+    def __init__(self, window: gui.Window, software: bool) -> None:
+        self.picture = gui.ImageWidget(image3d(np.full((8, 8, 3), BACKGROUND, np.uint8)))
+        self.scene = gui.SceneWidget()
+        self.scene.scene = rendering.Open3DScene(window.renderer)
+        self.scene.visible = False  # before it is first drawn: later, the memory is kept all the same
+        self.size = (1, 1)  # pixels
+        self._software = software
+        self._content = Scene3D(self.scene.scene)
+        self._in_scene: tuple[object, ...] = ()  # what the scene widget shows
+        self._painted_s = 0.0  # how long the last full picture took
+        self._redraw_at: list[float] = []  # times to come
+
+    @property
+    def painted_s(self) -> float | None:
+        """Seconds that a picture takes; None where Open3D draws it."""
+        return self._painted_s if self.picture.visible else None
+
+    def lay_out(self, frame: gui.Rect) -> bool:
+        """Takes the place; whether that is another size."""
+        if (frame.width, frame.height) == self.size:
+            return False
+        self.picture.frame = self.scene.frame = frame
+        self.size = frame.width, frame.height
+        return True
+
+    def draw(self, session: Session, hurried: bool) -> None:
+        """Shows the session's picture; `hurried`: the next one comes at once."""
+        view = session.viewpoint()
+        if view is None or min(self.size) < 2:
+            return
+        blends = session.state.blend > 0 and session.photograph() is not None
+        own = blends or not open3d_draws(session.state, self._software)
+        if self.picture.visible != own or self.scene.visible == own:
+            self.picture.visible, self.scene.visible = own, not own
+            self._content.set_drawing(not own)
+        self._redraw_at = [time.monotonic() + after for after in (_REDRAWN_S if own else _SCENE_REDRAWN_S)]
+        if own:
+            self._paint(session, hurried)
+        else:
+            self._draw_scene(session, view)
+
+    def redraws(self) -> bool:
+        """Whether the window is to be drawn once more, though nothing has changed."""
+        if not self._redraw_at or time.monotonic() < self._redraw_at[0]:
+            return False
+        del self._redraw_at[0]
+        self.scene.force_redraw()
+        return True
+
+    def take_image(self, session: Session, taken: Callable[[Image], None]) -> None:
+        """Calls `taken` with the picture that is shown, now or a drawing later."""
+        if not self.picture.visible:
+            self.scene.scene.scene.render_to_image(lambda image: taken(np.asarray(image)))
+        elif (image := session.paint(*self.size)) is not None:
+            taken(image)
+
+    def _paint(self, session: Session, hurried: bool) -> None:
+        width, height = self.size
+        half = hurried and self._painted_s > _SMOOTH_S
+        started = time.perf_counter()
+        image = session.paint(*((width // 2, height // 2) if half else (width, height)))
+        if image is not None:
+            self.picture.update_image(image3d(image))
+        if not half:
+            self._painted_s = time.perf_counter() - started
+
+    def _draw_scene(self, session: Session, view: Viewpoint) -> None:
+        state = session.state
+        wanted = (session.gaussians(), state.gaussians, state.as_points, state.point_size)
+        if len(self._in_scene) != len(wanted) or any(a is not b for a, b in zip(self._in_scene, wanted, strict=True)):
+            self._content.show_gaussians(session.gaussians(), state)
+            self._in_scene = wanted
+        self._content.show_shapes(session.shapes())
+        look_from(self.scene, view, *self.size)
+        self.scene.force_redraw()
