@@ -15,7 +15,7 @@ from recon.core import instruction_sets
 from recon.core.compile import FLAGS, INSTRUCTION_SETS, machine
 from recon.rasterize import reference
 from tests.conftest import ROOT
-from tests.test_rasterize import HEIGHT, NAMES, WIDTH, Case, image_weights, images, needles, random_case
+from tests.rasterize_cases import HEIGHT, NAMES, WIDTH, Case, image_weights, images, needles, random_case
 
 CORE = ROOT / "recon" / "core"
 SOURCES = [

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from recon.rasterize import gsplat, reference
 from recon.rasterize.reference import Splats, blend_weights
-from tests.test_rasterize import HEIGHT, NAMES, WIDTH, random_case, relative_error, render_and_differentiate
+from tests.rasterize_cases import HEIGHT, NAMES, WIDTH, random_case, relative_error, render_and_differentiate
 
 needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 
