@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import gc
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from types import ModuleType
 
 Command = Callable[[argparse.Namespace], int]  # returns the exit code
 
@@ -22,6 +24,19 @@ def lazily(module: str, function: str) -> Command:
     """`function` of `module`, which is imported when the verb runs and not before."""
 
     def run(args: argparse.Namespace) -> int:
-        return getattr(import_module(module), function)(args)
+        return getattr(_loaded(module), function)(args)
 
     return run
+
+
+def _loaded(module: str) -> ModuleType:
+    """The module, without the collector, which would walk through all that torch brings again and again meanwhile.
+
+    What is there then stays as long as the process, so that no later collection walks through it either.
+    """
+    gc.disable()
+    try:
+        return import_module(module)
+    finally:
+        gc.freeze()
+        gc.enable()

@@ -26,6 +26,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     off_path: float = 0.3  # how far these may lie beside the path from photograph to photograph, in its steps
     probes: int = 2  # random images a view from which the differences are estimated
     settled: int = 30  # iterations after which it is told, in less time than was planned, what a Gaussian is worth
+    afterwards: int = (
+        60  # iterations for which there must be time: pruning takes that of 30, and the rest has to settle
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +67,12 @@ class Pruning:
         return Change(gaussians.subset(kept), kept)
 
     def _settled(self, step: Step) -> bool:
-        """Whether the Gaussians have been fitted for long enough, or must become fewer all the same."""
+        """Whether the Gaussians were fitted for long enough and can be afterwards, or must become fewer all the same."""
         enough = min(self._config.settled, self._due[0] * step.iterations)
+        left = step.iteration * (1.0 - step.progress) / step.progress
+        needed = min(self._config.afterwards, 0.5 * (1.0 - self._due[0]) * step.iterations)
         too_many = step.max_gaussians is not None and len(step.gaussians) > step.max_gaussians
-        return step.iteration > enough or too_many
+        return (step.iteration > enough and left >= needed) or too_many
 
 
 def most_worth(worth: Tensor, least: float, limit: int | None) -> Tensor:
@@ -119,6 +124,7 @@ def changes_without(gaussians: Gaussians, sights: Sequence[Sight], probes: int, 
         visible = torch.from_numpy(visibility(rgb.detach().numpy(), scale))
         for _ in range(probes):
             signs = torch.randint(0, 2, rgb.shape, generator=generator) * 2.0 - 1.0
-            (gradient,) = torch.autograd.grad(rgb, opacities, signs * visible[..., None], retain_graph=True)
+            # Of a sum: of an image and weights torch would first load its symbolic shapes, for half a second.
+            (gradient,) = torch.autograd.grad((signs * visible[..., None] * rgb).sum(), opacities, retain_graph=True)
             total += (gradient * opacities.detach() / scale) ** 2
     return total / probes
