@@ -11,6 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from capture.diorama import prints
 from capture.diorama import textures as paint
 from capture.diorama.light import Light, lit
 from capture.diorama.solids import Shape, Solid, face_size
@@ -125,10 +126,10 @@ def _on_the_walls(builder: Builder, palette: Palette) -> None:
     frame, paper = paint.wood((92, 66, 50)), paint.plain(PAPER)
     inks = [accents[1], accents[0], accents[3], accents[2], INK]
     for x, z, width, height in ((0.62, 1.62, 0.56, 0.78), (2.95, 1.55, 0.72, 1.0)):
-        print_ = paint.poster(PAPER, [inks[i] for i in rng.permutation(4)] + [INK])
+        print_ = prints.poster(PAPER, [inks[i] for i in rng.permutation(4)] + [INK])
         builder.box((x, 0.012, z), (width + 0.05, 0.024, height + 0.05), frame)
         builder.box((x, 0.018, z), (width, 0.026, height), _only(PLUS_Y, print_, paper))
-    picture = paint.poster(CREAM, [inks[i] for i in rng.permutation(4)] + [INK])
+    picture = prints.poster(CREAM, [inks[i] for i in rng.permutation(4)] + [INK])
     y = rng.uniform(1.15, 1.35)
     builder.box((0.015, y, 1.72), (0.03, 0.84, 0.62), frame)
     builder.box((0.021, y, 1.72), (0.034, 0.76, 0.54), _only(PLUS_X, picture, paper))
@@ -139,9 +140,9 @@ def _on_the_walls(builder: Builder, palette: Palette) -> None:
     while left < shelf_left + 0.86:
         thickness, height = rng.uniform(0.028, 0.06), rng.uniform(0.20, 0.31)
         spine = accents[int(rng.integers(len(accents)))]
-        cover = paint.book(_scaled(spine, rng.uniform(0.75, 1.15)), PAPER if sum(spine) < 420 else INK)
+        cover = prints.book(_scaled(spine, rng.uniform(0.75, 1.15)), PAPER if sum(spine) < 420 else INK)
         size = (thickness, 0.16, height)
-        builder.box((left + thickness / 2, 0.10, shelf_z + 0.015 + height / 2), size, [cover] * 4 + [paint.pages] * 2)
+        builder.box((left + thickness / 2, 0.10, shelf_z + 0.015 + height / 2), size, [cover] * 4 + [prints.pages] * 2)
         left += thickness + 0.003
     builder.ball((shelf_left + 1.03, 0.11, shelf_z + 0.105), 0.18, paint.marble(accents[0], CREAM))
 
@@ -162,8 +163,8 @@ def _table(builder: Builder, palette: Palette, x: float, y: float, yaw_deg: floa
     z = 0.74
     for width, depth, thickness in ((0.30, 0.22, 0.045), (0.27, 0.20, 0.035), (0.23, 0.17, 0.05)):
         colour = accents[int(rng.integers(len(accents)))]
-        cover = paint.book(colour, PAPER if sum(colour) < 420 else INK)
-        faces = [paint.pages, cover, paint.pages, cover, cover, cover]
+        cover = prints.book(colour, PAPER if sum(colour) < 420 else INK)
+        faces = [prints.pages, cover, prints.pages, cover, cover, cover]
         builder.box(
             at(-0.30, 0.10, z + thickness / 2), (width, depth, thickness), faces, yaw_deg + rng.uniform(-20, 20)
         )
@@ -173,7 +174,7 @@ def _table(builder: Builder, palette: Palette, x: float, y: float, yaw_deg: floa
     stand = at(0.22, -0.12, 0.74)
     builder.cylinder(stand, 0.13, 0.03, dark)
     builder.ball((stand[0], stand[1], 0.77 + 0.14), 0.28, paint.globe((70, 120, 150), (176, 158, 96), PAPER), 23)
-    builder.box(at(0.02, 0.20, 0.74 + 0.075), (0.11, 0.11, 0.15), paint.carton(accents[1], INK), yaw_deg + 30)
+    builder.box(at(0.02, 0.20, 0.74 + 0.075), (0.11, 0.11, 0.15), prints.carton(accents[1], INK), yaw_deg + 30)
     builder.cylinder(at(0.38, 0.22, 0.74), 0.09, 0.17, paint.glazed(accents[3], PAPER))
 
 
@@ -194,13 +195,13 @@ def _plant(builder: Builder, palette: Palette, x: float, y: float) -> None:
 def _cartons(builder: Builder, palette: Palette, x: float, y: float) -> None:
     rng = builder.rng
     brown = (190, 148, 102)
-    builder.box((x, y, 0.22), (0.52, 0.46, 0.44), paint.carton(brown, INK), rng.uniform(-8, 12))
+    builder.box((x, y, 0.22), (0.52, 0.46, 0.44), prints.carton(brown, INK), rng.uniform(-8, 12))
     yaw = rng.uniform(8, 30)
     builder.box(
-        (x + 0.03, y - 0.02, 0.44 + 0.14), (0.36, 0.34, 0.28), paint.carton((206, 170, 122), (150, 44, 36)), yaw
+        (x + 0.03, y - 0.02, 0.44 + 0.14), (0.36, 0.34, 0.28), prints.carton((206, 170, 122), (150, 44, 36)), yaw
     )
     along = (0.12, 0.47) if x < y else (0.52, 0.10)  # beside the stack, along its wall
-    small = paint.carton(palette.accents[2], PAPER)
+    small = prints.carton(palette.accents[2], PAPER)
     builder.box((x + along[0], y + along[1], 0.13), (0.30, 0.30, 0.26), small, yaw + 20)
 
 
@@ -213,9 +214,9 @@ def _on_the_rug(builder: Builder, palette: Palette) -> None:
     builder.cylinder((x, y, 0.012), 0.36, 0.40, paint.glazed(accents[2], CREAM))
     for step in range(3):
         colour = accents[(step + 1) % len(accents)]
-        cover = paint.book(colour, PAPER if sum(colour) < 420 else INK)
+        cover = prints.book(colour, PAPER if sum(colour) < 420 else INK)
         size = (0.24, 0.18, 0.03)
-        faces = [paint.pages, cover, paint.pages, cover, cover, cover]
+        faces = [prints.pages, cover, prints.pages, cover, cover, cover]
         builder.box((x, y, 0.412 + 0.015 + 0.03 * step), size, faces, 120 + rng.uniform(-30, 30))
 
 
