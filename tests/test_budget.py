@@ -49,6 +49,14 @@ def test_the_limit_on_gaussians_is_named_with_what_the_scene_calls_for():
     assert record["code"] == "BUDGET_HIT" and str(record["message"]).startswith("BUDGET_HIT: max_gaussians of 1000 ")
 
 
+@pytest.mark.parametrize(
+    ("most", "gain", "words"), [(2500, 0.0, "hardly PSNR"), (1250, 0.6, "0.6 dB"), (10, 2.0, "2.0 dB")]
+)
+def test_what_more_gaussians_would_gain_is_told_as_it_was_measured(most, gain, words):
+    (hit,) = hits(Config(max_gaussians=most), begun(), refined(most), SECONDS)  # it would take 5000
+    assert hit.gain_db == gain and words in str(hit.record()["message"])
+
+
 def test_of_two_limits_the_one_that_bound_is_named():
     config = Config(max_gaussians=5000, max_mb=ply_bytes(1000, 1) / 1e6 + 1e-5)
     most = config.most_gaussians
@@ -67,12 +75,12 @@ def test_time_that_ran_out_is_told_with_the_seconds_for_the_rest_and_the_slope()
     losses = tuple(0.99**i for i in range(200))
     (hit,) = hits(Config(budget_s=7.0), begun(), refined(10, 200, losses), SECONDS)
     assert (hit.limit, hit.given, hit.would_take) == ("budget_s", 7.0, pytest.approx(13.0))
-    assert "200 of 500" in hit.basis and "a second" in hit.basis
+    assert "200 of 500" in hit.basis and "a second" in hit.basis and hit.gain_db == 0.2
 
 
 def test_time_that_was_gone_before_the_refinement_is_told():
     (hit,) = hits(Config(budget_s=1.0), begun(), refined(10, 0), SECONDS)
-    assert "nothing was refined" in hit.basis and hit.would_take == 7.0
+    assert "nothing was refined" in hit.basis and hit.would_take == 7.0 and hit.gain_db == 6.1
 
 
 def test_the_fall_of_the_loss():

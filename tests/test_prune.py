@@ -102,20 +102,23 @@ def test_it_is_done_once_when_it_is_due_however_fast_time_goes(truth):  # noqa: 
     control = load(Config(at=(0.3, 0.6), least_change=0.0), seed=0)
     step = Step(9, 9, 0.0, 0, truth.gaussians, [v.T_world_camera for v in truth.views], targets_of(truth), None)
     changed = [
-        control.after_step(replace(step, progress=progress)) is not None for progress in (0.2, 0.4, 0.5, 0.9, 0.95)
+        control.after_step(replace(step, progress=progress)) is not None for progress in (0.2, 0.4, 0.5, 0.7, 0.95)
     ]
     assert changed == [False, True, False, True, False]
     late = load(Config(at=(0.3, 0.6)), seed=0)
-    assert [late.after_step(replace(step, progress=progress)) is not None for progress in (0.9, 0.95)] == [True, False]
+    assert [late.after_step(replace(step, progress=progress)) is not None for progress in (0.65, 0.95)] == [True, False]
 
 
 def test_in_a_hurry_it_waits_until_the_gaussians_are_fitted_unless_there_are_too_many(truth):  # noqa: F811
-    def happens(iteration: int, limit: int | None) -> bool:
+    def happens(iteration: int, limit: int | None, progress: float = 0.5) -> bool:
         scene = truth.gaussians, [v.T_world_camera for v in truth.views], targets_of(truth), limit
-        return load(Config(), seed=0).after_step(Step(iteration, 500, 0.5, 0, *scene)) is not None
+        return load(Config(), seed=0).after_step(Step(iteration, 500, progress, 0, *scene)) is not None
 
-    assert not happens(30, None) and happens(31, None)
+    assert not happens(30, None, 0.3) and happens(31, None, 0.3)
     assert not happens(3, len(truth.gaussians)) and happens(3, len(truth.gaussians) - 1)
+    # There must be time for it and for what follows, unless there are too many.
+    assert happens(60, None) and not happens(59, None) and not happens(200, None, 0.9)
+    assert happens(200, len(truth.gaussians) - 1, 0.9)
 
 
 def test_the_same_seed_prunes_the_same(truth):  # noqa: F811

@@ -26,9 +26,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     off_path: float = 0.3  # how far these may lie beside the path from photograph to photograph, in its steps
     probes: int = 2  # random images a view from which the differences are estimated
     settled: int = 30  # iterations after which it is told, in less time than was planned, what a Gaussian is worth
-    afterwards: int = (
-        60  # iterations for which there must be time: pruning takes that of 30, and the rest has to settle
-    )
+    afterwards: int = 60  # iterations for which there must be time: pruning takes that of 30, and the rest settles
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,9 +65,9 @@ class Pruning:
         return Change(gaussians.subset(kept), kept)
 
     def _settled(self, step: Step) -> bool:
-        """Whether the Gaussians were fitted for long enough and can be afterwards, or must become fewer all the same."""
+        """Whether the Gaussians were, and can still be, fitted for long enough, or must become fewer all the same."""
         enough = min(self._config.settled, self._due[0] * step.iterations)
-        left = step.iteration * (1.0 - step.progress) / step.progress
+        left = step.iteration * (1.0 - step.progress) / max(step.progress, 1e-9)
         needed = min(self._config.afterwards, 0.5 * (1.0 - self._due[0]) * step.iterations)
         too_many = step.max_gaussians is not None and len(step.gaussians) > step.max_gaussians
         return (step.iteration > enough and left >= needed) or too_many
