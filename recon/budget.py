@@ -85,7 +85,8 @@ def _seconds(config: Config, begun: Scene, scene: Scene, seconds: Mapping[str, f
 
 def _gain(less: float, lacked: Sequence[tuple[float, float]]) -> float:
     """dB, between the measured ones."""
-    return round(float(np.interp(less, *zip(*lacked, strict=True))), 1)
+    measured, missing = np.array(lacked).T
+    return round(float(np.interp(less, measured, missing)), 1)
 
 
 def loss_fall(losses: Sequence[float]) -> float:
