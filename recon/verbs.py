@@ -34,7 +34,13 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--preset", metavar="P", help="a named set of parameters (default: balanced)")
     parser.add_argument("--prior", metavar="K", help="what gives poses and first points (default: classical)")
     parser.add_argument("--size", type=positive, metavar="PIXELS", help="longer side as modelled (default: 512)")
-    parser.add_argument("--budget-s", type=seconds, metavar="S", help="the best scene within this many seconds")
+    parser.add_argument(
+        "--budget-s",
+        type=seconds,
+        metavar="S",
+        help="the best scene within this many seconds from the first photograph on; starting the program, reading "
+        "photographs and writing files come on top, and cameras and first points take what they take",
+    )
     parser.add_argument("--max-gaussians", type=positive, metavar="N", help="and with at most so many Gaussians")
     parser.add_argument("--max-mb", type=megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes")
     parser.add_argument(
