@@ -34,7 +34,9 @@ class Hit:
         code = Code.BUDGET_HIT.value
         unit = {"max_gaussians": "Gaussians", "max_mb": "MB", "budget_s": "s"}[self.limit]
         bound = f"{self.limit} of {self.given:g} bound the scene, which would take about {self.would_take:.7g} {unit}"
-        gain = f"about {self.gain_db:.1f} dB of PSNR" if self.gain_db >= 0.1 else "sharpness, but hardly PSNR"
+        beyond = self.limit != "budget_s" and self.gain_db >= FEWER[-1][1]  # fewer than were ever measured
+        gain = f"{'at least' if beyond else 'about'} {self.gain_db:.1f} dB of PSNR"
+        gain = gain if self.gain_db >= 0.1 else "sharpness, but hardly PSNR"
         message = (
             f"{code}: {bound} by itself ({self.basis}). New views would gain {gain}, as in scenes that were measured"
         )
