@@ -160,7 +160,7 @@ def _config(args: argparse.Namespace) -> Config:
         "max_gaussians": args.max_gaussians,
         "max_mb": args.max_mb,
     }
-    return msgspec.structs.replace(config, **{key: value for key, value in flags.items() if value is not None})
+    return overlaid(config, {key: value for key, value in flags.items() if value is not None})
 
 
 def _chosen(args: argparse.Namespace) -> tuple[str, ...]:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
+from msgspec import Meta
 from msgspec.structs import replace
 
 from capture.config import Plugin, merged, typed
@@ -30,8 +31,8 @@ FITTING = optimize.Config(half_resolution_share=0.0, dssim=0.4, control=PRUNING,
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    size: int = 512  # longer side of the modelled images, pixels
-    seed: int = 0
+    size: Annotated[int, Meta(ge=64)] = 512  # longer side of the modelled images, pixels
+    seed: Annotated[int, Meta(ge=0)] = 0
     prior: PriorChoice = PriorChoice("classical", classical.Config())
     screening: screening.Config = screening.Config()
     verification: verify.Config = verify.Config()
@@ -43,10 +44,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     preview: optimize.Config = optimize.Config(iterations=20, half_resolution_share=1.0)  # after each keyframe
     optimize: optimize.Config = FITTING  # after the last one
     metric: metric.Config = metric.Config()  # of what is published
-    max_gaussians: int | None = None  # None: as many as the scene calls for
-    max_mb: float | None = None  # of scene.ply, in 10^6 bytes; None: as large as it gets
+    max_gaussians: Annotated[int, Meta(ge=1)] | None = None  # None: as many as the scene calls for
+    max_mb: Annotated[float, Meta(gt=0)] | None = None  # of scene.ply, in 10^6 bytes; None: as large as it gets
     surplus: float = 2.0  # with such a limit a scene begins with this many times as many; its control leaves the best
-    budget_s: float | None = None  # seconds for everything, from the first frame; None: as many as it takes
+    budget_s: Annotated[float, Meta(gt=0)] | None = None  # for all, from the first frame; None: as many as it takes
 
     @property
     def most_gaussians(self) -> int | None:

@@ -6,10 +6,12 @@ import time
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Annotated
 
 import msgspec
 import numpy as np
 import torch
+from msgspec import Meta
 from torch import Tensor
 
 from recon import dropout, regularise, rim
@@ -24,6 +26,7 @@ from recon.regularise import Regularisation
 from recon.scene import Scene
 from recon.target import Target, target
 
+Share = Annotated[float, Meta(ge=0, le=1)]
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # of Gaussians, that are optimised
 
 
@@ -43,10 +46,10 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    iterations: int = 500
+    iterations: Annotated[int, Meta(ge=0)] = 500
     checkpoints: tuple[int, ...] = (150,)  # iterations after which the scene is shown, besides the last one
-    half_resolution_share: float = 0.25  # of the iterations, at the start
-    dssim: float = 0.2  # lambda of (1 - lambda) L1 + lambda D-SSIM
+    half_resolution_share: Share = 0.25  # of the iterations, at the start
+    dssim: Share = 0.2  # lambda of (1 - lambda) L1 + lambda D-SSIM
     dropout: dropout.Config = dropout.Config()
     refine_poses: bool = True
     rates: Rates = Rates()

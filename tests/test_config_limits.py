@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import msgspec
+import pytest
 
+from capture.config import ConfigError
 from recon.config import Config, overlaid, preset
 from recon.export.ply import ply_bytes
 
@@ -31,3 +33,21 @@ def test_a_file_changes_a_control_or_leaves_it_out():
     assert control is not None and (control.kind, control.config.least_change) == ("prune", 0.5)
     assert changed.optimize.iterations == preset("fast").optimize.iterations
     assert overlaid(preset("fast"), {"optimize": {"control": None}}).optimize.control is None
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"max_gaussians": 0},
+        {"max_mb": -2.0},
+        {"budget_s": float("nan")},
+        {"size": 63},
+        {"seed": -1},
+        {"optimize": {"iterations": -1}},
+        {"optimize": {"dssim": 1.5}},
+    ],
+)
+def test_what_no_scene_can_have_is_refused_by_name(changes):
+    ((name, value),) = changes.items()
+    with pytest.raises(ConfigError, match=name if not isinstance(value, dict) else f"{name}.{next(iter(value))}"):
+        overlaid(Config(), changes)

@@ -278,6 +278,12 @@ def test_at_most_as_many_gaussians_as_are_allowed(most):
     assert len(bounded) >= min(most // 4, len(free))  # and not many fewer
 
 
+def test_large_pieces_are_not_coarsened_beyond_what_a_partition_takes():
+    noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3)).astype(np.uint8)
+    pointmap = plane_pointmap(np.eye(4), width=64, height=64)
+    assert len(initial_gaussians([pointmap], [noise], Config(largest_px=4096), max_gaussians=1)) == 1
+
+
 def render(gaussians: Gaussians, pointmap: Pointmap) -> torch.Tensor:
     height, width = pointmap.depth.shape
     image = rasterize(
