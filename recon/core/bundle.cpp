@@ -10,125 +10,13 @@
 #include <cstring>
 #include <vector>
 
+#include "bundle_cost.h"
 #include "threads.h"
 
 namespace core {
 namespace {
 
-constexpr int kChunks = 16;
-constexpr double kBehind = 1e6;     // squared pixels: the error of a point behind a camera
-constexpr double kFloor = 1e-12;    // added to diagonals that damping scales
-constexpr int kPose = 6, kLens = 4;  // numbers of a camera's pose and of a lens
-constexpr int kOwn = kPose + kLens;  // parameters of an observation but its point
-
-}  // namespace
-
-// As recon.registration.bundle.Problem; observations ordered by point. Parameters are the cameras' poses (rotation
-// vector applied from the left, translation), then the lenses' (log focal, radial, shift of the principal point).
-struct Bundle {
-    double *rotations, *translations;                            // (C, 3, 3), (C, 3)
-    double *log_focals, *radials, *shifts, *points;              // (G,), (G,), (G, 2), (P, 3)
-    const int32_t *lens_of_camera, *camera_of, *first_of_point;  // (C,), (O,), (P + 1,)
-    const double* pixels;                                        // (O, 2)
-    const double *prior_log_focals, *prior_sigmas, *radial_sigmas, *shift_sigmas;  // (G,); 0 fixes the parameter
-    int32_t num_cameras, num_lenses, num_points, fixed_camera;
-    double robust_squared;
-};
-
-namespace {
-
-struct Projection {
-    double turned[3], in_camera[3], u, v, focal, radial, squared_radius, distortion, residual[2], squared;
-};
-
-Projection project(const Bundle& bundle, int camera, const double* point, const double* pixel) {
-    Projection p;
-    const double* rotation = bundle.rotations + 9 * camera;
-    for (int i = 0; i < 3; ++i) {
-        p.turned[i] = rotation[3 * i] * point[0] + rotation[3 * i + 1] * point[1] + rotation[3 * i + 2] * point[2];
-        p.in_camera[i] = p.turned[i] + bundle.translations[3 * camera + i];
-    }
-    const double z = std::abs(p.in_camera[2]) < 1e-9 ? 1e-9 : p.in_camera[2];
-    const int lens = bundle.lens_of_camera[camera];
-    p.u = p.in_camera[0] / z;
-    p.v = p.in_camera[1] / z;
-    p.focal = std::exp(bundle.log_focals[lens]);
-    p.radial = bundle.radials[lens];
-    p.squared_radius = p.u * p.u + p.v * p.v;
-    p.distortion = 1 + p.radial * p.squared_radius;
-    p.residual[0] = p.focal * p.distortion * p.u + bundle.shifts[2 * lens] - pixel[0];
-    p.residual[1] = p.focal * p.distortion * p.v + bundle.shifts[2 * lens + 1] - pixel[1];
-    p.squared = p.residual[0] * p.residual[0] + p.residual[1] * p.residual[1];
-    return p;
-}
-
-// What pulls a lens' parameters; those without weight are fixed.
-struct LensPrior {
-    double deviations[kLens], weights[kLens];
-
-    LensPrior(const Bundle& bundle, int g)
-        : deviations{bundle.log_focals[g] - bundle.prior_log_focals[g], bundle.radials[g], bundle.shifts[2 * g],
-                     bundle.shifts[2 * g + 1]} {
-        const double sigmas[kLens] = {bundle.prior_sigmas[g], bundle.radial_sigmas[g], bundle.shift_sigmas[g],
-                                      bundle.shift_sigmas[g]};
-        for (int k = 0; k < kLens; ++k) weights[k] = sigmas[k] > 0 ? 1 / (sigmas[k] * sigmas[k]) : 0.0;
-    }
-};
-
-double total_cost(const Bundle& bundle) {
-    std::vector<double> costs(kChunks, 0.0);
-    run_parallel(kChunks, [&](int chunk, int) {
-        const int begin = int64_t(bundle.num_points) * chunk / kChunks;
-        const int end = int64_t(bundle.num_points) * (chunk + 1) / kChunks;
-        for (int point = begin; point < end; ++point)
-            for (int o = bundle.first_of_point[point]; o < bundle.first_of_point[point + 1]; ++o) {
-                const Projection p =
-                    project(bundle, bundle.camera_of[o], bundle.points + 3 * point, bundle.pixels + 2 * o);
-                const double squared = p.in_camera[2] > 0 ? p.squared : kBehind;
-                costs[chunk] += bundle.robust_squared * std::log1p(squared / bundle.robust_squared);
-            }
-    });
-    double cost = 0;
-    for (const double value : costs) cost += value;
-    for (int g = 0; g < bundle.num_lenses; ++g) {
-        const LensPrior prior(bundle, g);
-        for (int k = 0; k < kLens; ++k) cost += prior.deviations[k] * prior.deviations[k] * prior.weights[k];
-    }
-    return cost;
-}
-
-// Derivatives of a residual (2) by its camera's pose and lens (10) and by its point (3), and its weight.
-struct Derivatives {
-    double by_camera[2][kOwn], by_point[2][3], weight;
-};
-
-Derivatives differentiate(const Bundle& bundle, const Projection& p, int camera) {
-    Derivatives d;
-    const double z = std::abs(p.in_camera[2]) < 1e-9 ? 1e-9 : p.in_camera[2];
-    const double cross = p.focal * 2 * p.radial * p.u * p.v;
-    const double by_normalised[2][2] = {{p.focal * (p.distortion + 2 * p.radial * p.u * p.u), cross},
-                                        {cross, p.focal * (p.distortion + 2 * p.radial * p.v * p.v)}};
-    const double* rotation = bundle.rotations + 9 * camera;
-    const double normalised[2] = {p.u, p.v};
-    for (int k = 0; k < 2; ++k) {
-        const double* n = by_normalised[k];
-        const double position[3] = {n[0] / z, n[1] / z, -(n[0] * p.u + n[1] * p.v) / z};
-        // A turn by w moves the turned point by w x turned.
-        d.by_camera[k][0] = position[2] * p.turned[1] - position[1] * p.turned[2];
-        d.by_camera[k][1] = position[0] * p.turned[2] - position[2] * p.turned[0];
-        d.by_camera[k][2] = position[1] * p.turned[0] - position[0] * p.turned[1];
-        for (int i = 0; i < 3; ++i) d.by_camera[k][3 + i] = position[i];
-        d.by_camera[k][6] = normalised[k] * p.focal * p.distortion;
-        d.by_camera[k][7] = normalised[k] * p.focal * p.squared_radius;
-        d.by_camera[k][8] = k == 0;
-        d.by_camera[k][9] = k == 1;
-        for (int i = 0; i < 3; ++i)
-            d.by_point[k][i] =
-                position[0] * rotation[i] + position[1] * rotation[3 + i] + position[2] * rotation[6 + i];
-    }
-    d.weight = p.in_camera[2] > 0 ? 1 / (1 + p.squared / bundle.robust_squared) : 0.0;
-    return d;
-}
+constexpr double kFloor = 1e-12;  // added to diagonals that damping scales
 
 // False when the symmetric matrix (3, 3) is not invertible.
 bool invert(const double m[3][3], double inverse[3][3]) {
