@@ -168,4 +168,6 @@ def test_words_are_plain():
     assert "STALE" in words.waiting_line(12.0)
     assert "STALE" in words.feed_line(12.0, False) and words.feed_line(1.0, False) == "live"
     assert words.advice_line(None, moment(wall(3), verdict=refusal)) == "Take a step to the side."
+    file = moment(wall(3))
+    assert "file" in words.advice_line(None, replace(file, snapshot=replace(file.snapshot, cameras=(), final=True)))
     assert words.time_line(State(), (there,)) == "snapshot 1 of 1, the newest"

@@ -94,6 +94,7 @@ class Panel:
         self._set("counts", [*words.count_lines(moment), *rate, feed + (", paused" if state.paused else "")])
         self._set("dropped", words.dropped_lines(moment))
         self._set("time", [words.time_line(state, session.history)])
+        self._time.enabled = len(session.history) > 1
         self._time.set_limits(0, max(len(session.history) - 1, 1))
         self._time.int_value = moment_index(state, session.history)
         self._show_cameras(tuple(camera.name for camera in moment.snapshot.cameras), state.camera)

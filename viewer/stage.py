@@ -22,9 +22,11 @@ from viewer.viewpoint import Viewpoint
 Image = npt.NDArray[np.uint8]
 
 _SMOOTH_S = 0.04  # a picture that takes longer is painted at half the resolution while the pointer drags it
-# After the last change the window is drawn again: Open3D may skip a drawing while the one before is under way, and
-# shows what came into its scene a drawing later. On software Vulkan each one takes 60 ms of a processor.
+# Open3D skips a drawing while the one before is under way, and shows what came into its scene a drawing later: so the
+# window is drawn again. Keys and clicks make it draw by themselves, so that what they change is skipped more often. On
+# software Vulkan each drawing takes 60 ms of a processor, which a node may want.
 _REDRAWN_S = (0.3,)
+_ASKED_REDRAWN_S = (0.3, 1.0)
 _SCENE_REDRAWN_S = (0.0, 0.0, 0.3, 1.0)
 
 
@@ -56,8 +58,8 @@ class Stage:
         self.size = frame.width, frame.height
         return True
 
-    def draw(self, session: Session, hurried: bool) -> None:
-        """Shows the session's picture; `hurried`: the next one comes at once."""
+    def draw(self, session: Session, asked: bool, hurried: bool) -> None:
+        """Shows the session's picture; `asked`: by the person, not by news; `hurried`: the next one comes at once."""
         view = session.viewpoint()
         if view is None or min(self.size) < 2:
             return
@@ -66,7 +68,8 @@ class Stage:
         if self.picture.visible != own or self.scene.visible == own:
             self.picture.visible, self.scene.visible = own, not own
             self._content.set_drawing(not own)
-        self._redraw_at = [time.monotonic() + after for after in (_REDRAWN_S if own else _SCENE_REDRAWN_S)]
+        again = _SCENE_REDRAWN_S if not own else _ASKED_REDRAWN_S if asked else _REDRAWN_S
+        self._redraw_at = [time.monotonic() + after for after in again]
         if own:
             self._paint(session, hurried)
         else:

@@ -26,7 +26,7 @@ from viewer.stage import Image, Stage
 from viewer.state import Engine, open3d_draws
 
 _CALM_S = 1.0  # after what was last to be done
-_NAP_S = 0.03  # then: Open3D asks a hundred times a second whether there is anything, which takes 2 % of a processor
+_NAP_S = 0.05  # then: Open3D asks a hundred times a second whether there is anything, which takes 2 % of a processor
 _PANEL_EMS = 22  # the panel's width, in letter widths of the theme
 _KEYS = {
     gui.KeyName.SPACE: "space",
@@ -86,7 +86,7 @@ class _Window:
         self._window.set_on_layout(self._guarded(self._layout))
         self._window.set_on_key(self._guarded(self._key, False))
         self._window.set_on_tick_event(self._guarded(self._tick, False))
-        self._dirty = True
+        self._asked = True  # by the person, for another picture
         self._pointer = Pointer(session)
         self._analysed: object = None
         self._words_at = 0.0
@@ -118,19 +118,18 @@ class _Window:
         """Looks for news and redraws where there are any."""
         if self._stopped_by:
             raise KeyboardInterrupt if self._stopped_by == signal.SIGINT else SystemExit(0)
-        if self._session.receive():
-            self._dirty = True
+        news = self._session.receive()
         analysis = self._session.analysis()
         if analysis is not self._analysed:
-            self._analysed, self._dirty = analysis, True
+            self._analysed, news = analysis, True
         if time.monotonic() - self._words_at > 0.5:
             self._say()
-        if not self._dirty:
+        if not (news or self._asked):
             if time.monotonic() - self._busy_at > _CALM_S:
                 time.sleep(_NAP_S)
             return self._stage.redraws()
-        self._dirty, self._busy_at = False, time.monotonic()
-        self._stage.draw(self._session, self._pointer.dragging)
+        asked, self._asked, self._busy_at = self._asked, False, time.monotonic()
+        self._stage.draw(self._session, asked, self._pointer.dragging)
         self._say()
         return True
 
@@ -147,13 +146,13 @@ class _Window:
         frame = gui.Rect(area.x, area.y, area.width - panel, area.height)
         self._panel.root.frame = gui.Rect(area.get_right() - panel, area.y, panel, area.height)
         self._help.lay_out(context, frame)
-        self._dirty |= self._stage.lay_out(frame)  # otherwise the panel's words have changed, no more
+        self._asked |= self._stage.lay_out(frame)  # otherwise the panel's words have changed, no more
 
     # ---- What the person does -------------------------------------------------------------------------------------
 
     def _change(self, state) -> None:
         self._session.state = state
-        self._dirty = True
+        self._asked = True
 
     def _command(self, key: str) -> None:
         if key == "r":
@@ -164,7 +163,7 @@ class _Window:
             self._window.close()
         else:
             self._session.press(key)
-        self._dirty = True
+        self._asked = True
 
     def _key(self, event: gui.KeyEvent) -> bool:
         if event.type != gui.KeyEvent.Type.DOWN:
@@ -175,7 +174,7 @@ class _Window:
 
     def _mouse(self, event: gui.MouseEvent):
         frame = self._stage.picture.frame
-        self._dirty |= self._pointer.moved(event, float(event.x - frame.x), float(event.y - frame.y), self._stage.size)
+        self._asked |= self._pointer.moved(event, float(event.x - frame.x), float(event.y - frame.y), self._stage.size)
         return gui.Widget.EventCallbackResult.CONSUMED
 
     def _screenshot(self) -> None:

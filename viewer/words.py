@@ -49,6 +49,8 @@ def dropped_lines(moment: Moment) -> list[str]:
 
 def advice_line(advice: Advice | None, moment: Moment) -> str:
     """The next view; where the verdict says what to do, that comes first."""
+    if moment.snapshot.final and moment.snapshot.verdict.publishable and not moment.snapshot.cameras:
+        return "not known, because the file tells of no cameras."
     if not moment.snapshot.cameras or not moment.snapshot.verdict.publishable:
         return moment.snapshot.verdict.advice or "Take photographs that overlap, with a step to the side."
     return "looking for the best next view" if advice is None else advice.sentence

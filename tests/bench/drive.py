@@ -105,9 +105,9 @@ def steps(camera: npt.NDArray[np.floating]) -> list[Step]:
 def lists_and_sliders() -> list[Step]:
     """The panel's drop-down lists and sliders by mouse, and back to how it was."""
     return [
-        Step("colour_list", (click(1269, 158),)),
+        Step("colour_list", (click(1269, 158), "mousemove 1060 180")),
         Step("colour_chosen", (click(1050, 206),)),
-        Step("camera_list", (click(1269, 212),)),
+        Step("camera_list", (click(1269, 212), "mousemove 1060 234")),
         Step("camera_chosen", (click(1050, 260),)),
         Step("blend_slider", (click(1230, 320),)),
         Step("blend_slider_back", (click(940, 320),)),
