@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from recon.priors import patchmatchnet
-from recon.priors.patchmatchnet.network import PatchmatchNet, Source
+from recon.priors.patchmatchnet.network import PatchmatchNet
+from recon.priors.patchmatchnet.sampling import Source
 from recon.priors.patchmatchnet.stereo import NetworkStereo, _planes
 from recon.priors.stereo import Config, View
 

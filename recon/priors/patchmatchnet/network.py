@@ -15,6 +15,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from recon.priors.patchmatchnet.sampling import (
+    Source,
+    sampled_at,
+    sampling_grid,
+    square_of_steps,
+    warp_between,
+    warped_to,
+)
+
 _FIRST_SAMPLES = 48  # depths over the whole range, before there is an estimate
 
 
@@ -39,15 +48,6 @@ STAGES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Source:
-    """A photograph with its camera."""
-
-    image: Tensor  # (3, H, W) in [0, 1], sides multiples of 8
-    K: Tensor  # (3, 3), the centre of the first pixel at (0, 0)
-    T_camera_world: Tensor  # (4, 4)
-
-
 class PatchmatchNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
@@ -66,7 +66,7 @@ class PatchmatchNet(nn.Module):
         estimate: _Estimate | None = None
         for patchmatch in (self.patchmatch_3, self.patchmatch_2, self.patchmatch_1):
             level = patchmatch.stage.level
-            warps = [_warp(reference, source, level) for source in sources]
+            warps = [warp_between(reference, source, level) for source in sources]
             own, *others = (layers[level] for layers in features)
             finer = None if estimate is None else estimate.doubled()
             estimate = patchmatch(own, others, warps, near_far, finer, generator)
@@ -161,16 +161,16 @@ class _Patchmatch(nn.Module):
         generator: torch.Generator,
     ) -> _Estimate:
         stage = self.stage
-        around = _grid(self.eval_conv(own[None])[0], _square(stage.dilation - 1, centre=True))
-        ring = _square(stage.dilation)
+        around = sampling_grid(self.eval_conv(own[None])[0], square_of_steps(stage.dilation - 1, centre=True))
+        ring = square_of_steps(stage.dilation)
         ring = ring + [(2 * down, 2 * right) for down, right in ring] if stage.neighbours == 16 else ring
-        propagated = _grid(self.propa_conv(own[None])[0], ring) if stage.neighbours else None
+        propagated = sampling_grid(self.propa_conv(own[None])[0], ring) if stage.neighbours else None
         alike = self._alike(own, around)
         for iteration in range(stage.iterations):
             samples = self._samples(None if estimate is None else estimate.depth, own.shape[1:], near_far, generator)
             if propagated is not None:
                 middle = samples[samples.shape[0] // 2]
-                samples = torch.cat([samples, _sampled(middle[None], propagated)[0]]).sort(0).values
+                samples = torch.cat([samples, sampled_at(middle[None], propagated)[0]]).sort(0).values
             support = self._near(samples, around, near_far) * alike
             support = support / support.sum(1, keepdim=True)
             known = None if estimate is None else estimate.weights
@@ -199,7 +199,7 @@ class _Patchmatch(nn.Module):
     def _alike(self, own: Tensor, around: Tensor) -> Tensor:
         """(9, h, w) how much each neighbour looks like the pixel itself: one that does lies on the same surface."""
         groups = self.stage.groups
-        neighbours = _sampled(own, around).unflatten(0, (groups, -1))  # (G, C / G, 9, h, w)
+        neighbours = sampled_at(own, around).unflatten(0, (groups, -1))  # (G, C / G, 9, h, w)
         product = (neighbours * own.unflatten(0, (groups, -1))[:, :, None]).mean(1)
         return self.feature_weight_net(product).sigmoid()
 
@@ -207,7 +207,7 @@ class _Patchmatch(nn.Module):
         """(D, 9, h, w) how near each neighbour's depths are to the pixel's own."""
         farthest, nearest = 1.0 / near_far[1], 1.0 / near_far[0]
         place = (1.0 / samples - farthest) / (nearest - farthest)
-        gap = (_sampled(place, around) - place[:, None]).abs() / self.stage.interval
+        gap = (sampled_at(place, around) - place[:, None]).abs() / self.stage.interval
         return torch.sigmoid(4.0 - 2.0 * gap.clamp(0, 4))
 
 
@@ -235,14 +235,14 @@ class _Evaluation(nn.Module):
         reference = own.unflatten(0, (groups, -1))[:, :, None]
         found = []
         for index, (other, warp) in enumerate(zip(others, warps, strict=True)):
-            warped = _warped(other, warp, samples).unflatten(0, (groups, -1))
+            warped = warped_to(other, warp, samples).unflatten(0, (groups, -1))
             similarity = (warped * reference).mean(1)  # (G, D, h, w)
             weight = self.pixel_wise_net(similarity) if weights is None else weights[index]
             found.append(weight)
             summed = summed + similarity * weight
             total = total + weight
         scores = self.similarity_net(summed / total)
-        scores = (_sampled(scores, around) * support).sum(1)
+        scores = (sampled_at(scores, around) * support).sum(1)
         return scores, torch.stack(found)
 
 
@@ -292,58 +292,6 @@ class _Upsample(nn.Module):
 
 def _offsets(stage: Stage, out: int) -> nn.Conv2d:
     return nn.Conv2d(stage.channels, out, 3, padding=stage.dilation, dilation=stage.dilation)
-
-
-def _square(reach: int, centre: bool = False) -> list[tuple[int, int]]:
-    """(down, right) steps to the eight neighbours `reach` pixels away, row by row, with the middle or without."""
-    steps = [(down, right) for down in (-reach, 0, reach) for right in (-reach, 0, reach)]
-    return [step for step in steps if centre or step != (0, 0)]
-
-
-def _grid(learnt: Tensor, steps: Sequence[tuple[int, int]]) -> Tensor:
-    """(M, h, w, 2) where to sample for M neighbours: a fixed step and a `learnt` one (2 M, h, w; x then y)."""
-    height, width = learnt.shape[1:]
-    rows, columns = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
-    x = torch.stack([columns + right for _, right in steps]) + learnt[0::2]
-    y = torch.stack([rows + down for down, _ in steps]) + learnt[1::2]
-    return torch.stack([x / ((width - 1) / 2) - 1, y / ((height - 1) / 2) - 1], -1)
-
-
-def _sampled(images: Tensor, grid: Tensor) -> Tensor:
-    """(C, M, h, w) of images (C, h, w) at the M neighbours of every pixel."""
-    count, height, width, _ = grid.shape
-    flat = grid.reshape(1, count * height, width, 2)
-    sampled = functional.grid_sample(images[None], flat, mode="bilinear", padding_mode="border", align_corners=False)
-    return sampled[0].unflatten(1, (count, height))
-
-
-def _warp(reference: Source, source: Source, level: int) -> tuple[Tensor, Tensor]:
-    """Rotation-like (3, 3) and translation (3,) that carry (x, y, 1) * depth of the reference into the source."""
-    scale = torch.diag(torch.tensor([0.5**level, 0.5**level, 1.0], dtype=torch.float64))
-    K_reference, K_source = scale @ reference.K.double(), scale @ source.K.double()
-    motion = source.T_camera_world.double() @ torch.linalg.inv(reference.T_camera_world.double())
-    return (
-        (K_source @ motion[:3, :3] @ torch.linalg.inv(K_reference)).float(),
-        (K_source @ motion[:3, 3]).float(),
-    )
-
-
-def _warped(features: Tensor, warp: tuple[Tensor, Tensor], depths: Tensor) -> Tensor:
-    """(C, D, h, w): the source's features (C, h', w') where the reference's pixels lie at `depths` (D, h, w)."""
-    count, height, width = depths.shape
-    rows, columns = torch.meshgrid(torch.arange(float(height)), torch.arange(float(width)), indexing="ij")
-    pixels = torch.stack([columns, rows, torch.ones_like(rows)])
-    rays = torch.einsum("ij,jhw->ihw", warp[0], pixels)
-    projected = rays[:, None] * depths[None] + warp[1].view(3, 1, 1, 1)
-    behind = projected[2] <= 1e-3
-    z = torch.where(behind, 1.0, projected[2])
-    x = torch.where(behind, float(width), projected[0]) / z
-    y = torch.where(behind, float(height), projected[1]) / z
-    there_height, there_width = features.shape[1:]
-    grid = torch.stack([x / ((there_width - 1) / 2) - 1, y / ((there_height - 1) / 2) - 1], -1)
-    flat = grid.reshape(1, count * height, width, 2)
-    sampled = functional.grid_sample(features[None], flat, mode="bilinear", padding_mode="zeros", align_corners=True)
-    return sampled[0].unflatten(1, (count, height))
 
 
 def _expected_inverse(samples: Tensor, probability: Tensor) -> Tensor:

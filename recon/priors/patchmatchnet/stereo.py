@@ -13,7 +13,8 @@ import torch
 from recon.priors import fusion, stereo
 from recon.priors.fusion import DepthMap
 from recon.priors.patchmatch import Planes, make_level
-from recon.priors.patchmatchnet.network import PatchmatchNet, Source
+from recon.priors.patchmatchnet.network import PatchmatchNet
+from recon.priors.patchmatchnet.sampling import Source
 from recon.priors.stereo import Sparse, View
 
 Float32 = npt.NDArray[np.float32]
