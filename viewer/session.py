@@ -34,6 +34,7 @@ class Session:
         self._tracked: CameraEstimate | None = None  # the live camera
         self._touched = False  # whether the person has chosen a viewpoint
         self._coloured: tuple[tuple[object, ...], GaussianArrays] | None = None
+        self.paintings = 0  # of the Gaussians, which is what takes the time of a picture
         self._painted: tuple[tuple[object, ...], Canvas] | None = None
 
     def close(self) -> None:
@@ -159,6 +160,7 @@ class Session:
         if self._painted is None or self._painted[0] != key:
             canvas = paint_gaussians(gaussians, view.T_world_camera, view.K(width, height), state, width, height)
             self._painted = key, canvas
+            self.paintings += 1
         return self._painted[1]
 
     def photograph(self) -> Image | None:

@@ -93,11 +93,11 @@ class Stage:
     def _paint(self, session: Session, hurried: bool) -> None:
         width, height = self.size
         half = hurried and self._painted_s > _SMOOTH_S
-        started = time.perf_counter()
+        started, paintings = time.perf_counter(), session.paintings
         image = session.paint(*((width // 2, height // 2) if half else (width, height)))
         if image is not None:
             self.picture.update_image(image3d(image))
-        if not half:
+        if session.paintings > paintings and not half:
             self._painted_s = time.perf_counter() - started
 
     def _draw_scene(self, session: Session, view: Viewpoint) -> None:

@@ -39,6 +39,7 @@ from viewer.viewpoint import overview
 WINDOW = 1280, 800
 PICTURE = 928, 800  # the part of it that is not the panel
 SETTLE_S = 0.7  # after an action has begun to show
+HEARTBEAT_S = 1.0
 PATIENCE_S = 4.0  # with what does not show
 SEEN = 5e-4  # part of the screen: more than a button that lights up under the pointer
 REASONS = (DroppedFrame("blurred.jpg", "too blurred"), DroppedFrame("elsewhere.jpg", "it overlaps with no other frame"))
@@ -169,19 +170,24 @@ def main() -> None:
 def drive(moment: Moment, server: StateServer, heartbeats: Publisher, viewer: subprocess.Popen, out: Path) -> None:
     """Takes all the steps. Raises SystemExit where the viewer ends before."""
     screen, numbering = Screen(), Numbering()
+    tracked, beaten = None, 0.0
 
     def settle(seconds: float) -> None:
+        nonlocal beaten
         until = time.monotonic() + seconds
         while time.monotonic() < until:
             server.serve(0.02)
+            if time.monotonic() - beaten > HEARTBEAT_S:
+                beaten = time.monotonic()
+                heartbeats.send(heartbeat(numbering, tracked))
 
     while viewer.poll() is None and screen.picture(*PICTURE).std() < 8:
         settle(0.2)
     for snapshot in growing(moment.snapshot):
         server.publish(*to_message(snapshot, "place", numbering.next()))
         settle(2 * SETTLE_S)
-    heartbeats.send(heartbeat(numbering, moment.snapshot.cameras[-1]))
-    settle(SETTLE_S)
+    tracked = moment.snapshot.cameras[-1]
+    settle(HEARTBEAT_S + SETTLE_S)
     view = overview(moment, analyse(moment).advice.arrow or ())
     camera = project(moment.snapshot.cameras[1].T_world_camera[None, :3, 3], view, *PICTURE)[0, :2]
     before = screen.picture(*WINDOW)
