@@ -73,10 +73,9 @@ def with_looks(config: Config, every: int) -> Config:
 def run(
     frames: Iterable[Frame | DroppedFrame], config: Config, show: Callable[[Snapshot], None] = _shown_to_nobody
 ) -> Snapshot:
-    """The final snapshot; progress goes to the terminal, if there is one, and every snapshot to `show`."""
+    """The final snapshot; every one is given to `show`."""
     snapshot = None
     for snapshot in reconstruct(list(frames), config):
-        _progress(snapshot)
         show(snapshot)
     if snapshot is None:
         raise AssertionError("reconstruct always yields a last snapshot")
@@ -173,18 +172,6 @@ def _chosen(args: argparse.Namespace) -> tuple[str, ...]:
     if args.views > len(names):
         raise ValueError(f"--views {args.views}: the folder holds {len(names)} photographs; ask for at most as many")
     return tuple(names[i] for i in np.linspace(0, len(names) - 1, args.views).round().astype(int))
-
-
-def _progress(snapshot: Snapshot) -> None:
-    """One line that is written over, on a terminal only."""
-    if not sys.stderr.isatty():
-        return
-    line = (
-        f"\r{snapshot.seconds['total']:6.1f} s  {len(snapshot.cameras)} cameras  {len(snapshot.gaussians)} Gaussians  "
-        f"{snapshot.iterations} iterations  {snapshot.verdict.code.value}"
-    )
-    sys.stderr.write(line.ljust(90) + ("\n" if snapshot.final else ""))
-    sys.stderr.flush()
 
 
 def _tell(snapshot: Snapshot, out: Path, report: dict[str, object], *, as_json: bool) -> None:

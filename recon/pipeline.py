@@ -327,5 +327,9 @@ class Reconstruction:
             served_by=scene.served_by if scene else {},
             evidence=record(evidence) if evidence is not None else None,
         )
-        log.info("snapshot %d: %s, %d Gaussians", self.sequence, verdict.code.value, len(snapshot.gaussians))
+        log.info(
+            "snapshot %d: %s, %d cameras, %d Gaussians, %d iterations, %.1f s",
+            *(self.sequence, verdict.code.value, len(snapshot.cameras), len(snapshot.gaussians)),
+            *(snapshot.iterations, snapshot.seconds["total"]),
+        )
         return snapshot
