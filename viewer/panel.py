@@ -33,6 +33,7 @@ _SWITCHES = (
     ("advice", "next view (6)"),
 )
 _BUTTONS = (("Pause", "space"), ("Follow", "f"), ("Whole", "r"), ("Save", "s"), ("Help", "h"))
+_LASTING = {"space": "paused", "f": "follow", "h": "help"}  # the keys that switch something on, and what
 _GOOD, _BAD = gui.Color(0.5, 0.9, 0.5), gui.Color(1.0, 0.65, 0.4)
 
 
@@ -45,11 +46,14 @@ class Panel:
         self._session: Session | None = None
         self.root = gui.ScrollableVert(round(0.3 * em), gui.Margins(round(0.5 * em)))
         self._labels: dict[str, gui.Label] = {}
-        buttons = gui.Horiz(round(0.3 * em))
+        buttons, self._lasting = gui.Horiz(round(0.3 * em)), dict[str, gui.Button]()
         for text, key in _BUTTONS:
             button = gui.Button(text)
             button.horizontal_padding_em, button.vertical_padding_em = 0.4, 0.1
             button.set_on_clicked(lambda key=key: command(key))
+            if key in _LASTING:
+                button.toggleable = True
+                self._lasting[_LASTING[key]] = button
             buttons.add_child(button)
         self.root.add_child(buttons)
         pairs = gui.VGrid(2, round(0.3 * em))
@@ -78,6 +82,8 @@ class Panel:
         age = session.source.age_s
         feed = words.feed_line(age, bool(moment and moment.snapshot.final))
         rate = [f"{1 / seconds:.0f} pictures/s ({1000 * seconds:.0f} ms each)"] if seconds else []
+        for field, button in self._lasting.items():
+            button.is_on = getattr(state, field)
         for field, switch in self._switches.items():
             switch.checked = getattr(state, field)
         self._points.int_value = state.point_size
