@@ -23,6 +23,8 @@ import viewer.verbs
 
 # libgomp's threads spin while they wait. On a robot's busy processor that doubles the time of torch's operations.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+# So do OpenBLAS's, over matrices of three columns that one thread is through with before the others wake.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # What OpenCV warns of, a damaged photograph, is said with the name of that photograph.
 os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
 

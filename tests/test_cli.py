@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import os
 import json
 import re
 import signal
@@ -47,9 +48,11 @@ def test_help_loads_nothing_but_the_verbs():
     assert heavy == "[]"
 
 
-def test_openmp_threads_sleep_while_they_wait():
-    code = "import splatnode, os; print(os.environ['OMP_WAIT_POLICY'])"
-    assert subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).strip() == "passive"
+def test_no_threads_of_a_library_spin_while_they_wait():
+    code = "import splatnode, os; print(os.environ['OMP_WAIT_POLICY'], os.environ['OPENBLAS_NUM_THREADS'])"
+    plain = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+    printed = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, env=plain, text=True)
+    assert printed.split() == ["passive", "1"]
 
 
 @pytest.mark.parametrize(
