@@ -120,10 +120,12 @@ def test_no_window_is_no_failure(result, tmp_path, monkeypatch, capsys):
     assert (out / "overview.png").is_file() and "no window: there is no display" in capsys.readouterr().err
 
 
-def test_a_missing_open3d_is_told_with_its_remedy(result, monkeypatch, capsys):
+def test_a_missing_open3d_is_told_with_its_remedy_and_a_missing_file_before_it(result, monkeypatch, capsys):
     monkeypatch.setattr(cli, "open3d_installed", lambda: False)
     assert splatnode.main(["view", str(result)]) == 69
     assert "pip install 'splatnode[viewer]'" in capsys.readouterr().err
+    assert splatnode.main(["view", "missing.yaml"]) == 2
+    assert "missing.yaml: No such file" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,7 @@ _PICTURE = 960, 720  # pixels, where no window is opened
 def view(args: argparse.Namespace) -> int:
     """Shows what `args.what` names. Raises what opening it raises."""
     finished = _finished(args)
+    network = _network(args.what) if finished is None else None
     if args.export is not None and (finished is None or args.export.suffix.lower() != ".mp4"):
         raise ValueError("--export needs a finished result and a file that ends with .mp4")
     width, height = args.size or _PICTURE
@@ -45,7 +46,7 @@ def view(args: argparse.Namespace) -> int:
         return EXIT_UNAVAILABLE
     folder = args.out or (_beside(args.what) if finished is not None else Path("view"))
     if window is not None and window.window:
-        source = _source(args, finished)
+        source = _source(finished, network)
         from viewer.window import show  # brings Open3D
 
         background = (lambda: None) if finished is not None else _give_way
@@ -54,7 +55,7 @@ def view(args: argparse.Namespace) -> int:
     elif finished is not None:
         print(write_series(finished, folder, width, height, args.pictures))
     else:
-        source = _source(args, finished)
+        source = _source(finished, network)
         _give_way()
         with contextlib.closing(source):
             keep_picture(source, folder, width, height, until_final=args.until_final, say=_say)
@@ -83,11 +84,14 @@ def _window() -> Probe | None:
     return probe
 
 
-def _source(args: argparse.Namespace, finished: Moment | None) -> Source:
-    if finished is not None:
-        return Finished(finished)
-    raw = read_yaml(args.what) if args.what is not None else {}
-    return Live(typed(raw.get("network", {}), Network, "network"))
+def _network(config: Path | None) -> Network:
+    """Where the node of this configuration, or of none, is to be found."""
+    raw = read_yaml(config) if config is not None else {}
+    return typed(raw.get("network", {}), Network, "network")
+
+
+def _source(finished: Moment | None, network: Network | None) -> Source:
+    return Finished(finished) if finished is not None else Live(network or Network())
 
 
 def _give_way() -> None:

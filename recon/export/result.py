@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Mapping
@@ -74,6 +75,9 @@ def _remove_superseded(out_dir: Path, previous: Mapping[str, str], current: set[
         inside = path.resolve().is_relative_to(out_dir.resolve())  # a manifest is input, too
         if name not in current and inside and path.is_file() and _sha256(path.read_bytes()) == digest:
             path.unlink()
+            with contextlib.suppress(OSError):  # others' files may be beside it
+                if path.parent != out_dir:
+                    path.parent.rmdir()
 
 
 def _sha256(data: bytes) -> str:

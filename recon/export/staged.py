@@ -71,4 +71,5 @@ def _explain(error: OSError, folder: Path, contents: Mapping[str, bytes]) -> str
         errno.EROFS: "The file system is read-only: choose another folder",
         errno.ENOTDIR: "A file stands where the folder should be: choose another folder",
     }.get(error.errno or 0, "Choose another folder")
-    return f"cannot write {len(contents)} files ({megabytes:.1f} MB) to {folder}: {error.strerror or error}. {advice}"
+    what = f" {len(contents)} files ({megabytes:.1f} MB)" if len(contents) > 1 else ""
+    return f"cannot write{what} to {folder}: {error.strerror or error}. {advice}"
