@@ -223,5 +223,5 @@ def _coarser(config: Config, times: float) -> Config:
         config,
         most_error=times**1.3 * config.most_error,
         smallest_px=times * config.smallest_px,
-        largest_px=min(round(times**0.5 * config.largest_px), 16 * REFERENCE_PX),
+        largest_px=min(round(times**0.5 * config.largest_px), REFERENCE_PX),  # a whole photograph
     )

@@ -329,7 +329,11 @@ class Reconstruction:
         )
         log.info(
             "snapshot %d: %s, %d cameras, %d Gaussians, %d iterations, %.1f s",
-            *(self.sequence, verdict.code.value, len(snapshot.cameras), len(snapshot.gaussians)),
-            *(snapshot.iterations, snapshot.seconds["total"]),
+            self.sequence,
+            verdict.code.value,
+            len(snapshot.cameras),
+            len(snapshot.gaussians),
+            snapshot.iterations,
+            snapshot.seconds["total"],
         )
         return snapshot

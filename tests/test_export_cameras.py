@@ -26,7 +26,7 @@ def test_quaternions_and_matrices_agree_for_every_largest_component():
 
 
 def test_colmap_model_is_read_by_colmap(tmp_path):
-    pycolmap = pytest.importorskip("pycolmap")
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap reads COLMAP models (the extra bench)")
     snapshot = make_snapshot()
     for name, data in encode_colmap(snapshot.cameras, snapshot.gaussians).items():
         (tmp_path / name).write_bytes(data)

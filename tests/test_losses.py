@@ -118,7 +118,7 @@ def test_lpips_as_a_loss(shared):
     """The metric's own value, a gradient that agrees with finite differences, and zero for equal images."""
     network = load_lpips("alex", shared / "weights")
     if network is None:
-        pytest.skip("LPIPS weights are not there")
+        pytest.skip("needs LPIPS's weights, which the shared test data has not")
     truth, other = image(0), image(1).requires_grad_(True)
     distance = LpipsDistance(network, "LPIPS AlexNet").prepared(truth)
     assert distance(truth).item() == 0.0

@@ -77,7 +77,7 @@ def on_cuda(tensors: list[Tensor]) -> list[Tensor]:
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("seed", range(3))
 def test_cuda_agrees_with_the_reference(seed, antialias):
-    pytest.importorskip("gsplat")
+    pytest.importorskip("gsplat", reason="needs the extra cuda")
     case = random_case(seed)
     # Opacities below both cut-offs and centres well inside, where the two are meant to be equal.
     case_tensors = case.tensors()
@@ -103,7 +103,7 @@ def test_cuda_agrees_with_the_reference(seed, antialias):
 
 @needs_cuda
 def test_cuda_iterates_quickly():
-    pytest.importorskip("gsplat")
+    pytest.importorskip("gsplat", reason="needs the extra cuda")
     leaves = on_cuda(random_case(0, count=50_000, bases=1, width=512, height=384).tensors())
     with torch.no_grad():
         leaves[2] *= 0.1

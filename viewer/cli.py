@@ -33,8 +33,7 @@ _PICTURE = 960, 720  # pixels, where no window is opened
 
 def view(args: argparse.Namespace) -> int:
     """Shows what `args.what` names. Raises what opening it raises."""
-    finished = _finished(args)
-    network = _network(args.what) if finished is None else None
+    finished, network = _finished(args), _network(args)
     if args.export is not None and (finished is None or args.export.suffix.lower() != ".mp4"):
         raise ValueError("--export needs a finished result and a file that ends with .mp4")
     width, height = args.size or _PICTURE
@@ -68,9 +67,19 @@ def _say(line: str) -> None:
 
 def _finished(args: argparse.Namespace) -> Moment | None:
     """The result that is named; None where it is a running node."""
-    if args.what is None or args.what.suffix.lower() in (".yaml", ".yml"):
+    if args.what is None or _is_configuration(args.what):
         return None
     return load_result(args.what, args.photographs)
+
+
+def _network(args: argparse.Namespace) -> Network:
+    """Where the running node is to be found: as its configuration says, if one is named."""
+    raw = read_yaml(args.what) if args.what is not None and _is_configuration(args.what) else {}
+    return typed(raw.get("network", {}), Network, "network")
+
+
+def _is_configuration(what: Path) -> bool:
+    return what.suffix.lower() in (".yaml", ".yml")
 
 
 def _window() -> Probe | None:
@@ -84,14 +93,8 @@ def _window() -> Probe | None:
     return probe
 
 
-def _network(config: Path | None) -> Network:
-    """Where the node of this configuration, or of none, is to be found."""
-    raw = read_yaml(config) if config is not None else {}
-    return typed(raw.get("network", {}), Network, "network")
-
-
-def _source(finished: Moment | None, network: Network | None) -> Source:
-    return Finished(finished) if finished is not None else Live(network or Network())
+def _source(finished: Moment | None, network: Network) -> Source:
+    return Finished(finished) if finished is not None else Live(network)
 
 
 def _give_way() -> None:

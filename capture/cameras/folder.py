@@ -69,10 +69,10 @@ def _looped(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: int) -> I
 def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]:
     frame_id = 0
     for path in paths:
-        name = frame_name(path)
-        if path.suffix.lower() in FOREIGN_SUFFIXES:
-            yield DroppedFrame(name, f"{path.suffix.lower()} files cannot be read; convert it to JPEG or PNG")
+        if (unreadable := foreign_file(path)) is not None:
+            yield unreadable
             continue
+        name = frame_name(path)
         try:
             data = path.read_bytes()
             image, intrinsics = decode_image(data, config.max_pixels)
@@ -87,6 +87,14 @@ def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]
             stamp_ns = round(frame_id / config.frames_per_second * 1e9)
             yield Frame(frame_id, name, stamp_ns, image, intrinsics, encoded=data)
             frame_id += 1
+
+
+def foreign_file(path: Path) -> DroppedFrame | None:
+    """The photograph left out, where its format is one that cannot be read; else None."""
+    suffix = path.suffix.lower()
+    if suffix not in FOREIGN_SUFFIXES:
+        return None
+    return DroppedFrame(frame_name(path), f"{suffix} files cannot be read; convert it to JPEG or PNG")
 
 
 def frame_name(path: Path) -> str:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import msgspec
 
-from capture.cameras.folder import FOREIGN_SUFFIXES, frame_name, image_paths
+from capture.cameras.folder import foreign_file, frame_name, image_paths
 from capture.frame import DroppedFrame, Frame, Intrinsics
 from capture.image_file import UnusableImage, decode_image, read_header
 from capture.unavailable import CameraUnavailable
@@ -67,8 +67,9 @@ def _frames(config: Config, done: set[str]) -> Iterator[Frame | DroppedFrame]:
 
 def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> Frame | DroppedFrame | None:
     """The photograph; None while it is being written, or where it has gone."""
-    if path.suffix.lower() in FOREIGN_SUFFIXES:
-        return DroppedFrame(frame_name(path), f"{path.suffix.lower()} files cannot be read; convert it to JPEG or PNG")
+    if (unreadable := foreign_file(path)) is not None:
+        return unreadable
+    name = frame_name(path)
     try:
         found, now = path.stat(), time.monotonic()
         before = seen.get(path.name)
@@ -82,13 +83,13 @@ def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> 
         seen.pop(path.name, None)
         return None
     except OSError as error:
-        return DroppedFrame(frame_name(path), f"cannot be read: {error.strerror}")
+        return DroppedFrame(name, f"cannot be read: {error.strerror}")
     try:
         read_header(data)
     except UnusableImage as error:
         waited = now - before.first
-        return None if waited < config.give_up_s else DroppedFrame(frame_name(path), f"{error}, after {waited:.0f} s")
-    return _decoded(frame_name(path), data, config, frame_id)
+        return None if waited < config.give_up_s else DroppedFrame(name, f"{error}, after {waited:.0f} s")
+    return _decoded(name, data, config, frame_id)
 
 
 def _decoded(name: str, data: bytes, config: Config, frame_id: int) -> Frame | DroppedFrame:
