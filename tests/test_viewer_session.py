@@ -145,6 +145,18 @@ def test_the_live_camera_moves_between_moments():
     session.close()
 
 
+def test_the_first_look_makes_room_for_advice_only_where_it_is_shown():
+    for advice in (True, False):
+        session = Session(Finished(moments(1)[0]), State(advice=advice))
+        session.receive()
+        before = session.viewpoint()
+        deadline = time.monotonic() + 20
+        while session.analysis() is None and time.monotonic() < deadline:
+            time.sleep(0.005)
+        assert session.analysis() is not None and (session.viewpoint() is not before) == advice
+        session.close()
+
+
 def test_gaussians_are_painted_again_only_where_they_look_different():
     feed = Feed()
     session = Session(feed, State(advice=False))

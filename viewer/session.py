@@ -69,12 +69,12 @@ class Session:
         if usable and not self._needs_support():
             return known  # what is advised depends on the cameras: the same ones need no second look
         self._analysis = self._analyst.of(moment) or (known if usable else None)
-        if self._analysis is not None and not usable and not self._touched:
+        if self._analysis is not None and not usable and not self._touched and self.state.advice:
             self._see_all(moment)
         return self._analysis
 
     def _see_all(self, moment: Moment) -> None:
-        known = self._analysis
+        known = self._analysis if self.state.advice else None
         advised = known.advice.arrow if known is not None and _same_cameras(known.moment, moment) else None
         self._view = overview(moment, advised or ())
 
