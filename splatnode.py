@@ -1,4 +1,4 @@
-"""The command line. The verbs are listed in `verbs.py` of each room, which is imported only when one of them runs.
+"""The command line. Each room lists its verbs in its `verbs.py`; the rest of a room is imported when one of them runs.
 
 Exit codes: 0 good; 2 usage or configuration; 65 the frames cannot be reconstructed (the verdict says why);
 69 camera unavailable; 70 internal; 73, 74 cannot write; 75 try again; 77 not allowed; 130 interrupted.

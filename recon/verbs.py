@@ -11,14 +11,7 @@ from pathlib import Path
 from capture.arguments import add_json, counts, megabytes, names, natural, positive, seconds
 from capture.verb import Verb, lazily
 
-EXPORT_FILES = {  # where each format goes, beside the scene
-    "ply": "scene.ply",
-    "spz": "scene.spz",
-    "splat": "scene.splat",
-    "colmap": "colmap",
-    "nerfstudio": "transforms.json",
-    "tum": "trajectory.tum",
-}
+EXPORT_FORMATS = ("ply", "spz", "splat", "colmap", "nerfstudio", "tum")
 
 
 def _demo_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,19 +60,8 @@ def _retract_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE", help="a result's folder, or a .ply, .spz or .splat file")
-    parser.add_argument("--to", required=True, choices=EXPORT_FILES, help="the format")
+    parser.add_argument("--to", required=True, choices=EXPORT_FORMATS, help="the format")
     parser.add_argument("--out", type=Path, metavar="PATH", help="default: beside the scene")
-
-
-def _export(args: argparse.Namespace) -> int:
-    from recon.export import export_scene
-
-    beside = args.scene if args.scene.is_dir() else args.scene.parent
-    destination = args.out or beside / EXPORT_FILES[args.to]
-    if args.out is None and destination.exists():
-        raise ValueError(f"{destination} is there already: give another place with --out PATH")
-    print(export_scene(args.scene, args.to, destination))
-    return 0
 
 
 def _bench_arguments(parser: argparse.ArgumentParser) -> None:
@@ -130,7 +112,7 @@ def _weights_arguments(parser: argparse.ArgumentParser) -> None:
 VERBS = (
     Verb("demo", "reconstruct the built-in capture", _demo_arguments, lazily("recon.cli", "demo")),
     Verb("replay", "reconstruct a folder of photographs", _replay_arguments, lazily("recon.cli", "replay")),
-    Verb("export", "write a scene in another format", _export_arguments, _export),
+    Verb("export", "write a scene in another format", _export_arguments, lazily("recon.export.command", "export")),
     Verb("recon", "reconstruct what comes, for ever", _recon_arguments, lazily("recon.daemon.daemon", "recon")),
     Verb("retract", "take a key frame back", _retract_arguments, lazily("recon.daemon.control", "retract")),
     Verb("bench", "measure held-out quality, poses and seconds", _bench_arguments, lazily("recon.cli", "bench")),

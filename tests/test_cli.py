@@ -19,7 +19,7 @@ import splatnode
 from capture.verb import Verb
 from recon.export import FORMATS, ResultWriteError
 from recon.snapshot import GaussianArrays
-from recon.verbs import EXPORT_FILES
+from recon.verbs import EXPORT_FORMATS
 from tests.conftest import ROOT
 
 
@@ -175,7 +175,7 @@ def test_bench_lists_are_parsed():
 
 
 def test_export_offers_the_formats_that_there_are():
-    assert set(EXPORT_FILES) == set(FORMATS)
+    assert tuple(FORMATS) == EXPORT_FORMATS
 
 
 def test_export_writes_beside_the_scene_but_never_over_a_file(tmp_path, capsys):

@@ -23,7 +23,14 @@ _DECODERS: dict[str, Callable[[bytes, str], GaussianArrays]] = {
 }
 _SCENE_ENCODERS = {"ply": encode_ply, "spz": encode_spz, "splat": encode_splat}
 _CAMERA_ENCODERS = {"nerfstudio": encode_nerfstudio, "tum": encode_tum}
-FORMATS = (*_SCENE_ENCODERS, "colmap", *_CAMERA_ENCODERS)
+FORMATS = {  # and where each goes, beside the scene
+    "ply": "scene.ply",
+    "spz": "scene.spz",
+    "splat": "scene.splat",
+    "colmap": "colmap",
+    "nerfstudio": "transforms.json",
+    "tum": "trajectory.tum",
+}
 
 
 def read_gaussians(path: Path) -> GaussianArrays:
@@ -46,16 +53,21 @@ def read_cameras(path: Path) -> tuple[CameraEstimate, ...]:
     return decode_cameras(path.read_bytes(), path.name)
 
 
-def export_scene(source: Path, to: str, destination: Path) -> Path:
-    """Writes the result folder or scene file `source` as `to`, one of FORMATS; returns `destination`.
+def export_scene(source: Path, to: str, destination: Path | None = None) -> Path:
+    """Writes the result folder or scene file `source` as `to`, one of FORMATS; returns where it is.
 
-    `destination` is a file, for "colmap" a folder. Cameras come from the cameras.json of the folder or beside the file.
-    Raises ValueError for an unknown format, SceneFileError for input that cannot be read as what it should be,
-    FileNotFoundError where there is none, ResultWriteError where the output cannot be written.
+    `destination` is a file, for "colmap" a folder; without it, the place beside the scene, if nothing is there yet.
+    Cameras come from the cameras.json of the folder or beside the file. Raises ValueError for an unknown format or a
+    place that is taken, SceneFileError for input that cannot be read as what it should be, FileNotFoundError where
+    there is none, ResultWriteError where the output cannot be written.
     """
     if to not in FORMATS:
         raise ValueError(f"the format must be one of {', '.join(FORMATS)}; got {to!r}")
     scene = source / "scene.ply" if source.is_dir() else source
+    if destination is None:
+        destination = scene.with_name(FORMATS[to])
+        if destination.exists():
+            raise ValueError(f"{destination} is there already: give another place with --out PATH")
     cameras = scene.with_name("cameras.json")
     if to in _SCENE_ENCODERS:
         encode = partial(encode_ply, scale=_scale(cameras)) if to == "ply" else _SCENE_ENCODERS[to]
