@@ -18,6 +18,9 @@ import numpy.typing as npt
 from capture import exif
 from capture.frame import Intrinsics
 
+SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}  # of what can be decoded
+MAX_PIXELS = 100_000_000  # of an image, unless another limit is given
+
 
 class UnusableImage(Exception):
     """The bytes hold no image that can be used; the message says why."""
@@ -30,7 +33,7 @@ class ImageHeader:
     exif: bytes = b""  # a TIFF structure
 
 
-def decode_image(data: bytes, max_pixels: int) -> tuple[npt.NDArray[np.uint8], Intrinsics | None]:
+def decode_image(data: bytes, max_pixels: int = MAX_PIXELS) -> tuple[npt.NDArray[np.uint8], Intrinsics | None]:
     """The image (H, W, 3) uint8 RGB, upright after its EXIF orientation, with the intrinsics that its EXIF tells.
 
     Grey becomes RGB, 16 bits become the upper 8, and alpha is dropped: the colours beneath it are kept as stored, as

@@ -19,7 +19,7 @@ import msgspec
 
 from capture.durable import sync_folder
 from capture.frame import DroppedFrame, Frame, Intrinsics
-from capture.image_file import UnusableImage, decode_image
+from capture.image_file import MAX_PIXELS, UnusableImage, decode_image
 
 log = logging.getLogger(__name__)
 
@@ -110,7 +110,7 @@ class Recording:
     folder: Path
     lines: tuple[_Line | _DroppedLine, ...]
 
-    def frames(self, names: tuple[str, ...] = (), max_pixels: int = 1 << 40) -> Iterator[Frame | DroppedFrame]:
+    def frames(self, names: tuple[str, ...] = (), max_pixels: int = MAX_PIXELS) -> Iterator[Frame | DroppedFrame]:
         """The frames as they were seen, or those called `names`. Raises ValueError where one of these is missing."""
         missing = [name for name in names if not any(name in (line.name, Path(line.name).stem) for line in self.lines)]
         if missing:

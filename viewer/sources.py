@@ -32,7 +32,6 @@ from viewer.moment import Moment
 log = logging.getLogger(__name__)
 
 _POLL_S = 0.25
-_MAX_PIXELS = 100_000_000  # of a photograph
 _PHOTOGRAPH_SIDE = 640  # pixels: a blend with the render in a window needs no more
 
 
@@ -209,7 +208,7 @@ def _photographs(cameras: tuple[CameraEstimate, ...], folders: list[Path]) -> di
             if not path.is_file():
                 continue
             try:
-                found[camera.name] = _small(decode_image(path.read_bytes(), _MAX_PIXELS)[0])
+                found[camera.name] = _small(decode_image(path.read_bytes())[0])
             except UnusableImage as error:
                 log.warning("%s is shown without its photograph: %s", camera.name, error)
             break

@@ -12,10 +12,9 @@ import msgspec
 
 from capture import recording
 from capture.frame import DroppedFrame, Frame, Intrinsics
-from capture.image_file import UnusableImage, decode_image
+from capture.image_file import MAX_PIXELS, SUFFIXES, UnusableImage, decode_image
 from capture.pace import Pace, paced
 
-DECODED_SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}
 # Photographs that cannot be decoded here: they are named, so that nobody wonders where they went.
 FOREIGN_SUFFIXES = {".heic", ".heif", ".avif", ".jxl", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf"}
 
@@ -24,7 +23,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     folder: Path
     names: tuple[str, ...] = ()  # the files to take, with or without suffix; none: all
     intrinsics: Intrinsics | None = None  # of all images of its aspect ratio, instead of what their EXIF tells
-    max_pixels: int = 100_000_000  # larger images are left out
+    max_pixels: int = MAX_PIXELS  # larger images are left out
     frames_per_second: Annotated[float, msgspec.Meta(gt=0)] = 10.0  # of the stamps, unless they were recorded
     pace: Pace = "fastest"
     loops: Annotated[int, msgspec.Meta(ge=1)] = 1  # times that it is shown, each with names of its own
@@ -114,7 +113,7 @@ def image_paths(folder: Path) -> list[Path]:
     if not folder.is_dir():
         found = "is a file, not" if folder.exists() else "is not there; give"
         raise FileNotFoundError(f"{str(folder)!r} {found} a folder that holds JPEG or PNG photographs")
-    suffixes = DECODED_SUFFIXES | FOREIGN_SUFFIXES
+    suffixes = SUFFIXES | FOREIGN_SUFFIXES
     visible = [path for path in folder.iterdir() if not path.name.startswith(".")]
     chosen = [path for path in visible if path.suffix.lower() in suffixes and (path.is_file() or not path.exists())]
     return sorted(chosen, key=natural_order)

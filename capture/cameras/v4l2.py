@@ -21,7 +21,6 @@ from capture.video4linux.device import Device, Format, RawFrame, System
 
 LIVE = True
 
-_MAX_PIXELS = 100_000_000
 _BY_ID, _BY_PATH = Path("/dev/v4l/by-id"), Path("/dev/v4l/by-path")
 
 
@@ -106,7 +105,7 @@ def _frame(raw: RawFrame, chosen: Format, frame_id: int, intrinsics: Intrinsics 
 def _decode(data: bytes, chosen: Format) -> npt.NDArray[np.uint8]:
     """(H, W, 3) RGB. Raises UnusableImage."""
     if chosen.pixels == "MJPG":
-        return decode_image(data, _MAX_PIXELS)[0]
+        return decode_image(data)[0]
     if len(data) < chosen.bytes_per_line * chosen.height:
         raise UnusableImage(f"truncated: {len(data)} of {chosen.bytes_per_line * chosen.height} bytes")
     lines = np.frombuffer(data, np.uint8, chosen.bytes_per_line * chosen.height)

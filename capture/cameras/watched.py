@@ -12,7 +12,7 @@ import msgspec
 
 from capture.cameras.folder import foreign_file, frame_name, image_paths
 from capture.frame import DroppedFrame, Frame, Intrinsics
-from capture.image_file import UnusableImage, decode_image, read_header
+from capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_header
 from capture.unavailable import CameraUnavailable
 
 _TEMPORARY_SUFFIXES = {".tmp", ".part", ".partial", ".crdownload", ".filepart"}
@@ -24,7 +24,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     poll_s: Annotated[float, msgspec.Meta(gt=0)] = 0.2
     settle_s: Annotated[float, msgspec.Meta(ge=0)] = 0.4  # a file is whole when it has not changed for so long
     give_up_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0  # a file that is not whole by then is left out
-    max_pixels: int = 100_000_000
+    max_pixels: int = MAX_PIXELS  # larger images are left out
     intrinsics: Intrinsics | None = None  # of all images, instead of what their EXIF tells
 
 

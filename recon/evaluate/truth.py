@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from capture.frame import Frame
+from capture.image_file import SUFFIXES
 from recon.export import read_cameras
 
-_SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
 _CHOSEN = "24_views"  # of InstantSplat's data sets: the frames that its protocol uses
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -61,7 +61,7 @@ def load_scene(folder: Path) -> EvaluationScene:
     """
     place = scene_folder(folder)
     data = place / _CHOSEN if (place / _CHOSEN).is_dir() else place
-    paths = {path.name: path for path in sorted((data / "images").glob("*")) if path.suffix.lower() in _SUFFIXES}
+    paths = {path.name: path for path in sorted((data / "images").glob("*")) if path.suffix.lower() in SUFFIXES}
     if not paths:
         raise FileNotFoundError(f"{data / 'images'} must hold the scene's images; there are none")
     readers = {"cameras.json": _cameras_json, "transforms.json": _transforms_json, "sparse/0": _colmap}
