@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import logging
-import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -19,13 +18,13 @@ import msgspec
 from capture.lock import exclusive
 from capture.messaging.message_file import read_message, size_in_file, write_message
 from capture.messaging.wire import Part
+from capture.state_directory import state_directory
 
 log = logging.getLogger(__name__)
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    # None: $STATE_DIRECTORY, else $XDG_STATE_HOME/splatnode, else ~/.local/state/splatnode
-    directory: Path | None = None
+    directory: Path | None = None  # None: capture.state_directory
     max_frames: Annotated[int, msgspec.Meta(ge=1)] = 200
     max_mb: Annotated[int, msgspec.Meta(ge=1)] = 1024
 
@@ -130,10 +129,4 @@ class Spool:
 
 
 def spool_directory(config: Config) -> Path:
-    return (config.directory or _default_directory()) / "spool"
-
-
-def _default_directory() -> Path:
-    if os.environ.get("STATE_DIRECTORY"):
-        return Path(os.environ["STATE_DIRECTORY"].split(":")[0])
-    return Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state").expanduser() / "splatnode"
+    return (config.directory or state_directory()) / "spool"

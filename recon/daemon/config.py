@@ -18,8 +18,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     network: Network = Network()
     reconstruction: Reconstruction = Reconstruction()
     tracking: Tracking = Tracking()  # of the live camera against a finished scene
-    # None: $STATE_DIRECTORY, else $XDG_STATE_HOME/splatnode, else ~/.local/state/splatnode
-    checkpoint: Path | None = None
+    checkpoint: Path | None = None  # None: recon/ in capture.state_directory
     out: Path = Path("out")  # each place becomes a folder in it
     max_views: Annotated[int, msgspec.Meta(ge=4)] = 30  # beyond, those that others show too are given up
     max_gaussians: Positive = 300_000

@@ -27,6 +27,7 @@ from capture.messaging.services import RECON_CONTROL, RECON_SCENE, RECON_STATUS
 from capture.messaging.state import StateServer
 from capture.messaging.wire import Numbering
 from capture.service_manager import ServiceManager
+from capture.state_directory import state_directory
 from capture.status import own_rss_mb
 from recon.daemon.config import Config
 from recon.daemon.control import Answer, Retract
@@ -35,7 +36,7 @@ from recon.daemon.intake import Intake
 from recon.daemon.output import Shown
 from recon.daemon.scene_message import camera_record, to_message
 from recon.daemon.status import ReconStatus, State
-from recon.daemon.store import Store, default_directory
+from recon.daemon.store import Store
 from recon.daemon.watcher import Watcher
 from recon.daemon.worker import Worker
 
@@ -72,7 +73,7 @@ class Daemon:
             self._scenes = self._resources.enter_context(StateServer(RECON_SCENE, network))
             self._heartbeat = self._resources.enter_context(Publisher(RECON_STATUS, network))
             self._commands = self._resources.enter_context(CommandServer(RECON_CONTROL, network, Retract))
-            self._store = Store(config.checkpoint or default_directory())
+            self._store = Store(config.checkpoint or state_directory() / "recon")
             self._resources.callback(self._store.close)
             remove_leftovers(config.out)
         self._inbox = Inbox()

@@ -14,9 +14,7 @@ is whole or not there, and has a checksum.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import logging
-import os
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -26,6 +24,7 @@ from typing import Any
 import msgspec
 
 from capture.frame import DroppedFrame, Frame, Intrinsics
+from capture.lock import Held, exclusive
 from capture.messaging.keyframe_messages import ReceivedFrame
 from capture.messaging.message_file import read_message, write_message
 from capture.messaging.wire import Limits, Message, WireError, decode, encode
@@ -79,7 +78,13 @@ class Store:
         self.directory = directory
         self._frames = directory / "frames"
         self._frames.mkdir(mode=0o700, parents=True, exist_ok=True)
-        self._lock = _locked(directory / "lock")
+        self._resources = contextlib.ExitStack()
+        try:
+            self._resources.enter_context(exclusive(directory / "lock"))
+        except Held as error:
+            raise CheckpointError(
+                f"another process uses the checkpoint in {directory}; stop it, or give another --checkpoint"
+            ) from error
         for leftover in (*directory.glob(".*.tmp"), *self._frames.glob(".*.tmp")):
             leftover.unlink()
         self.ledger = self._read_ledger()
@@ -89,7 +94,7 @@ class Store:
         self._writing = threading.RLock()
 
     def close(self) -> None:
-        self._lock.close()
+        self._resources.close()
 
     @property
     def scene_id(self) -> str:
@@ -219,25 +224,6 @@ class Store:
                 "Use the splatnode that wrote it, or move the folder away to begin anew"
             )
         return found
-
-
-def default_directory() -> Path:
-    if os.environ.get("STATE_DIRECTORY"):
-        return Path(os.environ["STATE_DIRECTORY"].split(":")[0]) / "recon"
-    return Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state").expanduser() / "splatnode" / "recon"
-
-
-def _locked(path: Path) -> Any:
-    file = path.open("a")
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        with contextlib.suppress(OSError):
-            file.close()
-        raise CheckpointError(
-            f"another process uses the checkpoint in {path.parent}; stop it, or give another --checkpoint"
-        ) from error
-    return file
 
 
 def _stored(number: int, parts: Any) -> StoredFrame:
