@@ -33,8 +33,8 @@ from recon.gaussians import Gaussians
 from recon.points import gaussians_at
 from recon.priors.pointmap import world_points
 from recon.rasterize.cpu import rasterize
-from recon.rivals import colmap_3dgs, outcome
-from recon.rivals.known_depth import SERVED_BY, Sight, sights
+from recon.rivals import colmap_3dgs, known_depth, outcome
+from recon.rivals.known_depth import Sight
 from recon.scene import Scene, View
 from recon.snapshot import Snapshot
 
@@ -59,13 +59,15 @@ _TOGETHER = msgspec.structs.replace(
 
 def reconstruct(frames: Sequence[Frame], seed: int, config: Config | None = None) -> Iterator[Snapshot]:
     """Snapshots of the scene while all frames refine it; one refusal where fewer than three have a depth."""
-    config = config or Config()
-    clock = Clock()
-    known = sights(frames, seed)
-    clock.lap("points")
-    if len(known) < outcome.MIN_CAMERAS:
-        yield outcome.refused(frames, clock)
-        return
+    settings = config or Config()
+    return known_depth.optimised(
+        frames, seed, lambda known, clock: _frame_by_frame(frames, known, seed, settings, clock)
+    )
+
+
+def _frame_by_frame(
+    frames: Sequence[Frame], known: Sequence[Sight], seed: int, config: Config, clock: Clock
+) -> Iterator[Snapshot]:
     scene = Scene((_view(known[0], np.eye(4)),), _from_depth(known[0], np.eye(4), config))
     for sight, following in pairwise(known):
         T_world_camera = _next_pose(sight, scene.views[-1], following, seed, config)
@@ -74,7 +76,7 @@ def reconstruct(frames: Sequence[Frame], seed: int, config: Config | None = None
     clock.lap("poses")
     together = msgspec.structs.replace(_TOGETHER, iterations=config.final, checkpoints=(config.final // 3,))
     refined = optimize.refine(scene, colmap_3dgs.in_extent(together, scene), seed=seed)
-    yield from outcome.told((outcome.of_scene(frames, each) for each in refined), clock, SERVED_BY)
+    yield from (outcome.of_scene(frames, each) for each in refined)
 
 
 def _next_pose(sight: Sight, view: View, following: Sight, seed: int, config: Config) -> np.ndarray:

@@ -6,20 +6,22 @@ estimated with it. Unlike a network's, these depths are right up to one scale th
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from capture.frame import Frame
 from recon import completion
+from recon.clock import Clock
 from recon.config import Config
 from recon.pipeline import Reconstruction
 from recon.priors.pointmap import Pointmap
+from recon.rivals import outcome
+from recon.snapshot import Snapshot
 
-SERVED_BY = {"depth": "multi-view depth"}
+_SERVED_BY = {"depth": "multi-view depth"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +35,25 @@ class Sight:
     K: npt.NDArray[np.float64]  # (3, 3)
 
 
-def sights(frames: Sequence[Frame], seed: int, config: Config | None = None) -> tuple[Sight, ...]:
+def optimised(
+    frames: Sequence[Frame], seed: int, learnt: Callable[[tuple[Sight, ...], Clock], Iterable[Snapshot]]
+) -> Iterator[Snapshot]:
+    """The snapshots that `learnt` makes of the sights; one refusal where fewer than three frames have a depth.
+
+    The clock is for what `learnt` does before its first snapshot.
+    """
+    clock = Clock()
+    known = sights(frames, seed)
+    clock.lap("points")
+    if len(known) < outcome.MIN_CAMERAS:
+        yield outcome.refused(frames, clock)
+    else:
+        yield from outcome.told(learnt(known, clock), clock, _SERVED_BY)
+
+
+def sights(frames: Sequence[Frame], seed: int) -> tuple[Sight, ...]:
     """The frames whose depth is known, in their order; none where our own verdict is that they make no scene."""
-    work = Reconstruction(msgspec.structs.replace(config or Config(), seed=seed))
+    work = Reconstruction(Config(seed=seed))
     for frame in frames:
         work.take(frame)
     work.estimate()

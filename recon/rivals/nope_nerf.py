@@ -17,10 +17,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from capture.frame import Frame
-from recon.clock import Clock
 from recon.keyframe import modelled_image
-from recon.rivals import outcome
-from recon.rivals.known_depth import SERVED_BY, Sight, sights
+from recon.rivals import known_depth
+from recon.rivals.known_depth import Sight
 from recon.rivals.nerf import fit
 from recon.rivals.nerf.cameras import Focal
 from recon.rivals.nerf.look import lattice, of_field
@@ -34,12 +33,10 @@ _POINTS = 384  # of each view's cloud
 
 def reconstruct(frames: Sequence[Frame], seed: int, config: fit.Config = OPTIMIZE) -> Iterator[Snapshot]:
     """Snapshots of the field while it is learnt; one refusal where fewer than three frames have a depth."""
-    clock = Clock()
-    known = sights(frames, seed)
-    clock.lap("points")
-    if len(known) < outcome.MIN_CAMERAS:
-        yield outcome.refused(frames, clock)
-        return
+    return known_depth.optimised(frames, seed, lambda known, _clock: _learnt(frames, known, seed, config))
+
+
+def _learnt(frames: Sequence[Frame], known: Sequence[Sight], seed: int, config: fit.Config) -> Iterator[Snapshot]:
     by_name = {frame.name: frame for frame in frames}
     placed = [by_name[sight.name] for sight in known]
     views = [_look(sight) for sight in known]
@@ -48,7 +45,7 @@ def reconstruct(frames: Sequence[Frame], seed: int, config: fit.Config = OPTIMIZ
     learnt = fit.learn(
         [view.image for view in views], focal, config, seed=seed, further=terms, beside=(terms.scales, terms.offsets)
     )
-    yield from outcome.told((of_field(frames, placed, each) for each in learnt), clock, SERVED_BY)
+    yield from (of_field(frames, placed, each) for each in learnt)
 
 
 @dataclass(frozen=True, eq=False)
