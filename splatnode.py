@@ -1,14 +1,15 @@
 """The command line. Each room lists its verbs in its `verbs.py`; the rest of a room is imported when one of them runs.
 
 Exit codes: 0 good; 2 usage or configuration; 65 the frames cannot be reconstructed (the verdict says why);
-69 camera unavailable; 70 internal; 73, 74 cannot write; 75 try again; 77 not allowed; 130 interrupted.
-SIGTERM is a clean stop with 0.
+69 camera or package unavailable; 70 internal; 73, 74 cannot write; 75 try again; 77 not allowed; 130 interrupted.
+SIGTERM is a clean stop with 0; the second one ends the process at once.
 """
 
 from __future__ import annotations
 
 import argparse
 import errno
+import io
 import logging
 import os
 import signal
@@ -20,6 +21,7 @@ from collections.abc import Sequence
 import capture.verbs
 import recon.verbs
 import viewer.verbs
+from capture.stop_signals import on_first
 
 # libgomp's threads spin while they wait. On a robot's busy processor that doubles the time of torch's operations.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -38,19 +40,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     if args.verb is None:
         parser.print_help(sys.stderr)
         return 2
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")  # a name that a terminal cannot show costs no result
     logging.basicConfig(format="%(message)s", stream=sys.stderr)
     for room in ("capture", "recon", "viewer"):
         logging.getLogger(room).setLevel(logging.INFO)
     stopping = threading.Event()
 
-    def stop(_signal: int, _frame: object) -> None:
+    def stop() -> None:
         stopping.set()
         sys.exit(0)
 
-    signal.signal(signal.SIGTERM, stop)
+    on_first((signal.SIGTERM,), stop)
     try:
         code = args.run(args)
-        sys.stdout.flush()
+        print(end="", flush=True)  # where there is a standard output
         return code
     except (Exception, KeyboardInterrupt) as error:
         if stopping.is_set():  # a package that was being imported makes an ImportError of the exit
@@ -89,6 +93,8 @@ def exit_code(error: BaseException) -> int:
         return own
     if isinstance(error, OSError):
         return _os_exit_code(error)
+    if isinstance(error, ModuleNotFoundError):
+        return 69
     return 2 if isinstance(error, ValueError) else 70
 
 
@@ -98,6 +104,8 @@ def explain(error: BaseException, code: int) -> str:
         return "interrupted"
     if isinstance(error, OSError) and error.strerror:
         return f"{error.strerror}: {error.filename}" if error.filename is not None else error.strerror
+    if isinstance(error, ModuleNotFoundError):
+        return f"{error}. ./run in place of splatnode installs what it needs; or run: pip install 'splatnode[bench]'"
     if code == 70:
         return f"internal error: {type(error).__name__}: {error} (--debug shows where; splatnode doctor may tell why)"
     return str(error)

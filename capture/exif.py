@@ -34,8 +34,8 @@ def read_tags(tiff: bytes) -> Tags:
         return {}
     try:
         tags = _read_directory(tiff, struct.unpack_from(order + "I", tiff, 4)[0], order)
-        if EXIF_IFD in tags:
-            tags |= _read_directory(tiff, int(tags[EXIF_IFD][0]), order)
+        if (part := first(tags, EXIF_IFD)) is not None:
+            tags |= _read_directory(tiff, int(part), order)
     except struct.error:  # an offset points outside
         return {}
     return tags
@@ -63,7 +63,7 @@ def exif_intrinsics(tags: Tags, width: int, height: int) -> Intrinsics | None:
     The principal point is taken to be the centre. Tags are not believed where the image was cropped after it was
     taken or the focal length is not that of a real lens.
     """
-    taken = sorted((_first(tags, PIXEL_X_DIMENSION) or width, _first(tags, PIXEL_Y_DIMENSION) or height))
+    taken = sorted((first(tags, PIXEL_X_DIMENSION) or width, first(tags, PIXEL_Y_DIMENSION) or height))
     shorter, longer = sorted((width, height))  # sorted: programs that turn an image do not always turn its tags
     if abs(taken[0] * longer / (taken[1] * shorter) - 1) > 0.02:
         return None
@@ -75,20 +75,20 @@ def exif_intrinsics(tags: Tags, width: int, height: int) -> Intrinsics | None:
 
 def _focal_from_35mm(tags: Tags, width: int, height: int) -> float | None:
     """Pixels. The equivalent focal length compares diagonals (CIPA DCG-001), so that it holds for 4:3 sensors too."""
-    focal_mm = _first(tags, FOCAL_LENGTH_35MM)
+    focal_mm = first(tags, FOCAL_LENGTH_35MM)
     return focal_mm * math.hypot(width, height) / _FILM_DIAGONAL_MM if focal_mm else None
 
 
 def _focal_from_sensor(tags: Tags, resized: float) -> float | None:
     """Pixels, from the lens and the sensor's pixels per unit of length, for an image `resized` times its taken size."""
-    focal_mm, per_unit = _first(tags, FOCAL_LENGTH), _first(tags, FOCAL_PLANE_X_RESOLUTION)
-    mm_per_unit = _MM_PER_UNIT.get(int(_first(tags, FOCAL_PLANE_RESOLUTION_UNIT) or 2))
+    focal_mm, per_unit = first(tags, FOCAL_LENGTH), first(tags, FOCAL_PLANE_X_RESOLUTION)
+    mm_per_unit = _MM_PER_UNIT.get(int(first(tags, FOCAL_PLANE_RESOLUTION_UNIT) or 2))
     if not focal_mm or not per_unit or not mm_per_unit:
         return None
     return focal_mm / mm_per_unit * per_unit * resized
 
 
-def _first(tags: Tags, tag: int) -> float | None:
+def first(tags: Tags, tag: int) -> float | None:
     """The tag's first value; None where it is absent or says "unknown" (zero, negative, 0/0)."""
     value = tags.get(tag, (0.0,))[0]
     return float(value) if value > 0 and math.isfinite(value) else None

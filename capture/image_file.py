@@ -139,9 +139,10 @@ def _webp_header(data: bytes) -> ImageHeader:
 
 def _tiff_header(data: bytes) -> ImageHeader:
     tags = exif.read_tags(data)
-    if exif.IMAGE_WIDTH not in tags or exif.IMAGE_LENGTH not in tags:
+    width, height = exif.first(tags, exif.IMAGE_WIDTH), exif.first(tags, exif.IMAGE_LENGTH)
+    if width is None or height is None:
         raise UnusableImage("truncated: the TIFF has no image directory")
-    return ImageHeader(int(tags[exif.IMAGE_WIDTH][0]), int(tags[exif.IMAGE_LENGTH][0]), exif=data)
+    return ImageHeader(int(width), int(height), exif=data)
 
 
 def _bmp_header(data: bytes) -> ImageHeader:

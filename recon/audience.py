@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import subprocess
 import sys
 import tempfile
@@ -31,7 +32,7 @@ def viewer(pictures: Path, command: tuple[str, ...] = (sys.executable, "-m", "sp
     """
     with tempfile.TemporaryDirectory(prefix="splatnode-") as folder:
         config = Path(folder, "node.yaml")
-        config.write_text(f"network: {{directory: {folder}}}\n")
+        config.write_text(json.dumps({"network": {"directory": folder}}))  # YAML, whatever the folder's name is
         with _Stage(Network(directory=Path(folder))) as stage:
             child = subprocess.Popen([*command, str(config), "--until-final", "--out", str(pictures)])
             try:

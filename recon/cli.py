@@ -41,6 +41,7 @@ def replay(args: argparse.Namespace) -> int:
     config = _config(args)
     frames = list(folder.stream(folder.Config(folder=args.folder, names=_chosen(args))))
     _check_baseline(config, [frame.name for frame in frames])
+    _check_apart(args.out, args.folder)
     check_writable(args.out)
     with viewer(args.out / "view") if args.view else contextlib.nullcontext(_shown_to_nobody) as show:
         snapshot = run(frames, with_looks(config, LOOK_EVERY) if args.view else config, show)
@@ -57,6 +58,12 @@ def _check_baseline(config: Config, names: Sequence[str]) -> None:
     missing = [name for name in (config.metric.baseline or ())[:2] if name not in names]
     if missing:
         raise ValueError(f"the baseline's photograph {missing[0]!r} is not there; there are: {', '.join(names)}")
+
+
+def _check_apart(out: Path, photographs: Path) -> None:
+    """Raises ValueError where the preview would be a photograph of the next run."""
+    if out.resolve() == photographs.resolve():
+        raise ValueError(f"--out must not be the folder of the photographs; give one in it, such as {out / 'out'}")
 
 
 def _shown_to_nobody(snapshot: Snapshot) -> None:
@@ -85,10 +92,10 @@ def run(
 def demo(args: argparse.Namespace) -> int:
     """Writes the built-in capture, reconstructs it, and measures the result on views that it has not seen."""
     seed = args.seed or 0
+    config = overlaid(preset("balanced"), {"seed": seed})
     check_writable(args.out)
     capture = args.out / "capture"
     split = write_capture(capture, synthetic.Config(seed=seed))
-    config = msgspec.structs.replace(preset("balanced"), seed=seed)
     snapshot = run(folder.stream(folder.Config(folder=capture / "images", names=split.train)), config)
     measured = held_out_quality(snapshot, capture, split) if snapshot.verdict.publishable else None
     report = finish(snapshot, args.out, seed=seed, preset_name="balanced", held_out=measured)

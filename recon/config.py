@@ -32,7 +32,7 @@ FITTING = optimize.Config(half_resolution_share=0.0, dssim=0.4, control=PRUNING,
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     size: Annotated[int, Meta(ge=64)] = 512  # longer side of the modelled images, pixels
-    seed: Annotated[int, Meta(ge=0)] = 0
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0  # what generators of random numbers take
     prior: PriorChoice = PriorChoice("classical", classical.Config())
     screening: screening.Config = screening.Config()
     verification: verify.Config = verify.Config()

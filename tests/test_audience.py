@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,8 @@ import msgspec
 import pytest
 
 import recon.audience
+from capture.config import read_yaml, typed
+from capture.messaging.network import Network
 from recon.audience import viewer
 from recon.cli import LOOK_EVERY, with_looks
 from recon.config import preset
@@ -28,6 +31,16 @@ def test_the_viewer_gets_the_last_snapshot(tmp_path, capfd, monkeypatch):
             show(replace(snapshot(), sequence=sequence, final=sequence == 19))
     assert (tmp_path / "live.png").is_file()
     assert "live.png: OK: All is well." in capfd.readouterr().out
+
+
+def test_the_viewer_finds_the_run_wherever_temporary_files_lie(tmp_path, monkeypatch):
+    copy = (sys.executable, "-c", f"import shutil, sys; shutil.copy(sys.argv[1], {str(tmp_path / 'seen.yaml')!r})")
+    with tempfile.TemporaryDirectory(prefix="a: #") as folder:
+        monkeypatch.setattr(tempfile, "tempdir", folder)
+        with viewer(tmp_path, copy):
+            pass
+        network = typed(read_yaml(tmp_path / "seen.yaml")["network"], Network)
+        assert network.directory is not None and network.directory.parent == Path(folder)
 
 
 def test_showing_waits_for_nobody_and_a_failed_run_ends_the_viewer(tmp_path, monkeypatch):

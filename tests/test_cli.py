@@ -18,6 +18,7 @@ import pytest
 import splatnode
 from capture.verb import Verb
 from recon.export import FORMATS, ResultWriteError
+from recon.export.ply import encode_ply
 from recon.snapshot import GaussianArrays
 from recon.verbs import EXPORT_FORMATS
 from tests.conftest import ROOT
@@ -66,6 +67,7 @@ def test_no_threads_of_a_library_spin_while_they_wait():
         (ResultWriteError(errno.ENOTDIR, "cannot write 3 files to out. Choose another folder"), 73),
         (ResultWriteError(errno.ENOSPC, "cannot write 3 files to out. Free some space"), 74),
         (OSError(errno.EIO, "Input/output error"), 74),
+        (ModuleNotFoundError("No module named 'cv2'", name="cv2"), 69),
         (RuntimeError("a bug"), 70),
         (ZeroDivisionError("a bug"), 70),
         (KeyboardInterrupt(), 130),
@@ -82,6 +84,17 @@ def test_an_error_is_one_line_and_a_code(monkeypatch, capsys, error, code):
 def test_debug_shows_the_traceback(monkeypatch, capsys):
     assert run_verb(monkeypatch, raising(RuntimeError("a bug")), "--debug") == 70
     assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("redirected, encoding", [(">&-", "utf-8"), ("", "ascii"), ("", "utf-8:strict")])
+def test_what_standard_output_cannot_take_costs_no_result(tmp_path, redirected, encoding):
+    name = "b\udcff" if encoding == "utf-8:strict" else "ü"
+    command = f'"{sys.executable}" -m splatnode export "{tmp_path}" --to spz --out "{tmp_path}/{name}.spz" {redirected}'
+    (tmp_path / "scene.ply").write_bytes(encode_ply(GaussianArrays.empty()))
+    env = {**os.environ, "PYTHONIOENCODING": encoding}
+    done = subprocess.run(["sh", "-c", command], cwd=ROOT, env=env, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert (tmp_path / f"{name}.spz").is_file()
 
 
 @pytest.mark.parametrize("code", [0, 65])

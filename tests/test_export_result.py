@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recon.export import ResultWriteError, write_result
+from recon.export import ResultWriteError, write_file, write_result
 from recon.export import staged as staged_module
 from recon.export.ply import encode_ply
 from recon.report import build_report
@@ -103,6 +103,16 @@ def test_the_system_reporting_a_full_disk_surfaces(tmp_path, monkeypatch):
         write_result(snapshot, tmp_path, report)
     assert caught.value.errno == errno.ENOSPC
     assert not any(path.is_file() for path in tmp_path.rglob("*"))
+
+
+def test_a_device_or_a_pipe_is_not_replaced_and_a_link_is_followed(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ResultWriteError, match="pipe is a device or a pipe"):
+        write_file(tmp_path / "pipe", b"new")
+    assert (tmp_path / "pipe").is_fifo()
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    write_file(tmp_path / "link", b"new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "real").read_bytes() == b"new"
 
 
 def test_file_in_place_of_the_folder_is_a_clear_error(tmp_path):

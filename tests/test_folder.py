@@ -9,6 +9,7 @@ import pytest
 from capture.cameras.folder import Config, stream
 from capture.exif import exif_intrinsics, read_tags
 from capture.frame import DroppedFrame, Frame, Intrinsics
+from capture.image_file import UnusableImage, read_header
 
 # Left half red, right half blue, the top left corner white: tells every orientation and channel order apart.
 PICTURE = np.zeros((48, 64, 3), np.uint8)
@@ -133,6 +134,13 @@ def test_damaged_exif_is_ignored(tmp_path):
     broken = tiff({}, {0xA405: 28})[:-8]
     for data in (broken, b"MM\0*\xff\xff\xff\xff", b"nonsense"):
         assert exif_intrinsics(read_tags(data), 64, 48) is None
+
+
+def test_zero_over_zero_in_a_pointer_or_a_size_is_no_number():
+    nothing_over_nothing = tiff({0x8769: (0, 0)}, {})
+    assert 0x8769 in read_tags(nothing_over_nothing)
+    with pytest.raises(UnusableImage, match="no image directory"):
+        read_header(tiff({0x0100: (0, 0), 0x0101: 48}, {}))
 
 
 def test_given_intrinsics_are_scaled_to_images_of_their_shape(tmp_path):

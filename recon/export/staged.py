@@ -27,9 +27,11 @@ def write_files(folder: Path, contents: Mapping[str, bytes]) -> None:
     temporary: dict[Path, Path] = {}
     try:
         for name, content in contents.items():
-            target = folder / name
+            target = Path(os.path.realpath(folder / name))  # what a link names is written, as if it were opened
             if target.is_dir():
                 raise IsADirectoryError(errno.EISDIR, f"{name} is a folder")
+            if target.exists() and not target.is_file():  # root could replace /dev/null
+                raise FileExistsError(errno.EEXIST, f"{name} is a device or a pipe, not a file")
             temporary[target] = target.with_name(f".{target.name}{mark}")
             target.parent.mkdir(parents=True, exist_ok=True)
             _write_through(temporary[target], content)
