@@ -86,6 +86,18 @@ class Similarity:
     rotation: Array  # (3, 3)
     translation: Array  # (3,)
 
+    def __call__(self, points: Array) -> Array:
+        """Points (..., 3) where they are after it."""
+        return self.scale * points @ self.rotation.T + self.translation
+
+    def after(self, inner: Similarity) -> Similarity:
+        """This one applied to the result of `inner`."""
+        return Similarity(self.scale * inner.scale, self.rotation @ inner.rotation, self(inner.translation))
+
+    def inverse(self) -> Similarity:
+        rotation = self.rotation.T
+        return Similarity(1.0 / self.scale, rotation, -rotation @ self.translation / self.scale)
+
     def camera(self, T_world_camera: Array) -> Array:
         """The camera after the world was moved: its rotation turned, its centre moved, no scale in the matrix."""
         moved = np.eye(4)

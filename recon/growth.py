@@ -40,7 +40,7 @@ def in_world_of(scene: Scene, registration: Registration, graph: ViewGraph) -> R
         cameras=tuple(
             replace(camera, T_world_camera=similarity.camera(camera.T_world_camera)) for camera in registration.cameras
         ),
-        points=similarity.scale * registration.points @ similarity.rotation.T + similarity.translation,
+        points=similarity(registration.points),
     )
 
 

@@ -151,6 +151,17 @@ def test_a_moved_camera_is_rigid_and_sees_the_moved_world_alike():
     before = T[:3, :3].T @ (point - T[:3, 3])
     after = moved[:3, :3].T @ (moved_point - moved[:3, 3])
     np.testing.assert_allclose(after, similarity.scale * before, atol=1e-12)
+    np.testing.assert_allclose(similarity(point), moved_point, atol=1e-12)
+
+
+def test_similarities_are_composed_and_undone():
+    first, second = (
+        Similarity(scale, Rotation.random(random_state=seed).as_matrix(), np.array([1.0, seed, -2.0]))
+        for seed, scale in ((1, 0.3), (2, 4.0))
+    )
+    points = np.random.default_rng(0).normal(size=(5, 3))
+    np.testing.assert_allclose(second.after(first)(points), second(first(points)), atol=1e-12)
+    np.testing.assert_allclose(first.inverse()(first(points)), points, atol=1e-12)
 
 
 def test_cameras_that_never_moved_say_nothing_about_scale():

@@ -32,7 +32,7 @@ def test_sigmas_are_the_errors_of_repeated_estimates():
         vectors = np.stack([cv2.Rodrigues(turn)[0][:, 0] for turn in turns])
         turned.append(np.linalg.norm(vectors - vectors.mean(0), axis=1))
         fit = umeyama(centres(estimate), centres(true))
-        aligned = fit.scale * centres(estimate) @ fit.rotation.T + fit.translation
+        aligned = fit(centres(estimate))
         moved.append(np.linalg.norm(aligned - centres(true), axis=1) / spread)
     np.testing.assert_allclose(rotation_sigmas, np.degrees(np.sqrt(np.mean(np.square(turned), 0))), rtol=0.3)
     np.testing.assert_allclose(centre_sigmas, np.sqrt(np.mean(np.square(moved), 0)), rtol=0.3)

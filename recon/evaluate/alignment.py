@@ -116,8 +116,7 @@ def ate_instantsplat(Ts_estimated: Array, Ts_true: Array) -> float | None:
 
 
 def _rms_after_umeyama(source: Array, target: Array) -> float:
-    similarity = umeyama(source, target)
-    moved = similarity.scale * source @ similarity.rotation.T + similarity.translation
+    moved = umeyama(source, target)(source)
     return math.sqrt(float(((moved - target) ** 2).sum(1).mean()))
 
 

@@ -145,7 +145,7 @@ def shift(before: Fit, after: Fit) -> Shift:
     relative = [Ts[first, :3, :3].transpose(0, 2, 1) @ Ts[second, :3, :3] for Ts in (Ts_before, Ts_after)]
     chord = np.linalg.norm(relative[0] - relative[1], axis=(1, 2)) / np.sqrt(8.0)
     moved = align_cameras(Ts_after, Ts_before)
-    centres = moved.scale * Ts_after[:, :3, 3] @ moved.rotation.T + moved.translation
+    centres = moved(Ts_after[:, :3, 3])
     target = Ts_before[:, :3, 3]
     spread = np.sqrt(((target - target.mean(0)) ** 2).sum(1).mean())
     return Shift(

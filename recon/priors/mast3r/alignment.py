@@ -17,7 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-Array = npt.NDArray[np.floating]
+from recon.geometry import Similarity
+
+Array = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
 _SAMPLES = 400  # points of a pair that take part
@@ -130,30 +132,10 @@ def _edge(pair: tuple[int, int], points: PairPoints, unit: float, depth: Map, fo
     return _Edge(*pair, seen, own, np.log(points.second_confidence.ravel()[chosen]).astype(np.float64) + 1e-3)
 
 
-@dataclass(frozen=True, eq=False)
-class _Similarity:
-    """x -> scale * rotation @ x + translation, from a view's own frame to the world."""
-
-    scale: float
-    rotation: Array  # (3, 3)
-    translation: Array  # (3,)
-
-    def __call__(self, points: Array) -> Array:
-        return self.scale * points @ self.rotation.T + self.translation
-
-    def after(self, inner: _Similarity) -> _Similarity:
-        """This one applied to the result of `inner`."""
-        return _Similarity(self.scale * inner.scale, self.rotation @ inner.rotation, self(inner.translation))
-
-    def inverse(self) -> _Similarity:
-        rotation = self.rotation.T
-        return _Similarity(1.0 / self.scale, rotation, -rotation @ self.translation / self.scale)
+_IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 
 
-_IDENTITY = _Similarity(1.0, np.eye(3), np.zeros(3))
-
-
-def _procrustes(source: Array, target: Array, weights: Array) -> _Similarity:
+def _procrustes(source: Array, target: Array, weights: Array) -> Similarity:
     """The similarity that carries `source` (S, 3) onto `target`: weighted, and robust by reweighting."""
     fit, robust = _IDENTITY, weights
     for _ in range(8):
@@ -165,18 +147,18 @@ def _procrustes(source: Array, target: Array, weights: Array) -> _Similarity:
         rotation = u @ np.diag(signs) @ vt
         spread = float(share @ (centred_source**2).sum(1))
         scale = float((singular * signs).sum()) / max(spread, 1e-12)
-        fit = _Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
+        fit = Similarity(scale, rotation, mean_target - scale * rotation @ mean_source)
         relative = np.linalg.norm(fit(source) - target, axis=1) / np.maximum(np.linalg.norm(target, axis=1), 1e-9)
         robust = weights / (1.0 + (relative / _ROBUST) ** 2)
     return fit
 
 
-def _start(edges: Sequence[_Edge], count: int) -> list[_Similarity]:
+def _start(edges: Sequence[_Edge], count: int) -> list[Similarity]:
     """View-to-world similarities by the spanning tree of pairs that most other pairs agree with."""
     relative = [_procrustes(edge.own, edge.seen, edge.weights) for edge in edges]  # second's frame to first's
     errors = np.array([_error(edge, _IDENTITY, fit) for edge, fit in zip(edges, relative, strict=True)])
     rng = np.random.default_rng(0)
-    best: tuple[float, list[_Similarity]] | None = None
+    best: tuple[float, list[Similarity]] | None = None
     for _ in range(_TREES):
         order = np.argsort(errors * rng.lognormal(0.0, 0.7, len(edges)), kind="stable")
         placed = _along_tree(order.tolist(), edges, relative, count)
@@ -190,10 +172,10 @@ def _start(edges: Sequence[_Edge], count: int) -> list[_Similarity]:
 
 
 def _along_tree(
-    order: Sequence[int], edges: Sequence[_Edge], relative: Sequence[_Similarity], count: int
-) -> list[_Similarity]:
+    order: Sequence[int], edges: Sequence[_Edge], relative: Sequence[Similarity], count: int
+) -> list[Similarity]:
     """Every view placed from view 0 along the first edges in `order` that reach a new view."""
-    placed: dict[int, _Similarity] = {0: _IDENTITY}
+    placed: dict[int, Similarity] = {0: _IDENTITY}
     while len(placed) < count:
         for index in order:
             first, second = edges[index].first, edges[index].second
@@ -208,13 +190,13 @@ def _along_tree(
     return [placed[view] for view in range(count)]
 
 
-def _error(edge: _Edge, first: _Similarity, second: _Similarity) -> float:
+def _error(edge: _Edge, first: Similarity, second: Similarity) -> float:
     """Median distance of the pair's points from the second view's own, relative to their depth."""
     gap = np.linalg.norm(first(edge.seen) - second(edge.own), axis=1)
     return float(np.median(gap / np.maximum(second.scale * np.linalg.norm(edge.own, axis=1), 1e-12)))
 
 
-def _refined(similarities: list[_Similarity], edges: Sequence[_Edge], iterations: int = 15) -> list[_Similarity]:
+def _refined(similarities: list[Similarity], edges: Sequence[_Edge], iterations: int = 15) -> list[Similarity]:
     """All views together, by Gauss-Newton on the reweighted gaps of all pairs; view 0 stays.
 
     Geman-McClure weights: a wrong pair has hundreds of gaps far out, and Cauchy's would add up their pull to most of
@@ -243,7 +225,7 @@ def _refined(similarities: list[_Similarity], edges: Sequence[_Edge], iterations
     return similarities
 
 
-def _motion(points: Array, similarity: _Similarity) -> Array:
+def _motion(points: Array, similarity: Similarity) -> Array:
     """(S, 3, 7) change of world points (S, 3) with rotation about, translation and log scale from their camera."""
     arm = points - similarity.translation
     change = np.zeros((len(points), 3, 7))
@@ -255,15 +237,15 @@ def _motion(points: Array, similarity: _Similarity) -> Array:
     return change
 
 
-def _moved(similarity: _Similarity, step: Array) -> _Similarity:
+def _moved(similarity: Similarity, step: npt.NDArray[np.floating]) -> Similarity:
     rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ similarity.rotation
-    return _Similarity(
+    return Similarity(
         similarity.scale * float(np.exp(np.clip(step[6], -0.5, 0.5))), rotation, similarity.translation + step[3:6]
     )
 
 
 def _in_first_frame(
-    similarities: Sequence[_Similarity],
+    similarities: Sequence[Similarity],
     edges: Sequence[_Edge],
     focals: Sequence[float],
     depths: Sequence[Map],
