@@ -84,8 +84,8 @@ def overlaid(config: Config, changes: Mapping[str, Any]) -> Config:
     Another kind of prior starts from its own defaults.
     """
     tree = _as_in_files(msgspec.to_builtins(config))
-    kind = tree["prior"]["kind"]
-    if changes.get("prior", {}).get("kind", kind) != kind:
+    kind, prior = tree["prior"]["kind"], changes.get("prior")
+    if isinstance(prior, Mapping) and prior.get("kind", kind) != kind:
         tree["prior"] = {}
     return typed(merged(tree, changes), Config)
 
