@@ -79,6 +79,19 @@ def _detect(image: Image, squeeze: float, config: Config) -> tuple[npt.NDArray[n
     return points, root_sift(np.asarray(raw, np.float32)[order])
 
 
+def describe(grey: Image, points: npt.NDArray[np.float64], size: float) -> npt.NDArray[np.uint8]:
+    """(M, 128) descriptors of upright patches of the image (H, W), around `points` (M, 2).
+
+    `size` is that of a keypoint, in pixels: its descriptor looks at 6 times as much.
+    """
+    if not len(points):
+        return np.zeros((0, 128), np.uint8)
+    keypoints = [cv2.KeyPoint(float(x), float(y), size, 0.0) for x, y in points - 0.5]
+    kept, raw = cv2.SIFT.create().compute(grey, keypoints)
+    assert len(kept) == len(points)  # SIFT describes whatever it is given
+    return root_sift(np.asarray(raw, np.float32))
+
+
 def root_sift(raw: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:
     """(M, 128) RootSIFT (Arandjelovic and Zisserman, 2012) of SIFT descriptors: L1-normalised, then square-rooted.
 

@@ -7,13 +7,13 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.keyframe import Keyframe
-from recon.registration.features import root_sift
+from recon.registration.features import describe
 
 Index = npt.NDArray[np.int64]
 
 _MOST = 500  # matches that are looked at
 _FEWEST = 9
-_PATCH_SIZE = 4.0  # of a keypoint, modelled pixels: its descriptor looks at 6 times as much
+_PATCH_SIZE = 4.0  # of a keypoint, modelled pixels
 _ASIDE = 16.0  # modelled pixels
 _REACH = 12.0  # of a patch, modelled pixels
 _SIGMAS = 8.0  # above what points aside of the matched ones would reach; patches of neighbours overlap
@@ -52,7 +52,6 @@ def _inside(keyframe: Keyframe, points: npt.NDArray[np.float64], margin: float) 
 
 def _described(keyframe: Keyframe, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """(M, 128) of unit length: upright patches of the keyframe's image at modelled size, around `points` (M, 2)."""
-    keypoints = [cv2.KeyPoint(float(x), float(y), _PATCH_SIZE, 0.0) for x, y in points - 0.5]
-    _, raw = cv2.SIFT.create().compute(cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY), keypoints)
-    described = root_sift(np.asarray(raw, np.float32)).astype(np.float64)
+    grey = np.asarray(cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY), np.uint8)
+    described = describe(grey, points, _PATCH_SIZE).astype(np.float64)
     return described / np.maximum(np.linalg.norm(described, axis=1, keepdims=True), 1e-9)

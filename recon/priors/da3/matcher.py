@@ -17,12 +17,11 @@ from recon.keyframe import Keyframe
 from recon.networks.crop import cropped
 from recon.priors.da3.inference import Answer, Network, ask
 from recon.registration import matching
-from recon.registration.features import root_sift
+from recon.registration.features import describe
 
 Array = npt.NDArray[np.float64]
-Grey = npt.NDArray[np.uint8]
 
-_PATCH_SIZE = 6.0  # of a keypoint, network pixels: its descriptor looks at 6 times as much
+_PATCH_SIZE = 6.0  # of a keypoint, network pixels
 _NEAR = 1.0  # pixel: a point is drawn where the drawing has a pixel that comes from this near
 
 
@@ -48,7 +47,9 @@ class WarpMatcher:
         where1, chosen1 = _drawn_at(first.crop.to_network(keyframe1.features.points), origin)
         where2 = second.crop.to_network(keyframe2.features.points)
         (chosen2,) = np.nonzero(((where2 >= 0) & (where2 < [second.crop.width, second.crop.height])).all(1))
-        described1, described2 = _described(drawn, where1), _described(grey2, where2[chosen2])
+        # Upright and of one size: both pictures are from one viewpoint.
+        described1 = describe(drawn, where1, _PATCH_SIZE)
+        described2 = describe(grey2, where2[chosen2], _PATCH_SIZE)
         found = matching.match(described1, described2, matching.Config())
         return np.stack([chosen1[found[:, 0]], chosen2[found[:, 1]]], 1)
 
@@ -76,13 +77,3 @@ def _drawn_at(points: Array, origin: Array) -> tuple[Array, npt.NDArray[np.int64
     (chosen,) = np.nonzero(distance < _NEAR)
     pixels = np.stack([columns, rows], 1)[nearest[chosen].astype(np.int64)]
     return pixels.astype(np.float64) + 0.5, chosen
-
-
-def _described(image: Grey, points: Array) -> npt.NDArray[np.uint8]:
-    """(M, 128) descriptors of upright patches of one size: both pictures are from one viewpoint."""
-    if not len(points):
-        return np.zeros((0, 128), np.uint8)
-    keypoints = [cv2.KeyPoint(float(x), float(y), _PATCH_SIZE, 0.0) for x, y in points - 0.5]
-    kept, raw = cv2.SIFT.create().compute(image, keypoints)
-    assert len(kept) == len(points)  # SIFT describes whatever it is given
-    return root_sift(np.asarray(raw, np.float32))
