@@ -17,11 +17,11 @@ from recon.screening import Rejected
 from recon.verdict import Code, Verdict
 from recon.verification.cycles import Cycles
 from recon.verification.evidence import CameraEvidence, Evidence
+from recon.verification.jackknife import Spread
 from recon.verification.joints import Joint
 from recon.verification.lens import Distortion, FreedLens
 from recon.verification.photometric import Score
 from recon.verification.reflection import Reflection
-from recon.verification.stability import Spread
 from recon.view_graph import ViewGraph
 
 PLAIN, RICH = 20, 2000  # features

@@ -13,7 +13,7 @@ from recon.core import default_threads, set_threads
 from recon.registration import bundle
 
 NOISE_PX = 0.3
-PRIOR = bundle.FocalPrior(np.log([950.0]), np.array([0.3]), np.array([0.1]), np.array([10.0]))
+PRIOR = bundle.LensPrior(np.log([950.0]), np.array([0.3]), np.array([0.1]), np.array([10.0]))
 
 
 def problem(num_points: int = 60, seed: int = 0, noise_px: float = NOISE_PX) -> bundle.Problem:

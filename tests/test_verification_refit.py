@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from recon.registration import bundle
-from recon.verification import lens, refit, reversal, stability
+from recon.verification import jackknife, lens, refit, reversal
 
 FOCAL = 900.0
 
@@ -40,7 +40,7 @@ def made_up(noise_px: float = 0.2, depth: float = 1.0, radial: float = 0.0, foca
     problem = replace(
         exact, pixels=pixels + rng.normal(0, noise_px, pixels.shape), log_focals=np.log([focal]), radials=np.zeros(1)
     )
-    prior = bundle.FocalPrior(problem.log_focals, np.array([refit.FREE_SIGMA]), np.zeros(1), np.zeros(1))
+    prior = bundle.LensPrior(problem.log_focals, np.array([refit.FREE_SIGMA]), np.zeros(1), np.zeros(1))
     return refit.Fit(problem, prior, bundle.Config(robust_px=1.0), np.ones(4), np.full(1, np.nan))
 
 
@@ -91,7 +91,7 @@ def test_without_points_only_their_observations_go():
 
 def test_the_spread_grows_with_what_the_model_leaves_out():
     """Four times the noise, or distortion that is not modelled: both must show."""
-    quiet, noisy, bent = (stability.by_regions(fit) for fit in (made_up(0.1), made_up(0.4), made_up(0.1, radial=0.1)))
+    quiet, noisy, bent = (jackknife.by_regions(fit) for fit in (made_up(0.1), made_up(0.4), made_up(0.1, radial=0.1)))
     assert quiet.rotation_deg < 0.1 and quiet.centre_rel < 0.01
     assert noisy.centre_rel > 2 * quiet.centre_rel
     assert bent.centre_rel > 3 * quiet.centre_rel and bent.focal_rel > 3 * quiet.focal_rel

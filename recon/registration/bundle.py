@@ -43,7 +43,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, eq=False)
-class FocalPrior:
+class LensPrior:
     """Gaussian priors on each lens' log focal length, radial coefficient and principal point; a sigma of 0 fixes."""
 
     log_focals: Array  # (G,)
@@ -77,7 +77,7 @@ def robust_cost(problem: Problem, config: Config) -> float:
     return float(config.robust_px**2 * np.log1p(squared / config.robust_px**2).sum())
 
 
-def adjust(problem: Problem, prior: FocalPrior, config: Config, fixed_camera: int = 0) -> Problem:
+def adjust(problem: Problem, prior: LensPrior, config: Config, fixed_camera: int = 0) -> Problem:
     """The problem after minimising the robust cost. Camera `fixed_camera` stays where it is."""
     problem = _copy(_by_point(problem))
     native, _arrays = _native(problem, prior, config, fixed_camera)
@@ -101,7 +101,7 @@ class Covariance:
         return np.stack([self.joint[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] for c in range(count)])
 
 
-def covariance(problem: Problem, prior: FocalPrior, config: Config, fixed_camera: int = 0) -> Covariance:
+def covariance(problem: Problem, prior: LensPrior, config: Config, fixed_camera: int = 0) -> Covariance:
     """Inverse of the normal equations at the minimum, times the variance `config.noise_px ** 2` of an observation."""
     problem = _by_point(problem)
     native, _arrays = _native(problem, prior, config, fixed_camera)
@@ -179,7 +179,7 @@ class _Native(ctypes.Structure):
 
 
 def _native(
-    problem: Problem, prior: FocalPrior, config: Config, fixed_camera: int
+    problem: Problem, prior: LensPrior, config: Config, fixed_camera: int
 ) -> tuple[_Native, list[npt.NDArray[np.generic]]]:
     """The problem as the core reads it, and the arrays that must live as long."""
     first = np.searchsorted(problem.point_of, np.arange(len(problem.points) + 1))

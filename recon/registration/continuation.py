@@ -87,7 +87,7 @@ def _begun(
         point_of=np.zeros(0, np.int64),
         pixels=np.zeros((0, 2)),
     )
-    prior = bundle.FocalPrior(
+    prior = bundle.LensPrior(
         log_focals=log_focals,
         sigmas=np.array([lens.sigma for lens in known]),
         radial_sigmas=np.zeros(num_lenses),

@@ -62,7 +62,7 @@ def finish(of: Survey, grown: Growth, pictures: Sequence[Picture], config: Confi
     return Finished(grown, loss, float(np.sqrt(np.mean(errors**2))))
 
 
-def _free_lenses(of: Survey, prior: bundle.FocalPrior, config: Config) -> bundle.FocalPrior:
+def _free_lenses(of: Survey, prior: bundle.LensPrior, config: Config) -> bundle.LensPrior:
     """The prior that frees distortion and principal point of all lenses that are not calibrated."""
     unknown = prior.sigmas > 0
     longer_side = np.array([max(v.longer_side for v in of.views if v.lens == g) for g in range(len(of.lenses))])

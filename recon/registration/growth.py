@@ -84,7 +84,7 @@ def _begin(of: Survey, focals: list[float], first: tuple[int, int], config: Conf
         point_of=np.zeros(0, np.int64),
         pixels=np.zeros((0, 2)),
     )
-    prior = bundle.FocalPrior(
+    prior = bundle.LensPrior(
         log_focals=np.log(focals),
         sigmas=np.array([lens.sigma for lens in of.lenses]),
         radial_sigmas=np.zeros(num_lenses),

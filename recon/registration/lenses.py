@@ -108,7 +108,7 @@ def lenses(
 
 def contradicted(
     problem: bundle.Problem,
-    prior: bundle.FocalPrior,
+    prior: bundle.LensPrior,
     loss: bundle.Config,
     fixed_camera: int,
     grouping: Grouping,
@@ -129,7 +129,7 @@ def contradicted(
         shifts=problem.shifts[lens_of],
     )
     sigmas = prior.sigmas[lens_of]
-    free = bundle.FocalPrior(
+    free = bundle.LensPrior(
         log_focals=prior.log_focals[lens_of],
         sigmas=sigmas,
         radial_sigmas=prior.radial_sigmas[lens_of],

@@ -39,7 +39,7 @@ class Map:
 
     views: tuple[int, ...]  # indices of the registered views; the first is the world's origin
     problem: bundle.Problem
-    prior: bundle.FocalPrior
+    prior: bundle.LensPrior
     loss: bundle.Config
     agreement: dict[tuple[int, int], float]  # share of each pair's inliers that the map explains
     median_angle_deg: float  # of the points' widest rays

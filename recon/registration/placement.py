@@ -51,7 +51,7 @@ class Known:
 
 
 def place(
-    state: bundle.Problem,
+    problem: bundle.Problem,
     all_tracks: Tracks,
     track_of_point: Index,
     view: int,
@@ -61,20 +61,20 @@ def place(
     config: Config,
 ) -> Placement | None:
     """The best supported pose of `view`, or None when no proposal has enough support."""
-    known = _known(state, all_tracks, track_of_point, view)
+    known = _known(problem, all_tracks, track_of_point, view)
     neighbours = {
         other: pairs[min(view, other), max(view, other)]
         for other in registered
         if (min(view, other), max(view, other)) in pairs
     }
     limit = config.max_error_px * scale[view]
-    focal = float(np.exp(state.log_focals[state.lens_of_camera[view]]))
+    focal = float(np.exp(problem.log_focals[problem.lens_of_camera[view]]))
     available = max(1, len(known.tracks) + sum(len(pair.matches) for pair in neighbours.values()))
     best: Placement | None = None
-    for rotation, translation in _proposals(state, all_tracks, known, view, neighbours, limit, config):
+    for rotation, translation in _proposals(problem, all_tracks, known, view, neighbours, limit, config):
         error = reprojection_errors(known, rotation, translation, focal)
         support = float((error < 3.0 * limit).sum())
-        proposed = with_pose(state, view, rotation, translation)
+        proposed = with_pose(problem, view, rotation, translation)
         for other, pair in neighbours.items():
             errors = pair_errors(proposed, (min(view, other), max(view, other)), pair)
             support += float((errors < 2.0 * limit).sum())
@@ -83,11 +83,11 @@ def place(
     return best
 
 
-def with_pose(state: bundle.Problem, view: int, rotation: Array, translation: Array) -> bundle.Problem:
+def with_pose(problem: bundle.Problem, view: int, rotation: Array, translation: Array) -> bundle.Problem:
     """The problem with another pose of `view`, world to camera."""
-    rotations, translations = state.rotations.copy(), state.translations.copy()
+    rotations, translations = problem.rotations.copy(), problem.translations.copy()
     rotations[view], translations[view] = rotation, translation
-    return replace(state, rotations=rotations, translations=translations)
+    return replace(problem, rotations=rotations, translations=translations)
 
 
 def relative_pose(pair: TwoView, focal1: float, focal2: float, limit: float) -> tuple[Array, Array, int]:
@@ -102,18 +102,18 @@ def relative_pose(pair: TwoView, focal1: float, focal2: float, limit: float) -> 
     return np.asarray(pose.R), np.asarray(pose.t), int(sum(info["inliers"]))
 
 
-def pair_errors(state: bundle.Problem, key: tuple[int, int], pair: TwoView) -> Array:
+def pair_errors(problem: bundle.Problem, key: tuple[int, int], pair: TwoView) -> Array:
     """(M,) Sampson errors of a pair's matches, pixels; infinite for what is not in front of both cameras."""
     rays = []
     for view, points in zip(key, (pair.points1, pair.points2), strict=True):
-        normalised = normalise(state, np.full(len(points), view), points)
+        normalised = normalise(problem, np.full(len(points), view), points)
         rays.append(np.column_stack([normalised, np.ones(len(points))]))
-    rotation = state.rotations[key[1]] @ state.rotations[key[0]].T
-    translation = state.translations[key[1]] - rotation @ state.translations[key[0]]
+    rotation = problem.rotations[key[1]] @ problem.rotations[key[0]].T
+    translation = problem.translations[key[1]] - rotation @ problem.translations[key[0]]
     essential = bundle.cross_matrix(translation[None])[0] @ rotation
     line2, line1 = rays[0] @ essential.T, rays[1] @ essential
     residual = np.abs((rays[1] * line2).sum(1))
-    focal1, focal2 = np.exp(state.log_focals[state.lens_of_camera[list(key)]])
+    focal1, focal2 = np.exp(problem.log_focals[problem.lens_of_camera[list(key)]])
     gradient = (line2[:, :2] ** 2).sum(1) / focal2**2 + (line1[:, :2] ** 2).sum(1) / focal1**2
     errors = residual / np.sqrt(np.maximum(gradient, 1e-30))
     # Depths along both rays where they come closest: depth1 * R ray1 + t = depth2 * ray2.
@@ -126,13 +126,13 @@ def pair_errors(state: bundle.Problem, key: tuple[int, int], pair: TwoView) -> A
     return np.where(in_front, errors, np.inf)
 
 
-def normalise(state: bundle.Problem, camera: Index, pixels: Array) -> Array:
+def normalise(problem: bundle.Problem, camera: Index, pixels: Array) -> Array:
     """Coordinates (M, 2) at depth 1, without distortion, of `pixels` (M, 2) of the cameras `camera` (M,)."""
-    lens = state.lens_of_camera[camera]
-    distorted = (pixels - state.shifts[lens]) / np.exp(state.log_focals[lens])[:, None]
+    lens = problem.lens_of_camera[camera]
+    distorted = (pixels - problem.shifts[lens]) / np.exp(problem.log_focals[lens])[:, None]
     result = distorted
-    for _ in range(5 if np.any(state.radials) else 0):  # fixed-point iteration
-        result = distorted / (1.0 + state.radials[lens] * (result**2).sum(1))[:, None]
+    for _ in range(5 if np.any(problem.radials) else 0):  # fixed-point iteration
+        result = distorted / (1.0 + problem.radials[lens] * (result**2).sum(1))[:, None]
     return result
 
 
@@ -144,18 +144,18 @@ def reprojection_errors(known: Known, rotation: Array, translation: Array, focal
     return np.where(in_camera[:, 2] > 0, error, np.inf)
 
 
-def _known(state: bundle.Problem, all_tracks: Tracks, track_of_point: Index, view: int) -> Known:
+def _known(problem: bundle.Problem, all_tracks: Tracks, track_of_point: Index, view: int) -> Known:
     mine = all_tracks.camera_of == view
     tracks, pixels = all_tracks.track_of[mine], all_tracks.pixels[mine]
     if len(track_of_point) == 0:
         return Known(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0, np.int64))
     position = np.minimum(np.searchsorted(track_of_point, tracks), len(track_of_point) - 1)
     found = track_of_point[position] == tracks
-    return Known(pixels[found], state.points[position[found]], tracks[found])
+    return Known(pixels[found], problem.points[position[found]], tracks[found])
 
 
 def _proposals(
-    state: bundle.Problem,
+    problem: bundle.Problem,
     all_tracks: Tracks,
     known: Known,
     view: int,
@@ -164,7 +164,7 @@ def _proposals(
     config: Config,
 ) -> Iterator[tuple[Array, Array]]:
     """Poses from all known points, from those that one neighbour sees too, and from a pair and the points' scale."""
-    focals = np.exp(state.log_focals[state.lens_of_camera])
+    focals = np.exp(problem.log_focals[problem.lens_of_camera])
     most = 0
     strongest = sorted(neighbours, key=lambda other: -len(neighbours[other].matches))[:4]
     everything = np.ones(len(known.tracks), bool)
@@ -195,12 +195,12 @@ def _proposals(
             continue
         if view == first:  # The pair leads from the view to its neighbour: turned round.
             rotation, direction = rotation.T, -rotation.T @ direction
-        in_other = known.points[chosen] @ state.rotations[other].T + state.translations[other]
+        in_other = known.points[chosen] @ problem.rotations[other].T + problem.translations[other]
         rays = known.pixels[chosen] / focals[view]
         length = _scale(in_other @ rotation.T, direction, rays, limit / focals[view], config.min_scale_points)
         if length is None:
             continue
-        yield rotation @ state.rotations[other], rotation @ state.translations[other] + length * direction
+        yield rotation @ problem.rotations[other], rotation @ problem.translations[other] + length * direction
 
 
 def _scale(turned: Array, direction: Array, rays: Array, limit: float, min_points: int) -> float | None:

@@ -144,28 +144,28 @@ def in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe], enlarged: 
 
     Its pixels are those of the frames `enlarged` to the size of their lens.
     """
-    state = built.problem
+    problem = built.problem
     order = sorted(built.views)
-    covariances = bundle.covariance(state, built.prior, built.loss, built.views[0])
-    _, depths = bundle.project(state)
+    covariances = bundle.covariance(problem, built.prior, built.loss, built.views[0])
+    _, depths = bundle.project(problem)
     scale = 1.0 / max(float(np.median(depths)), 1e-9)
-    rotation0, translation0 = state.rotations[order[0]], state.translations[order[0]]
-    points = scale * (state.points @ rotation0.T + translation0)
-    rotation_sigmas, centre_sigmas = uncertainty.camera_sigmas(state, covariances, order)
+    rotation0, translation0 = problem.rotations[order[0]], problem.translations[order[0]]
+    points = scale * (problem.points @ rotation0.T + translation0)
+    rotation_sigmas, centre_sigmas = uncertainty.camera_sigmas(problem, covariances, order)
     cameras = []
     for place, i in enumerate(order):
         T_world_camera = np.eye(4)
-        T_world_camera[:3, :3] = rotation0 @ state.rotations[i].T
-        T_world_camera[:3, 3] = scale * (translation0 - T_world_camera[:3, :3] @ state.translations[i])
-        lens = state.lens_of_camera[i]
+        T_world_camera[:3, :3] = rotation0 @ problem.rotations[i].T
+        T_world_camera[:3, 3] = scale * (translation0 - T_world_camera[:3, :3] @ problem.translations[i])
+        lens = problem.lens_of_camera[i]
         cameras.append(
             RegisteredCamera(
                 index=i,
                 T_world_camera=T_world_camera,
                 lens=int(lens),
-                focal=float(np.exp(state.log_focals[lens])) / enlarged[i],
-                principal=principal_point(keyframes[i].frame) + state.shifts[lens] / enlarged[i],
-                radial=float(state.radials[lens]),
+                focal=float(np.exp(problem.log_focals[lens])) / enlarged[i],
+                principal=principal_point(keyframes[i].frame) + problem.shifts[lens] / enlarged[i],
+                radial=float(problem.radials[lens]),
                 rotation_sigma_deg=float(rotation_sigmas[place]),
                 centre_sigma_rel=float(centre_sigmas[place]),
             )
@@ -174,11 +174,11 @@ def in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe], enlarged: 
     return Registration(
         cameras=tuple(cameras),
         points=points,
-        observed_by=state.camera_of,
-        observed_point=state.point_of,
-        observed_pixels=state.pixels / np.array(enlarged)[state.camera_of, None] + principal[state.camera_of],
+        observed_by=problem.camera_of,
+        observed_point=problem.point_of,
+        observed_pixels=problem.pixels / np.array(enlarged)[problem.camera_of, None] + principal[problem.camera_of],
         agreement=built.agreement,
-        focal_sigma=float(np.sqrt(covariances.log_focals[state.lens_of_camera[order]].max())),
+        focal_sigma=float(np.sqrt(covariances.log_focals[problem.lens_of_camera[order]].max())),
         median_angle_deg=built.median_angle_deg,
         rms_px=built.rms_px,
         rival=built.rival,

@@ -48,7 +48,7 @@ class Growth:
 
     registered: tuple[int, ...]  # the first is held still
     problem: bundle.Problem
-    prior: bundle.FocalPrior
+    prior: bundle.LensPrior
     track_of_point: Index  # (P,)
 
 

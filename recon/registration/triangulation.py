@@ -50,7 +50,7 @@ def largest_angles(centres: Array, points: Array, camera_of: Index, track_of: In
 
 
 def retriangulate(
-    state: bundle.Problem,
+    problem: bundle.Problem,
     all_tracks: Tracks,
     registered: Sequence[int],
     scale: Array,
@@ -64,15 +64,15 @@ def retriangulate(
     """
     mine = np.isin(all_tracks.camera_of, registered)
     camera, track, pixels = all_tracks.camera_of[mine], all_tracks.track_of[mine], all_tracks.pixels[mine]
-    rays = placement.normalise(state, camera, pixels)
-    matrices = np.concatenate([state.rotations, state.translations[:, :, None]], 2)
+    rays = placement.normalise(problem, camera, pixels)
+    matrices = np.concatenate([problem.rotations, problem.translations[:, :, None]], 2)
     limit = widen * config.max_error_px * scale
     errors = np.zeros(0)
     points = np.zeros((all_tracks.num_tracks, 3))
     for _ in range(3):
         points = triangulate(matrices, rays, camera, track, all_tracks.num_tracks)
         errors = bundle.reprojection_errors(
-            replace(state, points=np.nan_to_num(points), camera_of=camera, point_of=track, pixels=pixels)
+            replace(problem, points=np.nan_to_num(points), camera_of=camera, point_of=track, pixels=pixels)
         )
         errors = np.where(np.isnan(points[track, 0]), np.inf, errors) / limit[camera]
         worst = np.zeros(all_tracks.num_tracks)
@@ -81,7 +81,7 @@ def retriangulate(
         if keep.all():
             break
         camera, track, pixels, rays, errors = camera[keep], track[keep], pixels[keep], rays[keep], errors[keep]
-    centres = -np.einsum("cji,cj->ci", state.rotations, state.translations)
+    centres = -np.einsum("cji,cj->ci", problem.rotations, problem.translations)
     angles = largest_angles(centres, np.nan_to_num(points), camera, track)
     count = np.bincount(track, minlength=all_tracks.num_tracks)
     worst = np.zeros(all_tracks.num_tracks)
@@ -91,7 +91,7 @@ def retriangulate(
     observed = good[track]
     return (
         replace(
-            state,
+            problem,
             points=points[kept],
             camera_of=camera[observed],
             point_of=np.searchsorted(kept, track[observed]),

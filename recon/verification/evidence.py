@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from recon.verification.cycles import Cycles
+from recon.verification.jackknife import Spread
 from recon.verification.joints import Joint
 from recon.verification.lens import Distortion, FreedLens
 from recon.verification.photometric import Score
 from recon.verification.reflection import Reflection
-from recon.verification.stability import Spread
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ class Fit:
     """A bundle that holds C registered cameras, numbered in their order, with what is known of their lenses."""
 
     problem: bundle.Problem
-    prior: bundle.FocalPrior
+    prior: bundle.LensPrior
     loss: bundle.Config
     scale: Array  # (C,) longer side of each frame's lens over 1024
     told: Array  # (G,) focal length that came with the frames, pixels of the lens; NaN where none did
@@ -79,7 +79,7 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
         pixels=(enlarged[camera_of, None] * (registration.observed_pixels - principal[camera_of]))[observed],
     )
     scale = longer_sides[lens_of_camera] / 1024.0
-    prior = bundle.FocalPrior(problem.log_focals, sigmas, np.zeros(len(lenses)), np.zeros(len(lenses)))
+    prior = bundle.LensPrior(problem.log_focals, sigmas, np.zeros(len(lenses)), np.zeros(len(lenses)))
     errors = bundle.reprojection_errors(problem)
     robust_px = float(np.clip(3.0 * np.median(errors), *(np.array([0.4, 1.5]) * np.median(scale))))
     return Fit(problem, prior, bundle.Config(robust_px=robust_px), scale, told)

@@ -14,13 +14,13 @@ from recon.verification import (
     cycles,
     exposure,
     flatness,
+    jackknife,
     joints,
     lens,
     photometric,
     refit,
     reflection,
     reversal,
-    stability,
 )
 from recon.verification.evidence import CameraEvidence, Evidence
 from recon.verification.photometric import Picture
@@ -56,7 +56,7 @@ def verify(
         loose=tuple(graph.keyframes[index].name for index in joints.loose(registration, graph.pairs)),
         reflection=_reflection(graph, registration, config.reflection),
         flatness=flatness.share_on_plane(registration.points),
-        spread=stability.by_regions(fit),
+        spread=jackknife.by_regions(fit),
         mirrored_cost=reversal.mirrored_cost(fit),
         cycles=cycles.measure(graph.keyframes, registration, graph.pairs, config.cycles),
         median_angle_deg=registration.median_angle_deg,
