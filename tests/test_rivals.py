@@ -10,7 +10,7 @@ pytest.importorskip("pycolmap", reason="stock COLMAP needs pycolmap (pip install
 from capture.cameras import synthetic
 from capture.frame import DroppedFrame, Frame
 from recon.config import Config
-from recon.evaluate import rivals
+from recon.evaluate.stability import stock
 from recon.evaluate.stability.outcome import compare
 from recon.evaluate.truth import TrueCamera
 from recon.verdict import Code
@@ -18,7 +18,7 @@ from recon.verdict import Code
 PLACE = synthetic.Config(views=3, width=320, height=240)
 
 
-@pytest.mark.parametrize("method", [rivals.colmap, rivals.glomap])
+@pytest.mark.parametrize("method", [stock.colmap, stock.glomap])
 def test_cameras_of_the_built_in_place_are_right(method):
     cameras = synthetic.scene_cameras(PLACE)
     truth = {synthetic.frame_name(i): TrueCamera(T, K, PLACE.width, PLACE.height) for i, (T, K) in enumerate(cameras)}
@@ -32,6 +32,6 @@ def test_what_shares_nothing_is_no_scene():
     rng = np.random.default_rng(0)
     noise = [Frame(i, f"{i}.png", i, rng.integers(0, 256, (120, 160, 3), dtype=np.uint8), None) for i in range(3)]
     for frames in (noise, noise[:1], []):
-        snapshot = rivals.colmap(frames, Config())
+        snapshot = stock.colmap(frames, Config())
         assert not snapshot.verdict.publishable and snapshot.cameras == ()
         assert snapshot.verdict.frames == tuple(frame.name for frame in frames)

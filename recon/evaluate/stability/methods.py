@@ -28,7 +28,7 @@ def by_name(name: str) -> Method:
     if name not in NAMES:
         raise ValueError(f"no method {name!r}; there are: {', '.join(NAMES)}")
     try:
-        from recon.evaluate import rivals
+        from recon.evaluate.stability import stock
     except ImportError as error:
         raise ValueError(f"method {name!r} needs pycolmap. Run: pip install 'splatnode[bench]'") from error
-    return rivals.colmap if name == "colmap" else rivals.glomap
+    return stock.colmap if name == "colmap" else stock.glomap
