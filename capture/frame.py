@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -26,6 +27,11 @@ class Intrinsics:
     cy: float
     source: str
     distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        lens = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
+        if min(self.width, self.height, self.fx, self.fy) <= 0 or not all(map(math.isfinite, lens)):
+            raise ValueError(f"intrinsics must be finite, sizes and focal lengths above 0; got {self}")
 
     @property
     def K(self) -> npt.NDArray[np.float64]:  # (3, 3)

@@ -59,6 +59,11 @@ def test_nested_structures_are_typed(tmp_path):
         ("camera: {kind: synthetic, views: 0}", r"camera\.views: expected int >= 1"),
         ("camera: {kind: folder, folder: 3}", r"camera\.folder: expected path, got int"),
         ("camera: {kind: folder, folder: x, names: [a, 1]}", r"camera\.names\[1\]: expected str, got int"),
+        (
+            "camera: {kind: folder, folder: x, intrinsics: "
+            "{width: 0, height: 1, fx: 1, fy: 1, cx: 0, cy: 0, source: given}}",
+            r"camera\.intrinsics: intrinsics must be finite, sizes and focal lengths above 0",
+        ),
         ("camera: {kind: folder, folder: x, intrinsics: {wdth: 1}}", r"camera\.intrinsics\.wdth: unknown key"),
         (SYNTHETIC + "\nquality: {blur_px: wide}", r"quality\.blur_px: expected float, got str"),
         ("- a", r"expected keys and values, got list"),

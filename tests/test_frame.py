@@ -1,3 +1,6 @@
+import math
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,6 +13,12 @@ def test_K_and_its_size_of_a_resized_image():
     half = intrinsics.resized(320, 240)
     assert (half.fx, half.fy, half.cx, half.cy) == (250.0, 255.0, 160.0, 118.0)
     assert (half.width, half.height, half.source, half.distortion) == (320, 240, "given", (0.1,))
+
+
+@pytest.mark.parametrize("change", [{"width": 0}, {"fy": -1.0}, {"cx": math.nan}, {"distortion": (math.inf,)}], ids=str)
+def test_what_no_lens_can_have_is_refused(change):
+    with pytest.raises(ValueError, match="intrinsics must be finite"):
+        replace(Intrinsics(640, 480, 500.0, 510.0, 320.0, 236.0, source="given"), **change)
 
 
 def test_resizing_keeps_where_a_ray_meets_the_image():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -83,17 +82,8 @@ def received(message: Message) -> ReceivedFrame:
         return ReceivedFrame(header.session, header.sequence, DroppedFrame(header.name, header.reason))
     if len(message.arrays) != 1 or min(message.arrays[0].shape, default=0) < 1:
         raise WireError("a frame has one image")
-    _check_intrinsics(header.intrinsics)
     try:
         frame = Frame(header.frame_id, header.name, header.stamp_ns, message.arrays[0], header.intrinsics)
     except ValueError as error:
         raise WireError(str(error)) from error
     return ReceivedFrame(header.session, header.sequence, frame)
-
-
-def _check_intrinsics(intrinsics: Intrinsics | None) -> None:
-    if intrinsics is None:
-        return
-    lens = (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, *intrinsics.distortion)
-    if min(intrinsics.width, intrinsics.height, intrinsics.fx, intrinsics.fy) <= 0 or not all(map(math.isfinite, lens)):
-        raise WireError(f"these are no intrinsics: {intrinsics}")
