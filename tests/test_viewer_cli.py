@@ -80,9 +80,11 @@ def test_a_refused_result_says_why(tmp_path):
 def test_what_is_no_result_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"scene\.ply is not there"):
         load_result(tmp_path)
-    (tmp_path / "report.json").write_text('{"verdict": {"code": "SUNNY"}}')
-    with pytest.raises(ValueError, match="not a report of splatnode"):
-        load_result(tmp_path)
+    told = '{"verdict": {"code": "OK", "message": "Good.", "advice": ""}, "seconds": []}'
+    for text in ('{"verdict": {"code": "SUNNY"}}', told, "[]", "{}", "{"):
+        (tmp_path / "report.json").write_text(text)
+        with pytest.raises(ValueError, match="not a report of splatnode"):
+            load_result(tmp_path)
     (tmp_path / "x.ply").write_bytes(b"ply\n")
     with pytest.raises(SceneFileError):
         load_result(tmp_path / "x.ply")
@@ -132,6 +134,7 @@ def test_a_missing_open3d_is_told_with_its_remedy_and_a_missing_file_before_it(r
     ("arguments", "said"),
     [
         (["nowhere"], "is not there"),
+        (["node.yaml", "--photographs", "nowhere"], "--photographs must be the folder"),
         (["--export", "x.mp4"], "needs a finished result"),
         (["node.yaml", "--headless"], "network"),
     ],

@@ -67,6 +67,10 @@ def _say(line: str) -> None:
 
 def _finished(args: argparse.Namespace) -> Moment | None:
     """The result that is named; None where it is a running node."""
+    if args.photographs is not None and not args.photographs.is_dir():
+        raise FileNotFoundError(
+            f"--photographs must be the folder of a result's photographs; {args.photographs} is none"
+        )
     if args.what is None or _is_configuration(args.what):
         return None
     return load_result(args.what, args.photographs)

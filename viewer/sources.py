@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Protocol
 
 import cv2
+import msgspec
 import numpy as np
 import numpy.typing as npt
 
@@ -138,25 +139,26 @@ def load_result(place: Path, photographs: Path | None = None) -> Moment:
     """
     folder = place if place.is_dir() else place.parent
     scene = place / "scene.ply" if place.is_dir() else place
-    report = _report(folder / "report.json") if place.is_dir() else {}
-    if not scene.is_file() and not report:
+    report = _report(folder / "report.json") if place.is_dir() else None
+    if not scene.is_file() and report is None:
         raise FileNotFoundError(
             f"{scene} is not there. Give a result's folder (splatnode replay FOLDER --out DIR), a .ply, .spz or .splat "
             "file, or the node's configuration (.yaml)"
         )
+    report = report or _Report(Verdict(Code.OK, "A scene from a file, without a report.", "", publishable=True))
     gaussians = read_gaussians(scene) if scene.is_file() else GaussianArrays.empty()
     cameras = read_cameras(folder / "cameras.json") if (folder / "cameras.json").is_file() else ()
     beside = [folder / "images", folder / "capture" / "images"]
-    reported = [Path(there)] if isinstance(there := report.get("photographs"), str) else []
+    reported = [] if report.photographs is None else [Path(report.photographs)]
     snapshot = Snapshot(
         sequence=0,
-        verdict=_verdict(report),
+        verdict=report.verdict,
         cameras=cameras,
         gaussians=gaussians,
         images=_photographs(cameras, [photographs] if photographs else reported + beside),
-        dropped=tuple(DroppedFrame(str(one["name"]), str(one["reason"])) for one in report.get("frames_dropped", ())),
-        iterations=int(report.get("iterations", 0)),
-        seconds={str(stage): float(seconds) for stage, seconds in report.get("seconds", {}).items()},
+        dropped=report.frames_dropped,
+        iterations=report.iterations,
+        seconds=report.seconds,
         final=True,
     )
     return Moment(snapshot, time.monotonic())
@@ -175,29 +177,24 @@ def is_camera(camera: CameraEstimate) -> bool:
     return bool(rigid and camera.K[0, 0] > 0 and camera.K[1, 1] > 0)
 
 
-def _report(path: Path) -> dict:
-    """report.json, empty where there is none. Raises ValueError where it is something else."""
+class _Report(msgspec.Struct, frozen=True):
+    """What is shown of report.json."""
+
+    verdict: Verdict
+    frames_dropped: tuple[DroppedFrame, ...] = ()
+    iterations: int = 0
+    seconds: dict[str, float] = {}
+    photographs: str | None = None
+
+
+def _report(path: Path) -> _Report | None:
+    """None where there is none. Raises ValueError where it is something else."""
     if not path.is_file():
-        return {}
+        return None
     try:
-        report = json.loads(path.read_bytes())
-        _verdict(report)
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is not a report of splatnode, or is damaged: {error!r}") from error
-    return report
-
-
-def _verdict(report: dict) -> Verdict:
-    if not report:
-        return Verdict(Code.OK, "A scene from a file, without a report.", "", publishable=True)
-    verdict = report["verdict"]
-    return Verdict(
-        Code(verdict["code"]),
-        str(verdict["message"]),
-        str(verdict["advice"]),
-        tuple(str(name) for name in verdict["frames"]),
-        bool(verdict["publishable"]),
-    )
+        return msgspec.convert(json.loads(path.read_bytes()), _Report)
+    except (ValueError, msgspec.ValidationError) as error:
+        raise ValueError(f"{path} is not a report of splatnode, or is damaged: {error}") from error
 
 
 def _photographs(cameras: tuple[CameraEstimate, ...], folders: list[Path]) -> dict[str, npt.NDArray[np.uint8]]:
