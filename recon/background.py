@@ -24,7 +24,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     opacity: float = 0.95
 
 
-SOURCE_FRAME = -1  # of Gaussians that no frame's pixels started
+SHELL = -1  # the source_frame of its Gaussians, which no frame's pixels started
 
 
 def background(
@@ -66,7 +66,7 @@ def _shell(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]
         log_scales=torch.from_numpy(np.log(scales)).float(),
         logit_opacities=torch.full((count,), float(np.log(config.opacity / (1 - config.opacity)))),
         sh=torch.from_numpy((colours - 0.5) / SH_C0).float()[:, None],
-        source_frame=torch.full((count,), SOURCE_FRAME, dtype=torch.int32),
+        source_frame=torch.full((count,), SHELL, dtype=torch.int32),
     )
 
 

@@ -231,7 +231,7 @@ def _terms(scene: Scene, config: regularise.Config, seed: int) -> Regularisation
 
     Raises ValueError where they would compare with what is known of a view, and nothing is.
     """
-    if not any(term.weight for term in (config.point_render, config.depth, config.normal, config.semantic)):
+    if not any(term.weight for term in config.terms):
         return None
     pointmaps = []
     for view in scene.views:

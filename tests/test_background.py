@@ -10,7 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from recon.background import SOURCE_FRAME, Config, background
+from recon.background import SHELL, Config, background
 from recon.gaussians import Gaussians
 from recon.rasterize.cpu import rasterize
 from tests.synthetic import plane_pointmap
@@ -47,7 +47,7 @@ def test_the_shell_stands_at_its_distance_and_faces_the_cameras():
     axes = Rotation.from_quat(shell.quats.double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
     np.testing.assert_allclose(axes[:, :, 2], directions(shell), atol=1e-5)
     assert (shell.scales[:, 2] < 0.2 * shell.scales[:, 0]).all()
-    assert set(shell.source_frame.tolist()) == {SOURCE_FRAME}
+    assert set(shell.source_frame.tolist()) == {SHELL}
 
 
 def test_neighbours_are_about_the_spacing_apart():

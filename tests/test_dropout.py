@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from recon.background import SOURCE_FRAME
+from recon.background import SHELL
 from recon.dropout import Config, Dropout, doubt
 from recon.gaussians import Gaussians
 from recon.scene import View
@@ -20,7 +20,7 @@ def view(pointmap=SEEN) -> View:
     return View(SEEN.name, 4, image, torch.eye(4), torch.from_numpy(SEEN.K).float(), None, None, pointmap)
 
 
-def gaussians(count: int, source_frame: int = SOURCE_FRAME) -> Gaussians:
+def gaussians(count: int, source_frame: int = SHELL) -> Gaussians:
     """All at one place before the camera."""
     return Gaussians(
         means=torch.tensor([[0.0, 0.0, 2.0]]).repeat(count, 1),

@@ -213,7 +213,7 @@ def test_a_bound_on_gaussians_keeps_those_that_cover_most():
     limit = len(scene.gaussians) // 2
     grown = grow(scene, maps_of(range(4)), graph, registration_of(4), changed(Config(), max_gaussians=limit))
     assert len(grown.gaussians) == limit
-    assert int((grown.gaussians.source_frame == background.SOURCE_FRAME).sum()) > 0
+    assert int((grown.gaussians.source_frame == background.SHELL).sum()) > 0
 
 
 def test_a_view_that_goes_takes_its_gaussians_along_and_the_next_becomes_the_world():

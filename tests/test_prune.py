@@ -9,9 +9,9 @@ import pytest
 import torch
 from msgspec import structs
 
-from recon.background import SOURCE_FRAME
+from recon.background import SHELL
 from recon.control.control import ControlChoice, Step
-from recon.control.prune import Config, Sight, between, changes_without, load, most_worth
+from recon.control.prune import Camera, Config, between, changes_without, load, most_worth
 from recon.gaussians import Gaussians, concatenate
 from recon.masking import visibility
 from recon.optimize import Config as Optimising
@@ -25,13 +25,13 @@ def targets_of(scene: Scene, scale: float = 1.0) -> list[Target]:
     return [target(view, np.ones(view.image.shape[:2], bool), scale, 0.2) for view in scene.views]
 
 
-def sights_of(scene: Scene, scale: float = 1.0) -> list[Sight]:
+def cameras_of(scene: Scene, scale: float = 1.0) -> list[Camera]:
     targets = zip(scene.views, targets_of(scene, scale), strict=True)
-    return [Sight(view.T_world_camera, each.K, each.width, each.height) for view, each in targets]
+    return [Camera(view.T_world_camera, each.K, each.width, each.height) for view, each in targets]
 
 
 def worth(scene: Scene, probes: int, scale: float = 1.0) -> torch.Tensor:
-    return changes_without(scene.gaussians, sights_of(scene, scale), probes, torch.Generator().manual_seed(0))
+    return changes_without(scene.gaussians, cameras_of(scene, scale), probes, torch.Generator().manual_seed(0))
 
 
 def left_out(gaussians: Gaussians, view: View, index: int) -> float:
@@ -74,23 +74,23 @@ def pruned(scene: Scene, config: Config, limit: int | None = None) -> Scene:
 def test_what_no_photograph_shows_goes_and_the_far_shell_stays(truth):  # noqa: F811
     behind = replace(truth.gaussians, means=truth.gaussians.means - torch.tensor([0.0, 0.0, 1e3]))
     ids = torch.full((len(behind),), 77, dtype=torch.int32)
-    unseen, shell = replace(behind, source_frame=ids), replace(behind, source_frame=0 * ids + SOURCE_FRAME)
+    unseen, shell = replace(behind, source_frame=ids), replace(behind, source_frame=0 * ids + SHELL)
     scene = replace(truth, gaussians=concatenate([unseen, truth.gaussians, shell]))
     found = pruned(scene, Config(least_change=1e-6)).gaussians.source_frame
     assert not (found == 77).any()
-    assert (found == SOURCE_FRAME).sum() == len(shell)
-    assert ((found != 77) & (found != SOURCE_FRAME)).sum() > len(truth.gaussians) / 2
+    assert (found == SHELL).sum() == len(shell)
+    assert ((found != 77) & (found != SHELL)).sum() > len(truth.gaussians) / 2
 
 
 def test_views_between_lie_near_the_path_and_are_no_photographs(truth):  # noqa: F811
-    sights = sights_of(truth)
-    centres = torch.stack([sight.T_world_camera[:3, 3] for sight in sights])
-    found = between(sights, 6, 0.0, np.random.default_rng(0))
+    cameras = cameras_of(truth)
+    centres = torch.stack([camera.T_world_camera[:3, 3] for camera in cameras])
+    found = between(cameras, 6, 0.0, np.random.default_rng(0))
     assert len(found) == 6
-    for sight in found:
-        away = (centres - sight.T_world_camera[:3, 3]).norm(dim=1)
+    for camera in found:
+        away = (centres - camera.T_world_camera[:3, 3]).norm(dim=1)
         assert 0 < away.min() < 0.6 * torch.pdist(centres).max()
-    assert between(sights[:1], 3, 0.0, np.random.default_rng(0)) == []
+    assert between(cameras[:1], 3, 0.0, np.random.default_rng(0)) == []
 
 
 @pytest.mark.parametrize("limit", [1, 7])

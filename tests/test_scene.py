@@ -54,7 +54,7 @@ def test_a_scene_begins_with_the_registered_cameras_and_a_gaussian_for_what_they
     # Every pixel of noise from the surer view; from the other what only it sees: 0.3 * 35.2 / 2 = 5.3 of 32 columns.
     assert int((sources == 0).sum()) == 32 * 24
     assert 4 * 24 <= int((sources == 1).sum()) <= 6 * 24
-    assert int((sources == background.SOURCE_FRAME).sum()) > 10
+    assert int((sources == background.SHELL).sum()) > 10
 
 
 def test_depths_that_stereo_does_not_believe_in_move_neither_surfaces_nor_the_shell():
@@ -96,7 +96,7 @@ def test_a_gaussian_a_pixel_is_asked_for_by_naming_it_in_the_configuration():
 def test_a_bound_on_gaussians_counts_the_shell(most):
     scene = begun(most)
     assert most // 4 <= len(scene.gaussians) <= most
-    assert int((scene.gaussians.source_frame == background.SOURCE_FRAME).sum()) <= most // 10
+    assert int((scene.gaussians.source_frame == background.SHELL).sum()) <= most // 10
 
 
 def test_what_is_published_is_activated_and_a_copy():

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from recon.background import SOURCE_FRAME as SHELL
+from recon.background import SHELL
 from recon.control.control import Change, Step
 from recon.density import REFERENCE_PX
 from recon.gaussians import Gaussians
@@ -30,9 +30,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """A camera."""
-
+class Camera:
     T_world_camera: Tensor  # (4, 4)
     K: Tensor  # (3, 3)
     width: int
@@ -56,9 +54,9 @@ class Pruning:
         while self._due and step.progress >= self._due[0]:
             self._due.pop(0)
         gaussians = step.gaussians.map(Tensor.detach)
-        sights = [Sight(T, t.K, t.width, t.height) for T, t in zip(step.Ts_world_camera, step.targets, strict=True)]
-        sights += between(sights, self._config.between * len(sights), self._config.off_path, self._rng)
-        worth = changes_without(gaussians, sights, self._config.probes, self._generator)
+        cameras = [Camera(T, t.K, t.width, t.height) for T, t in zip(step.Ts_world_camera, step.targets, strict=True)]
+        cameras += between(cameras, self._config.between * len(cameras), self._config.off_path, self._rng)
+        worth = changes_without(gaussians, cameras, self._config.probes, self._generator)
         # What the photographs do not show is what the far shell is for.
         worth[gaussians.source_frame == SHELL] = torch.inf
         kept = most_worth(worth, self._config.least_change, step.max_gaussians)
@@ -81,21 +79,21 @@ def most_worth(worth: Tensor, least: float, limit: int | None) -> Tensor:
     return kept
 
 
-def between(sights: Sequence[Sight], count: int, off_path: float, rng: np.random.Generator) -> list[Sight]:
+def between(cameras: Sequence[Camera], count: int, off_path: float, rng: np.random.Generator) -> list[Camera]:
     """`count` views where no photograph was taken: what hides behind something in all photographs shows there."""
-    if len(sights) < 2:
+    if len(cameras) < 2:
         return []
-    Ts_world_camera = [sight.T_world_camera.double().numpy() for sight in sights]
-    Ks = [sight.K.double().numpy() for sight in sights]
-    sizes = [(sight.width, sight.height) for sight in sights]
+    Ts_world_camera = [camera.T_world_camera.double().numpy() for camera in cameras]
+    Ks = [camera.K.double().numpy() for camera in cameras]
+    sizes = [(camera.width, camera.height) for camera in cameras]
     views = pseudo_views(Ts_world_camera, Ks, sizes, count, off_path=off_path, rng=rng)
     return [
-        Sight(torch.from_numpy(view.T_world_camera).float(), torch.from_numpy(view.K).float(), view.width, view.height)
+        Camera(torch.from_numpy(view.T_world_camera).float(), torch.from_numpy(view.K).float(), view.width, view.height)
         for view in views
     ]
 
 
-def changes_without(gaussians: Gaussians, sights: Sequence[Sight], probes: int, generator: torch.Generator) -> Tensor:
+def changes_without(gaussians: Gaussians, cameras: Sequence[Camera], probes: int, generator: torch.Generator) -> Tensor:
     """(N,) the squared visible difference to all images together if one Gaussian is left out: an estimate.
 
     What a pixel shows is linear in each opacity, so that leaving a Gaussian out changes it by opacity * derivative.
@@ -104,18 +102,18 @@ def changes_without(gaussians: Gaussians, sights: Sequence[Sight], probes: int, 
     """
     opacities = gaussians.opacities.requires_grad_(True)
     total = torch.zeros(len(gaussians))
-    for sight in sights:
-        scale = max(sight.width, sight.height) / REFERENCE_PX
+    for camera in cameras:
+        scale = max(camera.width, camera.height) / REFERENCE_PX
         rgb = rasterize(
             gaussians.means,
             gaussians.quats,
             gaussians.scales,
             opacities,
             gaussians.sh,
-            sight.T_world_camera,
-            sight.K,
-            sight.width,
-            sight.height,
+            camera.T_world_camera,
+            camera.K,
+            camera.width,
+            camera.height,
             channels=("rgb",),
         ).rgb
         assert rgb is not None  # it was asked for
