@@ -156,7 +156,7 @@ class Daemon:
 
     def _status(self) -> ReconStatus:
         snapshot = self._shown.snapshot if self._shown else None
-        intake, worker, motion, tracked = self._intake, self._worker, self._watcher.motion, self._watcher.tracked()
+        intake, worker, motion, tracked = self._intake, self._worker, self._watcher.motion, self._watcher.tracked
         return ReconStatus(
             **self._numbering.next(),
             state=State.FULL if intake.problem else worker.state,

@@ -204,8 +204,7 @@ def _covariance(T_world_camera: Array, pixels: Array, points: Array, K: Array, i
     row_v = K[1, 1] * np.stack([zero, -inverse, y * inverse, 1 + y * y, -x * y, -x], 1)
     jacobian = np.concatenate([row_u, row_v])
     residuals = np.linalg.norm(pixels - projected[:, :2], axis=1)
-    variance = (
-        float(np.median(residuals)) / 1.1774
-    ) ** 2 + 1e-4  # of one coordinate; the residuals' lengths are Rayleigh's
+    # Of one coordinate: the residuals' lengths have Rayleigh's distribution, whose median is 1.1774 sigma.
+    variance = (float(np.median(residuals)) / 1.1774) ** 2 + 1e-4
     share = max(1.0, len(points) / independent)
     return share * variance * np.linalg.inv(jacobian.T @ jacobian + 1e-9 * np.eye(6))

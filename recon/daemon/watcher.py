@@ -37,7 +37,7 @@ class Watcher:
     ) -> None:
         """`finished` gives the finished scene, the same as long as it is; None while it changes."""
         self._network, self._config, self._finished, self._stopping = network, config, finished, stopping
-        self._camera: CameraEstimate | None = None
+        self.tracked: CameraEstimate | None = None  # the live camera in the finished scene, where it is known
         self.motion: Motion | None = None  # since the scene was finished
 
     def run(self) -> None:
@@ -50,7 +50,7 @@ class Watcher:
             while not self._stopping.wait(self._config.every_s):
                 finished = self._finished()
                 if finished is not watched:
-                    watched, watch, self.motion, self._camera = finished, None, None, None
+                    watched, watch, self.motion, self.tracked = finished, None, None, None
                 message = previews.latest(0)
                 if watched is None or message is None:
                     continue
@@ -61,14 +61,10 @@ class Watcher:
                 except WireError as error:
                     log.warning("a preview was refused: %s", error)
 
-    def tracked(self) -> CameraEstimate | None:
-        """The live camera in the finished scene; None where it is not known."""
-        return self._camera
-
     def _look(self, watch: Watch, image: npt.NDArray[np.uint8], snapshot: Snapshot) -> None:
         height, width = image.shape[:2]
         position, motion = watch.look(image, preview_intrinsics(snapshot.cameras[-1], width, height))
-        self._camera = position and CameraEstimate(
+        self.tracked = position and CameraEstimate(
             "live", -1, position.T_world_camera, position.K, width, height, None, None
         )
         if motion is not None and motion.moved and not (self.motion and self.motion.moved):
