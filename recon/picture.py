@@ -39,7 +39,6 @@ def take_picture(
     height: int,
     *,
     channels: Collection[str] = ("rgb",),
-    near: float = NEAR,
 ) -> Picture:
     """The image of the Gaussians, as `recon.rasterize.reference.rasterize` defines it, by the compiled core.
 
@@ -72,7 +71,7 @@ def take_picture(
         height,
         channels,
         False,
-        near,
+        NEAR,
     )
     planes = {"rgb": 3, "depth": 1, "normal": 3, "alpha": 1}
     wanted = {*channels, "alpha"}  # the core always writes alpha

@@ -14,19 +14,14 @@ from recon.snapshot import Snapshot
 _PACKAGES = ("splatnode", "numpy", "torch", "opencv-contrib-python-headless", "pycolmap", "poselib")
 
 
-def build_report(
-    snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: float | None, seconds_total: float | None = None
-) -> dict[str, object]:
+def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: float | None) -> dict[str, object]:
     """The report of `snapshot`, ready for `json.dumps`; a value that was not measured is None.
 
-    `seconds_total` is wall time; without it, "total" is the snapshot's own, or the sum of its stages. `scene_bytes` is
-    the size of scene.ply, and `num_gaussians` what it holds, where the verdict lets it be published.
+    `scene_bytes` is the size of scene.ply, and `num_gaussians` what it holds, where the verdict lets it be published.
     """
     gaussians = viewer_safe(snapshot.gaussians)
     verdict = snapshot.verdict
     stages = {stage: seconds for stage, seconds in snapshot.seconds.items() if stage != "total"}
-    if seconds_total is None:
-        seconds_total = snapshot.seconds.get("total", sum(stages.values()))
     return {
         **snapshot.scale.record(),
         "verdict": {
@@ -37,7 +32,7 @@ def build_report(
             "publishable": verdict.publishable,
         },
         "evidence": snapshot.evidence,
-        "seconds": {**stages, "total": seconds_total},
+        "seconds": {**stages, "total": snapshot.seconds.get("total", sum(stages.values()))},
         "peak_rss_mb": peak_rss_mb,
         "num_gaussians": len(gaussians),
         "scene_bytes": ply_bytes(len(gaussians), gaussians.sh.shape[1], snapshot.scale) if verdict.publishable else 0,

@@ -54,9 +54,8 @@ def test_nerfstudio_cameras_look_along_minus_z():
     assert frame["file_path"] == "images/0002.jpg"
 
 
-def test_tum_trajectory_has_times_positions_and_xyzw():
+def test_tum_trajectory_has_frame_ids_positions_and_xyzw():
     camera = make_camera(2, angle=np.pi / 2)
-    line = encode_tum([camera], {"0002.jpg": 1_500_000_000}).decode().splitlines()[-1].split()
-    assert line[0] == "1.500000000"
+    line = encode_tum([camera]).decode().splitlines()[-1].split()
+    assert line[:3] == ["2", "2", "-0.5"]
     assert np.allclose([float(value) for value in line[1:]], [2, -0.5, 0.25, 0, np.sqrt(0.5), 0, np.sqrt(0.5)])
-    assert encode_tum([camera]).decode().splitlines()[-1].startswith("2 2 -0.5")

@@ -126,24 +126,13 @@ def encode_nerfstudio(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE
     return json_bytes({"camera_model": "OPENCV", **scale.record(), "frames": frames})
 
 
-def encode_tum(
-    cameras: Sequence[CameraEstimate], stamps_ns: Mapping[str, int] | None = None, scale: Scale = RELATIVE
-) -> bytes:
-    """trajectory.tum: `time x y z qx qy qz qw` a line, camera to world.
-
-    The time is the exposure's, in seconds, where `stamps_ns` (by camera name) is given, and the frame's id otherwise.
-    """
+def encode_tum(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -> bytes:
+    """trajectory.tum: `time x y z qx qy qz qw` a line, camera to world; the time is the frame's id."""
     lines = []
     for camera in sorted(cameras, key=lambda camera: camera.frame_id):
         w, x, y, z = quats_from_matrices(camera.T_world_camera[:3, :3])
-        time = _seconds(stamps_ns[camera.name]) if stamps_ns else str(camera.frame_id)
-        lines.append(f"{time} {_row([*camera.T_world_camera[:3, 3], x, y, z, w])}")
-    meaning = "seconds" if stamps_ns else "frame id"
-    return _text([f"# time ({meaning}), x y z, qx qy qz qw of T_world_camera"], lines, scale)
-
-
-def _seconds(stamp_ns: int) -> str:
-    return f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
+        lines.append(f"{camera.frame_id} {_row([*camera.T_world_camera[:3, 3], x, y, z, w])}")
+    return _text(["# time (frame id), x y z, qx qy qz qw of T_world_camera"], lines, scale)
 
 
 def _row(values: Sequence[float]) -> str:

@@ -18,12 +18,7 @@ MANIFEST = "manifest.json"
 
 
 def write_result(
-    snapshot: Snapshot,
-    out_dir: Path,
-    report: Mapping[str, object],
-    *,
-    preview: bytes | None = None,
-    stamps_ns: Mapping[str, int] | None = None,
+    snapshot: Snapshot, out_dir: Path, report: Mapping[str, object], *, preview: bytes | None = None
 ) -> Path:
     """Writes scene.ply, the cameras in four formats, preview.png, report.json and manifest.json; returns its path.
 
@@ -34,7 +29,7 @@ def write_result(
     """
     files = {"report.json": json_bytes(report)}
     if snapshot.verdict.publishable:
-        files = _scene_files(snapshot, preview, stamps_ns) | files
+        files = _scene_files(snapshot, preview) | files
     previous = _read_manifest(out_dir)
     manifest = {
         **snapshot.scale.record(),
@@ -46,7 +41,7 @@ def write_result(
     return out_dir / MANIFEST
 
 
-def _scene_files(snapshot: Snapshot, preview: bytes | None, stamps_ns: Mapping[str, int] | None) -> dict[str, bytes]:
+def _scene_files(snapshot: Snapshot, preview: bytes | None) -> dict[str, bytes]:
     gaussians = viewer_safe(snapshot.gaussians)
     cameras, scale = snapshot.cameras, snapshot.scale
     colmap = encode_colmap(cameras, gaussians, scale)
@@ -54,7 +49,7 @@ def _scene_files(snapshot: Snapshot, preview: bytes | None, stamps_ns: Mapping[s
         "scene.ply": encode_ply(gaussians, scale),
         "cameras.json": encode_cameras(cameras, scale),
         **{f"colmap/{name}": data for name, data in colmap.items()},
-        "trajectory.tum": encode_tum(cameras, stamps_ns, scale),
+        "trajectory.tum": encode_tum(cameras, scale),
         "transforms.json": encode_nerfstudio(cameras, scale),
         **({"preview.png": preview} if preview is not None else {}),
     }

@@ -50,21 +50,12 @@ class TwoView:
         return replace(self, points1=by1 * self.points1, points2=by2 * self.points2)
 
 
-def verify(
-    points1: Array, points2: Array, matches: npt.NDArray[np.int64], size: tuple[int, int], config: Config
-) -> TwoView | None:
-    """The pair's geometry, or None when chance explains the agreement of `points1` and `points2` (both (M, 2)).
-
-    As `examine`, of which it is the first answer.
-    """
-    return examine(points1, points2, matches, size, config)[0]
-
-
 def examine(
     points1: Array, points2: Array, matches: npt.NDArray[np.int64], size: tuple[int, int], config: Config
 ) -> tuple[TwoView | None, float]:
-    """What `verify` says, and log10 of the expected number of false alarms also where that is not enough.
+    """The pair's geometry, or None when chance explains the agreement of `points1` and `points2` (both (M, 2)).
 
+    With it, also where it is None, log10 of the expected number of false alarms.
     The most distinct matches come first. Pixels are relative to the principal points; `size` is the second image's
     (width, height). The test is a contrario (Moisan and Stival, 2004): the expected number of fundamental matrices,
     among all that the matches define, that as many unrelated points would fit within the threshold.

@@ -45,8 +45,6 @@ class Mast3rPrior:
     network invents between unrelated photographs is not in agreement with any.
     """
 
-    licence = LICENCE
-
     def __init__(self, network: Network, config: Config) -> None:
         self._config = config
         self._asked = Asked(network, config.longer_side)
