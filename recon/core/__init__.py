@@ -10,6 +10,7 @@ import ctypes
 import functools
 import os
 from pathlib import Path
+from typing import Any
 
 from recon.core.compile import INSTRUCTION_SETS, library_path, machine
 
@@ -50,6 +51,11 @@ def library(instruction_set: str | None = None) -> ctypes.CDLL:
     core = ctypes.CDLL(str(library_path(usable[0])))
     core.core_set_threads(default_threads())
     return core
+
+
+def pointer(array: Any) -> ctypes.c_void_p:
+    """To the first element of a C-contiguous NumPy array, which must outlive its use."""
+    return ctypes.c_void_p(array.ctypes.data)
 
 
 def default_threads() -> int:

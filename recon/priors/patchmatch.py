@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon.core import library
+from recon.core import library, pointer
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -186,11 +186,6 @@ def resized(planes: Planes, view: Level) -> Planes:
     inverse_depth = values[..., 0] + values[..., 1] * right[None, :] + values[..., 2] * down[:, None]
     resized_values = np.stack([inverse_depth, values[..., 1] * per_column, values[..., 2] * per_row], -1)
     return Planes(resized_values.astype(np.float32), planes.costs[rows[:, None], columns[None, :]])
-
-
-def pointer(array: npt.NDArray) -> ctypes.c_void_p:
-    """The address of a C-contiguous array, which must outlive its use."""
-    return ctypes.c_void_p(array.ctypes.data)
 
 
 def _nearest(size: int, new_size: int) -> tuple[npt.NDArray[np.intp], Float32, float]:

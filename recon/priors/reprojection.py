@@ -7,7 +7,7 @@ import ctypes
 import numpy as np
 import numpy.typing as npt
 
-from recon.core import library
+from recon.core import library, pointer
 from recon.priors.pointmap import Pointmap
 
 Float32 = npt.NDArray[np.float32]
@@ -22,7 +22,7 @@ def nearest(source: Pointmap, target: Pointmap) -> tuple[Float32, Float32]:
     depth, footprint = (np.full(target.depth.shape, np.inf, np.float32) for _ in range(2))
     call = _reprojection(source, target)
     focal = ctypes.c_float(source.K[0, 0])
-    library().core_reproject_nearest(ctypes.byref(call.native), focal, _pointer(depth), _pointer(footprint))
+    library().core_reproject_nearest(ctypes.byref(call.native), focal, pointer(depth), pointer(footprint))
     return depth, footprint
 
 
@@ -37,7 +37,7 @@ def explained(
     call = _reprojection(source, target)
     images = [np.ascontiguousarray(image) for image in (source_image, target_image)]
     library().core_reproject_explained(
-        ctypes.byref(call.native), *map(_pointer, images), int(255 * like), _pointer(falls), _pointer(alike)
+        ctypes.byref(call.native), *map(pointer, images), int(255 * like), pointer(falls), pointer(alike)
     )
     return falls > 0, alike > 0
 
@@ -48,7 +48,7 @@ def hiding(source: Pointmap, target: Pointmap, in_front: float) -> Mask:
     call = _reprojection(source, target)
     surface = np.ascontiguousarray(target.depth, np.float32)
     library().core_reproject_hiding(
-        ctypes.byref(call.native), _pointer(surface), ctypes.c_float(in_front), _pointer(marks)
+        ctypes.byref(call.native), pointer(surface), ctypes.c_float(in_front), pointer(marks)
     )
     return marks > 0
 
@@ -81,7 +81,3 @@ def _reprojection(source: Pointmap, target: Pointmap) -> _Call:
     T_target_source = np.linalg.inv(target.T_world_camera) @ source.T_world_camera
     A = target.K @ T_target_source[:3, :3] @ np.linalg.inv(source.K)
     return _Call(np.ascontiguousarray(source.depth, np.float32), target, A, target.K @ T_target_source[:3, 3])
-
-
-def _pointer(array: npt.NDArray) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)

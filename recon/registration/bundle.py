@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from recon.core import library
+from recon.core import library, pointer
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -107,7 +107,7 @@ def covariance(problem: Problem, prior: LensPrior, config: Config, fixed_camera:
     native, _arrays = _native(problem, prior, config, fixed_camera)
     count, num_lenses = len(problem.rotations), len(problem.log_focals)
     information = np.empty((6 * count + 4 * num_lenses,) * 2)
-    library().core_bundle_information(ctypes.byref(native), _pointer(information))
+    library().core_bundle_information(ctypes.byref(native), pointer(information))
     free = np.ones(len(information), bool)
     free[6 * fixed_camera : 6 * fixed_camera + 6] = False
     of_lens = np.stack([prior.sigmas, prior.radial_sigmas, prior.shift_sigmas, prior.shift_sigmas], 1)
@@ -198,14 +198,10 @@ def _native(
         *(np.ascontiguousarray(values, dtype=np.float64) for values in observed),
     ]
     native = _Native(
-        *(_pointer(array) for array in arrays),
+        *(pointer(array) for array in arrays),
         len(problem.rotations), len(problem.log_focals), len(problem.points), fixed_camera, config.robust_px**2,
     )  # fmt: skip
     return native, arrays
-
-
-def _pointer(array: npt.NDArray[np.generic]) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)
 
 
 def _safe_depth(depth: Array) -> Array:

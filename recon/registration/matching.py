@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
-
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from recon.core import library
+from recon.core import library, pointer
 
 Bytes = npt.NDArray[np.uint8]
 Index = npt.NDArray[np.int64]
@@ -43,8 +41,8 @@ def match(descriptors1: Bytes, descriptors2: Bytes, config: Config) -> Index:
     nearest, score, second_score = (np.empty(count1, np.int32) for _ in range(3))
     back = np.empty(count2, np.int32)
     library().core_match(
-        *(_pointer(first), count1, _pointer(second), count2),
-        *(_pointer(nearest), _pointer(score), _pointer(second_score), _pointer(back)),
+        *(pointer(first), count1, pointer(second), count2),
+        *(pointer(nearest), pointer(score), pointer(second_score), pointer(back)),
     )
     squared_norm = (first.astype(np.int32) ** 2).sum(1)
     nearest_squared, second_squared = (
@@ -54,7 +52,3 @@ def match(descriptors1: Bytes, descriptors2: Bytes, config: Config) -> Index:
     (chosen,) = np.nonzero(good)
     chosen = chosen[np.argsort(nearest_squared[chosen] / np.maximum(second_squared[chosen], 1), kind="stable")]
     return np.stack([chosen, nearest[chosen]], 1).astype(np.int64)
-
-
-def _pointer(array: npt.NDArray[np.generic]) -> ctypes.c_void_p:
-    return ctypes.c_void_p(array.ctypes.data)
