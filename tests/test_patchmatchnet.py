@@ -75,7 +75,7 @@ def test_slopes_of_a_tilted_plane_and_none_across_a_step():
 
 def test_weights_that_are_not_its_own_are_named(tmp_path, monkeypatch):
     torch.save({"feature.conv0.conv.weight": torch.zeros(1)}, tmp_path / "other.pth")
-    with pytest.raises(ValueError, match="not the state dict of PatchmatchNet"):
+    with pytest.raises(ValueError, match="not the checkpoint of PatchmatchNet"):
         patchmatchnet.load(patchmatchnet.Config(weights=tmp_path / "other.pth"))
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
     with pytest.raises(ValueError, match="splatnode weights fetch patchmatchnet_dtu"):

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
+from recon.networks import checkpoint
 from recon.priors import classical
 from recon.priors.classical import ClassicalPrior
 from recon.priors.patchmatchnet.network import PatchmatchNet
 from recon.priors.patchmatchnet.stereo import NetworkStereo
-from recon.weights import WeightsError, find
+from recon.weights import find
 
 WEIGHTS = "patchmatchnet/patchmatchnet_dtu.pth"
 
@@ -20,15 +19,10 @@ class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
 
 
 def load(config: Config) -> ClassicalPrior:
-    """Raises WeightsError where there are no weights, or not PatchmatchNet's."""
+    """Raises WeightsError where there are no weights, ValueError where they are not PatchmatchNet's."""
     return ClassicalPrior(config, NetworkStereo(load_network(config.weights or find(WEIGHTS))).depth_maps)
 
 
 def load_network(path: Path) -> PatchmatchNet:
-    network = PatchmatchNet()
-    try:
-        network.load_state_dict(torch.load(path, map_location="cpu", weights_only=True))
-    except Exception as error:
-        first_line = str(error).splitlines()[0]
-        raise WeightsError(f"{path} is not the state dict of PatchmatchNet ({first_line}); fetch it again") from error
-    return network.eval().requires_grad_(False)
+    """Raises ValueError where the file is damaged or another network's, and FileNotFoundError."""
+    return checkpoint.load_network(PatchmatchNet, checkpoint.read_weights(path), path, "PatchmatchNet")
