@@ -53,6 +53,12 @@ def decode_image(data: bytes, max_pixels: int = MAX_PIXELS) -> tuple[npt.NDArray
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False), intrinsics
 
 
+def encode_png(image: npt.NDArray[np.uint8]) -> bytes:
+    """An image (H, W, 3) RGB as a PNG file."""
+    _, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    return png.tobytes()
+
+
 def read_header(data: bytes) -> ImageHeader:
     """Size and EXIF of a JPEG, PNG, WebP, TIFF or BMP file that is structurally complete. Raises UnusableImage."""
     if not data:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from capture.image_file import encode_png
 from recon.picture import take_picture
 from recon.snapshot import CameraEstimate, GaussianArrays, Snapshot
 
@@ -38,5 +39,4 @@ def contact_sheet(snapshot: Snapshot, max_views: int = 4, height: int = 240) -> 
         pair = [snapshot.images[camera.name], render_camera(snapshot.gaussians, camera)]
         size = (round(camera.width * height / camera.height), height)
         columns.append(np.vstack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in pair]))
-    _, png = cv2.imencode(".png", cv2.cvtColor(np.hstack(columns), cv2.COLOR_RGB2BGR))
-    return png.tobytes()
+    return encode_png(np.hstack(columns))

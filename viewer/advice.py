@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from recon.export.prepare import take
 from recon.snapshot import CameraEstimate, GaussianArrays
-from viewer.colours import normals
+from viewer.colours import middle, normals
 from viewer.support import Support
 from viewer.viewpoint import look_at, scene_up
 
@@ -53,10 +53,9 @@ def surface_points(
     """At most `most` Gaussians, evenly spread over those that any camera sees, as points."""
     visible = np.flatnonzero(support.views > 0)
     chosen = visible[:: max(1, math.ceil(len(visible) / most))]
-    middle = np.mean([camera.T_world_camera[:3, 3] for camera in cameras], axis=0) if cameras else np.zeros(3)
     return Points(
         positions=gaussians.means[chosen].astype(np.float64),
-        normals=normals(take(gaussians, chosen), middle).astype(np.float64),
+        normals=normals(take(gaussians, chosen), middle(cameras)).astype(np.float64),
         seen_by=support.sizes[chosen] > 0,
     )
 

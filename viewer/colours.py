@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -9,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from recon.export.prepare import SH_C0
-from recon.snapshot import GaussianArrays
+from recon.export.quaternions import matrices_from_quats
+from recon.snapshot import CameraEstimate, GaussianArrays
 from viewer.moment import Moment
 from viewer.state import Colouring
 from viewer.support import Support
@@ -37,16 +39,8 @@ def coloured(moment: Moment, colouring: Colouring, support: Support) -> Gaussian
 
 def normals(gaussians: GaussianArrays, centre: npt.NDArray[np.float64]) -> Array:
     """(N, 3) the direction in which each Gaussian is thinnest, on the side of `centre`."""
-    w, x, y, z = gaussians.quats.T
-    axes = np.stack(
-        [
-            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)], 1),
-            np.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)], 1),
-            np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], 1),
-        ],
-        1,
-    )  # (N, axis, 3)
-    normal = axes[np.arange(len(gaussians)), gaussians.scales.argmin(1)]
+    axes = matrices_from_quats(gaussians.quats)
+    normal = axes[np.arange(len(gaussians)), :, gaussians.scales.argmin(1)]
     away = ((gaussians.means - centre) * normal).sum(1) > 0
     return np.where(away[:, None], -normal, normal).astype(np.float32)
 
@@ -58,9 +52,9 @@ def source_colour(index: int) -> tuple[float, float, float]:
     return float(red), float(green), float(blue)
 
 
-def _middle(moment: Moment) -> npt.NDArray[np.float64]:
-    centres = [camera.T_world_camera[:3, 3] for camera in moment.snapshot.cameras]
-    return np.mean(centres, axis=0) if centres else np.zeros(3)
+def middle(cameras: Sequence[CameraEstimate]) -> npt.NDArray[np.float64]:
+    """(3,) the mean of the cameras' centres; the origin without any."""
+    return np.mean([camera.T_world_camera[:3, 3] for camera in cameras], axis=0) if cameras else np.zeros(3)
 
 
 def _by_depth(moment: Moment, _support: Support) -> Array:
@@ -68,14 +62,15 @@ def _by_depth(moment: Moment, _support: Support) -> Array:
     means = moment.snapshot.gaussians.means
     if not len(means):
         return np.zeros((0, 3), np.float32)
-    nearness = 1.0 / np.maximum(np.linalg.norm(means - _middle(moment), axis=1), 1e-6)
+    nearness = 1.0 / np.maximum(np.linalg.norm(means - middle(moment.snapshot.cameras), axis=1), 1e-6)
     low, high = np.percentile(nearness, [2, 98])
     levels = np.rint(255 * np.clip((nearness - low) / max(high - low, 1e-9), 0, 1)).astype(np.uint8)
     return cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1].astype(np.float32) / 255
 
 
 def _by_normal(moment: Moment, _support: Support) -> Array:
-    return 0.5 + 0.5 * normals(moment.snapshot.gaussians, _middle(moment)) * np.array([1, -1, -1], np.float32)
+    snapshot = moment.snapshot
+    return 0.5 + 0.5 * normals(snapshot.gaussians, middle(snapshot.cameras)) * np.array([1, -1, -1], np.float32)
 
 
 def _by_support(_moment: Moment, support: Support) -> Array:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from capture.image_file import encode_png
 from recon.export import write_file, write_files
 from viewer import words
 from viewer.analysis import Analysis, analyse
@@ -33,7 +34,7 @@ def write_series(moment: Moment, folder: Path, width: int, height: int, frames: 
 
     Raises ResultWriteError where they cannot be written.
     """
-    files = {"overview.png": _png(overview_picture(analyse(moment), width, height))}
+    files = {"overview.png": encode_png(overview_picture(analyse(moment), width, height))}
     view = overview(moment)
     for camera in moment.snapshot.cameras:
         here = at_camera(view, camera)
@@ -41,9 +42,9 @@ def write_series(moment: Moment, folder: Path, width: int, height: int, frames: 
         photograph = moment.snapshot.images.get(camera.name)
         if photograph is not None:
             image = np.hstack([blended(image, photograph, camera, here.K(width, height), 1.0), image])
-        files[f"camera_{camera.frame_id:03d}.png"] = _png(image)
+        files[f"camera_{camera.frame_id:03d}.png"] = encode_png(image)
     for number, image in enumerate(turntable(moment, width, height, frames)):
-        files[f"turntable_{number:03d}.png"] = _png(image)
+        files[f"turntable_{number:03d}.png"] = encode_png(image)
     write_files(folder, files)
     return folder
 
@@ -89,7 +90,7 @@ def keep_picture(
     for moment in _moments(source):
         started = time.perf_counter()
         picture = overview_picture(analyse(moment), width, height)
-        write_file(folder / _LIVE, _png(picture))
+        write_file(folder / _LIVE, encode_png(picture))
         line = words.verdict_lines(moment)[0]
         say(f"{folder / _LIVE}: {line} ({time.perf_counter() - started:.1f} s)")
         if until_final and moment.snapshot.final:
@@ -105,7 +106,3 @@ def _moments(source: Source) -> Iterator[Moment]:
             return
         else:
             time.sleep(_WAIT_S)
-
-
-def _png(image: Image) -> bytes:
-    return cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()

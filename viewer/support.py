@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from recon.picture import take_picture
 from recon.snapshot import CameraEstimate, GaussianArrays
+from viewer.canvas import in_camera
 
 _LONGER_SIDE = 160  # pixels of the depth images that tell what is hidden
 _BEHIND = 1.05  # a Gaussian this many times as far as the surface that a camera sees there is hidden from it
@@ -45,7 +46,7 @@ def seen(gaussians: GaussianArrays, camera: CameraEstimate) -> npt.NDArray[np.fl
     width, height = max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
     K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
     T_camera_world = np.linalg.inv(camera.T_world_camera)
-    points = gaussians.means @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+    points = in_camera(gaussians.means, T_camera_world)
     depth = points[:, 2]
     ahead = depth > 1e-3
     pixels = points[:, :2] / np.where(ahead, depth, 1.0)[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]

@@ -12,10 +12,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import open3d as o3d  # pyright: ignore[reportMissingImports]
 from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
+from capture.image_file import encode_png
 from recon.export import write_file
 from viewer import words
 from viewer.help_sheet import HelpSheet
@@ -182,6 +182,5 @@ class _Window:
         self._stage.take_image(self._session, self._guarded(lambda image: self._save(path, image)))
 
     def _save(self, path: Path, image: Image) -> None:
-        _, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-        write_file(path, png.tobytes())
+        write_file(path, encode_png(image))
         self._notice = f"saved {path}"

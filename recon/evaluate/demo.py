@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
-
 from capture.cameras import synthetic
+from capture.image_file import encode_png
 from recon.evaluate.splits import Split
 from recon.export.cameras import encode_cameras
 from recon.export.staged import write_file, write_files
@@ -23,8 +22,7 @@ def write_capture(folder: Path, place: synthetic.Config) -> Split:
     files, cameras = {}, []
     for number, (name, (T_world_camera, K)) in enumerate({**training, **testing}.items()):
         image = synthetic.photograph(place, (T_world_camera, K), noise_seed=number)
-        _, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-        files[name] = png.tobytes()
+        files[name] = encode_png(image)
         cameras.append(CameraEstimate(name, number, T_world_camera, K, place.width, place.height, None, None))
     write_files(folder / "images", files)
     write_file(folder / "cameras.json", encode_cameras(cameras))
