@@ -110,6 +110,11 @@ class Recording:
     folder: Path
     lines: tuple[_Line | _DroppedLine, ...]
 
+    @property
+    def names(self) -> list[str]:
+        """Of the frames that were seen, in their order."""
+        return [line.name for line in self.lines if isinstance(line, _Line)]
+
     def frames(self, names: tuple[str, ...] = (), max_pixels: int = MAX_PIXELS) -> Iterator[Frame | DroppedFrame]:
         """The frames as they were seen, or those called `names`. Raises ValueError where one of these is missing."""
         missing = [name for name in names if not any(name in (line.name, Path(line.name).stem) for line in self.lines)]

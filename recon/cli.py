@@ -175,7 +175,7 @@ def _chosen(args: argparse.Namespace) -> tuple[str, ...]:
         return args.frames
     if not args.views:
         return ()
-    names = [path.name for path in folder.chosen_images(args.folder)]
+    names = folder.names_in(args.folder)
     if args.views > len(names):
         raise ValueError(f"--views {args.views}: the folder holds {len(names)} photographs; ask for at most as many")
     return tuple(names[i] for i in np.linspace(0, len(names) - 1, args.views).round().astype(int))

@@ -65,6 +65,7 @@ def test_a_copy_of_a_folder_of_photographs(shared, tmp_path):
 
 def test_some_frames_by_name(tmp_path):
     path = record(tmp_path / "walk", frames())
+    assert folder.names_in(path) == ["b 1.png", "ä/2", "d", "e"]
     assert [item.name for item in folder.stream(folder.Config(path, names=("b 1", "e")))] == ["b 1.png", "e"]
     with pytest.raises(ValueError, match="no frame named f"):
         list(folder.stream(folder.Config(path, names=("f",))))

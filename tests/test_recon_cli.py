@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import splatnode
+from capture.cameras.folder import Config, stream
+from capture.recording import Recorder
 from recon import cli
 
 
@@ -46,6 +48,15 @@ def test_a_seed_that_cannot_be_used_is_told_before_the_capture_is_made(tmp_path,
     assert splatnode.main(["demo", "--seed", str(2**63), "--out", str(tmp_path / "out")]) == 2
     assert "seed: expected int <=" in capsys.readouterr().err
     assert not any(tmp_path.iterdir())
+
+
+def test_so_many_views_of_a_recording_go_by_the_names_that_its_frames_had(photographs, capsys):
+    recording, out = photographs.parent / "recording", photographs.parent / "out"
+    with Recorder(recording) as recorder:
+        for frame in stream(Config(folder=photographs)):
+            recorder.write(frame)
+    assert splatnode.main(["replay", str(recording), "--views", "1", "--out", str(out)]) == 65
+    assert json.loads((out / "report.json").read_text())["verdict"]["code"] == "TOO_FEW_VIEWS"
 
 
 def test_a_refusal_leaves_a_report_that_says_why(photographs, capsys):

@@ -100,8 +100,9 @@ def frame_name(path: Path) -> str:
     """The file's name as text of one line: bytes that are no UTF-8, and control characters, are written as escapes.
 
     Names go into messages, JSON and lists of cameras, where a stray byte or a line break would end the reconstruction.
+    So would two frames of one name: a backslash is escaped too.
     """
-    escaped = (char if char.isprintable() else char.encode("unicode_escape").decode() for char in path.name)
+    escaped = (c if c.isprintable() and c != "\\" else c.encode("unicode_escape").decode() for c in path.name)
     return "".join(escaped)
 
 
@@ -117,6 +118,13 @@ def image_paths(folder: Path) -> list[Path]:
     visible = [path for path in folder.iterdir() if not path.name.startswith(".")]
     chosen = [path for path in visible if path.suffix.lower() in suffixes and (path.is_file() or not path.exists())]
     return sorted(chosen, key=natural_order)
+
+
+def names_in(folder: Path) -> list[str]:
+    """What `Config.names` can choose from, in order. Raises as `stream` does."""
+    if recording.is_recording(folder):
+        return recording.read(folder).names
+    return [path.name for path in chosen_images(folder)]
 
 
 def chosen_images(folder: Path, names: tuple[str, ...] = ()) -> list[Path]:
