@@ -41,4 +41,5 @@ def test_services_run_a_verb_under_a_watchdog(path):
     assert program.endswith("/splatnode") and verb in {verb.name for verb in splatnode.VERBS}
     assert service["Type"] == "notify" and int(service["WatchdogSec"]) > 0
     assert service["RuntimeDirectoryMode"] == "0700"  # or the sockets would be refused
+    assert service["MemoryMax"]  # the only bound on what a peer with a key can send
     assert service["Restart"] == "on-failure" and "2" in service["RestartPreventExitStatus"].split()

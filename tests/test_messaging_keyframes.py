@@ -23,7 +23,7 @@ from capture.messaging.services import CAPTURE_KEYFRAMES
 from capture.messaging.spool import Config, Key, Spool, SpoolFull, spool_directory
 from capture.messaging.wire import WireError, encode
 from tests.conftest import ROOT
-from tests.test_messaging_sockets import ipc, tcp
+from tests.test_messaging_sockets import ipc, tcp, wait_for
 
 INTRINSICS = Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0, "calibration", (0.1, -0.2))
 KEY = Key("0" * 32, 0)
@@ -38,7 +38,7 @@ def open_spool(folder, **limits):
     return Spool(Config(folder / "state", **limits))
 
 
-def receive(server, client, count, seconds=5.0):
+def receive(server, client, count, seconds=30.0):
     received = []
     deadline = time.monotonic() + seconds
     while len(received) < count and time.monotonic() < deadline:
@@ -48,11 +48,17 @@ def receive(server, client, count, seconds=5.0):
     return received
 
 
-def settled(server, client):
-    """Everything that was said has been heard."""
-    for _ in range(10):
+def settle(server, client, until=lambda: True):
+    """What was said is heard: until this is so, and for a while, in which what must not come could."""
+
+    def serve():
         server.serve(0.01)
-        client.receive(0.005)
+        assert client.receive(0.005) is None
+        return until()
+
+    wait_for(serve)
+    for _ in range(10):
+        serve()
 
 
 def assert_same(received, sent):
@@ -69,7 +75,7 @@ def test_frames_arrive_in_order_and_leave_the_spool_when_acknowledged(tmp_path, 
         server.offer(DroppedFrame("blurred.png", "blurred: its edges are 9 px wide"))
         received = receive(server, client, 3)
         assert [one.sequence for one in received] == [0, 1, 2]
-        settled(server, client)
+        settle(server, client)
         assert server.queued == 7 and client.receive(0) is None  # its capacity is used up
         for one in received:
             assert_same(one.frame, frame(one.sequence))
@@ -81,7 +87,7 @@ def test_frames_arrive_in_order_and_leave_the_spool_when_acknowledged(tmp_path, 
         (dropped,) = receive(server, client, 1)
         assert dropped.frame == DroppedFrame("blurred.png", "blurred: its edges are 9 px wide")
         client.acknowledge(dropped)
-        settled(server, client)
+        settle(server, client, lambda: server.queued == 0)
         assert server.queued == 0 and client.duplicates == client.refused == server.refused == 0
 
 
@@ -93,10 +99,10 @@ def test_a_new_recon_gets_what_the_old_one_had_not_acknowledged(tmp_path):
         with KeyframeClient(network) as killed:
             first, second, _third = receive(server, killed, 3)
             killed.acknowledge(first)
-            settled(server, killed)
+            settle(server, killed, lambda: server.queued == 2)
         with KeyframeClient(network, seen=[first.key, second.key]) as client:  # the checkpoint also holds the second
             assert [one.sequence for one in receive(server, client, 1)] == [2]
-            settled(server, client)
+            settle(server, client, lambda: client.duplicates and server.queued == 1)
             assert client.duplicates == 1 and server.queued == 1
 
 
@@ -111,12 +117,11 @@ def test_a_restarted_capture_does_not_send_again_what_recon_holds(tmp_path):
             server.offer(frame(2))
             (new,) = receive(server, client, 1)
             assert new.session != held[0].session and new.sequence == 0
-            settled(server, client)
+            settle(server, client)
             assert client.duplicates == 0
             for one in (*held, new):
                 client.acknowledge(one)
-            settled(server, client)
-            assert server.queued == 0
+            settle(server, client, lambda: server.queued == 0)
 
 
 KILLED = """
@@ -175,12 +180,11 @@ def test_what_is_no_key_frame_is_refused(tmp_path, caplog):
     with zmq.Context() as context, context.socket(zmq.ROUTER) as impostor, KeyframeClient(network) as client:
         impostor.linger = 0
         impostor.bind(f"ipc://{runtime_directory(network) / CAPTURE_KEYFRAMES.name}")
-        while not impostor.poll(10):
-            assert client.receive(0.01) is None
+        wait_for(lambda: client.receive(0.01) or impostor.poll(10))
         identity, *_ = impostor.recv_multipart()
         for parts in [*bad, encode(header, images)]:
             impostor.send_multipart([identity, *parts])
-        assert client.receive(2).frame.name == "a.png"
+        assert client.receive(30).frame.name == "a.png"
         assert client.refused == len(bad)
     told = [record for record in caplog.records if "refused a key frame" in record.message]
     assert len(told) == len(bad).bit_length()  # the 1st, 2nd, 4th, ...: the journal cannot be filled

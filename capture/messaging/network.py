@@ -2,7 +2,8 @@
 
 Measured pitfalls this file is built on: a second bind on an ipc path succeeds and steals it, hence the lock; a queue
 to nobody blocks for ever without a timeout; a pending message keeps a process from ending without LINGER; a plain tcp
-socket hands raw bytes of anybody to the application, hence no tcp without CURVE.
+socket hands raw bytes of anybody to the application, hence no tcp without CURVE. Nothing bounds how many parts one
+message has: whoever is let in could fill the memory, which the services' MemoryMax answers.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import contextlib
 import errno
 import logging
 import os
+import resource
 import stat
 import tempfile
 from collections.abc import Iterator
@@ -78,6 +80,7 @@ class Endpoint:
             self._keys = _curve_keys(network)
             self._links: list[_Link] = []
             if offers is not None:
+                _room_for_connections()
                 self._lock(offers)
             self._context = zmq.Context()
             self._resources.callback(self._context.term)
@@ -180,6 +183,16 @@ class _Link:
             self._failures = 0 if event == zmq.EVENT_HANDSHAKE_SUCCEEDED else self._failures + 1
         if self._failures >= _MOST_FAILED_HANDSHAKES:
             raise NotAllowed(f"{self._address} does not have the key that server.key in network.keys expects of it")
+
+
+def _room_for_connections() -> None:
+    """Lets the process have as many open files as the system allows it.
+
+    Every connection takes one, those of strangers too until their handshake fails; where none are left, nothing can be
+    written and libzmq ends the process.
+    """
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 def runtime_directory(network: Network) -> Path:

@@ -22,6 +22,13 @@ from capture.video4linux import layout as v4l2
 BUFFERS = 4
 
 
+def _readable(fd: int, timeout_s: float) -> bool:
+    """Whether there is something to read, or a loss to be told of, within the time."""
+    poller = select.poll()
+    poller.register(fd, select.POLLIN)
+    return bool(poller.poll(timeout_s * 1000))
+
+
 @dataclass(frozen=True)
 class System:
     """What is asked of the operating system; tests put a driver of their own in its place."""
@@ -32,7 +39,7 @@ class System:
     map: Callable[[int, int, int], memoryview] = lambda fd, length, offset: memoryview(
         mmap.mmap(fd, length, offset=offset)
     )
-    readable: Callable[[int, float], bool] = lambda fd, timeout_s: bool(select.select([fd], [], [], timeout_s)[0])
+    readable: Callable[[int, float], bool] = _readable
 
 
 @dataclass(frozen=True)
