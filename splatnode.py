@@ -2,7 +2,7 @@
 
 Exit codes: 0 good; 2 usage or configuration; 65 the frames cannot be reconstructed (the verdict says why);
 69 camera or package unavailable; 70 internal; 73, 74 cannot write; 75 try again; 77 not allowed; 130 interrupted.
-SIGTERM is a clean stop with 0.
+SIGTERM is a clean stop with 0; the second one ends the process at once.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from collections.abc import Sequence
 import capture.verbs
 import recon.verbs
 import viewer.verbs
+from capture.stop_signals import on_first
 
 # libgomp's threads spin while they wait. On a robot's busy processor that doubles the time of torch's operations.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -46,11 +47,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         logging.getLogger(room).setLevel(logging.INFO)
     stopping = threading.Event()
 
-    def stop(_signal: int, _frame: object) -> None:
+    def stop() -> None:
         stopping.set()
         sys.exit(0)
 
-    signal.signal(signal.SIGTERM, stop)
+    on_first((signal.SIGTERM,), stop)
     try:
         code = args.run(args)
         print(end="", flush=True)  # where there is a standard output

@@ -127,6 +127,21 @@ def test_signals_end_a_verb_cleanly(number, code):
     assert "Traceback" not in err
 
 
+def test_the_second_signal_ends_a_process_at_once():
+    program = (
+        "import signal\n"
+        "from capture import stop_signals\n"
+        "now = [0.0]\n"
+        "stop_signals.time.monotonic = lambda: now[0]\n"
+        "stop_signals.on_first((signal.SIGTERM, signal.SIGINT), lambda: print('stopping', flush=True))\n"
+        "for now[0], number in ((0.0, 15), (0.1, 15), (0.2, 2), (0.8, 2)):\n"
+        "    signal.raise_signal(number)\n"
+        "    print('goes on', flush=True)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, text=True, capture_output=True, timeout=60)
+    assert (done.returncode, done.stdout) == (-signal.SIGINT, "stopping\ngoes on\ngoes on\ngoes on\n")
+
+
 def test_a_stop_that_an_import_turns_into_its_own_error_is_a_stop(monkeypatch, capsys):
     def interrupted_import(_args):
         try:

@@ -29,6 +29,7 @@ from capture.messaging.wire import Numbering
 from capture.service_manager import ServiceManager
 from capture.state_directory import state_directory
 from capture.status import own_rss_mb
+from capture.stop_signals import on_first
 from recon.daemon.config import Config
 from recon.daemon.control import Answer, Retract
 from recon.daemon.inbox import Inbox, LeftOut
@@ -48,7 +49,7 @@ STUCK_S = 300.0  # without the worker getting on: what takes longest, a verifica
 
 
 def recon(args: argparse.Namespace) -> int:
-    """Runs until SIGTERM or SIGINT; 0 then."""
+    """Runs until SIGTERM or SIGINT; 0 then. The second signal does not wait for what is being written."""
     use_structured_lines()
     config = load_config(args.config, Config) if args.config else Config()
     if args.checkpoint:
@@ -56,8 +57,7 @@ def recon(args: argparse.Namespace) -> int:
     if args.out:
         config = msgspec.structs.replace(config, out=args.out)
     stopping = threading.Event()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: stopping.set())
+    on_first((signal.SIGTERM, signal.SIGINT), stopping.set)
     with Daemon(config, stopping) as daemon:
         daemon.run()
     return 0
