@@ -30,6 +30,7 @@ from recon.daemon.tracking import Config as Tracking
 from recon.export import read_cameras
 from recon.verdict import Code
 from tests.synthetic import photographs, places
+from tests.test_messaging_sockets import wait_for
 
 QUICK = Reconstruction(
     size=160,
@@ -151,6 +152,22 @@ def test_key_frames_become_a_scene_that_survives_the_process_and_forgets_what_it
         peer.wait(lambda scene: scene.session not in (first.session, again.session), "a third session")
         assert len(peer.heard[-1].snapshot.cameras) == 3
         assert peer.heard[-1].snapshot.dropped == less.snapshot.dropped
+
+
+def test_a_process_that_died_while_it_exported_leaves_the_result_to_the_next(config, peer, monkeypatch):
+    died = threading.Event()
+
+    def die(*_, **__):
+        died.set()
+        raise SystemExit
+
+    for frame in photographs()[:3]:
+        peer.server.offer(frame)
+    with monkeypatch.context() as patch, pytest.raises(AssertionError, match="SystemExit"), running(config):
+        patch.setattr("recon.daemon.output.finish", die)
+        wait_for(lambda: peer.server.serve(0.02) or died.is_set(), PATIENCE_S)
+    with running(config):
+        wait_for((config.out / "scene-0001" / "manifest.json").exists, PATIENCE_S)
 
 
 def offer_when_three_are_shown(peer, frames) -> None:

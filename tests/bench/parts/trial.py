@@ -74,6 +74,7 @@ def expect_whole(node: Node, views: int = VIEWS) -> None:
     expect_scene(node, views)
     wait_for(lambda: node.spooled() == 0, "acknowledgement of all key frames", 30)
     expect(node.end("recon") == 0, "recon did not end with 0")
+    expect(any((node.folder / "out").glob("*/manifest.json")), "there is no result")
     expect_exports_whole(node)
     expect(not list(node.folder.rglob(".*.tmp")), f"half-written files: {list(node.folder.rglob('.*.tmp'))}")
 
