@@ -57,7 +57,7 @@ def test_showing_waits_for_nobody_and_a_failed_run_ends_the_viewer(tmp_path, mon
         begin = time.perf_counter()
         for _ in range(10_000):
             show(shown)
-        assert time.perf_counter() - begin < 1.0
+        assert time.perf_counter() - begin < 30  # the viewer sleeps for twice that
         raise RuntimeError("the run failed")
     assert started[0].returncode is not None
 

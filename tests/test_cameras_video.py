@@ -64,9 +64,10 @@ def test_the_recorded_pace():
     start = time.monotonic()
     assert list(paced(items, "recorded")) == items
     assert time.monotonic() - start >= 0.15
+    hour = [frame(10**12), frame(10**12 + 3600 * 10**9)]
     start = time.monotonic()
-    assert list(paced(items, "fastest")) == items
-    assert time.monotonic() - start < 0.1
+    assert list(paced(hour, "fastest")) == hour
+    assert time.monotonic() - start < 60
 
 
 def test_a_folder_can_be_shown_again_and_again(tmp_path):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -59,14 +60,21 @@ def test_a_file_that_is_being_written_is_waited_for(tmp_path, pause_s):
     assert isinstance(frame, Frame) and frame.encoded == data
 
 
-def test_a_file_that_never_becomes_whole_is_named(tmp_path):
+def test_a_file_that_never_becomes_whole_is_named(tmp_path, monkeypatch):
+    now = [0.0]
+
+    def sleep(seconds):
+        now[0] += seconds
+
+    clock = SimpleNamespace(monotonic=lambda: now[0], monotonic_ns=lambda: round(now[0] * 1e9), sleep=sleep)
+    monkeypatch.setattr("capture.cameras.watched.time", clock)
     (tmp_path / "half.jpg").write_bytes(photograph()[:-500])
     (tmp_path / "whole.jpg").write_bytes(photograph(1))
     frames = watch(tmp_path)
     assert next(frames).name == "whole.jpg"  # one file does not hold up the others
     dropped = next(frames)
     assert isinstance(dropped, DroppedFrame) and dropped.name == "half.jpg"
-    assert "truncated" in dropped.reason and "after 0 s" in dropped.reason
+    assert "truncated" in dropped.reason and "after 0 s" in dropped.reason and 0.4 <= now[0] < 0.5
 
 
 def test_temporary_and_hidden_files_are_not_looked_at(tmp_path):

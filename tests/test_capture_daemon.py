@@ -79,23 +79,21 @@ def take_all(tmp_path, process):
     """Acts as recon until capture ends."""
     items = []
     with KeyframeClient(network(tmp_path)) as client:
-        while process.poll() is None:
-            received = client.receive(0.05)
-            if received is not None:
+
+        def ended():
+            if (received := client.receive(0.05)) is not None:
                 items.append(received.frame)
                 client.acknowledge(received)
+            return process.poll() is not None
+
+        wait_for(ended)
     return items
 
 
 def test_a_folder_from_its_first_frame_to_its_last_acknowledgement(tmp_path, photographs, start):
     process = start()
-    with (
-        Subscriber(CAPTURE_PREVIEW, network(tmp_path), PreviewHeader) as previews,
-        Subscriber(CAPTURE_STATUS, network(tmp_path), CaptureStatus) as heartbeats,
-    ):
-        preview = wait_for(lambda: previews.latest(0.1), 20)
-        assert decode_preview(preview).shape == (240, 320, 3) and preview.header.name.endswith(".png")
-        status = wait_for(lambda: (it := heartbeats.latest(0.1)) and it.header.state == "finished" and it.header, 20)
+    with Subscriber(CAPTURE_STATUS, network(tmp_path), CaptureStatus) as heartbeats:
+        status = wait_for(lambda: (it := heartbeats.latest(0.1)) and it.header.state == "finished" and it.header)
         assert status.key_frames == 5 and status.frames == 6 and status.dropped == 1 and status.unusable == 1
         assert status.waiting == 6 and not status.recon_connected and 10 < status.rss_mb < 1000
     items = take_all(tmp_path, process)
@@ -103,7 +101,7 @@ def test_a_folder_from_its_first_frame_to_its_last_acknowledgement(tmp_path, pho
     stored = cv2.cvtColor(cv2.imread(str(photographs / "1.png")), cv2.COLOR_BGR2RGB)
     assert np.array_equal(items[1].image, stored) and items[1].stamp_ns == 125_000_000
     assert "truncated" in items[5].reason or "damaged" in items[5].reason
-    assert process.wait(10) == 0
+    assert process.returncode == 0
     log = process.stderr.read()
     assert log.count("event=keyframe") == 5 and 'reason="every frame is taken"' in log
     assert not list((tmp_path / "state" / "spool").iterdir())
@@ -112,9 +110,9 @@ def test_a_folder_from_its_first_frame_to_its_last_acknowledgement(tmp_path, pho
 def test_sigterm_is_a_clean_end_and_what_waits_is_kept(tmp_path, start):
     process = start(", loops: 1000")
     spool = tmp_path / "state" / "spool"
-    wait_for(lambda: spool.exists() and len(list(spool.glob("*.frame"))) >= 2, 20)
+    wait_for(lambda: spool.exists() and len(list(spool.glob("*.frame"))) >= 2)
     process.send_signal(signal.SIGTERM)
-    assert process.wait(10) == 0
+    assert process.wait(60) == 0
     assert "Traceback" not in process.stderr.read()
     kept = sorted(path.name for path in spool.iterdir())
     assert all(name.endswith(".frame") for name in kept) and len(kept) >= 2
@@ -124,7 +122,7 @@ def test_sigterm_is_a_clean_end_and_what_waits_is_kept(tmp_path, start):
 def test_a_killed_capture_is_continued_by_the_next(tmp_path, start):
     process = start()
     spool = tmp_path / "state" / "spool"
-    wait_for(lambda: spool.exists() and len(list(spool.glob("*.frame"))) >= 2, 20)
+    wait_for(lambda: spool.exists() and len(list(spool.glob("*.frame"))) >= 2)
     process.kill()
     process.wait()
     items = take_all(tmp_path, start())
@@ -134,9 +132,9 @@ def test_a_killed_capture_is_continued_by_the_next(tmp_path, start):
 
 def test_the_second_capture_is_told_who_the_first_is(tmp_path, start):
     first = start(", loops: 1000")
-    wait_for(lambda: (tmp_path / "run" / "capture.preview").exists(), 20)
+    wait_for(lambda: (tmp_path / "run" / "capture.preview").exists())
     second = start()
-    assert second.wait(20) == 75
+    assert second.wait(60) == 75
     assert f"by process {first.pid}" in second.stderr.read()
 
 
@@ -144,12 +142,16 @@ def test_systemd_is_told(tmp_path, start):
     address = tmp_path / "notify"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(address))
-        manager.settimeout(20)
+        manager.settimeout(60)
         process = start(", loops: 1000", NOTIFY_SOCKET=str(address), WATCHDOG_USEC="400000")
         messages = []
-        while sum(message.startswith("WATCHDOG=1") for message in messages) < 3:
+
+        def streams():
             messages.append(manager.recv(1000).decode())
-        assert "READY=1" in messages and "streaming: " in messages[-1]
+            return sum(message.startswith("WATCHDOG=1") for message in messages) >= 3 and "streaming: " in messages[-1]
+
+        wait_for(streams)
+        assert "READY=1" in messages
         process.send_signal(signal.SIGTERM)
         while messages[-1] != "STOPPING=1":
             messages.append(manager.recv(1000).decode())
@@ -157,7 +159,7 @@ def test_systemd_is_told(tmp_path, start):
 
 def test_status_says_how_it_is(tmp_path, start):
     start(", loops: 1000")
-    wait_for(lambda: (tmp_path / "run" / "capture.status").exists(), 20)
+    wait_for(lambda: list(tmp_path.glob("state/spool/*.frame")))
     command = [sys.executable, "-m", "splatnode", "status", "--json", "--config", str(tmp_path / "capture.yaml")]
     result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     found = json.loads(result.stdout)
@@ -167,9 +169,14 @@ def test_status_says_how_it_is(tmp_path, start):
 
 def test_a_full_spool_is_said_once_and_stops_nothing(tmp_path, start, photographs):
     process = start(", loops: 1000", spool="max_frames: 2, ")
-    with Subscriber(CAPTURE_STATUS, network(tmp_path), CaptureStatus) as heartbeats:
-        status = wait_for(lambda: (beat := heartbeats.latest(0.1)) and beat.header.not_taken > 1 and beat.header, 20)
+    with (
+        Subscriber(CAPTURE_PREVIEW, network(tmp_path), PreviewHeader) as previews,
+        Subscriber(CAPTURE_STATUS, network(tmp_path), CaptureStatus) as heartbeats,
+    ):
+        status = wait_for(lambda: (beat := heartbeats.latest(0.1)) and beat.header.not_taken > 1 and beat.header)
         assert status.waiting == 2 and "is splatnode recon running" in status.why
+        preview = wait_for(lambda: previews.latest(0.1))
+        assert decode_preview(preview).shape == (240, 320, 3) and preview.header.name.endswith(".png")
     process.terminate()
     assert process.stderr.read().count("event=spool_full") == 1
 

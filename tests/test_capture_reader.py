@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
+from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -26,10 +29,22 @@ def recorded(items):
 
 def read_all(reader):
     items = []
-    while not (reader.state is State.FINISHED and reader.empty):
+
+    def finished():
         if (item := reader.next(0.05)) is not None:
             items.append(item)
+        return reader.state is State.FINISHED and reader.empty
+
+    wait_for(finished)
     return items
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """What readers take for the time, which stands still until the test moves it."""
+    now = SimpleNamespace(s=100.0)
+    monkeypatch.setattr("capture.reader.time", SimpleNamespace(monotonic=lambda: now.s))
+    return now
 
 
 def test_a_recording_is_read_whole_however_slow_the_reader():
@@ -51,7 +66,7 @@ def test_of_a_live_camera_the_newest_are_read():
         time.sleep(0.3)
 
     with Reader(camera, live=True, config=QUICK) as reader:
-        seen.wait()
+        assert seen.wait(60)
         wait_for(lambda: reader.skipped == 98)
         assert [reader.next(0.1).name, reader.next(0.1).name] == ["98", "99"]
 
@@ -68,7 +83,7 @@ def test_a_lost_camera_comes_back_under_new_numbers():
         if len(openings) < 5:
             raise CameraUnavailable("unplugged")
 
-    with Reader(camera, live=False, config=QUICK) as reader:
+    with Reader(camera, live=False, config=msgspec.structs.replace(QUICK, give_up_s=60.0)) as reader:
         items = read_all(reader)
     assert [item.frame_id for item in items] == [0, 1, 2, 3, 4, 5]
     assert len(openings) == 5 and reader.why == ""
@@ -76,7 +91,7 @@ def test_a_lost_camera_comes_back_under_new_numbers():
     assert pauses[1] > 0.015 and pauses[2] > 0.035  # 0.01, 0.02, 0.04
 
 
-def test_while_it_is_lost_it_says_so():
+def test_while_it_is_lost_it_says_so(clock):
     lost = threading.Event()
 
     def camera():
@@ -87,8 +102,9 @@ def test_while_it_is_lost_it_says_so():
         raise CameraUnavailable("unplugged")
 
     with Reader(camera, live=True, config=QUICK) as reader:
-        assert reader.next(1).name == "0"
+        assert reader.next(60).name == "0"
         wait_for(lambda: reader.state is State.DEGRADED and "no camera" in reader.why)
+        clock.s += 1.1
         with pytest.raises(CameraUnavailable, match="no frame|no camera"):
             while True:
                 reader.next(0.05)
@@ -100,18 +116,23 @@ def test_a_camera_that_is_not_there_at_first_is_not_waited_for():
         yield
 
     with Reader(camera, live=True, config=QUICK) as reader, pytest.raises(CameraUnavailable) as caught:
-        reader.next(1)
+        reader.next(60)
     assert caught.value.exit_code == 69
 
 
-def test_a_silent_camera_is_degraded_and_then_given_up():
+def test_a_silent_camera_is_degraded_and_then_given_up(clock):
+    closing = threading.Event()
+
     def camera():
         yield frame(0)
-        time.sleep(2)
+        closing.wait(60)
 
-    with Reader(camera, live=True, config=QUICK) as reader:
-        assert reader.next(1) is not None and reader.state is State.STREAMING
-        wait_for(lambda: reader.state is State.DEGRADED)
+    with Reader(camera, live=True, config=QUICK) as reader, contextlib.ExitStack() as end:
+        end.callback(closing.set)
+        assert reader.next(60) is not None and reader.state is State.STREAMING
+        clock.s += 0.3
+        assert reader.state is State.DEGRADED
+        clock.s += 1.1
         with pytest.raises(CameraUnavailable, match="no frame for 1 s"):
             while True:
                 reader.next(0.05)
@@ -147,5 +168,5 @@ def test_closing_closes_the_camera():
             closed.set()
 
     with Reader(camera, live=False, config=QUICK) as reader:
-        reader.next(1)
+        reader.next(60)
     assert closed.is_set()
