@@ -16,7 +16,7 @@ from capture.cameras import synthetic
 from capture.diorama.cast import Camera, cast
 from capture.diorama.layout import BRICK_WALL, place
 from capture.frame import Frame
-from recon.evaluate.alignment import CameraErrors, camera_errors
+from recon.evaluate.camera_errors import CameraErrors, camera_errors
 from recon.gaussians import Gaussians
 from recon.keyframe import Keyframe, modelled_image
 from recon.priors.pointmap import Pointmap

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from recon.evaluate.alignment import camera_errors
+from recon.evaluate.camera_errors import camera_errors
 from recon.priors.mast3r.alignment import PairPoints, align
 
 HEIGHT, WIDTH, FOCAL = 36, 48, 45.0

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from capture.cameras import synthetic
-from recon.evaluate.alignment import camera_errors
+from recon.evaluate.camera_errors import camera_errors
 from recon.judge import Config as JudgeConfig
 from recon.judge import hopeless, judge
 from recon.keyframe import Features, Keyframe

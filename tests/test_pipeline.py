@@ -18,8 +18,9 @@ from capture.cameras import synthetic
 from capture.frame import DroppedFrame, Frame
 from recon import optimize
 from recon.config import Config
-from recon.evaluate.alignment import CameraErrors, align_test_pose, camera_errors
+from recon.evaluate.alignment import align_test_pose
 from recon.evaluate.appearance import Splats
+from recon.evaluate.camera_errors import CameraErrors, camera_errors
 from recon.evaluate.metrics import psnr
 from recon.evaluate.protocol import mean_intrinsics
 from recon.evaluate.splits import load_split

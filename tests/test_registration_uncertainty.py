@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from recon.evaluate.alignment import umeyama
+from recon.evaluate.camera_errors import umeyama
 from recon.registration import bundle, uncertainty
 from tests.test_registration_bundle import NOISE_PX, PRIOR, problem
 

@@ -12,8 +12,9 @@ import torch
 from torch import Tensor
 
 from recon import rim
-from recon.evaluate.alignment import CameraErrors, align_test_pose, camera_errors
+from recon.evaluate.alignment import align_test_pose
 from recon.evaluate.appearance import Appearance, Rasterize, appearance_of
+from recon.evaluate.camera_errors import CameraErrors, camera_errors
 from recon.evaluate.metrics import psnr, ssim
 from recon.evaluate.splits import Split
 from recon.evaluate.truth import EvaluationScene

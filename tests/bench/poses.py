@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from recon.config import Config
-from recon.evaluate.alignment import camera_errors
+from recon.evaluate.camera_errors import camera_errors
 from recon.evaluate.splits import load_split
 from recon.evaluate.truth import EvaluationScene, load_scene
 from recon.judge import hopeless, judge

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.evaluate.alignment import camera_errors
+from recon.evaluate.camera_errors import camera_errors
 from recon.priors.mast3r.alignment import align
 from recon.priors.mast3r.network import Mast3r
 from recon.priors.stereo import Config

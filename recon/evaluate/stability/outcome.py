@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.evaluate.alignment import camera_errors
+from recon.evaluate.camera_errors import camera_errors
 from recon.evaluate.stability.case import Demand, World
 from recon.snapshot import CameraEstimate
 

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from capture.cameras import synthetic
 from capture.frame import Intrinsics
-from recon.evaluate.alignment import angles_deg
+from recon.evaluate.camera_errors import angles_deg
 from recon.evaluate.demo import write_capture
 from recon.evaluate.truth import EvaluationScene, TrueCamera, load_scene
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from capture.frame import Frame
 from recon.config import Config
-from recon.evaluate.alignment import camera_errors
+from recon.evaluate.camera_errors import camera_errors
 from recon.evaluate.protocol import Networks, Run, Settings, evaluate
 from recon.evaluate.splits import Split
 from recon.evaluate.stability.case import Measured, Probe, frames
