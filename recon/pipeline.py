@@ -1,13 +1,14 @@
 """Frames in, snapshots of a growing Gaussian scene out: read this first.
 
 `reconstruct` is the one function that the offline replay, the tests and the benchmarks call; only the frames differ.
-The daemon (recon/daemon) takes the same steps of `Reconstruction`, in the order in which frames happen to come.
+The daemon (recon/daemon) takes the same steps of `Reconstruction`, in the order in which frames happen to come; what it
+needs beyond them is in recon/daemon/reconstruction.py.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
 import msgspec
 
@@ -21,7 +22,6 @@ from recon.keyframe import Features, Keyframe, modelled_image
 from recon.priors.pointmap import Pointmap
 from recon.priors.prior import Prior
 from recon.registration import features
-from recon.registration.two_view import TwoView
 from recon.scene import Scene, begin
 from recon.screening import Look, Rejected, look, screen
 from recon.snapshot import GaussianArrays, Snapshot
@@ -90,7 +90,6 @@ class Reconstruction:
         settings = config.prior.config
         self._prior: Prior = config.prior.module.load(msgspec.structs.replace(settings, seed=config.seed))
         self.graph = ViewGraph(settings.registration, self._prior.matcher)
-        self._beside = self.graph.without(())  # what is known of keyframes that were set aside, and of others
         self.dropped: list[DroppedFrame] = []
         self.rejected: list[Rejected] = []  # those of `dropped` that the screening left out
         self.begun: Scene | None = None  # from the last estimate of all frames, not optimised
@@ -108,13 +107,6 @@ class Reconstruction:
     def names(self) -> list[str]:
         """Of the keyframes, in their order."""
         return [keyframe.name for keyframe in self.graph.keyframes]
-
-    @property
-    def aside(self) -> list[Keyframe]:
-        """Keyframes that are known and do not belong to the scene, in the order in which their frames came."""
-        belonging = set(self.names)
-        found = [keyframe for keyframe in self._beside.keyframes if keyframe.name not in belonging]
-        return sorted(found, key=lambda keyframe: keyframe.frame.frame_id)
 
     def drop(self, frame: DroppedFrame) -> None:
         """Keeps in mind that there was a frame that was left out."""
@@ -160,19 +152,8 @@ class Reconstruction:
 
     def retract(self, names: Collection[str]) -> None:
         """Forgets keyframes and what the scene has from them alone. What is shown waits for the next estimate."""
-        self._beside = self._beside.without(names)
         self._looks = {name: seen for name, seen in self._looks.items() if name not in names}
         self._leave_out(names)
-
-    def set_aside(self, names: Collection[str]) -> None:
-        """Takes keyframes out of the scene as `retract` does, and remembers them and what their pairs say."""
-        self._beside = self.graph.joined(self._beside)
-        self._leave_out(names)
-
-    def bring_back(self, names: Collection[str]) -> None:
-        """The keyframes among these that were set aside are keyframes as before."""
-        others = {keyframe.name for keyframe in self.aside}.difference(names)
-        self.graph = self.graph.joined(self._beside.without(others))
 
     def _leave_out(self, names: Collection[str]) -> None:
         if set(self.names).isdisjoint(names):
@@ -184,45 +165,12 @@ class Reconstruction:
             rest = growth.without(self.scene, names)
             self.scene = rest if rest.views else None
 
-    def restore(
-        self,
-        keyframes: Sequence[Keyframe],
-        pairs: Mapping[tuple[str, str], TwoView],
-        pending: Collection[tuple[str, str]] = (),
-    ) -> None:
-        """Takes over keyframes whose pairs, by their names, an earlier process knew; it had not looked at `pending`."""
-        self.graph.keyframes[:] = keyframes
-        place = {keyframe.name: index for index, keyframe in enumerate(keyframes)}
-        self.graph.pairs = {(place[i], place[j]): pair for (i, j), pair in pairs.items() if i in place and j in place}
-        self.graph.pending = {(place[i], place[j]) for i, j in pending if i in place and j in place}
-        self._looks |= {keyframe.name: look(keyframe.frame) for keyframe in keyframes}
-
-    def restore_judgement(self, judgement: Judgement, proven: Collection[str]) -> None:
-        """Takes over what an earlier process had judged of just the keyframes that there are."""
-        self._judging.restore(self.graph, judgement, proven)
-
     def judge(self) -> Judgement:
         """Cameras of the keyframes and the verdict on them, as soon as possible: maybe for now only."""
         self.clock.lap("wait")
         judgement = self._judging.soon(self.graph, self.rejected)
         self.clock.lap("poses")
         return judgement
-
-    def judge_quickly(self) -> Judgement | None:
-        """The same if it is known or continues what is known; None where that cannot be said quickly."""
-        self.clock.lap("wait")
-        judgement = self._judging.quickly(self.graph, self.rejected)
-        self.clock.lap("poses")
-        return judgement
-
-    def refused(self, names: Collection[str]) -> bool:
-        """Whether a thorough judgement of these keyframes, just these, is known to forbid a scene."""
-        return self._judging.refused(names)
-
-    @property
-    def proven(self) -> frozenset[str]:
-        """The keyframes that a publishable verdict was last given on thoroughly."""
-        return self._judging.proven
 
     def judge_thoroughly(self, pause: Callable[[], None] = lambda: None) -> Judgement:
         """The same from all that there is to know, whatever it takes. `pause` may raise to abandon the work."""

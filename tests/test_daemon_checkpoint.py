@@ -12,18 +12,20 @@ from capture.messaging.keyframe_messages import ReceivedFrame
 from recon import optimize
 from recon.config import Config
 from recon.daemon import checkpoint
+from recon.daemon.reconstruction import LiveReconstruction
+from recon.daemon.saved import GraphRecord
 from recon.daemon.store import MADE_ANEW, Store
-from recon.pipeline import Reconstruction, prepare
+from recon.pipeline import prepare
 from tests.synthetic import photographs
 
 CONFIG = Config(size=160, preview=optimize.Config(iterations=1, half_resolution_share=1.0))
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory) -> tuple[Path, Reconstruction]:
+def saved(tmp_path_factory) -> tuple[Path, LiveReconstruction]:
     """A checkpoint with a scene of three key frames, and what is in it."""
     folder = tmp_path_factory.mktemp("checkpoint")
-    store, made = Store(folder), Reconstruction(CONFIG)
+    store, made = Store(folder), LiveReconstruction(CONFIG)
     for sequence, frame in enumerate(photographs()[:3]):
         made.add(prepare(store.put(ReceivedFrame("0" * 32, sequence, frame)).frame, CONFIG))
     made.work_in()
@@ -33,7 +35,7 @@ def saved(tmp_path_factory) -> tuple[Path, Reconstruction]:
 
 
 @pytest.fixture
-def work(saved) -> Reconstruction:
+def work(saved) -> LiveReconstruction:
     return saved[1]
 
 
@@ -45,7 +47,7 @@ def store(saved, tmp_path):
 
 
 def test_what_was_judged_and_measured_comes_back_and_is_not_made_anew(store, work, monkeypatch):
-    again = Reconstruction(CONFIG)
+    again = LiveReconstruction(CONFIG)
     found = checkpoint.restore(store, again)
     assert (found.keyframes, found.new, found.final) == (3, [], True)
 
@@ -70,10 +72,16 @@ def test_what_was_judged_and_measured_comes_back_and_is_not_made_anew(store, wor
     assert again.grow() and [view.name for view in again.scene.views] == [*work.names, further.name]
 
 
+def test_what_another_version_wrote_is_made_anew(store, caplog):
+    store.save("graph", GraphRecord(names=["a.png"], features=[{"unknown": 1}], pairs=[], pending=[]), [])
+    found = checkpoint.restore(store, LiveReconstruction(CONFIG))
+    assert (found.keyframes, len(found.new), found.final) == (3, 3, False) and "made anew" in caplog.text
+
+
 @pytest.mark.parametrize("lost", MADE_ANEW)
 def test_what_is_missing_is_made_anew(store, lost):
     (store.directory / lost).write_bytes(b"damaged")
-    again = Reconstruction(CONFIG)
+    again = LiveReconstruction(CONFIG)
     found = checkpoint.restore(store, again)
     assert found.keyframes == 3
     for keyframe in found.new:

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from capture.frame import Frame
 from recon.daemon import saved, saved_judgement
+from recon.daemon.reconstruction import LiveReconstruction
 from recon.daemon.store import Store
 from recon.keyframe import Keyframe
-from recon.pipeline import Reconstruction, prepare
+from recon.pipeline import prepare
 
 log = logging.getLogger(__name__)
 
@@ -20,7 +23,7 @@ class Restored:
     final: bool  # whether its scene is as good as it gets
 
 
-def save(store: Store, work: Reconstruction, final: bool) -> None:
+def save(store: Store, work: LiveReconstruction, final: bool) -> None:
     """Keeps what `work` knows; whether its scene is `final`. Raises OSError."""
     store.save("graph", *saved.graph_message(work.graph))
     judged = work.judge()
@@ -31,24 +34,21 @@ def save(store: Store, work: Reconstruction, final: bool) -> None:
         store.save("scene", *saved.scene_message(work.scene, final))
 
 
-def restore(store: Store, work: Reconstruction) -> Restored:
+def restore(store: Store, work: LiveReconstruction) -> Restored:
     """Gives `work` what the checkpoint holds."""
     work.dropped = store.dropped
+    frames = [stored.frame for stored in store.frames()]
     try:
-        return _restored(store, work)
+        return _restored(store, frames, work)
     except ValueError as error:
         log.warning("the checkpoint's scene is made anew: %s", error)
-        new = [prepare(stored.frame, work.config) for stored in store.frames()]
-        return Restored(len(new), new, final=False)
+        return Restored(len(frames), [prepare(frame, work.config) for frame in frames], final=False)
 
 
-def _restored(store: Store, work: Reconstruction) -> Restored:
+def _restored(store: Store, frames: Sequence[Frame], work: LiveReconstruction) -> Restored:
     record = store.load("graph", saved.GraphRecord)
     graph = saved.graph_from(record) if record is not None else saved.SavedGraph({}, {}, [])
-    keyframes = {
-        stored.frame.name: prepare(stored.frame, work.config, graph.features.get(stored.frame.name))
-        for stored in store.frames()
-    }
+    keyframes = {frame.name: prepare(frame, work.config, graph.features.get(frame.name)) for frame in frames}
     record = store.load("scene", saved.SceneRecord)
     scene = saved.scene_from(record, keyframes) if record is not None else None
     final = record is not None and record.header.final and scene is not None

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from capture.logs import event
 from recon.daemon import checkpoint
 from recon.daemon.config import Config
+from recon.daemon.reconstruction import LiveReconstruction
 from recon.daemon.store import Store
 from recon.metric import in_metres
-from recon.pipeline import Reconstruction
 from recon.result import finish
 from recon.snapshot import Snapshot
 
@@ -33,12 +33,12 @@ class Output:
         """A disk that takes nothing costs time after a restart, or a result: `complain` is told, and all goes on."""
         self._config, self._store, self._publish, self._complain = config, store, publish, complain
 
-    def show(self, work: Reconstruction, final: bool = False) -> Snapshot:
+    def show(self, work: LiveReconstruction, final: bool = False) -> Snapshot:
         snapshot = work.snapshot(final)
         self._publish(Shown(snapshot, self._store.scene_id))
         return snapshot
 
-    def save(self, work: Reconstruction, final: bool) -> None:
+    def save(self, work: LiveReconstruction, final: bool) -> None:
         """What could be made anew from the key frames."""
         try:
             checkpoint.save(self._store, work, final)

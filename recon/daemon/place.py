@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Sequence
 
+from recon.daemon.reconstruction import LiveReconstruction
 from recon.judging import Judgement
 from recon.keyframe import Keyframe
-from recon.pipeline import Reconstruction
 from recon.view_graph import ViewGraph
 
 NEWEST = 3  # keyframes that are never given up: what comes next connects to them
@@ -19,7 +19,7 @@ MOST = 0.6  # of a scene's cameras, that a scene has to have to be that scene wi
 Pause = Callable[[], None]
 
 
-def add(work: Reconstruction, keyframes: Sequence[Keyframe]) -> set[str]:
+def add(work: LiveReconstruction, keyframes: Sequence[Keyframe]) -> set[str]:
     """Adds keyframes to the reconstruction; sets those aside that do not fit the scene at once, and names them.
 
     Where there is no scene that may be published there is nothing that they could fit, and all of them are kept.
@@ -36,7 +36,7 @@ def add(work: Reconstruction, keyframes: Sequence[Keyframe]) -> set[str]:
     return {name for name in names if len(names) == 1 or not _fits_alone(work, name)}
 
 
-def join(work: Reconstruction, names: Iterable[str], pause: Pause = lambda: None) -> bool:
+def join(work: LiveReconstruction, names: Iterable[str], pause: Pause = lambda: None) -> bool:
     """Brings keyframes back that were set aside, if all are a scene together: this one, judged thoroughly.
 
     Some of them may still be without a camera then. `pause` may raise to abandon the work, and they stay aside.
@@ -57,7 +57,7 @@ def join(work: Reconstruction, names: Iterable[str], pause: Pause = lambda: None
     return False
 
 
-def connected(work: Reconstruction, pause: Pause = lambda: None) -> bool:
+def connected(work: LiveReconstruction, pause: Pause = lambda: None) -> bool:
     """Whether any verified pairs lead from the scene to what was set aside; without them nothing can join the two."""
     placed, aside = _standing(work), {keyframe.name for keyframe in work.aside}
     work.bring_back(aside)
@@ -69,7 +69,7 @@ def connected(work: Reconstruction, pause: Pause = lambda: None) -> bool:
     return any(not group.isdisjoint(placed) and not group.isdisjoint(aside) for group in groups)
 
 
-def prove(work: Reconstruction, pause: Pause = lambda: None) -> None:
+def prove(work: LiveReconstruction, pause: Pause = lambda: None) -> None:
     """Judges thoroughly what was added for now and what was set aside: together, else one after the other.
 
     Keyframes by which the scene fails are set aside. `pause` may raise to abandon the work; what was not judged by then
@@ -87,7 +87,7 @@ def prove(work: Reconstruction, pause: Pause = lambda: None) -> None:
         join(work, [name], pause)
 
 
-def strangers(work: Reconstruction) -> list[Keyframe]:
+def strangers(work: LiveReconstruction) -> list[Keyframe]:
     """The last keyframes in a row, as their frames came, that have no camera in the scene that there is."""
     placed = _standing(work)
     if not placed:
@@ -97,7 +97,7 @@ def strangers(work: Reconstruction) -> list[Keyframe]:
     return everyone[last + 1 :]
 
 
-def contradicting(work: Reconstruction) -> list[Keyframe]:
+def contradicting(work: LiveReconstruction) -> list[Keyframe]:
     """Keyframes that were set aside, after which others fitted."""
     last = _names(strangers(work))
     return [keyframe for keyframe in work.aside if keyframe.name not in last] if _standing(work) else []
@@ -111,7 +111,7 @@ def most_redundant(graph: ViewGraph) -> str:
     return graph.keyframes[first].name
 
 
-def _fits_alone(work: Reconstruction, name: str) -> bool:
+def _fits_alone(work: LiveReconstruction, name: str) -> bool:
     """Whether a keyframe that was set aside fits at once; it is brought back then."""
     work.bring_back([name])
     if _fits(work, [name]):
@@ -120,17 +120,17 @@ def _fits_alone(work: Reconstruction, name: str) -> bool:
     return False
 
 
-def _fits(work: Reconstruction, names: Collection[str]) -> bool:
+def _fits(work: LiveReconstruction, names: Collection[str]) -> bool:
     judged = work.judge_quickly()
     return judged is not None and _placed(work, judged).issuperset(names)
 
 
-def _standing(work: Reconstruction) -> set[str]:
+def _standing(work: LiveReconstruction) -> set[str]:
     """The keyframes that have a camera in the scene that there is, if it may be published."""
     return _placed(work, work.judge()) if work.scene is not None else set()
 
 
-def _placed(work: Reconstruction, judged: Judgement) -> set[str]:
+def _placed(work: LiveReconstruction, judged: Judgement) -> set[str]:
     """The keyframes that have a camera in a scene that may be published."""
     if not judged.verdict.publishable or judged.registration is None:
         return set()

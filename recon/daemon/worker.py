@@ -16,11 +16,11 @@ from recon.daemon import checkpoint, place
 from recon.daemon.config import Config
 from recon.daemon.inbox import Arrived, Inbox, LeftOut
 from recon.daemon.output import Output, Shown
+from recon.daemon.reconstruction import LiveReconstruction
 from recon.daemon.status import State
 from recon.daemon.store import Store
 from recon.daemon.watcher import Finished
 from recon.keyframe import Keyframe
-from recon.pipeline import Reconstruction
 from recon.snapshot import Snapshot
 
 log = logging.getLogger(__name__)
@@ -49,7 +49,7 @@ class Worker:
         self._config, self._store, self._inbox = config, store, inbox
         self._output = Output(config, store, publish, self._complain)
         self._stopping = stopping
-        self._work = Reconstruction(self._recipe)
+        self._work = LiveReconstruction(self._recipe)
         self._settled = True  # nothing can be made better before the next key frame
         self.state = State.WAITING
         self.problem = ""
@@ -178,7 +178,7 @@ class Worker:
         before = self._store.scene_id
         self._store.begin_place(strangers[0].frame.frame_id)
         event(log, logging.WARNING, "another_place", before=before, now=self._store.scene_id)
-        self._work = Reconstruction(self._recipe)
+        self._work = LiveReconstruction(self._recipe)
         for keyframe in strangers:
             self._work.add(keyframe)
 
