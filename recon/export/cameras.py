@@ -1,4 +1,4 @@
-"""Cameras as text: cameras.json (ours), COLMAP's text model, nerfstudio's transforms.json, a TUM trajectory.
+"""Cameras as files: cameras.json (ours), COLMAP's model, nerfstudio's transforms.json, a TUM trajectory.
 
 All are for the images at modelled size, with the centre of the top-left pixel at (0.5, 0.5) (COLMAP's and nerfstudio's
 convention too). Every file says whether the world's unit is the metre.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from struct import pack
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from recon.export.staged import json_bytes
 from recon.scale import RELATIVE, Scale
 from recon.snapshot import CameraEstimate, GaussianArrays
 
+_PINHOLE = 1  # COLMAP's number for the model
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes right, up, back
 
 
@@ -84,28 +86,44 @@ def _camera_from_record(record: Mapping) -> CameraEstimate:
 def encode_colmap(
     cameras: Sequence[CameraEstimate], gaussians: GaussianArrays, scale: Scale = RELATIVE
 ) -> dict[str, bytes]:
-    """COLMAP's text model: cameras.txt, images.txt and points3D.txt (the Gaussians' centres, without tracks).
+    """COLMAP's model: cameras, images and points3D (the Gaussians' centres, without tracks).
 
+    As text; in binary where a name has a space, at which COLMAP, and all who read its text, would end the name.
     Images with the same calibration share a camera; the number of an image is its place in `cameras`, from 1.
     """
     calibrations = [(c.width, c.height, c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2]) for c in cameras]
     camera_ids = {calibration: i + 1 for i, calibration in enumerate(dict.fromkeys(calibrations))}
-    camera_lines = [f"{i} PINHOLE {_row(calibration)}" for calibration, i in camera_ids.items()]
-    image_lines = []
+    images = []
     for number, (camera, calibration) in enumerate(zip(cameras, calibrations, strict=True), 1):
         T_camera_world = np.linalg.inv(camera.T_world_camera)
-        numbers = _row([*quats_from_matrices(T_camera_world[:3, :3]), *T_camera_world[:3, 3]])
-        image_lines += [f"{number} {numbers} {camera_ids[calibration]} {camera.name}", ""]
+        motion = [*quats_from_matrices(T_camera_world[:3, :3]), *T_camera_world[:3, 3]]
+        images.append((number, motion, camera_ids[calibration], camera.name))
     colours = base_rgb(gaussians)
-    point_lines = [
-        f"{i} {x:.6g} {y:.6g} {z:.6g} {r} {g} {b} 0"
-        for i, ((x, y, z), (r, g, b)) in enumerate(zip(gaussians.means.tolist(), colours.tolist(), strict=True), 1)
+    points = [
+        (i, *mean, *colour)
+        for i, (mean, colour) in enumerate(zip(gaussians.means.tolist(), colours.tolist(), strict=True), 1)
     ]
+    if any(character.isspace() for camera in cameras for character in camera.name):
+        return {
+            "cameras.bin": _records([pack("<IiQQ4d", i, _PINHOLE, *lens) for lens, i in camera_ids.items()]),
+            "images.bin": _records(
+                [pack("<I7dI", i, *motion, of) + name.encode() + bytes(1 + 8) for i, motion, of, name in images]
+            ),
+            "points3D.bin": _records([pack("<Q3d3BdQ", *point, 0.0, 0) for point in points]),
+        }
+    camera_lines = [f"{i} PINHOLE {_row(calibration)}" for calibration, i in camera_ids.items()]
+    image_lines = [line for i, motion, of, name in images for line in (f"{i} {_row(motion)} {of} {name}", "")]
+    point_lines = [f"{i} {x:.6g} {y:.6g} {z:.6g} {r} {g} {b} 0" for i, x, y, z, r, g, b in points]
     return {
         "cameras.txt": _text(["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"], camera_lines, scale),
         "images.txt": _text(["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME"], image_lines, scale),
         "points3D.txt": _text(["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"], point_lines, scale),
     }
+
+
+def _records(records: Sequence[bytes]) -> bytes:
+    """As COLMAP's binary files hold them: their number first."""
+    return pack("<Q", len(records)) + b"".join(records)
 
 
 def encode_nerfstudio(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -> bytes:
