@@ -56,6 +56,17 @@ def test_numbers_go_on_and_frames_keep_their_order(open_store):
         assert [store.put(received(2 * run + i)).number for i in (0, 1)] == [2 * run, 2 * run + 1]
 
 
+def test_what_comes_while_the_frames_are_read_takes_no_number_and_no_name_of_theirs(open_store):
+    for i in range(3):
+        open_store().put(received(i))
+    again = open_store()
+    assert sorted(again.seen) == [(SESSION, i) for i in range(3)] and again.names == {"0.png", "1.png", "2.png"}
+    new = again.put(received(3, "1.png"))
+    assert new.number == 3 and new.frame.name != "1.png"
+    assert [stored.key[1] for stored in again.frames()] == [0, 1, 2]
+    assert [stored.key[1] for stored in open_store().frames()] == [0, 1, 2, 3]
+
+
 def test_frames_of_the_same_name_are_told_apart(open_store):
     store = open_store()
     names = [store.put(received(i, "same.png")).frame.name for i in range(3)]
@@ -111,6 +122,7 @@ def test_a_damaged_frame_is_put_aside_and_the_others_are_there(open_store, caplo
     store = open_store()
     paths = [store.directory / "frames" / f"{store.put(received(i)).number:012d}.frame" for i in range(3)]
     paths[1].write_bytes(paths[1].read_bytes()[:-9])
+    (store.directory / "frames" / "stranger.frame").write_bytes(b"?")
     again = open_store()
     assert [stored.number for stored in again.frames()] == [0, 2]
     assert "put aside" in caplog.text and paths[1].with_suffix(".damaged").exists()

@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import threading
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,6 +93,7 @@ class Store:
         self._names: dict[str, int] = {}
         self._next = self.ledger.next
         self._writing = threading.RLock()
+        self._found = deque(self._read_frames())
 
     def close(self) -> None:
         self._resources.close()
@@ -115,14 +117,19 @@ class Store:
         return [*self.ledger.gone, *self._keys.values()]
 
     def frames(self) -> Iterator[StoredFrame]:
-        """The present place's frames in the order in which they came; a damaged one is put aside and named."""
+        """The present place's frames that an earlier process stored, in the order in which they came, each once."""
+        while self._found:
+            yield self._found.popleft()
+
+    def _read_frames(self) -> Iterator[StoredFrame]:
+        """The stored frames; a damaged one is put aside and named. All are known before another is added."""
         for path in sorted(self._frames.glob("*.frame")):
-            number = int(path.stem)
-            self._next = max(self._next, number + 1)
-            if number < self.ledger.first:
-                path.unlink()
-                continue
             try:
+                number = int(path.stem)
+                self._next = max(self._next, number + 1)
+                if number < self.ledger.first:
+                    path.unlink()
+                    continue
                 stored = _stored(number, read_message(path))
             except (OSError, ValueError) as error:
                 log.error("a key frame is lost on the disk, put aside: %s", error)
