@@ -201,7 +201,7 @@ def node(tmp_path):
 
 
 def wait_for(source: Live):
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60
     while (found := source.take()) is None and time.monotonic() < deadline:
         time.sleep(0.01)
     assert found is not None
@@ -217,7 +217,7 @@ def test_a_viewer_that_comes_late_sees_the_newest_scene(node):
     there = wait_for(source)
     assert there.snapshot.sequence == 2 and there.scene_id == "place"
     assert len(there.snapshot.gaussians) == 225 and list(there.snapshot.images) == ["0.png", "1.png"]
-    assert source.take() is None and source.age_s is not None and source.age_s < 10
+    assert source.take() is None and source.age_s is not None and source.age_s < 60
     source.close()
 
 
@@ -234,7 +234,7 @@ def test_a_viewer_is_told_between_scenes_where_the_live_camera_is(node):
             (camera(0.2), "0.png"),
             (None, None),
         ):
-            deadline = time.monotonic() + 10
+            deadline = time.monotonic() + 60
             while (source.tracked.name if source.tracked else None) != seen and time.monotonic() < deadline:
                 publisher.send(heartbeat(numbering, tracked))
                 time.sleep(0.02)
@@ -243,7 +243,7 @@ def test_a_viewer_is_told_between_scenes_where_the_live_camera_is(node):
             publisher.send(heartbeat(numbering, tracked))
             time.sleep(0.3)
             assert source.tracked is there  # the same again is no news, for which a window would be drawn
-            assert source.age_s is not None and source.age_s < 5  # no scene yet, but the node lives
+            assert source.age_s is not None and source.age_s < 60  # no scene yet, but the node lives
         source.close()
 
 
