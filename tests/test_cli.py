@@ -37,7 +37,7 @@ def raising(error):
     return command
 
 
-def test_help_loads_nothing_but_the_verbs():
+def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
     code = (
         "import sys, splatnode\n"
         "splatnode.build_parser().format_help()\n"
@@ -45,7 +45,7 @@ def test_help_loads_nothing_but_the_verbs():
         "print(sorted({'cv2', 'msgspec', 'numpy', 'torch', 'zmq'} & set(sys.modules)))"
     )
     loaded, heavy = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).splitlines()
-    assert loaded == "capture.arguments capture.verb capture.verbs recon.verbs viewer.verbs"
+    assert loaded == "capture.arguments capture.stop_signals capture.verb capture.verbs recon.verbs viewer.verbs"
     assert heavy == "[]"
 
 
