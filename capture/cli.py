@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from importlib import import_module
 
 from capture import cameras, daemon
-from capture.config import CaptureConfig, is_live, load_config, open_stream, read_yaml, typed
+from capture.capture_config import CaptureConfig, is_live, open_stream
+from capture.config import load_config, read_yaml, typed
 from capture.frame import DroppedFrame, Frame
 from capture.logs import use_structured_lines
 from capture.messaging import keys as key_files
@@ -49,7 +50,7 @@ def record(args: argparse.Namespace) -> int:
 
 
 def _config(args: argparse.Namespace) -> CaptureConfig:
-    return load_config(args.config, CaptureConfig, [f"--{change}" for change in args.set])
+    return load_config(args.config, CaptureConfig, args.set)
 
 
 def _until(reader: Reader, seconds: float | None) -> Iterator[Frame | DroppedFrame]:

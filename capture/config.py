@@ -1,6 +1,6 @@
-"""YAML and command-line flags -> a typed, frozen Struct. What the Struct does not know fails, with what it does know.
+"""YAML and changes to it -> a typed, frozen Struct. What the Struct does not know fails, with what it does know.
 
-Defaults and units live in the Structs; a file and its flags hold only what differs. A field whose type is a Plugin
+Defaults and units live in the Structs; a file and the changes hold only what differs. A field whose type is a Plugin
 names a module by its `kind`: `camera: {kind: folder, folder: photos}` is capture.cameras.folder and its Config.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import re
 import typing
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -19,12 +19,6 @@ from typing import Any, ClassVar, TypeVar
 
 import msgspec
 import yaml
-
-from capture import preview, reader, selection
-from capture.frame import DroppedFrame, Frame
-from capture.messaging import spool
-from capture.messaging.network import Network
-from capture.quality import Limits
 
 T = TypeVar("T")
 
@@ -68,32 +62,9 @@ class Plugin:
         return sorted(module.name for module in iter_modules(import_module(cls.package).__path__))
 
 
-class Camera(Plugin):
-    package = "capture.cameras"
-
-
-class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    camera: Camera
-    quality: Limits = Limits()
-    selection: selection.Config = selection.Config()
-    reader: reader.Config = reader.Config()
-    preview: preview.Config = preview.Config()
-    spool: spool.Config = spool.Config()
-    network: Network = Network()
-
-
-def open_stream(camera: Camera) -> Iterator[Frame | DroppedFrame]:
-    return camera.module.stream(camera.config)
-
-
-def is_live(camera: Camera) -> bool:
-    """Whether it goes on when nobody reads: then the newest frames are wanted, and of a recording all."""
-    return getattr(camera.module, "LIVE", False)
-
-
-def load_config(path: Path, schema: type[T], flags: Sequence[str] = ()) -> T:
-    """The YAML file at `path`, changed by `flags` such as ["--camera.fps", "5"], as a `schema`. Raises ConfigError."""
-    return typed(merged(read_yaml(path), parse_flags(flags)), schema)
+def load_config(path: Path, schema: type[T], changes: Sequence[str] = ()) -> T:
+    """The YAML file at `path` with `changes`, such as ["camera.folder=photos"], as a `schema`. Raises ConfigError."""
+    return typed(merged(read_yaml(path), parse_changes(changes)), schema)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
@@ -109,23 +80,18 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return content or {}
 
 
-def parse_flags(flags: Sequence[str]) -> dict[str, Any]:
-    """["--camera.fps", "5", "--camera.frame-size=[640, 480]"] -> {"camera": {"fps": 5, "frame_size": [640, 480]}}."""
+def parse_changes(changes: Sequence[str]) -> dict[str, Any]:
+    """["camera.loops=2", "camera.frames-per-second=5"] -> {"camera": {"loops": 2, "frames_per_second": 5}}."""
     tree: dict[str, Any] = {}
-    remaining = list(flags)
-    while remaining:
-        key, equals, value = remaining.pop(0).partition("=")
-        if not key.startswith("--") or len(key) < 3:
-            raise ConfigError(f"expected a flag such as --camera.kind folder, got {key!r}")
-        if not equals:
-            if not remaining:
-                raise ConfigError(f"{key} needs a value")
-            value = remaining.pop(0)
+    for change in changes:
+        key, equals, value = change.partition("=")
+        if not (key and equals):
+            raise ConfigError(f"expected KEY=VALUE such as camera.loops=2, got {change!r}")
         try:
             leaf: Any = _parse_yaml(value)
         except yaml.YAMLError as error:
             raise ConfigError(f"{key}: {value!r} is not a YAML value: {error}") from error
-        for name in reversed(key[2:].replace("-", "_").split(".")):
+        for name in reversed(key.replace("-", "_").split(".")):
             leaf = {name: leaf}
         tree = merged(tree, leaf)
     return tree

@@ -9,7 +9,7 @@ from contextlib import ExitStack
 
 import cv2
 
-from capture.config import CaptureConfig, is_live, open_stream
+from capture.capture_config import CaptureConfig, is_live, open_stream
 from capture.frame import DroppedFrame, Frame
 from capture.logs import event
 from capture.memory import keep_freed

@@ -7,7 +7,8 @@ import configparser
 import pytest
 
 import splatnode
-from capture.config import CaptureConfig, load_config, read_yaml
+from capture.capture_config import CaptureConfig
+from capture.config import load_config, read_yaml
 from tests.conftest import ROOT
 
 CAMERAS = [path for path in sorted((ROOT / "configs").glob("*.yaml")) if "camera" in read_yaml(path)]

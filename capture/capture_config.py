@@ -1,0 +1,37 @@
+"""What can be configured in the capture room, with defaults and units."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import msgspec
+
+from capture import preview, reader, selection
+from capture.config import Plugin
+from capture.frame import DroppedFrame, Frame
+from capture.messaging import spool
+from capture.messaging.network import Network
+from capture.quality import Limits
+
+
+class Camera(Plugin):
+    package = "capture.cameras"
+
+
+class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    camera: Camera
+    quality: Limits = Limits()
+    selection: selection.Config = selection.Config()
+    reader: reader.Config = reader.Config()
+    preview: preview.Config = preview.Config()
+    spool: spool.Config = spool.Config()
+    network: Network = Network()
+
+
+def open_stream(camera: Camera) -> Iterator[Frame | DroppedFrame]:
+    return camera.module.stream(camera.config)
+
+
+def is_live(camera: Camera) -> bool:
+    """Whether it goes on when nobody reads: then the newest frames are wanted, and of a recording all."""
+    return getattr(camera.module, "LIVE", False)
