@@ -20,13 +20,14 @@ assert not [name for name in sys.modules if name.startswith("torch.")]
 @pytest.mark.parametrize(
     "module",
     [
-        "capture.frame",
-        "capture.cameras.folder",
+        "capture.cli",
+        "capture.cameras.synthetic",
         "recon",
         "recon.snapshot",
         "recon.verdict",
         "recon.export",
         "recon.preview",
+        "recon.report",
         "recon.daemon.scene_message",
         "viewer",
     ],
