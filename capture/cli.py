@@ -56,7 +56,7 @@ def _config(args: argparse.Namespace) -> CaptureConfig:
 def _until(reader: Reader, seconds: float | None) -> Iterator[Frame | DroppedFrame]:
     """The reader's items until its end, or for `seconds` after the first by their stamps."""
     last_ns = math.inf
-    while not (reader.state is State.FINISHED and reader.empty):
+    while reader.state is not State.FINISHED:
         item = reader.next(0.1)
         if isinstance(item, Frame) and seconds is not None:
             last_ns = min(last_ns, item.stamp_ns + seconds * 1e9)

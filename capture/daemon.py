@@ -46,7 +46,7 @@ def capture(config: CaptureConfig) -> None:
         event(log, logging.INFO, "started", camera=camera.kind, waiting=server.queued)
         if not is_live(camera):
             manager.ready()  # its first frame may be long in coming; a live camera's proves that it is there
-        while not (reader.state is State.FINISHED and reader.empty and server.queued == 0):
+        while not (reader.state is State.FINISHED and server.queued == 0):
             item = reader.next(TURN_S)
             if isinstance(item, Frame):
                 node.take(item, reader.state)

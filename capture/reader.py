@@ -32,7 +32,7 @@ class State(Enum):
     STARTING = "starting"
     STREAMING = "streaming"
     DEGRADED = "degraded"  # the camera is lost, or silent
-    FINISHED = "finished"  # a recording's end
+    FINISHED = "finished"  # a recording's end, of which everything has been read
 
 
 @dataclass(frozen=True)
@@ -73,17 +73,14 @@ class Reader:
     def state(self) -> State:
         if self._state is State.STREAMING and self._live and self.silent_s > self.config.silence_s:
             return State.DEGRADED
+        if self._state is State.FINISHED and not self._items.empty():
+            return State.STREAMING
         return self._state
 
     @property
     def silent_s(self) -> float:
         """Seconds since the last frame, or since the start."""
         return time.monotonic() - self._last
-
-    @property
-    def empty(self) -> bool:
-        """Everything that the camera has given has been read."""
-        return self._items.empty()
 
     def next(self, timeout_s: float) -> Frame | DroppedFrame | None:
         """The next frame; None where none comes in time. Raises what ended the camera for good."""

@@ -33,7 +33,7 @@ def read_all(reader):
     def finished():
         if (item := reader.next(0.05)) is not None:
             items.append(item)
-        return reader.state is State.FINISHED and reader.empty
+        return reader.state is State.FINISHED
 
     wait_for(finished)
     return items
@@ -54,6 +54,15 @@ def test_a_recording_is_read_whole_however_slow_the_reader():
         items = read_all(reader)
     assert [item.name for item in items] == [item.name for item in sent]
     assert reader.skipped == 0
+
+
+def test_a_recording_is_not_finished_before_all_of_it_was_read():
+    with Reader(recorded([frame(0), frame(1)]), live=False, config=QUICK) as reader:
+        reader._thread.join(60)
+        states = [reader.state]
+        while reader.next(0.05) is not None:
+            states.append(reader.state)
+    assert states == [State.STREAMING, State.STREAMING, State.FINISHED]
 
 
 def test_of_a_live_camera_the_newest_are_read():
