@@ -77,9 +77,9 @@ class Recorder:
         try:
             temporary.write_bytes(content)
             temporary.replace(path)
-        except OSError:
+        except OSError as error:
             temporary.unlink(missing_ok=True)
-            raise
+            raise OSError(error.errno, error.strerror, str(path)) from error
         digest = hashlib.sha256(content).hexdigest()
         self._append(_Line(item.name, item.stamp_ns, item.intrinsics, path.name, digest))
         self.frames += 1

@@ -363,3 +363,11 @@ def test_keys_are_private_and_not_overwritten(tmp_path):
     (tmp_path / "secret.key").chmod(0o644)
     with pytest.raises(keys.KeyFileError, match="chmod 600"):
         keys.read_keys(tmp_path)
+
+
+def test_keys_that_the_disk_did_not_take_are_not_in_the_way_of_the_next(tmp_path):
+    (tmp_path / keys.PUBLIC).mkdir()
+    with pytest.raises(IsADirectoryError):
+        keys.create_keys(tmp_path)
+    (tmp_path / keys.PUBLIC).rmdir()
+    assert keys.create_keys(tmp_path) == keys.read_keys(tmp_path).public

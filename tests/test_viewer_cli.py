@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import resource
 import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -111,6 +113,15 @@ def test_a_movie_without_a_display(result, tmp_path):
     frames = [movie.read()[1] for _ in range(int(movie.get(cv2.CAP_PROP_FRAME_COUNT)))]
     assert len(frames) == 5 and frames[0].shape == (120, 160, 3)
     assert not np.array_equal(frames[0], frames[2])
+
+
+def test_a_movie_that_does_not_fit_is_not_kept(result, tmp_path):
+    path = tmp_path / "movie.mp4"
+    command = [sys.executable, "-B", "-m", "splatnode", "view", str(result), "--export", str(path), "--pictures", "5"]
+    limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (1000, 1000))  # bytes a file, as on a full disk
+    done = subprocess.run(command, cwd=ROOT, preexec_fn=limit, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 74 and "the movie does not fit into" in done.stderr
+    assert not path.exists()
 
 
 def test_no_window_is_no_failure(result, tmp_path, monkeypatch, capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -12,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from capture.image_file import encode_png
-from recon.export import write_file, write_files
+from recon.export import ResultWriteError, write_file, write_files
 from viewer import words
 from viewer.analysis import Analysis, analyse
 from viewer.moment import Moment
@@ -60,6 +61,11 @@ def write_movie(moment: Moment, path: Path, width: int, height: int, frames: int
         for image in turntable(moment, *size, frames):
             writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
         writer.release()
+        if round(cv2.VideoCapture(str(draft)).get(cv2.CAP_PROP_FRAME_COUNT)) != frames:  # the writer tells nothing
+            where = tempfile.gettempdir()
+            raise ResultWriteError(
+                errno.ENOSPC, f"the movie does not fit into {where}: free some space or name another folder by TMPDIR"
+            )
         write_file(path, draft.read_bytes())
     return path
 

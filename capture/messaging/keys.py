@@ -41,9 +41,13 @@ def create_keys(folder: Path) -> bytes:
         descriptor = os.open(folder / SECRET, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     except FileExistsError as error:
         raise KeyFileError(f"{folder / SECRET} is there already; remove it to replace this machine's keys") from error
-    with open(descriptor, "wb") as file:
-        file.write(secret + b"\n")
-    (folder / PUBLIC).write_bytes(public + b"\n")
+    try:
+        with open(descriptor, "wb") as file:
+            file.write(secret + b"\n")
+        (folder / PUBLIC).write_bytes(public + b"\n")
+    except OSError:  # half a pair would be in the way of the next try
+        (folder / SECRET).unlink()
+        raise
     return public
 
 
