@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 import pytest
@@ -154,18 +154,26 @@ def test_key_frames_become_a_scene_that_survives_the_process_and_forgets_what_it
         assert peer.heard[-1].snapshot.dropped == less.snapshot.dropped
 
 
-def test_a_process_that_died_while_it_exported_leaves_the_result_to_the_next(config, peer, monkeypatch):
-    died = threading.Event()
+@pytest.mark.parametrize(
+    "error, end",
+    [
+        (SystemExit(), pytest.raises(AssertionError, match="SystemExit")),
+        (OSError(28, "No space left on device"), nullcontext()),
+    ],
+    ids=["death", "full disk"],
+)
+def test_a_result_that_could_not_be_written_is_written_by_the_next_process(config, peer, monkeypatch, error, end):
+    failed = threading.Event()
 
-    def die(*_, **__):
-        died.set()
-        raise SystemExit
+    def fail(*_, **__):
+        failed.set()
+        raise error
 
     for frame in photographs()[:3]:
         peer.server.offer(frame)
-    with monkeypatch.context() as patch, pytest.raises(AssertionError, match="SystemExit"), running(config):
-        patch.setattr("recon.daemon.output.finish", die)
-        wait_for(lambda: peer.server.serve(0.02) or died.is_set(), PATIENCE_S)
+    with monkeypatch.context() as patch, end, running(config):
+        patch.setattr("recon.daemon.output.finish", fail)
+        wait_for(lambda: peer.server.serve(0.02) or failed.is_set(), PATIENCE_S)
     with running(config):
         wait_for((config.out / "scene-0001" / "manifest.json").exists, PATIENCE_S)
 

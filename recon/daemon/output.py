@@ -45,12 +45,13 @@ class Output:
         except OSError as error:
             self._complain(f"the scene cannot be kept ({error.strerror}): make room on the disk")
 
-    def export(self, snapshot: Snapshot) -> None:
-        """The result folder, whole or not at all."""
+    def export(self, snapshot: Snapshot) -> bool:
+        """The result folder, whole or not at all; whether it is there."""
         recipe, folder = self._config.reconstruction, self._config.out / self._store.scene_id
         try:
             finish(in_metres(snapshot, recipe.metric), folder, seed=recipe.seed, preset_name="live")
         except OSError as error:
             self._complain(str(error))
-        else:
-            event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians))
+            return False
+        event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians))
+        return True

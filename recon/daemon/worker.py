@@ -228,8 +228,8 @@ class Worker:
         self._work.show(refined)
         snapshot = self._show(final=refined is not None)
         if refined is not None:
-            self._output.export(snapshot)  # first: what is kept as final is not exported again after a restart
-            self._output.save(self._work, final=True)
+            exported = self._output.export(snapshot)
+            self._output.save(self._work, final=exported)  # what is kept as final is not exported after a restart
         self.state = State.WAITING if refined is None else State.LOST if place.strangers(self._work) else State.IDLE
 
     def _pause(self, until_s: float = 0.0) -> None:
