@@ -121,9 +121,11 @@ def _eight_bit(image: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
 
-def view_graph(frames: Iterable[Frame], matcher: Matcher | None = None) -> ViewGraph:
+def view_graph(
+    frames: Iterable[Frame], matcher: Matcher | None = None, config: register.Config | None = None
+) -> ViewGraph:
     """The frames as keyframes, each compared with all before it."""
-    config = register.Config()
+    config = config or register.Config()
     graph = ViewGraph(config, matcher)
     for frame in frames:
         found = features.extract(frame.image, config.features)

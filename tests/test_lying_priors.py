@@ -17,11 +17,10 @@ from scipy.spatial import KDTree
 from capture.frame import Frame
 from recon.judge import Config as JudgeConfig
 from recon.judge import hopeless, judge
-from recon.keyframe import Features, Keyframe, modelled_image
+from recon.keyframe import Features, Keyframe
 from recon.registration import features, looks, register
 from recon.verification.verify import Config as VerificationConfig
 from recon.verification.verify import verify
-from recon.view_graph import ViewGraph
 from tests.synthetic import SMALL, photographs, places, renumbered, view_graph
 
 WIDTH, HEIGHT = 192, 144
@@ -103,10 +102,7 @@ LIARS = {"surface": SurfaceLiar(), "flat": SurfaceLiar(flat=True), "snapping": S
 @pytest.mark.parametrize("photographed", [unrelated, noise, repeating])
 @pytest.mark.parametrize("lie", LIARS)
 def test_what_a_prior_invents_is_refused(lie, photographed):
-    graph = ViewGraph(SETTINGS, LIARS[lie])
-    for frame in photographed():
-        found = features.extract(frame.image, SETTINGS.features)
-        graph.add(Keyframe(frame, modelled_image(frame.image, WIDTH), found))
+    graph = view_graph(photographed(), LIARS[lie], SETTINGS)
     registration = register.register(graph.keyframes, graph.pairs, SETTINGS)
     evidence = verify(graph, registration, VerificationConfig())
     verdict = hopeless(graph, (), JudgeConfig()) or judge(graph, registration, evidence, JudgeConfig())
@@ -116,10 +112,7 @@ def test_what_a_prior_invents_is_refused(lie, photographed):
 def test_the_best_lie_looks_right_to_all_but_the_photographs(monkeypatch):
     """The invented matches fit one set of cameras: the test above would be void if their geometry refused them."""
     monkeypatch.setattr("recon.registration.looks.alike", lambda *asked: True)
-    graph = ViewGraph(SETTINGS, SurfaceLiar())
-    for frame in noise():
-        found = features.extract(frame.image, SETTINGS.features)
-        graph.add(Keyframe(frame, modelled_image(frame.image, WIDTH), found))
+    graph = view_graph(noise(), SurfaceLiar(), SETTINGS)
     assert sorted(graph.pairs) == [(0, 1), (0, 2), (1, 2)]
     registration = register.register(graph.keyframes, graph.pairs, SETTINGS)
     assert registration is not None and len(registration.cameras) == 3 and registration.rms_px < 1.0

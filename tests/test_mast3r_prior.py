@@ -20,6 +20,7 @@ from recon.priors.depth_normals import normals_of_depth
 from recon.priors.mast3r.inference import PATCH, Asked, prepared
 from recon.priors.mast3r.network import Encoded, Prediction
 from recon.priors.mast3r.prior import Config, Mast3rPrior, load
+from recon.registration import features, register
 from recon.verification.verify import Config as VerificationConfig
 from recon.verification.verify import verify
 from tests.synthetic import SMALL, photographs, places, renumbered, view_graph
@@ -121,12 +122,13 @@ def test_cameras_and_depth_come_out_right():
 @pytest.mark.parametrize("noise", [False, True])
 def test_what_a_lying_network_invents_is_refused(noise):
     """Frames of three places, or of nothing at all: the network claims that all of them show one wall."""
+    few = register.Config(features=features.Config(num_features=2000, shortest_longer_side=500))
     frames = places(msgspec.structs.replace(SMALL, views=3, width=192, height=144), seeds=(0, 1, 2))
     if noise:
         rng = np.random.default_rng(0)
         frames = [replace(frame, image=rng.integers(0, 256, frame.image.shape, np.uint8)) for frame in frames]
-    prior = Mast3rPrior(Liar(), Config(longer_side=192))
-    graph = view_graph(frames, prior.matcher)
+    prior = Mast3rPrior(Liar(), Config(longer_side=192, registration=few))
+    graph = view_graph(frames, prior.matcher, few)
     registration = prior.register(graph)
     evidence = verify(graph, registration, VerificationConfig())
     verdict = hopeless(graph, (), JudgeConfig()) or judge(graph, registration, evidence, JudgeConfig())
