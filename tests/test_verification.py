@@ -63,6 +63,13 @@ def test_a_right_answer_has_evidence_from_every_source():
     assert evidence.freed == () and evidence.distortion.corner_shift < 0.02
 
 
+@pytest.mark.filterwarnings("error")
+def test_where_no_camera_is_further_those_that_are_known_keep_their_evidence():
+    again = verify.verify_further(*placed(), good(), CONFIG)
+    assert [camera.patches for camera in again.cameras] == [camera.patches for camera in good().cameras]
+    assert [camera.gain for camera in again.cameras] == [camera.gain for camera in good().cameras]
+
+
 def test_fewer_than_three_cameras_confirm_nothing():
     graph, found = placed()
     assert verify.verify(graph, replace(found, cameras=found.cameras[:2]), CONFIG) is None

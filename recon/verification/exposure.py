@@ -36,7 +36,7 @@ def gains(
             index: found[index] + _median((corrected - mean)[known & (registration.observed_by == index)])
             for index in greys
         }
-    middle = float(np.median(list(found.values())))
+    middle = _median(np.array(list(found.values())))
     return {index: float(np.exp(value - middle)) for index, value in found.items()}
 
 
