@@ -145,7 +145,10 @@ def _network() -> Finding:
 def _spool() -> Finding:
     """Room for key frames that wait."""
     config = spool.Config()
-    directory = spool.spool_directory(config)
+    try:
+        directory = spool.spool_directory(config)
+    except ValueError as error:
+        return Finding("spool", "missing", f"capture cannot keep key frames: {error}")
     there = next(folder for folder in (directory, *directory.parents) if folder.exists())
     if not os.access(there, os.W_OK):
         return Finding("spool", "missing", f"capture cannot keep key frames: {there} cannot be written to")
@@ -164,7 +167,10 @@ def _version(distribution: str) -> str:
 
 def _learned(part: Part) -> Finding:
     """Whether a learned part is ready; one that is not costs nothing but itself."""
-    hindered = obstacle(part)
+    try:
+        hindered = obstacle(part)
+    except ValueError as error:
+        hindered = str(error)
     detail = f"{part.purpose}; weights: {part.licence}"
     return Finding(part.name, "optional" if hindered else "ok", f"{hindered or 'ready'}; {detail}")
 

@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
+from capture.state_directory import home
 from recon.catalogue import CATALOGUE, Weights
 
 _CHUNK = 1 << 20
@@ -30,8 +31,10 @@ class WeightsError(ValueError):
 def folder() -> Path:
     """Where `fetch` puts weights: $SPLATNODE_WEIGHTS, else splatnode/weights among the user's data."""
     named = os.environ.get("SPLATNODE_WEIGHTS")
-    data = os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share"
-    return Path(named) if named else Path(data) / "splatnode" / "weights"
+    if named:
+        return Path(named)
+    data = os.environ.get("XDG_DATA_HOME") or home("SPLATNODE_WEIGHTS") / ".local" / "share"
+    return Path(data) / "splatnode" / "weights"
 
 
 def located(path: str) -> Path | None:

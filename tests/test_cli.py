@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -239,6 +240,20 @@ def test_doctor_demands_what_an_installation_brings_and_no_more():
 
     plain = [line for line in requires("splatnode") or () if "extra ==" not in line]
     assert set(doctor.REQUIRED.values()) == {re.split(r"[<>=!~ ]", line)[0].lower() for line in plain}
+
+
+def test_a_user_without_a_home_is_told_what_to_set(monkeypatch, capsys):
+    def no_home():
+        raise RuntimeError("Could not determine home directory.")
+
+    for name in ("STATE_DIRECTORY", "XDG_STATE_HOME", "XDG_DATA_HOME", "SPLATNODE_WEIGHTS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(Path, "home", no_home)
+    assert splatnode.main(["doctor"]) == 2
+    found = capsys.readouterr().out
+    assert "has no home directory; set XDG_STATE_HOME" in found and "set SPLATNODE_WEIGHTS" in found
+    assert splatnode.main(["weights", "list"]) == 2
+    assert capsys.readouterr().err.count("has no home directory; set SPLATNODE_WEIGHTS") == 1
 
 
 def test_doctor_fails_when_the_core_is_missing(monkeypatch, capsys):
