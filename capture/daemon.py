@@ -1,4 +1,4 @@
-"""The capture process: camera -> key frames, previews, heartbeats. Read `capture` for what happens to a frame."""
+"""The capture process: camera -> keyframes, previews, heartbeats. Read `capture` for what happens to a frame."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ TURN_S = 0.05  # the longest that a request waits for its answer
 
 
 def capture(config: CaptureConfig) -> None:
-    """Runs until the camera's end, when all its key frames are acknowledged; a live camera has none.
+    """Runs until the camera's end, when all its keyframes are acknowledged; a live camera has none.
 
     Raises CameraUnavailable, AlreadyRunning, NetworkError, OSError. SystemExit and KeyboardInterrupt end it cleanly.
     """
@@ -55,8 +55,8 @@ def capture(config: CaptureConfig) -> None:
                 node.drop(item)
             server.serve(0)
             node.beat(reader)
-            manager.alive(f"{reader.state.value}: {node.frames} frames, {node.key_frames} key frames")
-        event(log, logging.INFO, "finished", frames=node.frames, key_frames=node.key_frames)
+            manager.alive(f"{reader.state.value}: {node.frames} frames, {node.keyframes} keyframes")
+        event(log, logging.INFO, "finished", frames=node.frames, keyframes=node.keyframes)
 
 
 class _Node:
@@ -64,7 +64,7 @@ class _Node:
 
     def __init__(self, config: CaptureConfig, server: KeyframeServer, resources: ExitStack) -> None:
         self.config = config
-        self.frames = self.key_frames = self.unusable = self.dropped = self.not_taken = 0
+        self.frames = self.keyframes = self.unusable = self.dropped = self.not_taken = 0
         self.last_decision = ""
         self._spool_full = ""
         self._server = server
@@ -78,7 +78,7 @@ class _Node:
         self._rate = _Rate()
 
     def take(self, frame: Frame, state: State) -> None:
-        """A frame that the camera gave: as a key frame where it adds something, and as a preview in any case."""
+        """A frame that the camera gave: as a keyframe where it adds something, and as a preview in any case."""
         self.frames += 1
         self._rate.count()
         decision = self._selector.decide(frame, waiting=self._server.queued)
@@ -109,7 +109,7 @@ class _Node:
             uptime_s=time.monotonic() - self._started,
             frames=self.frames,
             frames_per_second=self._rate.per_second(),
-            key_frames=self.key_frames,
+            keyframes=self.keyframes,
             unusable=self.unusable,
             dropped=self.dropped,
             skipped=reader.skipped,
@@ -128,7 +128,7 @@ class _Node:
         if not self._deliver(frame):
             self._selector.forget_last()
             return
-        self.key_frames += 1
+        self.keyframes += 1
         event(log, logging.INFO, "keyframe", name=frame.name, reason=decision.reason, waiting=self._server.queued)
 
     def _deliver(self, item: Frame | DroppedFrame) -> bool:

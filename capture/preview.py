@@ -27,7 +27,7 @@ class PreviewHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     name: str
     stamp_ns: int
     state: str  # of the camera: reader.State
-    taken: bool  # it became a key frame
+    taken: bool  # it became a keyframe
     reason: str  # why, or why not
 
 

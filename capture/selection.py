@@ -1,6 +1,6 @@
-"""Which frames of a stream become key frames: those that are usable and add parallax or coverage, with the reason why.
+"""Which frames of a stream become keyframes: those that are usable and add parallax or coverage, with the reason why.
 
-Corners of the last key frame are followed through the stream, in small images. What they tell is how much of that view
+Corners of the last keyframe are followed through the stream, in small images. What they tell is how much of that view
 has left the picture (coverage), how far it has moved, and how much of the motion no homography explains (parallax).
 The first of these that exceeds its limit makes a candidate; only candidates are examined for blur and exposure.
 """
@@ -33,7 +33,7 @@ Points = npt.NDArray  # (P, 1, 2) float32, as OpenCV has them
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     every_frame: bool = False  # photographs: each was taken on purpose, and only unusable ones and copies are left out
-    coverage: Share = 0.25  # share of the last key frame's corners that are out of the picture
+    coverage: Share = 0.25  # share of the last keyframe's corners that are out of the picture
     motion: Share = 0.08  # median way of the corners, in longer sides of the image
     parallax: Share = 0.01  # median distance from the way that the best homography explains
     per_second: Annotated[float, msgspec.Meta(gt=0)] = 8.0  # frames examined; the others only pass
@@ -50,7 +50,7 @@ class Decision:
 
 @dataclass(frozen=True)
 class Motion:
-    """What the corners of a key frame did since."""
+    """What the corners of a keyframe did since."""
 
     lost: float  # share that is out of the picture, or can no longer be recognised
     median: float  # way, in longer sides
@@ -59,7 +59,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class _View:
-    """A key frame as it is remembered."""
+    """A keyframe as it is remembered."""
 
     name: str
     small: Picture
@@ -67,13 +67,13 @@ class _View:
 
 
 class Selector:
-    """Remembers the key frames so far. Frames are given in the order of their stamps."""
+    """Remembers the keyframes so far. Frames are given in the order of their stamps."""
 
     def __init__(self, config: Config, limits: Limits) -> None:
         self.config = config
         self.limits = limits
         self._views: list[_View] = []  # newest last
-        self._start: Picture | None = None  # the last key frame as it is followed, grey
+        self._start: Picture | None = None  # the last keyframe as it is followed, grey
         self._corners: Points = np.zeros((0, 1, 2), np.float32)
         self._now: Points = self._corners
         self._sharpest_px: float | None = None
@@ -108,7 +108,7 @@ class Selector:
         if self._start is None or self._start.shape != grey.shape:
             return "first view of this stream", True
         if len(self._corners) < LEAST_CORNERS:
-            return "the last key frame has too few corners to follow", True
+            return "the last keyframe has too few corners to follow", True
         self._now, followed = follow(self._start, grey, self._corners, self._now)
         motion = measure(self._corners, self._now, followed, max(grey.shape))
         return what_it_adds(motion, self.config, patience)
@@ -175,7 +175,7 @@ def what_it_adds(motion: Motion, config: Config, patience: float = 1.0) -> tuple
         if value >= limit:
             return f"{what}: {value:.1%} {text}, {limit:.1%} are asked", True
     values = ", ".join(f"{what} {value:.1%} of {limit:.1%}" for what, (value, limit, _) in measured.items())
-    return f"adds too little since the last key frame: {values}", False
+    return f"adds too little since the last keyframe: {values}", False
 
 
 def _gist(small: Picture) -> Picture:

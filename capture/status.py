@@ -25,13 +25,13 @@ class CaptureStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     uptime_s: float
     frames: int
     frames_per_second: float
-    key_frames: int
+    keyframes: int
     unusable: int  # frames that would have added something and were blurred, badly exposed, or copies
     dropped: int  # frames that the camera could not give
     skipped: int  # frames for which there was no time
-    not_taken: int  # key frames that found no room in the spool
+    not_taken: int  # keyframes that found no room in the spool
     last_decision: str
-    waiting: int  # key frames that recon has not acknowledged
+    waiting: int  # keyframes that recon has not acknowledged
     waiting_mb: float
     acknowledged: int
     recon_connected: bool

@@ -143,18 +143,18 @@ def _network() -> Finding:
 
 
 def _spool() -> Finding:
-    """Room for key frames that wait."""
+    """Room for keyframes that wait."""
     config = spool.Config()
     try:
         directory = spool.spool_directory(config)
     except ValueError as error:
-        return Finding("spool", "missing", f"capture cannot keep key frames: {error}")
+        return Finding("spool", "missing", f"capture cannot keep keyframes: {error}")
     there = next(folder for folder in (directory, *directory.parents) if folder.exists())
     if not os.access(there, os.W_OK):
-        return Finding("spool", "missing", f"capture cannot keep key frames: {there} cannot be written to")
+        return Finding("spool", "missing", f"capture cannot keep keyframes: {there} cannot be written to")
     free_mb = shutil.disk_usage(there).free >> 20
     state = "ok" if free_mb > config.max_mb else "optional"
-    detail = f"{directory}, {len(list(directory.glob('*.frame')))} key frames wait, {free_mb} MB free"
+    detail = f"{directory}, {len(list(directory.glob('*.frame')))} keyframes wait, {free_mb} MB free"
     return Finding("spool", state, detail if state == "ok" else f"{detail}; {config.max_mb} MB may be needed")
 
 

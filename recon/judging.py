@@ -19,7 +19,7 @@ from recon.view_graph import ViewGraph
 REMEMBERED = 3  # judgements: a keyframe may be tried, and taken back
 REMEMBERED_REFUSED = 100  # sets of keyframes of which nothing came: they need not be tried again
 BEYOND_DOUBT = 50  # points of a further camera that two others see; another place, taken for this one, had up to 20
-FOR_NOW = "For now: all evidence is weighed when no key frame waits."
+FOR_NOW = "For now: all evidence is weighed when no keyframe waits."
 
 Known = tuple[tuple[str, ...], int]  # keyframes, and how many frames were left out
 

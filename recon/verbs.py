@@ -54,7 +54,7 @@ def _recon_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _retract_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("name", metavar="NAME", help="of the key frame, as the viewer and the report show it")
+    parser.add_argument("name", metavar="NAME", help="of the keyframe, as the viewer and the report show it")
     parser.add_argument("--config", type=Path, metavar="CONFIG", help="of the daemon; default: the one on this machine")
 
 
@@ -114,7 +114,7 @@ VERBS = (
     Verb("replay", "reconstruct a folder of photographs", _replay_arguments, lazily("recon.cli", "replay")),
     Verb("export", "write a scene in another format", _export_arguments, lazily("recon.export.command", "export")),
     Verb("recon", "reconstruct what comes, for ever", _recon_arguments, lazily("recon.daemon.daemon", "recon")),
-    Verb("retract", "take a key frame back", _retract_arguments, lazily("recon.daemon.control", "retract")),
+    Verb("retract", "take a keyframe back", _retract_arguments, lazily("recon.daemon.control", "retract")),
     Verb("bench", "measure held-out quality, poses and seconds", _bench_arguments, lazily("recon.cli", "bench")),
     Verb(
         "stability",

@@ -79,7 +79,7 @@ class Node:
         return (self.folder / f"{verb}.log").read_text()
 
     def spooled(self) -> int:
-        """Key frames that capture still keeps."""
+        """Keyframes that capture still keeps."""
         return len(list((self.folder / "spool").glob("*.frame")))
 
     def close(self) -> None:

@@ -94,7 +94,7 @@ def test_a_folder_from_its_first_frame_to_its_last_acknowledgement(tmp_path, pho
     process = start()
     with Subscriber(CAPTURE_STATUS, network(tmp_path), CaptureStatus) as heartbeats:
         status = wait_for(lambda: (it := heartbeats.latest(0.1)) and it.header.state == "finished" and it.header)
-        assert status.key_frames == 5 and status.frames == 6 and status.dropped == 1 and status.unusable == 1
+        assert status.keyframes == 5 and status.frames == 6 and status.dropped == 1 and status.unusable == 1
         assert status.waiting == 6 and not status.recon_connected and 10 < status.rss_mb < 1000
     items = take_all(tmp_path, process)
     assert [item.name for item in items] == ["0.png", "1.png", "2.png", "3.png", "4.png", "9.jpg"]

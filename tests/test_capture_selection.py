@@ -1,4 +1,4 @@
-"""Which frames become key frames: those that add parallax or coverage, and can be used."""
+"""Which frames become keyframes: those that add parallax or coverage, and can be used."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def taken(frames, config=EVERY, waiting=0):
     return [selector.decide(frame, waiting) for frame in frames]
 
 
-def test_a_standing_camera_gives_one_key_frame():
+def test_a_standing_camera_gives_one_keyframe():
     decisions = taken([view(0, index) for index in range(10)])
     assert [decision.take for decision in decisions] == [True] + 9 * [False]
     assert decisions[0].reason == "first view of this stream"

@@ -1,4 +1,4 @@
-"""The daemon as a whole, over its sockets: key frames in, a scene out, killed and gone on, a frame taken back."""
+"""The daemon as a whole, over its sockets: keyframes in, a scene out, killed and gone on, a frame taken back."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def running(config: Config) -> Iterator[None]:
 
 
 class Peer:
-    """Capture and viewer at once: offers key frames and hears scenes."""
+    """Capture and viewer at once: offers keyframes and hears scenes."""
 
     def __init__(self, config: Config, folder: Path) -> None:
         self.server = KeyframeServer(config.network, Spool(SpoolConfig(directory=folder)))
@@ -120,7 +120,7 @@ def finished(cameras: int) -> Callable[[LiveScene], bool]:
     return lambda scene: scene.snapshot.final and len(scene.snapshot.cameras) == cameras
 
 
-def test_key_frames_become_a_scene_that_survives_the_process_and_forgets_what_it_must(config, peer):
+def test_keyframes_become_a_scene_that_survives_the_process_and_forgets_what_it_must(config, peer):
     frames = photographs()[:4]
     with running(config):
         for frame in frames[:3]:
@@ -199,7 +199,7 @@ def test_another_place_begins_another_scene_and_the_old_one_is_exported(config, 
     assert len(list((config.checkpoint / "frames").glob("*.frame"))) == 3
 
 
-def test_key_frames_that_do_not_fit_at_once_join_the_scene_when_all_are_judged_together(config, peer, monkeypatch):
+def test_keyframes_that_do_not_fit_at_once_join_the_scene_when_all_are_judged_together(config, peer, monkeypatch):
     monkeypatch.setattr("recon.judging.BEYOND_DOUBT", 10**6)  # points: nothing fits at once
     frames = photographs()
     with running(replace(config, lost_after=3)):
@@ -210,7 +210,7 @@ def test_key_frames_that_do_not_fit_at_once_join_the_scene_when_all_are_judged_t
     assert len(list((config.checkpoint / "frames").glob("*.frame"))) == 6
 
 
-def test_a_key_frame_that_cannot_be_worked_in_keeps_no_other_out(config, peer, monkeypatch):
+def test_a_keyframe_that_cannot_be_worked_in_keeps_no_other_out(config, peer, monkeypatch):
     add = place.add
 
     def failing(work, keyframes):

@@ -23,7 +23,7 @@ CONFIG = Config(size=160, preview=optimize.Config(iterations=1, half_resolution_
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory) -> tuple[Path, LiveReconstruction]:
-    """A checkpoint with a scene of three key frames, and what is in it."""
+    """A checkpoint with a scene of three keyframes, and what is in it."""
     folder = tmp_path_factory.mktemp("checkpoint")
     store, made = Store(folder), LiveReconstruction(CONFIG)
     for sequence, frame in enumerate(photographs()[:3]):

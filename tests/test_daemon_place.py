@@ -1,4 +1,4 @@
-"""Which key frames belong to the scene, and which of its views can be spared."""
+"""Which keyframes belong to the scene, and which of its views can be spared."""
 
 from __future__ import annotations
 

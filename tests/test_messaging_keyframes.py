@@ -1,4 +1,4 @@
-"""No key frame that was offered is lost, and none is delivered twice, whoever dies in between."""
+"""No keyframe that was offered is lost, and none is delivered twice, whoever dies in between."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def test_what_was_offered_survives_a_kill(tmp_path):
         assert [one.frame.image.max() for one in received[:3]] == [0, 1, 2]
 
 
-def test_one_process_offers_key_frames(tmp_path):
+def test_one_process_offers_keyframes(tmp_path):
     with KeyframeServer(ipc(tmp_path), open_spool(tmp_path)):
         with pytest.raises(AlreadyRunning):
             KeyframeServer(ipc(tmp_path), open_spool(tmp_path / "other"))
@@ -159,7 +159,7 @@ def test_one_process_offers_key_frames(tmp_path):
     open_spool(tmp_path / "other").close()  # the one that came too late has let go of its spool
 
 
-def test_what_is_no_key_frame_is_refused(tmp_path, caplog):
+def test_what_is_no_keyframe_is_refused(tmp_path, caplog):
     header = FrameHeader(
         session="0" * 32, sequence=0, mono_ns=0, frame_id=0, name="a.png", stamp_ns=0, intrinsics=INTRINSICS
     )
@@ -186,7 +186,7 @@ def test_what_is_no_key_frame_is_refused(tmp_path, caplog):
             impostor.send_multipart([identity, *parts])
         assert client.receive(30).frame.name == "a.png"
         assert client.refused == len(bad)
-    told = [record for record in caplog.records if "refused a key frame" in record.message]
+    told = [record for record in caplog.records if "refused a keyframe" in record.message]
     assert len(told) == len(bad).bit_length()  # the 1st, 2nd, 4th, ...: the journal cannot be filled
 
 

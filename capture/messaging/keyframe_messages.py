@@ -1,4 +1,4 @@
-"""What capture and recon say about key frames: frames one way, readiness and acknowledgements the other."""
+"""What capture and recon say about keyframes: frames one way, readiness and acknowledgements the other."""
 
 from __future__ import annotations
 

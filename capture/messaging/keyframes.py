@@ -1,4 +1,4 @@
-"""Key frames from capture to recon, none of which is lost once it is offered.
+"""Keyframes from capture to recon, none of which is lost once it is offered.
 
     capture                                      recon
       offer: to the spool on disk     <------    Ready(capacity, holding): at start and every half second
@@ -58,7 +58,7 @@ class KeyframeServer(Endpoint):
     """Capture's end."""
 
     def __init__(self, network: Network, spool: Spool) -> None:
-        """Takes the spool over and closes it. Raises AlreadyRunning where another process offers key frames."""
+        """Takes the spool over and closes it. Raises AlreadyRunning where another process offers keyframes."""
         with contextlib.ExitStack() as taken:
             taken.callback(spool.close)
             super().__init__(network, offers=CAPTURE_KEYFRAMES)
@@ -136,7 +136,7 @@ class KeyframeServer(Endpoint):
         try:
             parts = self.spool.get(key)
         except (OSError, ValueError) as error:
-            log.error("a key frame is lost on the disk: %s", error)
+            log.error("a keyframe is lost on the disk: %s", error)
             self.spool.set_aside(key)
             return True
         try:
@@ -198,7 +198,7 @@ class KeyframeClient(Endpoint):
             except WireError as error:
                 self.refused += 1
                 if self.refused.bit_count() == 1:  # at 1, 2, 4, 8, ...: who sends rubbish does not fill the journal
-                    log.warning("refused a key frame (%d so far): %s", self.refused, error)
+                    log.warning("refused a keyframe (%d so far): %s", self.refused, error)
                 continue
             if frame.key in self._seen:
                 self.duplicates += 1

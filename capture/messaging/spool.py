@@ -1,4 +1,4 @@
-"""Key frames on disk until somebody else holds them: bounded, oldest first, whole or not there.
+"""Keyframes on disk until somebody else holds them: bounded, oldest first, whole or not there.
 
 The name of a message's file gives the order, which is kept from one process to the next: what a killed process left is
 delivered before what its successor adds.
@@ -30,11 +30,11 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SpoolFull(RuntimeError):
-    """The bound, or the disk, is reached: no key frame can be taken until one is acknowledged."""
+    """The bound, or the disk, is reached: no keyframe can be taken until one is acknowledged."""
 
 
 class Key(NamedTuple):
-    """What names a key frame for ever."""
+    """What names a keyframe for ever."""
 
     session: str
     sequence: int
@@ -85,7 +85,7 @@ class Spool:
             write_message(path, parts)
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise SpoolFull(f"no space left for key frames in {self.directory}: {error.strerror}") from error
+                raise SpoolFull(f"no space left for keyframes in {self.directory}: {error.strerror}") from error
             raise
         self._files[key], self._bytes[key] = path, size
         self._number += 1
@@ -111,7 +111,7 @@ class Spool:
     def _make_sure_of_room(self, size: int) -> None:
         if len(self) >= self.config.max_frames or self.size_bytes + size > self.config.max_mb << 20:
             raise SpoolFull(
-                f"{len(self)} key frames ({self.size_bytes >> 20} MB) wait in {self.directory}, which is the bound; "
+                f"{len(self)} keyframes ({self.size_bytes >> 20} MB) wait in {self.directory}, which is the bound; "
                 "is splatnode recon running?"
             )
 
@@ -121,7 +121,7 @@ class Spool:
             key = Key(session, int(sequence))
             read_message(path)
         except (OSError, ValueError) as error:
-            log.error("put aside a damaged key frame: %s", error)
+            log.error("put aside a damaged keyframe: %s", error)
             with contextlib.suppress(OSError):
                 path.rename(path.with_suffix(".damaged"))
         else:

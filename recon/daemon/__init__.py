@@ -1,1 +1,1 @@
-"""The reconstruction as a process that runs for weeks: key frames in, scenes out, nothing acknowledged lost."""
+"""The reconstruction as a process that runs for weeks: keyframes in, scenes out, nothing acknowledged lost."""

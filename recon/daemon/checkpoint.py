@@ -1,4 +1,4 @@
-"""A reconstruction into the checkpoint and out of it again. What is missing there is made anew from the key frames."""
+"""A reconstruction into the checkpoint and out of it again. What is missing there is made anew from the keyframes."""
 
 from __future__ import annotations
 

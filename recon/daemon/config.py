@@ -22,8 +22,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     out: Path = Path("out")  # each place becomes a folder in it
     max_views: Annotated[int, msgspec.Meta(ge=4)] = 30  # beyond, those that others show too are given up
     max_gaussians: Positive = 300_000
-    # Without a key frame, until all evidence is weighed and the scene made afresh. A verification takes seconds that a
-    # key frame would have to wait; with one every two seconds there is no time for it.
+    # Without a keyframe, until all evidence is weighed and the scene made afresh. A verification takes seconds that a
+    # keyframe would have to wait; with one every two seconds there is no time for it.
     settle_s: Annotated[float, msgspec.Meta(ge=0)] = 3.0
-    lost_after: Annotated[int, msgspec.Meta(ge=3)] = 3  # key frames in a row that do not fit: a new place
+    lost_after: Annotated[int, msgspec.Meta(ge=3)] = 3  # keyframes in a row that do not fit: a new place
     status_every_s: Annotated[float, msgspec.Meta(gt=0)] = 1.0

@@ -13,7 +13,7 @@ from recon.daemon.config import Config
 
 
 class Retract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="retract"):
-    """Forget the key frame with this name."""
+    """Forget the keyframe with this name."""
 
     name: str
 
@@ -24,7 +24,7 @@ class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="answe
 
 
 def retract(args: argparse.Namespace) -> int:
-    """Takes a key frame back; 2 where there is none of that name."""
+    """Takes a keyframe back; 2 where there is none of that name."""
     config = load_config(args.config, Config) if args.config else Config()
     answer = ask(RECON_CONTROL, config.network, Retract(args.name), Answer)
     print(answer.message)

@@ -109,7 +109,7 @@ class Daemon:
                     status = self._status()
                     self._heartbeat.send(status)
                     if time.monotonic() - self._worker.moved_s < STUCK_S:  # else the service manager starts it anew
-                        manager.alive(f"{status.state.value}, {status.keyframes} key frames, {status.verdict}")
+                        manager.alive(f"{status.state.value}, {status.keyframes} keyframes, {status.verdict}")
         finally:
             self._stopping.set()
             manager.stopping()
@@ -148,7 +148,7 @@ class Daemon:
 
     def _answer(self, command: Retract) -> Answer:
         if command.name not in self._store.names:
-            return Answer(False, f"no key frame {command.name!r}; there are: {', '.join(sorted(self._store.names))}")
+            return Answer(False, f"no keyframe {command.name!r}; there are: {', '.join(sorted(self._store.names))}")
         self._store.forget(command.name, "retracted")
         self._inbox.put(LeftOut(command.name), self._stopping)
         event(log, logging.INFO, "retracted", frame=command.name)

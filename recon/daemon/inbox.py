@@ -1,4 +1,4 @@
-"""What waits for the worker: key frames with their features, and what became of others, in the order they came."""
+"""What waits for the worker: keyframes with their features, and what became of others, in the order they came."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 from recon.keyframe import Keyframe
 
-CAPACITY = 32  # events in memory; further key frames wait with their sender
+CAPACITY = 32  # events in memory; further keyframes wait with their sender
 
 
 @dataclass(frozen=True, eq=False)
 class Arrived:
-    """A key frame that the checkpoint holds."""
+    """A keyframe that the checkpoint holds."""
 
     keyframe: Keyframe
     at_s: float  # monotonic
@@ -46,7 +46,7 @@ class Inbox:
             self._changed.notify_all()
 
     def get(self, timeout_s: float) -> list[Event]:
-        """The next event, and with a key frame those that follow it; none where none comes in time."""
+        """The next event, and with a keyframe those that follow it; none where none comes in time."""
         with self._changed:
             self._changed.wait_for(lambda: self._events, timeout_s)
             events = [self._events.popleft()] if self._events else []

@@ -1,4 +1,4 @@
-"""The thread that takes key frames: onto the disk, acknowledged, their features found; whatever the worker does."""
+"""The thread that takes keyframes: onto the disk, acknowledged, their features found; whatever the worker does."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class Output:
         return snapshot
 
     def save(self, work: LiveReconstruction, final: bool) -> None:
-        """What could be made anew from the key frames."""
+        """What could be made anew from the keyframes."""
         try:
             checkpoint.save(self._store, work, final)
         except OSError as error:

@@ -1,7 +1,7 @@
-"""Does a key frame belong to the place? A quick answer at once, a thorough one in the end. Which views can be spared?
+"""Does a keyframe belong to the place? A quick answer at once, a thorough one in the end. Which views can be spared?
 
-A key frame that does not fit at once is set aside, out of the scene: it may spoil it. It belongs all the same where all
-key frames, judged together as an offline run judges them, make a scene: a later one may have joined it.
+A keyframe that does not fit at once is set aside, out of the scene: it may spoil it. It belongs all the same where all
+keyframes, judged together as an offline run judges them, make a scene: a later one may have joined it.
 """
 
 from __future__ import annotations

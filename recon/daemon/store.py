@@ -1,13 +1,13 @@
 """The checkpoint: all that a killed daemon needs to go on where it was.
 
     ledger              which frames there are to know about, and where the present place begins
-    frames/<number>     a key frame as it came; the number is its position in all that ever came
+    frames/<number>     a keyframe as it came; the number is its position in all that ever came
     graph               features and matches
     judgement           the cameras that they lead to, the evidence and the verdict
     scene               cameras and Gaussians as they are shown
     pointmaps           depths of its views, from which it grows
 
-The last four are made anew where they are missing. A key frame is the daemon's as soon as its file is there. Every file
+The last four are made anew where they are missing. A keyframe is the daemon's as soon as its file is there. Every file
 is whole or not there, and has a checksum.
 """
 
@@ -45,7 +45,7 @@ class CheckpointError(ValueError):
 
 
 class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A stored key frame; its image is the only array."""
+    """A stored keyframe; its image is the only array."""
 
     version: int
     session: str
@@ -132,7 +132,7 @@ class Store:
                     continue
                 stored = _stored(number, read_message(path))
             except (OSError, ValueError) as error:
-                log.error("a key frame is lost on the disk, put aside: %s", error)
+                log.error("a keyframe is lost on the disk, put aside: %s", error)
                 path.rename(path.with_suffix(".damaged"))
                 continue
             self._remember(stored)
@@ -223,7 +223,7 @@ class Store:
         except (OSError, ValueError) as error:
             raise CheckpointError(
                 f"the checkpoint in {self.directory} is damaged ({error}). Move the folder away to begin anew; "
-                "its key frames are in frames/"
+                "its keyframes are in frames/"
             ) from error
         if found.version != VERSION:
             raise CheckpointError(

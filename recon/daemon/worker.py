@@ -1,4 +1,4 @@
-"""The thread that reconstructs: works key frames in as they come, and makes the scene as good as it gets in between."""
+"""The thread that reconstructs: works keyframes in as they come, and makes the scene as good as it gets in between."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ log = logging.getLogger(__name__)
 
 STEP = 10  # iterations between looks at the inbox
 IDLE_S = 0.5  # between looks at whether to stop
-PATIENCE_S = 3.0  # that a thorough judgement of a key frame that does not fit may keep others waiting
-MOST_ASIDE = 8  # key frames that may still find their place
+PATIENCE_S = 3.0  # that a thorough judgement of a keyframe that does not fit may keep others waiting
+MOST_ASIDE = 8  # keyframes that may still find their place
 
 
 class _Abandoned(Exception):
@@ -50,11 +50,11 @@ class Worker:
         self._output = Output(config, store, publish, self._complain)
         self._stopping = stopping
         self._work = LiveReconstruction(self._recipe)
-        self._settled = True  # nothing can be made better before the next key frame
+        self._settled = True  # nothing can be made better before the next keyframe
         self.state = State.WAITING
         self.problem = ""
         self.keyframe_s: float | None = None
-        self.finished: Finished | None = None  # while no key frame waits
+        self.finished: Finished | None = None  # while no keyframe waits
         self.moved_s = time.monotonic()  # when the work last got on
 
     def run(self) -> None:
@@ -97,7 +97,7 @@ class Worker:
             self._show(final=self._settled)
 
     def _take_in(self, arrived: Sequence[Arrived]) -> None:
-        """Key frames that have come, shown together."""
+        """Keyframes that have come, shown together."""
         self.state, self.problem = State.GROWING, ""
         self._settled, self.finished = False, None
         self._make_room(len(arrived))
@@ -110,7 +110,7 @@ class Worker:
         self.state = State.LOST if place.strangers(self._work) else State.GROWING
 
     def _show_grown(self, arrived: Sequence[Arrived]) -> None:
-        """The scene with the key frames that have come to belong to it."""
+        """The scene with the keyframes that have come to belong to it."""
         self._work.work_in()
         snapshot = self._show()
         if arrived:
@@ -145,7 +145,7 @@ class Worker:
             return set()
 
     def _receive(self, newest: set[str]) -> bool:
-        """Whether the scene changes by key frames that did not fit at once. Raises _Abandoned.
+        """Whether the scene changes by keyframes that did not fit at once. Raises _Abandoned.
 
         They are judged thoroughly with all others, as long as what waits can wait; if they are too many, in any case.
         If that does not help them, another place begins with them.
@@ -161,7 +161,7 @@ class Worker:
         return self._lost(newest) or joined
 
     def _lost(self, newest: Collection[str]) -> bool:
-        """Says which of the newest key frames do not fit; where too many in a row do not, another place begins."""
+        """Says which of the newest keyframes do not fit; where too many in a row do not, another place begins."""
         strangers = place.strangers(self._work)
         for keyframe in strangers:
             if keyframe.name in newest:
@@ -208,7 +208,7 @@ class Worker:
         self._work.dropped = self._store.dropped
 
     def _settle(self) -> None:
-        """Makes the scene afresh from all key frames and refines it. Raises _Abandoned when something comes."""
+        """Makes the scene afresh from all keyframes and refines it. Raises _Abandoned when something comes."""
         self.state = State.REFINING
         config = self._recipe.optimize
         steps = msgspec.structs.replace(config, checkpoints=tuple(range(STEP, config.iterations, STEP)))

@@ -2,7 +2,7 @@
 
 The real processes reconstruct a folder of photographs again and again, for some minutes: with no viewer, with one, and
 with one that was stopped (SIGSTOP) once its window was open, in turn and in rounds, so that what else the machine does
-meets all three alike. Intake is key frames a second until all are placed, iterations a second are what recon itself
+meets all three alike. Intake is keyframes a second until all are placed, iterations a second are what recon itself
 says of its refinement. Each run is compared with the one without a viewer in the same round; said are the median of
 these ratios and the rounds' range that holds the true median with at least 90 % confidence, whatever their
 distribution. `taken` is the part of the machine's processor time that the viewer took: recon can lose no more to it.

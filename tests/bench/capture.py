@@ -1,7 +1,7 @@
 """What the capture process costs besides decoding: `python -m tests.bench.capture --seconds 30 --out capture.json`.
 
 A walk past a wall is written as JPEGs of 1280 x 720 and shown at 30 frames a second; somebody reads the previews and
-acknowledges the key frames. The cost is processor time of the whole process, as the kernel counts it, less the time
+acknowledges the keyframes. The cost is processor time of the whole process, as the kernel counts it, less the time
 that decoding the same files at the same pace takes in this process, in the same minute. Back to back, with its memory
 still in the caches, decoding takes less; that figure is told too.
 """
@@ -103,7 +103,7 @@ def observe(pid: int, network: Network, photographs: list[Path], seconds: float)
     decoding, back_to_back = (decoding_s(photographs[:DECODED], pause) * rate for pause in (1 / rate, 0.0))
     return {
         "frames_per_second_reached": rate,
-        "key_frames_per_second": (newest.header.key_frames - first.header.key_frames) / wall,
+        "keyframes_per_second": (newest.header.keyframes - first.header.keyframes) / wall,
         "process_share_of_a_core": used / wall,
         "decoding_share_of_a_core": decoding,
         "besides_decoding": used / wall - decoding,

@@ -51,7 +51,7 @@ def main() -> None:
         "preview_latency_ms": {f"p{p}": float(np.percentile(latencies, p)) for p in (50, 99, 100)},
         "previews": len(latencies),
         "previews_lost": lost,
-        "key_frames_waiting": waiting,
+        "keyframes_waiting": waiting,
         "heartbeats": said,
         "exit_codes": codes,
         "load_average": os.getloadavg()[0],

@@ -1,4 +1,4 @@
-"""Key frames over a real link between two network namespaces that is slow, lossy and cut: each arrives once."""
+"""Keyframes over a real link between two network namespaces that is slow, lossy and cut: each arrives once."""
 
 from __future__ import annotations
 

@@ -144,7 +144,7 @@ def subscriber_batch(rng: random.Random, context: zmq.Context, folder: Path, goo
 
 
 def client_batch(rng: random.Random, context: zmq.Context, folder: Path, goods: list[Parts], count: int) -> int:
-    """An impostor sends rubbish where key frames come from."""
+    """An impostor sends rubbish where keyframes come from."""
     network = Network(directory=folder)
     with context.socket(zmq.ROUTER) as impostor, KeyframeClient(network) as client:
         impostor.linger = 0
@@ -166,7 +166,7 @@ def client_batch(rng: random.Random, context: zmq.Context, folder: Path, goods: 
 
 
 def probe(network: Network, keyframes: KeyframeServer, scene: StateServer) -> None:
-    """Real peers are still served; nobody has taken the key frame away."""
+    """Real peers are still served; nobody has taken the keyframe away."""
     deadline = time.monotonic() + 20
     with KeyframeClient(network) as recon, StateClient(RECON_SCENE, network, DroppedHeader) as viewer:
         received = state = None

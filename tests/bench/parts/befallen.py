@@ -27,7 +27,7 @@ from tests.node import Viewer, finished, memory_mb, running
 
 
 def kill_recon(trial: Trial) -> None:
-    """kill -9 of recon at a random moment, from its start until well after the last key frame."""
+    """kill -9 of recon at a random moment, from its start until well after the last keyframe."""
     with running(trial.node()) as node:
         node.start("recon")
         node.start("capture")
@@ -51,7 +51,7 @@ def kill_capture(trial: Trial) -> None:
         kept = [(stored.key[0], str(stored.key[1])) for stored in store.frames()]
         store.close()
         expect(spooled <= set(kept), f"lost: {spooled - set(kept)}")
-        expect(len(kept) == len(set(kept)), "a key frame was taken twice")
+        expect(len(kept) == len(set(kept)), "a keyframe was taken twice")
 
 
 def camera_lost(trial: Trial) -> None:
@@ -64,7 +64,7 @@ def camera_lost(trial: Trial) -> None:
         node.start("capture")
         for index, path in enumerate(sorted(waiting.iterdir())):
             if index == 3:
-                wait_for(lambda: node.log("capture").count("event=keyframe") == 3, "three key frames")
+                wait_for(lambda: node.log("capture").count("event=keyframe") == 3, "three keyframes")
                 gone = trial.images.rename(trial.folder / "gone")
                 trial.some_time(6.0)
                 gone.rename(trial.images)
@@ -115,7 +115,7 @@ def slow_viewer(trial: Trial) -> None:
 
 
 def full_disk(trial: Trial) -> None:
-    """The disk is full after two key frames, and has room later. What is not stored waits with capture."""
+    """The disk is full after two keyframes, and has room later. What is not stored waits with capture."""
     disk = trial.folder / "disk"
     disk.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=600k", "tmpfs", str(disk)], capture_output=True).returncode:
@@ -128,7 +128,7 @@ def full_disk(trial: Trial) -> None:
             while (status := heartbeats(node.network)["recon"]) is None or status["state"] != "full":
                 expect(time.monotonic() < deadline, f"recon does not tell that the disk is full: {status}")
             trial.some_time(4.0)
-            expect(node.spooled() > 0, "key frames were acknowledged that were not stored")
+            expect(node.spooled() > 0, "keyframes were acknowledged that were not stored")
             subprocess.run(["mount", "-o", "remount,size=200m", str(disk)], check=True)
             expect_whole(node)
     finally:

@@ -72,7 +72,7 @@ def wait_for(condition: Callable[[], bool], what: str, patience_s: float = 120.0
 def expect_whole(node: Node, views: int = VIEWS) -> None:
     """All photographs in a finished scene, which is exported whole; nothing half written; a clean end."""
     expect_scene(node, views)
-    wait_for(lambda: node.spooled() == 0, "acknowledgement of all key frames", 30)
+    wait_for(lambda: node.spooled() == 0, "acknowledgement of all keyframes", 30)
     expect(node.end("recon") == 0, "recon did not end with 0")
     expect(any((node.folder / "out").glob("*/manifest.json")), "there is no result")
     expect_exports_whole(node)
