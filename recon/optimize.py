@@ -20,29 +20,30 @@ from recon.control.control import Control, ControlChoice, Step
 from recon.gaussians import Gaussians
 from recon.geometry import exp_se3, twist_gradient
 from recon.pseudo_views import PseudoView
-from recon.rasterize.cpu import rasterize
 from recon.rasterize.render import Render
+from recon.rasterize.seen import seen
 from recon.regularise import Regularisation
 from recon.scene import Scene
 from recon.target import Target, target
 
 Share = Annotated[float, Meta(ge=0, le=1)]
+Rate = Annotated[float, Meta(ge=0, le=1)]
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # of Gaussians, that are optimised
 
 
 class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Adam's step sizes at the start. Lengths are relative to the median depth of the scene, which is 1."""
 
-    means: float = 8e-4
-    quats: float = 2e-2
-    log_scales: float = 1e-1
-    logit_opacities: float = 1e-1
-    sh: float = 3e-2
-    translation: float = 2e-4
-    rotation: float = 2e-4  # radians
-    final_means: float = 0.1  # those of the means have fallen to this part at the end, exponentially
-    final: float = 0.3  # the Gaussians' others to this
-    final_pose: float = 0.1  # and those of the cameras to this
+    means: Rate = 8e-4
+    quats: Rate = 2e-2
+    log_scales: Rate = 1e-1
+    logit_opacities: Rate = 1e-1
+    sh: Rate = 3e-2
+    translation: Rate = 2e-4
+    rotation: Rate = 2e-4  # radians
+    final_means: Share = 0.1  # those of the means have fallen to this part at the end, exponentially
+    final: Share = 0.3  # the Gaussians' others to this
+    final_pose: Share = 0.1  # and those of the cameras to this
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -131,7 +132,8 @@ class _Fit:
         T_world_camera = self._Ts_world_camera[index].requires_grad_(refine_pose)
         channels = self._terms.channels(progress) if self._terms else ("rgb",)
         opacities = self._dropout(self._gaussians.opacities, progress)
-        render = self._render(opacities, T_world_camera, photograph.K, photograph.width, photograph.height, channels)
+        size = photograph.width, photograph.height
+        render = seen(self._gaussians, opacities, T_world_camera, photograph.K, *size, channels)
         assert render.rgb is not None  # it was asked for
         loss = photograph.loss(render.rgb)
         self.losses.append(float(loss.detach()))
@@ -168,35 +170,12 @@ class _Fit:
             self._adam.follow(_leaves(change.gaussians), change.origin)
             self._dropout.follow(change.gaussians)
 
-    def _render(
-        self,
-        opacities: Tensor,
-        T_world_camera: Tensor,
-        K: Tensor,
-        width: int,
-        height: int,
-        channels: Collection[str],
-    ) -> Render:
-        gaussians = self._gaussians
-        return rasterize(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.scales,
-            opacities,
-            gaussians.sh,
-            T_world_camera,
-            K,
-            width,
-            height,
-            channels=channels,
-        )
-
     def _regularisation(self, terms: Regularisation, index: int, render: Render, progress: float) -> Tensor | float:
         """The terms on training view `index`, as rendered, and on a pseudo view."""
 
         def draw(view: PseudoView, channels: Collection[str]) -> Render:
             camera = torch.from_numpy(view.T_world_camera).float(), torch.from_numpy(view.K).float()
-            return self._render(self._gaussians.opacities, *camera, view.width, view.height, channels)
+            return seen(self._gaussians, self._gaussians.opacities, *camera, view.width, view.height, channels)
 
         parts = (terms.training_loss(index, render, progress), terms.pseudo_loss(draw, progress))
         return sum((part for part in parts if part is not None), 0.0)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 import msgspec
 
 from capture.frame import DroppedFrame, Frame
-from recon import growth, optimize
+from recon import divergence, growth, optimize
 from recon.budget import hits
 from recon.clock import Clock
 from recon.config import Config
@@ -260,6 +260,11 @@ class Reconstruction:
         judged = self.judge()
         verdict, evidence = judged.verdict, judged.evidence
         scene = self.scene if verdict.publishable else None
+        if scene is not None and self.begun is not None:
+            self.clock.lap("wait")
+            refused = divergence.refusal(self.begun, scene)
+            self.clock.lap("optimise")
+            verdict, scene = (refused, None) if refused else (verdict, scene)
         bound = hits(self.config, self.begun, scene, self.clock.booked) if final else ()
         snapshot = Snapshot(
             sequence=self.sequence,

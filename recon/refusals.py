@@ -189,3 +189,13 @@ def reflected(names: Names) -> Verdict:
 
 def too_close(names: Names, found: str) -> Verdict:
     return Verdict(Code.BASELINE_TOO_SMALL, found, _SIDEWAYS, tuple(names))
+
+
+def diverged(names: Names, before: float, after: float) -> Verdict:
+    """`before` and `after` are the losses over the photographs that the scene began with and that it ended with."""
+    return Verdict(
+        Code.DIVERGED,
+        f"The refinement ruined the scene: it misses the photographs by {after:.2g}, and began with {before:.2g}.",
+        "Take smaller steps (optimize.rates), or a preset as it is.",
+        tuple(names),
+    )

@@ -17,7 +17,7 @@ from recon.geometry import exp_se3
 from recon.optimize import Config, Rates, refine
 from recon.priors.pointmap import Pointmap
 from recon.pseudo_views import PseudoView
-from recon.rasterize.cpu import rasterize
+from recon.rasterize.seen import seen
 from recon.scene import Scene, View
 from tests.synthetic import tiny_scene
 
@@ -26,22 +26,10 @@ QUICK = Config(iterations=12, checkpoints=(), half_resolution_share=0.0)
 
 
 def render(gaussians: Gaussians, view: View) -> torch.Tensor:
-    return rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        view.T_world_camera,
-        view.K,
-        view.width,
-        view.height,
-        channels=("rgb",),
-    ).rgb.clamp(0, 1)
+    return seen(gaussians, gaussians.opacities, view.T_world_camera, view.K, view.width, view.height).rgb.clamp(0, 1)
 
 
-@pytest.fixture(scope="module")
-def truth() -> Scene:
+def photographed() -> Scene:
     """Three photographs of Gaussians, and these Gaussians."""
     tiny = tiny_scene(seed=3, width=64, height=48)
     views = []
@@ -51,6 +39,11 @@ def truth() -> Scene:
         image = (255 * render(tiny.gaussians, view)).round().byte().numpy()
         views.append(replace(view, image=image))
     return Scene(tuple(views), tiny.gaussians, iterations=7)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Scene:
+    return photographed()
 
 
 def disturbed(scene: Scene) -> Scene:

@@ -184,6 +184,13 @@ def test_a_bound_on_gaussians_and_a_budget_of_seconds_are_kept(quick):
     assert final.iterations < 100  # the poses alone took longer than a millisecond
 
 
+def test_a_scene_that_its_refinement_ruined_is_no_result():
+    wild = replace(QUICK.optimize.rates, means=1.0, log_scales=1.0)
+    final = last(three(), replace(QUICK, optimize=replace(QUICK.optimize, rates=wild)))
+    assert final.verdict.code is Code.DIVERGED and not final.verdict.publishable
+    assert final.final and not final.cameras and not len(final.gaussians)
+
+
 def test_time_counts_from_the_first_frame_and_a_readers_time_is_waiting():
     taken: list[float] = []
 

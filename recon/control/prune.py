@@ -16,7 +16,7 @@ from recon.density import REFERENCE_PX
 from recon.gaussians import Gaussians
 from recon.masking import visibility
 from recon.pseudo_views import pseudo_views
-from recon.rasterize.cpu import rasterize
+from recon.rasterize.seen import seen
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -104,18 +104,7 @@ def changes_without(gaussians: Gaussians, cameras: Sequence[Camera], probes: int
     total = torch.zeros(len(gaussians))
     for camera in cameras:
         scale = max(camera.width, camera.height) / REFERENCE_PX
-        rgb = rasterize(
-            gaussians.means,
-            gaussians.quats,
-            gaussians.scales,
-            opacities,
-            gaussians.sh,
-            camera.T_world_camera,
-            camera.K,
-            camera.width,
-            camera.height,
-            channels=("rgb",),
-        ).rgb
+        rgb = seen(gaussians, opacities, camera.T_world_camera, camera.K, camera.width, camera.height).rgb
         assert rgb is not None  # it was asked for
         visible = torch.from_numpy(visibility(rgb.detach().numpy(), scale))
         for _ in range(probes):

@@ -25,7 +25,7 @@ struct Transfer {
 
 // A view that the reference view is compared with. The layout is repeated in recon/priors/patchmatch.py.
 struct Source {
-    const int32_t* packed;       // (height, width) 2x2 neighbourhoods of grey values, see pack_neighbourhoods
+    const int32_t* packed;       // (height, width) 2x2 neighbourhoods of grey values, see patchmatch_pack
     const float* inverse_depth;  // (height, width), 0 where unknown; read only where Problem.geometric is not 0
     int32_t width, height;
     Transfer from_reference;

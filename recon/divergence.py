@@ -1,0 +1,50 @@
+"""Whether the refinement ruined a scene: then it is no result, however right its cameras were at the start."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+
+import numpy as np
+
+from recon import refusals
+from recon.optimize import PARAMETERS
+from recon.rasterize.seen import seen
+from recon.scene import Scene, View
+from recon.target import target
+from recon.verdict import Verdict
+
+WORSE = 1.1  # times the misfit that the scene began with; refinements that work end between .2 and .8 of it
+_LOOKED_AT = 4  # views at most
+_SCALE = 0.5  # of the photographs' size
+_DSSIM = 0.2
+
+
+def refusal(begun: Scene, scene: Scene) -> Verdict | None:
+    """The verdict on `scene` where it shows the photographs worse than `begun`, from which it was refined; else None.
+
+    Photographs that only one of them knows are not compared.
+    """
+    known = {view.name for view in begun.views}
+    names = [view.name for view in scene.views if view.name in known]
+    if scene is begun or not names:
+        return None
+    looked_at = names[:: math.ceil(len(names) / _LOOKED_AT)]
+    before, after = misfit(begun, looked_at), misfit(scene, looked_at)
+    return refusals.diverged(names, before, after) if not after <= WORSE * before else None
+
+
+def misfit(scene: Scene, names: Collection[str]) -> float:
+    """The mean photometric loss over these views; infinite where the scene has become numbers that none can show."""
+    if not all(bool(getattr(scene.gaussians, name).isfinite().all()) for name in PARAMETERS):
+        return math.inf
+    views = [view for view in scene.views if view.name in names]
+    return sum(_misfit(scene, view) for view in views) / len(views)
+
+
+def _misfit(scene: Scene, view: View) -> float:
+    photograph = target(view, np.ones((view.height, view.width), np.bool_), _SCALE, _DSSIM)
+    size = photograph.width, photograph.height
+    rgb = seen(scene.gaussians, scene.gaussians.opacities, view.T_world_camera, photograph.K, *size).rgb
+    assert rgb is not None  # it was asked for
+    return float(photograph.loss(rgb))

@@ -1,0 +1,69 @@
+"""What a refinement may not do to a scene."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from recon.divergence import misfit, refusal
+from recon.optimize import refine
+from recon.scene import Scene
+from recon.verdict import Code
+from tests.test_optimize import QUICK, disturbed, photographed
+
+
+@pytest.fixture(scope="module")
+def truth() -> Scene:
+    return photographed()
+
+
+def scattered(scene: Scene, lost: float = 0.0) -> Scene:
+    """With all Gaussians shrunk to nothing; means moved by `lost`."""
+    gaussians = scene.gaussians
+    return replace(
+        scene,
+        gaussians=replace(gaussians, means=gaussians.means + lost, log_scales=gaussians.log_scales - 5),
+        iterations=scene.iterations + 100,
+    )
+
+
+def test_the_true_scene_misses_nothing_and_others_more(truth):
+    names = [view.name for view in truth.views]
+    assert misfit(truth, names) < 0.02 < misfit(disturbed(truth), names) < misfit(scattered(truth), names)
+
+
+def test_a_refinement_that_works_is_let_through(truth):
+    begun = disturbed(truth)
+    *_, refined = refine(begun, QUICK, seed=0)
+    assert refusal(begun, refined) is None and refusal(begun, begun) is None
+
+
+def test_a_ruined_scene_is_refused_with_both_figures(truth):
+    refused = refusal(truth, scattered(truth))
+    assert refused is not None and refused.code is Code.DIVERGED and not refused.publishable
+    assert refused.frames == tuple(view.name for view in truth.views)
+    assert f"{misfit(scattered(truth), refused.frames):.2g}" in refused.message and "optimize.rates" in refused.advice
+
+
+def test_numbers_that_nothing_can_show_are_refused(truth):
+    broken = scattered(truth, lost=math.nan)
+    assert misfit(broken, ["0.png"]) == math.inf
+    refused = refusal(truth, broken)
+    assert refused is not None and refused.code is Code.DIVERGED
+
+
+def test_only_photographs_that_both_know_are_compared(truth):
+    first = replace(truth, views=truth.views[:1])
+    refused = refusal(first, scattered(truth))
+    assert refused is not None and refused.frames == ("0.png",)
+    assert refusal(first, replace(scattered(truth), views=truth.views[1:])) is None
+
+
+def test_of_many_photographs_some_are_looked_at(truth, monkeypatch):
+    looked_at: list[str] = []
+    monkeypatch.setattr("recon.divergence._misfit", lambda scene, view: looked_at.append(view.name) or 1.0)
+    views = tuple(replace(truth.views[0], name=f"{index}.png") for index in range(30))
+    assert refusal(replace(truth, views=views), replace(scattered(truth), views=views)) is None
+    assert looked_at == ["0.png", "8.png", "16.png", "24.png"] * 2
