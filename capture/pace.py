@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
-from typing import Literal
+from typing import Annotated, Literal
+
+import msgspec
 
 from capture.frame import DroppedFrame, Frame
 
+FramesPerSecond = Annotated[float, msgspec.Meta(ge=0.001, le=1000)]
 Pace = Literal["recorded", "fastest"]  # by the stamps, or as fast as the consumer reads
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import splatnode
 from capture.capture_config import CaptureConfig
-from capture.config import load_config, read_yaml
+from capture.config import ConfigError, load_config, read_yaml, typed
 from tests.conftest import ROOT
 
 CAMERAS = [path for path in sorted((ROOT / "configs").glob("*.yaml")) if "camera" in read_yaml(path)]
@@ -31,6 +31,13 @@ def test_the_commented_calibration_can_be_used(tmp_path):
     path = tmp_path / "webcam.yaml"
     path.write_text(text.replace(line, line.replace("# ", "", 1)))
     assert load_config(path, CaptureConfig).camera.config.intrinsics.distortion == (0.1, -0.2, 0, 0, 0)
+
+
+@pytest.mark.parametrize("rate", [0, 1e-300, float("inf")])
+@pytest.mark.parametrize("kind", ["depthai", "synthetic", "v4l2"])
+def test_a_rate_that_no_camera_has_is_refused(kind, rate):
+    with pytest.raises(ConfigError, match="camera.frames_per_second: expected float"):
+        typed({"camera": {"kind": kind, "frames_per_second": rate}}, CaptureConfig)
 
 
 @pytest.mark.parametrize("path", SERVICES, ids=lambda path: path.name)

@@ -18,6 +18,7 @@ import numpy as np
 
 from capture.frame import Frame, Intrinsics
 from capture.logs import event
+from capture.pace import FramesPerSecond
 from capture.unavailable import CameraUnavailable
 
 log = logging.getLogger(__name__)
@@ -29,7 +30,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     device: str = ""  # id, IP address or USB port, as `splatnode find` prints it; "": the only one
     width: Annotated[int, msgspec.Meta(ge=1)] = 1280
     height: Annotated[int, msgspec.Meta(ge=1)] = 720
-    frames_per_second: Annotated[float, msgspec.Meta(gt=0)] = 10.0
+    frames_per_second: FramesPerSecond = 10.0
     undistort: bool = True  # on the camera; otherwise its distortion goes with the intrinsics
     lock: bool = True  # exposure and white balance, once the camera has chosen them
     settle_s: Annotated[float, msgspec.Meta(ge=0)] = 1.5  # in which it chooses; these frames are not given

@@ -13,7 +13,7 @@ import msgspec
 from capture import recording
 from capture.frame import DroppedFrame, Frame, Intrinsics
 from capture.image_file import MAX_PIXELS, SUFFIXES, UnusableImage, decode_image
-from capture.pace import Pace, paced
+from capture.pace import FramesPerSecond, Pace, paced
 
 # Photographs that cannot be decoded here: they are named, so that nobody wonders where they went.
 FOREIGN_SUFFIXES = {".heic", ".heif", ".avif", ".jxl", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf"}
@@ -24,7 +24,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     names: tuple[str, ...] = ()  # the files to take, with or without suffix; none: all
     intrinsics: Intrinsics | None = None  # of all images of its aspect ratio, instead of what their EXIF tells
     max_pixels: int = MAX_PIXELS  # larger images are left out
-    frames_per_second: Annotated[float, msgspec.Meta(gt=0)] = 10.0  # of the stamps, unless they were recorded
+    frames_per_second: FramesPerSecond = 10.0  # of the stamps, unless they were recorded
     pace: Pace = "fastest"
     loops: Annotated[int, msgspec.Meta(ge=1)] = 1  # times that it is shown, each with names of its own
 

@@ -18,6 +18,7 @@ from capture.diorama.cast import Camera, Matrix, cast
 from capture.diorama.layout import place
 from capture.diorama.solids import Solid
 from capture.frame import Frame
+from capture.pace import FramesPerSecond
 
 TARGET = np.array([1.05, 1.05, 0.82])  # what the photographer looks at: the table in the corner, metres
 
@@ -32,7 +33,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: int = 0  # of the place and of the photographer's path
     noise: float = 1.0  # standard deviation of the sensor noise, grey levels
     samples: Count = 2  # rays a pixel in each direction
-    frames_per_second: Annotated[float, msgspec.Meta(gt=0)] = 2.0
+    frames_per_second: FramesPerSecond = 2.0
 
 
 def stream(config: Config) -> Iterator[Frame]:

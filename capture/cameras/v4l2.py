@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from capture.frame import DroppedFrame, Frame, Intrinsics
 from capture.image_file import UnusableImage, decode_image
+from capture.pace import FramesPerSecond
 from capture.unavailable import CameraUnavailable
 from capture.video4linux import locks
 from capture.video4linux.device import Device, Format, RawFrame, System
@@ -28,7 +29,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     device: str = ""  # as `splatnode find` prints it: a name that stays when ports and numbers change; "": the only one
     width: Annotated[int, msgspec.Meta(ge=1)] = 1280
     height: Annotated[int, msgspec.Meta(ge=1)] = 720
-    frames_per_second: Annotated[float, msgspec.Meta(gt=0)] = 30.0
+    frames_per_second: FramesPerSecond = 30.0
     pixels: Literal["MJPG", "YUYV"] = "MJPG"  # USB 2 carries no more than 10 frames of 1280 x 720 a second as YUYV
     lock: bool = True  # exposure, gain, white balance and focus, once the camera has chosen them
     settle_s: Annotated[float, msgspec.Meta(ge=0)] = 1.5  # in which it chooses; these frames are not given

@@ -148,7 +148,8 @@ class Daemon:
 
     def _answer(self, command: Retract) -> Answer:
         if command.name not in self._store.names:
-            return Answer(False, f"no keyframe {command.name!r}; there are: {', '.join(sorted(self._store.names))}")
+            known = ", ".join(sorted(self._store.names)) or "none yet"
+            return Answer(False, f"no keyframe {command.name!r}; there are: {known}")
         self._store.forget(command.name, "retracted")
         self._inbox.put(LeftOut(command.name), self._stopping)
         event(log, logging.INFO, "retracted", frame=command.name)
