@@ -21,14 +21,8 @@ _DSSIM = 0.2
 
 
 def refusal(begun: Scene, scene: Scene) -> Verdict | None:
-    """The verdict on `scene` where it shows the photographs worse than `begun`, from which it was refined; else None.
-
-    Photographs that only one of them knows are not compared.
-    """
-    known = {view.name for view in begun.views}
-    names = [view.name for view in scene.views if view.name in known]
-    if scene is begun or not names:
-        return None
+    """The verdict on `scene` where it shows its photographs worse than `begun`, which was refined; else None."""
+    names = [view.name for view in scene.views]
     looked_at = names[:: math.ceil(len(names) / _LOOKED_AT)]
     before, after = misfit(begun, looked_at), misfit(scene, looked_at)
     return refusals.diverged(names, before, after) if not after <= WORSE * before else None

@@ -26,6 +26,7 @@ from recon.scene import Scene, begin
 from recon.screening import Look, Rejected, look, screen
 from recon.snapshot import GaussianArrays, Snapshot
 from recon.undistort import undistorted
+from recon.verdict import Verdict
 from recon.verification.likelihood import record
 from recon.view_graph import ViewGraph
 
@@ -94,6 +95,7 @@ class Reconstruction:
         self.rejected: list[Rejected] = []  # those of `dropped` that the screening left out
         self.begun: Scene | None = None  # from the last estimate of all frames, not optimised
         self.scene: Scene | None = None  # what is shown
+        self._ruined: Verdict | None = None  # of the last refinement, if it was given up
         self.sequence = 0
         self._looks: dict[str, Look] = {}  # of the frames that were taken
         self._judging = Judging(self._prior, config)
@@ -241,30 +243,35 @@ class Reconstruction:
         self.clock.lap("points")
 
     def refine(self, scene: Scene | None, config: optimize.Config, deadline: float | None = None) -> Iterator[Scene]:
-        """`scene`, if there is one, at every checkpoint of its refinement and at the end."""
+        """`scene`, if there is one, at every checkpoint of its refinement and at the end, unless that ruins it."""
         if scene is None:
             return
+        self._ruined = None
         self.clock.lap("wait")
         most = self.config.most_gaussians
         for refined in optimize.refine(scene, config, seed=self.config.seed, deadline=deadline, max_gaussians=most):
+            if refined.losses or refined.iterations in self.config.optimize.checkpoints:
+                self._ruined = divergence.refusal(scene, refined)
             self.clock.lap("optimise")
+            if self._ruined is not None:
+                return
             yield refined
             self.clock.lap("wait")
 
     def show(self, scene: Scene | None) -> None:
-        """Makes `scene`, or as much of it as there may be, the one that snapshots show."""
-        self.scene = None if scene is None else growth.within(scene, self.config.most_gaussians)
+        """Makes `scene`, or as much of it as there may be, the one that snapshots show; none where it was ruined."""
+        if scene is None or self._ruined is not None:
+            self.scene = None
+        else:
+            self.scene = growth.within(scene, self.config.most_gaussians)
 
     def snapshot(self, final: bool = False) -> Snapshot:
         self.sequence += 1
         judged = self.judge()
         verdict, evidence = judged.verdict, judged.evidence
+        if verdict.publishable and self._ruined is not None:
+            verdict = self._ruined
         scene = self.scene if verdict.publishable else None
-        if scene is not None and self.begun is not None:
-            self.clock.lap("wait")
-            refused = divergence.refusal(self.begun, scene)
-            self.clock.lap("optimise")
-            verdict, scene = (refused, None) if refused else (verdict, scene)
         bound = hits(self.config, self.begun, scene, self.clock.booked) if final else ()
         snapshot = Snapshot(
             sequence=self.sequence,

@@ -178,6 +178,19 @@ def test_a_result_that_could_not_be_written_is_written_by_the_next_process(confi
         wait_for((config.out / "scene-0001" / "manifest.json").exists, PATIENCE_S)
 
 
+def test_a_scene_that_its_refinement_ruined_is_neither_shown_nor_kept(config, peer):
+    wild = replace(QUICK.optimize, rates=optimize.Rates(means=1.0, log_scales=1.0))
+    config = replace(config, reconstruction=replace(QUICK, optimize=wild))
+    for frame in photographs()[:3]:
+        peer.server.offer(frame)
+    for _ in range(2):  # a restarted one does not take it from the checkpoint
+        with running(config):
+            ruined = peer.wait(lambda scene: scene.snapshot.verdict.code is Code.DIVERGED, "a refinement gone wrong")
+            assert not ruined.snapshot.verdict.publishable and not len(ruined.snapshot.gaussians)
+            peer.wait_for_acknowledgements()
+    assert not config.out.exists()
+
+
 def offer_when_three_are_shown(peer, frames) -> None:
     """The first three frames, and the others once there is a scene of those."""
     for frame in frames[:3]:

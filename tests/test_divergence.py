@@ -54,13 +54,6 @@ def test_numbers_that_nothing_can_show_are_refused(truth):
     assert refused is not None and refused.code is Code.DIVERGED
 
 
-def test_only_photographs_that_both_know_are_compared(truth):
-    first = replace(truth, views=truth.views[:1])
-    refused = refusal(first, scattered(truth))
-    assert refused is not None and refused.frames == ("0.png",)
-    assert refusal(first, replace(scattered(truth), views=truth.views[1:])) is None
-
-
 def test_of_many_photographs_some_are_looked_at(truth, monkeypatch):
     looked_at: list[str] = []
     monkeypatch.setattr("recon.divergence._misfit", lambda scene, view: looked_at.append(view.name) or 1.0)

@@ -226,11 +226,12 @@ class Worker:
                 self._show()
         self._settled = True
         self._work.show(refined)
-        snapshot = self._show(final=refined is not None)
-        if refined is not None:
+        shown = self._work.scene is not None
+        snapshot = self._show(final=shown)
+        if shown:
             exported = self._output.export(snapshot)
             self._output.save(self._work, final=exported)  # what is kept as final is not exported after a restart
-        self.state = State.WAITING if refined is None else State.LOST if place.strangers(self._work) else State.IDLE
+        self.state = State.WAITING if not shown else State.LOST if place.strangers(self._work) else State.IDLE
 
     def _pause(self, until_s: float = 0.0) -> None:
         """Raises _Abandoned if the daemon stops, and from `until_s` (monotonic) on if something has come."""
