@@ -23,7 +23,7 @@ from viewer.moment import Moment
 from viewer.sources import load_result
 from viewer.viewpoint import scene_pivot
 
-PIXEL = 60, 60  # of the screen, where the colour of a scene is looked for: no camera is drawn there
+PIXEL = 130, 110  # of a screen of 1280 x 800, where a scene's colour is looked for: within the window, beside cameras
 COLOURS = [(1.0, 0.3, 0.5), (0.3, 1.0, 0.5), (0.3, 0.5, 1.0), (0.9, 0.9, 0.2), (0.2, 0.9, 0.9)]  # of scenes, in turn
 
 
@@ -51,7 +51,10 @@ def watch(result: Path, minutes: float, period_s: float) -> dict:
             try:
                 first = scene_of_colour(moment, 20_000, (1.0, 1.0, 1.0))
                 server.publish(*to_message(first.snapshot, "place", numbering.next()))
-                wait_for_colour(screen, PIXEL, (1.0, 1.0, 1.0), server, 120.0)
+                if not wait_for_colour(screen, PIXEL, (1.0, 1.0, 1.0), server, 120.0):
+                    raise SystemExit(
+                        f"no scene at {PIXEL} of the screen: is it of 1280 x 800, with the viewer in its middle?"
+                    )
                 started, processor = time.monotonic(), processor_s(viewer.pid)
                 while time.monotonic() - started < 60 * minutes and viewer.poll() is None:
                     begin = time.monotonic()
