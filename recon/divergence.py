@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
 
 import numpy as np
 
@@ -20,19 +19,17 @@ _SCALE = 0.5  # of the photographs' size
 _DSSIM = 0.2
 
 
-def refusal(begun: Scene, scene: Scene) -> Verdict | None:
-    """The verdict on `scene` where it shows its photographs worse than `begun`, which was refined; else None."""
-    names = [view.name for view in scene.views]
-    looked_at = names[:: math.ceil(len(names) / _LOOKED_AT)]
-    before, after = misfit(begun, looked_at), misfit(scene, looked_at)
-    return refusals.diverged(names, before, after) if not after <= WORSE * before else None
+def refusal(before: float, scene: Scene) -> Verdict | None:
+    """The verdict on `scene` where its misfit is worse than the one `before` the refinement; else None."""
+    after = misfit(scene)
+    return None if after <= WORSE * before else refusals.diverged([view.name for view in scene.views], before, after)
 
 
-def misfit(scene: Scene, names: Collection[str]) -> float:
-    """The mean photometric loss over these views; infinite where the scene has become numbers that none can show."""
+def misfit(scene: Scene) -> float:
+    """The mean photometric loss over some views; infinite where the scene has become numbers that none can show."""
     if not all(bool(getattr(scene.gaussians, name).isfinite().all()) for name in PARAMETERS):
         return math.inf
-    views = [view for view in scene.views if view.name in names]
+    views = scene.views[:: math.ceil(len(scene.views) / _LOOKED_AT)]
     return sum(_misfit(scene, view) for view in views) / len(views)
 
 

@@ -224,6 +224,7 @@ class Reconstruction:
 
     def begin(self) -> None:
         """Begins a scene from the points that were found last, which is not shown yet."""
+        self._ruined = None
         judged = self.judge_thoroughly()
         registration = judged.registration
         if registration is None or not judged.verdict.publishable:
@@ -246,12 +247,12 @@ class Reconstruction:
         """`scene`, if there is one, at every checkpoint of its refinement and at the end, unless that ruins it."""
         if scene is None:
             return
-        self._ruined = None
         self.clock.lap("wait")
+        self._ruined, before = None, divergence.misfit(scene)
         most = self.config.most_gaussians
         for refined in optimize.refine(scene, config, seed=self.config.seed, deadline=deadline, max_gaussians=most):
             if refined.losses or refined.iterations in self.config.optimize.checkpoints:
-                self._ruined = divergence.refusal(scene, refined)
+                self._ruined = divergence.refusal(before, refined)
             self.clock.lap("optimise")
             if self._ruined is not None:
                 return

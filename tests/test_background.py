@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from recon.background import SHELL, Config, background
 from recon.gaussians import Gaussians
-from recon.rasterize.cpu import rasterize
+from recon.rasterize.seen import seen
 from tests.synthetic import plane_pointmap
 
 WIDTH, HEIGHT = 64, 48
@@ -101,18 +101,8 @@ def test_each_direction_has_the_colour_of_the_view_that_looks_there():
 def test_no_gap_shows_through(yaw_deg):
     view, white = pointmap(turned(yaw_deg)), np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     shell = background([view], [white], Config())
-    image = rasterize(
-        shell.means,
-        shell.quats,
-        shell.scales,
-        shell.opacities,
-        shell.sh,
-        torch.from_numpy(view.T_world_camera).float(),
-        torch.from_numpy(view.K).float(),
-        WIDTH,
-        HEIGHT,
-        channels=("rgb",),
-    ).rgb
+    camera = torch.from_numpy(view.T_world_camera).float(), torch.from_numpy(view.K).float()
+    image = seen(shell, shell.opacities, *camera, WIDTH, HEIGHT).rgb
     assert image.min() > 0.8
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from recon.density import Config, gaussians_from_pointmap, initial_gaussians, redundant
 from recon.gaussians import Gaussians
 from recon.priors.pointmap import Pointmap
-from recon.rasterize.cpu import rasterize
+from recon.rasterize.seen import seen
 from tests.synthetic import plane_pointmap, without
 
 NORMAL = (0.36, 0.48, -0.8)  # of a slanted plane
@@ -286,17 +286,7 @@ def test_large_pieces_are_not_coarsened_beyond_what_a_partition_takes():
 
 def render(gaussians: Gaussians, pointmap: Pointmap) -> torch.Tensor:
     height, width = pointmap.depth.shape
-    image = rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        torch.from_numpy(pointmap.T_world_camera).float(),
-        torch.from_numpy(pointmap.K).float(),
-        width,
-        height,
-        channels=("rgb",),
-    ).rgb
+    camera = torch.from_numpy(pointmap.T_world_camera).float(), torch.from_numpy(pointmap.K).float()
+    image = seen(gaussians, gaussians.opacities, *camera, width, height).rgb
     assert image is not None
     return image

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from recon.gaussians import SH_C0, Gaussians, concatenate
 from recon.geometry import Similarity
-from recon.rasterize.cpu import rasterize
+from recon.rasterize.seen import seen
 from tests.synthetic import TinyScene, tiny_scene
 
 
@@ -22,18 +22,7 @@ def covariances(gaussians: Gaussians) -> np.ndarray:
 
 
 def render(scene: TinyScene, gaussians: Gaussians, T_world_camera: torch.Tensor) -> torch.Tensor:
-    image = rasterize(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.sh,
-        T_world_camera,
-        scene.Ks[0],
-        scene.width,
-        scene.height,
-        channels=("rgb",),
-    ).rgb
+    image = seen(gaussians, gaussians.opacities, T_world_camera, scene.Ks[0], scene.width, scene.height).rgb
     assert image is not None
     return image
 

@@ -27,7 +27,7 @@ from recon.evaluate.splits import load_split
 from recon.evaluate.truth import load_scene
 from recon.geometry import align_cameras
 from recon.judge import hopeless, judge
-from recon.pipeline import reconstruct
+from recon.pipeline import Reconstruction, reconstruct
 from recon.preview import render_rgb
 from recon.rasterize.cpu import rasterize
 from recon.registration import register
@@ -189,6 +189,18 @@ def test_a_scene_that_its_refinement_ruined_is_no_result():
     final = last(three(), replace(QUICK, optimize=replace(QUICK.optimize, rates=wild)))
     assert final.verdict.code is Code.DIVERGED and not final.verdict.publishable
     assert final.final and not final.cameras and not len(final.gaussians)
+
+
+def test_a_new_estimate_is_shown_after_a_ruined_scene():
+    wild = replace(QUICK.optimize.rates, means=1.0, log_scales=1.0)
+    work = Reconstruction(replace(QUICK, optimize=replace(QUICK.optimize, rates=wild)))
+    for frame in three():
+        work.take(frame)
+    work.estimate()
+    assert not list(work.refine(work.begun, work.config.optimize)) and work.snapshot().verdict.code is Code.DIVERGED
+    work.estimate()
+    work.show(work.begun)
+    assert work.snapshot().verdict.publishable and work.scene is not None
 
 
 def test_time_counts_from_the_first_frame_and_a_readers_time_is_waiting():
