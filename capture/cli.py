@@ -10,16 +10,16 @@ import pkgutil
 from collections.abc import Iterator
 from importlib import import_module
 
-from capture import cameras, daemon
-from capture.capture_config import CaptureConfig, is_live, open_stream
-from capture.config import load_config, read_yaml, typed
-from capture.frame import DroppedFrame, Frame
-from capture.logs import use_structured_lines
-from capture.messaging import keys as key_files
-from capture.messaging.network import Network
-from capture.reader import Reader, State
-from capture.recording import Recorder
-from capture.status import heartbeats
+from splatnode.capture import cameras, daemon
+from splatnode.capture.config import CaptureConfig, is_live, open_stream
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.messaging import keys as key_files
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.process.config import load_config, read_yaml, typed
+from splatnode.capture.process.logs import use_structured_lines
+from splatnode.capture.reader import Reader, State
+from splatnode.capture.recording import Recorder
+from splatnode.capture.status import heartbeats
 
 log = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ def find(args: argparse.Namespace) -> int:
     """Lists the cameras that are connected, in the words of a configuration."""
     found = {}
     for module in pkgutil.iter_modules(cameras.__path__):
-        source = import_module(f"capture.cameras.{module.name}")
+        source = import_module(f"splatnode.capture.cameras.{module.name}")
         if hasattr(source, "find"):
             found[module.name] = source.find()
     if args.json:

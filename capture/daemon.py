@@ -9,20 +9,20 @@ from contextlib import ExitStack
 
 import cv2
 
-from capture.capture_config import CaptureConfig, is_live, open_stream
-from capture.frame import DroppedFrame, Frame
-from capture.logs import event
-from capture.memory import keep_freed
-from capture.messaging.broadcast import Publisher
-from capture.messaging.keyframes import KeyframeServer
-from capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
-from capture.messaging.spool import Spool, SpoolFull
-from capture.messaging.wire import Numbering, WireError
-from capture.preview import encode_preview
-from capture.reader import Reader, State
-from capture.selection import Decision, Selector
-from capture.service_manager import ServiceManager
-from capture.status import HEARTBEAT_S, CaptureStatus, own_rss_mb
+from splatnode.capture.config import CaptureConfig, is_live, open_stream
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.messaging.broadcast import Publisher
+from splatnode.capture.messaging.keyframes import KeyframeServer
+from splatnode.capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
+from splatnode.capture.messaging.spool import Spool, SpoolFull
+from splatnode.capture.messaging.wire import Numbering, WireError
+from splatnode.capture.preview import encode_preview
+from splatnode.capture.process.logs import event
+from splatnode.capture.process.memory import keep_freed
+from splatnode.capture.process.service_manager import ServiceManager
+from splatnode.capture.reader import Reader, State
+from splatnode.capture.selection import Decision, Selector
+from splatnode.capture.status import HEARTBEAT_S, CaptureStatus, own_rss_mb
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ import math
 import struct
 from collections.abc import Mapping
 
-from capture.frame import Intrinsics
+from splatnode.capture.frame import Intrinsics
 
 IMAGE_WIDTH, IMAGE_LENGTH = 0x0100, 0x0101
 EXIF_IFD = 0x8769

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from capture import exif
-from capture.frame import Intrinsics
+from splatnode.capture import exif
+from splatnode.capture.frame import Intrinsics
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}  # of what can be decoded
 MAX_PIXELS = 100_000_000  # of an image, unless another limit is given

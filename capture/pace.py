@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from capture.frame import DroppedFrame, Frame
+from splatnode.capture.frame import DroppedFrame, Frame
 
 FramesPerSecond = Annotated[float, msgspec.Meta(ge=0.001, le=1000)]
 Pace = Literal["recorded", "fastest"]  # by the stamps, or as fast as the consumer reads

@@ -8,9 +8,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from capture.frame import Frame, reduced
-from capture.messaging.jpeg import from_jpeg, to_jpeg
-from capture.messaging.wire import Header, Message, Numbering, WireError
+from splatnode.capture.frame import Frame, reduced
+from splatnode.capture.messaging.jpeg import from_jpeg, to_jpeg
+from splatnode.capture.messaging.wire import Header, Message, Numbering, WireError
 
 _LARGEST_SIDE = 4096  # of what is decoded: a JPEG of a few bytes may ask for gigabytes
 

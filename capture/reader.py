@@ -13,8 +13,8 @@ from typing import Annotated
 
 import msgspec
 
-from capture.frame import DroppedFrame, Frame
-from capture.unavailable import CameraUnavailable
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.unavailable import CameraUnavailable
 
 log = logging.getLogger(__name__)
 

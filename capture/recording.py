@@ -17,9 +17,9 @@ from pathlib import Path
 import cv2
 import msgspec
 
-from capture.durable import sync_folder
-from capture.frame import DroppedFrame, Frame, Intrinsics
-from capture.image_file import MAX_PIXELS, UnusableImage, decode_image
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image
+from splatnode.capture.process.durable import sync_folder
 
 log = logging.getLogger(__name__)
 

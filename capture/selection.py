@@ -15,8 +15,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from capture.frame import Frame, reduced
-from capture.quality import Limits, assess, novelty, why_redundant, why_unusable
+from splatnode.capture.frame import Frame, reduced
+from splatnode.capture.quality import Limits, assess, novelty, why_redundant, why_unusable
 
 TRACKED_SIDE = 320  # the longer side of the images in which corners are followed is at least this
 CORNERS = 100

@@ -6,10 +6,10 @@ import os
 import time
 from typing import Any
 
-from capture.messaging.broadcast import Subscriber
-from capture.messaging.network import Network
-from capture.messaging.services import CAPTURE_STATUS, RECON_STATUS, Service
-from capture.messaging.wire import Header
+from splatnode.capture.messaging.broadcast import Subscriber
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.services import CAPTURE_STATUS, RECON_STATUS, Service
+from splatnode.capture.messaging.wire import Header
 
 HEARTBEAT_S = 1.0
 WAIT_S = 2.0

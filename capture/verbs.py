@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from capture.arguments import add_json, seconds
-from capture.verb import Verb, lazily
+from splatnode.capture.process.arguments import add_json, seconds
+from splatnode.capture.process.verb import Verb, lazily
 
 
 def _camera_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,9 +35,16 @@ def _status_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 VERBS = (
-    Verb("capture", "run the camera's process", _camera_arguments, lazily("capture.cli", "capture")),
-    Verb("record", "write what a camera sees into a folder", _record_arguments, lazily("capture.cli", "record")),
-    Verb("find", "list the cameras that are connected", add_json, lazily("capture.cli", "find")),
-    Verb("keys", "make this machine's keys; say who may connect", _keys_arguments, lazily("capture.cli", "keys")),
-    Verb("status", "tell how the running processes are", _status_arguments, lazily("capture.cli", "status")),
+    Verb("capture", "run the camera's process", _camera_arguments, lazily("splatnode.capture.cli", "capture")),
+    Verb(
+        "record", "write what a camera sees into a folder", _record_arguments, lazily("splatnode.capture.cli", "record")
+    ),
+    Verb("find", "list the cameras that are connected", add_json, lazily("splatnode.capture.cli", "find")),
+    Verb(
+        "keys",
+        "make this machine's keys; say who may connect",
+        _keys_arguments,
+        lazily("splatnode.capture.cli", "keys"),
+    ),
+    Verb("status", "tell how the running processes are", _status_arguments, lazily("splatnode.capture.cli", "status")),
 )

@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from recon.config import Config
-from recon.export.ply import ply_bytes
-from recon.scene import Scene
-from recon.verdict import Code
+from splatnode.recon.config import Config
+from splatnode.recon.result.export.ply import ply_bytes
+from splatnode.recon.result.verdict import Code
+from splatnode.recon.scene.scene import Scene
 
 STAYS = 0.5  # of the Gaussians that a scene begins with, after pruning without a limit: mean of 4 scenes of 6 views
 # What held-out views lacked, in dB of PSNR, where there was less: means of the 2 scenes of `tests.bench budgets`.

@@ -13,24 +13,24 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from capture.cameras import folder, synthetic
-from capture.config import read_yaml
-from capture.frame import DroppedFrame, Frame
-from recon.audience import viewer
-from recon.config import Config, overlaid, preset
-from recon.evaluate import methods
-from recon.evaluate.bench import Entrants, Plan, Scoring, run_bench, told
-from recon.evaluate.demo import write_capture
-from recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
-from recon.evaluate.records import merged, read_bench
-from recon.evaluate.report import redraw
-from recon.evaluate.splits import Split
-from recon.evaluate.truth import load_scene
-from recon.metric import in_metres
-from recon.pipeline import reconstruct
-from recon.rasterize.cpu import rasterize
-from recon.result import check_writable, finish
-from recon.snapshot import Snapshot
+from splatnode.capture.cameras import folder, synthetic
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.process.config import read_yaml
+from splatnode.recon.config import Config, overlaid, preset
+from splatnode.recon.evaluate import methods
+from splatnode.recon.evaluate.bench import Entrants, Plan, Scoring, run_bench, told
+from splatnode.recon.evaluate.demo import write_capture
+from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
+from splatnode.recon.evaluate.records import merged, read_bench
+from splatnode.recon.evaluate.report import redraw
+from splatnode.recon.evaluate.splits import Split
+from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.metric import in_metres
+from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.write import check_writable, finish
+from splatnode.recon.viewer_process import viewer
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
 LOOK_EVERY = 50  # iterations between the snapshots that a viewer is shown

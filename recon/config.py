@@ -9,25 +9,30 @@ import msgspec
 from msgspec import Meta
 from msgspec.structs import replace
 
-from capture.config import Plugin, merged, typed
-from recon import background, completion, density, dropout, judge, metric, optimize, pixelwise, screening
-from recon.control import prune
-from recon.control.control import ControlChoice
-from recon.export.ply import most_in_ply
-from recon.priors import classical
-from recon.verification import verify
+from splatnode.capture.process.config import Plugin, merged, typed
+from splatnode.recon import metric
+from splatnode.recon.frames import screening
+from splatnode.recon.matching import config as matching
+from splatnode.recon.optimize import dropout, refinement
+from splatnode.recon.optimize.control import prune
+from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.priors import classical
+from splatnode.recon.registration import config as registration
+from splatnode.recon.result.export.ply import most_in_ply
+from splatnode.recon.scene import background, completion, pixelwise, seeding
+from splatnode.recon.verification import decision, verify
 
 
 class PriorChoice(Plugin):
-    """What gives cameras and first points: a module of recon.priors."""
+    """What gives depth, and matches that plain features miss: a module of recon/priors."""
 
-    package = "recon.priors"
+    package = "splatnode.recon.priors"
     needs = ("Config", "load")
     usual = "classical"
 
 
 PRUNING = ControlChoice("prune", prune.Config())
-FITTING = optimize.Config(half_resolution_share=0.0, dssim=0.4, control=PRUNING, dropout=dropout.Config(share=0.4))
+FITTING = refinement.Config(half_resolution_share=0.0, dssim=0.4, control=PRUNING, dropout=dropout.Config(share=0.4))
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -35,14 +40,16 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0  # what generators of random numbers take
     prior: PriorChoice = PriorChoice("classical", classical.Config())
     screening: screening.Config = screening.Config()
+    matching: matching.Config = matching.Config()
+    registration: registration.Config = registration.Config()
     verification: verify.Config = verify.Config()
-    judge: judge.Config = judge.Config()
+    decision: decision.Config = decision.Config()
     completion: completion.Config = completion.Config()
-    density: density.Config = density.Config()
+    seeding: seeding.Config = seeding.Config()
     background: background.Config = background.Config()
     pixelwise: pixelwise.Config | None = None  # in place of completion, density and background, for comparison
-    preview: optimize.Config = optimize.Config(iterations=20, half_resolution_share=1.0)  # after each keyframe
-    optimize: optimize.Config = FITTING  # after the last one
+    preview: refinement.Config = refinement.Config(iterations=20, half_resolution_share=1.0)  # after each keyframe
+    optimize: refinement.Config = FITTING  # after the last one
     metric: metric.Config = metric.Config()  # of what is published
     max_gaussians: Annotated[int, Meta(ge=1)] | None = None  # None: as many as the scene calls for
     max_mb: Annotated[float, Meta(gt=0)] | None = None  # of scene.ply, in 10^6 bytes; None: as large as it gets

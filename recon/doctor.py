@@ -13,12 +13,12 @@ from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
 
-from capture.cameras import v4l2
-from capture.messaging import spool
-from capture.messaging.network import Network, runtime_directory
-from recon import core
-from recon.core.compile import find_compiler
-from recon.learned import PARTS, Part, obstacle
+from splatnode.capture.cameras import v4l2
+from splatnode.capture.messaging import spool
+from splatnode.capture.messaging.network import Network, runtime_directory
+from splatnode.recon import core
+from splatnode.recon.core.compile import find_compiler
+from splatnode.recon.networks.capabilities import PARTS, Part, obstacle
 
 _UDEV_RULES = Path("/etc/udev/rules.d")
 
@@ -179,7 +179,7 @@ def _lpips(network: str) -> Finding:
     """Loads the network, because a file of that name may hold something else."""
     name = f"lpips-{network}"
     try:
-        from recon.losses.lpips import load_lpips
+        from splatnode.recon.networks.lpips import load_lpips
 
         loaded = load_lpips(network)
     except (ImportError, OSError, ValueError) as error:

@@ -13,11 +13,11 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from recon.networks.crop import Crop
-from recon.networks.depth_anything import load_metric
-from recon.picture import take_picture
-from recon.scale import Scale
-from recon.snapshot import CameraEstimate, Snapshot
+from splatnode.recon.networks.crop import Crop
+from splatnode.recon.networks.depth_anything import load_metric
+from splatnode.recon.result.picture import take_picture
+from splatnode.recon.result.scale import Scale
+from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
 Map = npt.NDArray[np.float32]
 _VIEWS = 6  # that the network is asked about

@@ -12,23 +12,24 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 
 import msgspec
 
-from capture.frame import DroppedFrame, Frame
-from recon import divergence, growth, optimize
-from recon.budget import hits
-from recon.clock import Clock
-from recon.config import Config
-from recon.judging import Judgement, Judging
-from recon.keyframe import Features, Keyframe, modelled_image
-from recon.priors.pointmap import Pointmap
-from recon.priors.prior import Prior
-from recon.registration import features
-from recon.scene import Scene, begin
-from recon.screening import Look, Rejected, look, screen
-from recon.snapshot import GaussianArrays, Snapshot
-from recon.undistort import undistorted
-from recon.verdict import Verdict
-from recon.verification.likelihood import record
-from recon.view_graph import ViewGraph
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.recon.budget import hits
+from splatnode.recon.clock import Clock
+from splatnode.recon.config import Config
+from splatnode.recon.estimation import Judgement, Judging
+from splatnode.recon.frames.keyframe import Features, Keyframe, modelled_image
+from splatnode.recon.frames.screening import Look, Rejected, look, screen
+from splatnode.recon.frames.undistort import undistorted
+from splatnode.recon.matching import features
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.optimize import divergence, refinement
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors.prior import Prior
+from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
+from splatnode.recon.result.verdict import Verdict
+from splatnode.recon.scene import growth
+from splatnode.recon.scene.scene import Scene, begin
+from splatnode.recon.verification.likelihood import record
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +79,7 @@ def prepare(frame: Frame, config: Config, found: Features | None = None) -> Keyf
     No other frame is needed. Raises ValueError where the given intrinsics cannot be used.
     """
     frame = undistorted(frame)
-    found = found or features.extract(frame.image, config.prior.config.registration.features)
+    found = found or features.extract(frame.image, config.matching.features)
     return Keyframe(frame, modelled_image(frame.image, config.size), found)
 
 
@@ -88,9 +89,9 @@ class Reconstruction:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.clock = Clock()
-        settings = config.prior.config
-        self._prior: Prior = config.prior.module.load(msgspec.structs.replace(settings, seed=config.seed))
-        self.graph = ViewGraph(settings.registration, self._prior.matcher)
+        settings = msgspec.structs.replace(config.prior.config, seed=config.seed)
+        self._prior: Prior = config.prior.module.load(settings)
+        self.graph = ViewGraph(config.matching, self._prior.matcher)
         self.dropped: list[DroppedFrame] = []
         self.rejected: list[Rejected] = []  # those of `dropped` that the screening left out
         self.begun: Scene | None = None  # from the last estimate of all frames, not optimised
@@ -98,7 +99,7 @@ class Reconstruction:
         self._ruined: Verdict | None = None  # of the last refinement, if it was given up
         self.sequence = 0
         self._looks: dict[str, Look] = {}  # of the frames that were taken
-        self._judging = Judging(self._prior, config)
+        self._judging = Judging(config)
         self.pointmaps: dict[str, Pointmap] = {}  # by keyframe, as they were last computed
 
     @property
@@ -236,21 +237,21 @@ class Reconstruction:
             {keyframe.name: keyframe.image for keyframe in self.graph.keyframes},
             registration.cameras,
             config.completion,
-            config.density,
+            config.seeding,
             config.background,
             config.first_gaussians,
             config.pixelwise,
         )
         self.clock.lap("points")
 
-    def refine(self, scene: Scene | None, config: optimize.Config, deadline: float | None = None) -> Iterator[Scene]:
+    def refine(self, scene: Scene | None, config: refinement.Config, deadline: float | None = None) -> Iterator[Scene]:
         """`scene`, if there is one, at every checkpoint of its refinement and at the end, unless that ruins it."""
         if scene is None:
             return
         self.clock.lap("wait")
         self._ruined, before = None, divergence.misfit(scene)
         most = self.config.most_gaussians
-        for refined in optimize.refine(scene, config, seed=self.config.seed, deadline=deadline, max_gaussians=most):
+        for refined in refinement.refine(scene, config, seed=self.config.seed, deadline=deadline, max_gaussians=most):
             if refined.losses or refined.iterations in self.config.optimize.checkpoints:
                 self._ruined = divergence.refusal(before, refined)
             self.clock.lap("optimise")

@@ -8,8 +8,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from capture.arguments import add_json, counts, megabytes, names, natural, positive, seconds
-from capture.verb import Verb, lazily
+from splatnode.capture.process.arguments import add_json, counts, megabytes, names, natural, positive, seconds
+from splatnode.capture.process.verb import Verb, lazily
 
 EXPORT_FORMATS = ("ply", "spz", "splat", "colmap", "nerfstudio", "tum")
 
@@ -110,23 +110,32 @@ def _weights_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 VERBS = (
-    Verb("demo", "reconstruct the built-in capture", _demo_arguments, lazily("recon.cli", "demo")),
-    Verb("replay", "reconstruct a folder of photographs", _replay_arguments, lazily("recon.cli", "replay")),
-    Verb("export", "write a scene in another format", _export_arguments, lazily("recon.export.command", "export")),
-    Verb("recon", "reconstruct what comes, for ever", _recon_arguments, lazily("recon.daemon.daemon", "recon")),
-    Verb("retract", "take a keyframe back", _retract_arguments, lazily("recon.daemon.control", "retract")),
-    Verb("bench", "measure held-out quality, poses and seconds", _bench_arguments, lazily("recon.cli", "bench")),
+    Verb("demo", "reconstruct the built-in capture", _demo_arguments, lazily("splatnode.recon.cli", "demo")),
+    Verb("replay", "reconstruct a folder of photographs", _replay_arguments, lazily("splatnode.recon.cli", "replay")),
+    Verb(
+        "export",
+        "write a scene in another format",
+        _export_arguments,
+        lazily("splatnode.recon.result.export.command", "export"),
+    ),
+    Verb(
+        "recon", "reconstruct what comes, for ever", _recon_arguments, lazily("splatnode.recon.daemon.daemon", "recon")
+    ),
+    Verb("retract", "take a keyframe back", _retract_arguments, lazily("splatnode.recon.daemon.control", "retract")),
+    Verb(
+        "bench", "measure held-out quality, poses and seconds", _bench_arguments, lazily("splatnode.recon.cli", "bench")
+    ),
     Verb(
         "stability",
         "measure how often the answer is wrong",
         _stability_arguments,
-        lazily("recon.evaluate.stability.command", "stability"),
+        lazily("splatnode.recon.evaluate.stability.command", "stability"),
     ),
     Verb(
         "weights",
         "get and check the weights of optional networks",
         _weights_arguments,
-        lazily("recon.weights", "command"),
+        lazily("splatnode.recon.networks.weights", "command"),
     ),
-    Verb("doctor", "tell what is installed and what is missing", add_json, lazily("recon.doctor", "doctor")),
+    Verb("doctor", "tell what is installed and what is missing", add_json, lazily("splatnode.recon.doctor", "doctor")),
 )

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from recon.export.prepare import take
-from recon.snapshot import CameraEstimate, GaussianArrays
-from viewer.colours import middle, normals
-from viewer.support import Support
-from viewer.viewpoint import look_at, scene_up
+from splatnode.recon.result.export.prepare import take
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+from splatnode.viewer.colours import middle, normals
+from splatnode.viewer.support import Support
+from splatnode.viewer.viewpoint import look_at, scene_up
 
 Array = npt.NDArray[np.float64]
 

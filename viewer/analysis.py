@@ -5,9 +5,9 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass
 
-from viewer.advice import Advice, next_view, surface_points
-from viewer.moment import Moment
-from viewer.support import Support, support
+from splatnode.viewer.advice import Advice, next_view, surface_points
+from splatnode.viewer.moment import Moment
+from splatnode.viewer.support import Support, support
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from viewer.viewpoint import Viewpoint
+from splatnode.viewer.viewpoint import Viewpoint
 
 Array = npt.NDArray[np.floating]
 Image = npt.NDArray[np.uint8]  # (H, W, 3) RGB

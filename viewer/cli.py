@@ -10,15 +10,15 @@ from pathlib import Path
 
 import cv2
 
-from capture.config import read_yaml, typed
-from capture.messaging.network import Network
-from recon.picture import use_threads
-from viewer.moment import Moment
-from viewer.pictures import keep_picture, write_movie, write_series
-from viewer.probe import Probe, open3d_installed, probe_window
-from viewer.session import Session
-from viewer.sources import Finished, Live, Source, load_result
-from viewer.state import State
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.process.config import read_yaml, typed
+from splatnode.recon.result.picture import use_threads
+from splatnode.viewer.moment import Moment
+from splatnode.viewer.pictures import keep_picture, write_movie, write_series
+from splatnode.viewer.probe import Probe, open3d_installed, probe_window
+from splatnode.viewer.session import Session
+from splatnode.viewer.sources import Finished, Live, Source, load_result
+from splatnode.viewer.state import State
 
 EXIT_GOOD, EXIT_UNAVAILABLE = 0, 69
 
@@ -46,7 +46,7 @@ def view(args: argparse.Namespace) -> int:
     folder = args.out or (_beside(args.what) if finished is not None else Path("view"))
     if window is not None and window.window:
         source = _source(finished, network)
-        from viewer.window import show  # brings Open3D
+        from splatnode.viewer.window import show  # brings Open3D
 
         background = (lambda: None) if finished is not None else _give_way
         session, size = Session(source, State()), args.size or window.size

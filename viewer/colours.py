@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon.export.prepare import SH_C0
-from recon.export.quaternions import matrices_from_quats
-from recon.snapshot import CameraEstimate, GaussianArrays
-from viewer.moment import Moment
-from viewer.state import Colouring
-from viewer.support import Support
+from splatnode.recon.result.export.prepare import SH_C0
+from splatnode.recon.result.export.quaternions import matrices_from_quats
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+from splatnode.viewer.moment import Moment
+from splatnode.viewer.state import Colouring
+from splatnode.viewer.support import Support
 
 Array = npt.NDArray[np.float32]
 

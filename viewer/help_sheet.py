@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
-from viewer.state import help_lines
+from splatnode.viewer.state import help_lines
 
 
 class HelpSheet:

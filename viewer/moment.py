@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon.snapshot import Snapshot
+from splatnode.recon.result.snapshot import Snapshot
 
 MEMORY_BYTES = 256_000_000
 _SMALLEST = 16  # pixels: a photograph that is drawn smaller is a spot

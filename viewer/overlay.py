@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from viewer.canvas import NEAR, Array, Canvas, Image, in_camera
-from viewer.shapes import Lines, Photograph, Shapes
+from splatnode.viewer.canvas import NEAR, Array, Canvas, Image, in_camera
+from splatnode.viewer.shapes import Lines, Photograph, Shapes
 
 _BEHIND = 1.02  # a shape this many times as far as the surface is behind it
 _PIECES = 24  # that a line is cut into, each of them hidden or not

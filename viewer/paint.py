@@ -11,14 +11,14 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from recon.picture import take_picture
-from recon.snapshot import CameraEstimate, GaussianArrays
-from viewer.canvas import BACKGROUND, Array, Canvas, Image, empty_canvas
-from viewer.overlay import paint_shapes
-from viewer.points import paint_points
-from viewer.shapes import Shapes
-from viewer.state import State
-from viewer.viewpoint import Viewpoint
+from splatnode.recon.result.picture import take_picture
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+from splatnode.viewer.canvas import BACKGROUND, Array, Canvas, Image, empty_canvas
+from splatnode.viewer.overlay import paint_shapes
+from splatnode.viewer.points import paint_points
+from splatnode.viewer.shapes import Shapes
+from splatnode.viewer.state import State
+from splatnode.viewer.viewpoint import Viewpoint
 
 _LETTER = 8  # pixels, the width of a wide letter of a caption
 

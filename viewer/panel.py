@@ -8,18 +8,10 @@ from dataclasses import replace
 
 from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
-from recon.verdict import Code
-from viewer import words
-from viewer.session import Session
-from viewer.state import (
-    POINT_SIZES,
-    Colouring,
-    Engine,
-    State,
-    go_to_camera,
-    go_to_moment,
-    moment_index,
-)
+from splatnode.recon.result.verdict import Code
+from splatnode.viewer import words
+from splatnode.viewer.session import Session
+from splatnode.viewer.state import POINT_SIZES, Colouring, Engine, State, go_to_camera, go_to_moment, moment_index
 
 _LINE = 47  # characters
 _FREE = "free viewpoint"

@@ -12,16 +12,16 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from capture.image_file import encode_png
-from recon.export import ResultWriteError, write_file, write_files
-from viewer import words
-from viewer.analysis import Analysis, analyse
-from viewer.moment import Moment
-from viewer.paint import blended, caption, paint
-from viewer.shapes import Shapes, shapes
-from viewer.sources import Source
-from viewer.state import State
-from viewer.viewpoint import Viewpoint, at_camera, overview, swing
+from splatnode.capture.image_file import encode_png
+from splatnode.recon.result.export import ResultWriteError, write_file, write_files
+from splatnode.viewer import words
+from splatnode.viewer.analysis import Analysis, analyse
+from splatnode.viewer.moment import Moment
+from splatnode.viewer.paint import blended, caption, paint
+from splatnode.viewer.shapes import Shapes, shapes
+from splatnode.viewer.sources import Source
+from splatnode.viewer.state import State
+from splatnode.viewer.viewpoint import Viewpoint, at_camera, overview, swing
 
 Image = npt.NDArray[np.uint8]
 

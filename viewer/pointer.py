@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
-from viewer.session import Session
-from viewer.viewpoint import orbited, panned, zoomed
+from splatnode.viewer.session import Session
+from splatnode.viewer.viewpoint import orbited, panned, zoomed
 
 _TURN_PER_PIXEL = 0.006  # radians
 _ZOOM_PER_NOTCH = 0.88

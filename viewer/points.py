@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from recon.export.prepare import base_rgb
-from recon.snapshot import GaussianArrays
-from viewer.canvas import BACKGROUND, NEAR, Array, Canvas, in_camera
+from splatnode.recon.result.export.prepare import base_rgb
+from splatnode.recon.result.snapshot import GaussianArrays
+from splatnode.viewer.canvas import BACKGROUND, NEAR, Array, Canvas, in_camera
 
 
 def paint_points(

@@ -12,12 +12,12 @@ import numpy.typing as npt
 import open3d as o3d  # pyright: ignore[reportMissingImports]
 from open3d.visualization import rendering  # pyright: ignore[reportMissingImports]
 
-from recon.export.prepare import base_rgb
-from recon.snapshot import GaussianArrays
-from viewer.canvas import BACKGROUND
-from viewer.shapes import Lines, Photograph, Shapes
-from viewer.state import State
-from viewer.viewpoint import Viewpoint
+from splatnode.recon.result.export.prepare import base_rgb
+from splatnode.recon.result.snapshot import GaussianArrays
+from splatnode.viewer.canvas import BACKGROUND
+from splatnode.viewer.shapes import Lines, Photograph, Shapes
+from splatnode.viewer.state import State
+from splatnode.viewer.viewpoint import Viewpoint
 
 _BOUNDS = o3d.geometry.AxisAlignedBoundingBox(np.full(3, -20.0), np.full(3, 20.0))  # for near and far planes
 _CLOUD = "gaussians"

@@ -6,17 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from recon.snapshot import CameraEstimate, GaussianArrays
-from viewer.analysis import Analysis, Analyst
-from viewer.canvas import Canvas, Image, project
-from viewer.colours import coloured
-from viewer.moment import History, Moment, remembered
-from viewer.paint import blended, paint_gaussians, with_shapes
-from viewer.shapes import Photograph, Shapes, live_camera, shapes
-from viewer.sources import Source
-from viewer.state import Colouring, State, go_to_camera, press, shown_moment
-from viewer.support import Support
-from viewer.viewpoint import Viewpoint, at_camera, overview, scene_pivot
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+from splatnode.viewer.analysis import Analysis, Analyst
+from splatnode.viewer.canvas import Canvas, Image, project
+from splatnode.viewer.colours import coloured
+from splatnode.viewer.moment import History, Moment, remembered
+from splatnode.viewer.paint import blended, paint_gaussians, with_shapes
+from splatnode.viewer.shapes import Photograph, Shapes, live_camera, shapes
+from splatnode.viewer.sources import Source
+from splatnode.viewer.state import Colouring, State, go_to_camera, press, shown_moment
+from splatnode.viewer.support import Support
+from splatnode.viewer.viewpoint import Viewpoint, at_camera, overview, scene_pivot
 
 _CLICK_RADIUS = 14  # pixels around a camera's centre that are the camera
 

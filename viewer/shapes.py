@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from recon.snapshot import CameraEstimate
-from viewer.advice import Advice
-from viewer.colours import source_colour
-from viewer.moment import Moment
-from viewer.state import State
+from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.viewer.advice import Advice
+from splatnode.viewer.colours import source_colour
+from splatnode.viewer.moment import Moment
+from splatnode.viewer.state import State
 
 Array = npt.NDArray[np.float64]
 Colour = tuple[float, float, float]

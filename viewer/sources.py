@@ -16,19 +16,19 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from capture.frame import DroppedFrame
-from capture.image_file import UnusableImage, decode_image
-from capture.messaging.broadcast import Subscriber
-from capture.messaging.network import Network
-from capture.messaging.services import RECON_SCENE, RECON_STATUS
-from capture.messaging.state import StateClient
-from capture.messaging.wire import WireError
-from recon.daemon.scene_message import CameraRecord, SceneHeader, camera_from, from_message
-from recon.daemon.status import ReconStatus
-from recon.export import read_cameras, read_gaussians, viewer_safe
-from recon.snapshot import CameraEstimate, GaussianArrays, Snapshot
-from recon.verdict import Code, Verdict
-from viewer.moment import Moment
+from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.image_file import UnusableImage, decode_image
+from splatnode.capture.messaging.broadcast import Subscriber
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.services import RECON_SCENE, RECON_STATUS
+from splatnode.capture.messaging.state import StateClient
+from splatnode.capture.messaging.wire import WireError
+from splatnode.recon.daemon.status import ReconStatus
+from splatnode.recon.result.export import read_cameras, read_gaussians, viewer_safe
+from splatnode.recon.result.message import CameraRecord, SceneHeader, camera_from, from_message
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.viewer.moment import Moment
 
 log = logging.getLogger(__name__)
 

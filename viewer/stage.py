@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 from open3d.visualization import gui, rendering  # pyright: ignore[reportMissingImports]
 
-from viewer.canvas import BACKGROUND
-from viewer.scene3d import Scene3D, image3d, look_from
-from viewer.session import Session
-from viewer.state import open3d_draws
-from viewer.viewpoint import Viewpoint
+from splatnode.viewer.canvas import BACKGROUND
+from splatnode.viewer.scene3d import Scene3D, image3d, look_from
+from splatnode.viewer.session import Session
+from splatnode.viewer.state import open3d_draws
+from splatnode.viewer.viewpoint import Viewpoint
 
 Image = npt.NDArray[np.uint8]
 

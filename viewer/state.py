@@ -6,7 +6,7 @@ import enum
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from viewer.moment import History, Moment
+from splatnode.viewer.moment import History, Moment
 
 POINT_SIZES = (1, 12)  # pixels
 BLEND_STEP = 0.25

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from recon.picture import take_picture
-from recon.snapshot import CameraEstimate, GaussianArrays
-from viewer.canvas import in_camera
+from splatnode.recon.result.picture import take_picture
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+from splatnode.viewer.canvas import in_camera
 
 _LONGER_SIDE = 160  # pixels of the depth images that tell what is hidden
 _BEHIND = 1.05  # a Gaussian this many times as far as the surface that a camera sees there is hidden from it

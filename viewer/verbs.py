@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from capture.arguments import positive, size
-from capture.verb import Verb, lazily
+from splatnode.capture.process.arguments import positive, size
+from splatnode.capture.process.verb import Verb, lazily
 
 
 def _view_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,4 +26,6 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--until-final", action="store_true", help="without a window: stop when a scene is finished")
 
 
-VERBS = (Verb("view", "show a result, a scene or a running node", _view_arguments, lazily("viewer.cli", "view")),)
+VERBS = (
+    Verb("view", "show a result, a scene or a running node", _view_arguments, lazily("splatnode.viewer.cli", "view")),
+)

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from recon.snapshot import CameraEstimate
-from viewer.moment import Moment
+from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.viewer.moment import Moment
 
 Array = npt.NDArray[np.float64]
 

@@ -15,15 +15,15 @@ from pathlib import Path
 import open3d as o3d  # pyright: ignore[reportMissingImports]
 from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
-from capture.image_file import encode_png
-from recon.export import write_file
-from viewer import words
-from viewer.help_sheet import HelpSheet
-from viewer.panel import Panel
-from viewer.pointer import Pointer
-from viewer.session import Session
-from viewer.stage import Image, Stage
-from viewer.state import Engine, open3d_draws
+from splatnode.capture.image_file import encode_png
+from splatnode.recon.result.export import write_file
+from splatnode.viewer import words
+from splatnode.viewer.help_sheet import HelpSheet
+from splatnode.viewer.panel import Panel
+from splatnode.viewer.pointer import Pointer
+from splatnode.viewer.session import Session
+from splatnode.viewer.stage import Image, Stage
+from splatnode.viewer.state import Engine, open3d_draws
 
 _CALM_S = 1.0  # after what was last to be done
 _NAP_S = 0.05  # then: Open3D asks a hundred times a second whether there is anything, which takes 2 % of a processor

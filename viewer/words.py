@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from viewer.advice import Advice
-from viewer.moment import History, Moment
-from viewer.state import State, moment_index
+from splatnode.viewer.advice import Advice
+from splatnode.viewer.moment import History, Moment
+from splatnode.viewer.state import State, moment_index
 
 _STALE_S = 5.0  # a node that is at work is heard from more often
 _MOST_DROPPED = 6

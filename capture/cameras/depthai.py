@@ -16,10 +16,10 @@ import cv2
 import msgspec
 import numpy as np
 
-from capture.frame import Frame, Intrinsics
-from capture.logs import event
-from capture.pace import FramesPerSecond
-from capture.unavailable import CameraUnavailable
+from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.pace import FramesPerSecond
+from splatnode.capture.process.logs import event
+from splatnode.capture.unavailable import CameraUnavailable
 
 log = logging.getLogger(__name__)
 

@@ -10,10 +10,10 @@ from typing import Annotated
 
 import msgspec
 
-from capture import recording
-from capture.frame import DroppedFrame, Frame, Intrinsics
-from capture.image_file import MAX_PIXELS, SUFFIXES, UnusableImage, decode_image
-from capture.pace import FramesPerSecond, Pace, paced
+from splatnode.capture import recording
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.image_file import MAX_PIXELS, SUFFIXES, UnusableImage, decode_image
+from splatnode.capture.pace import FramesPerSecond, Pace, paced
 
 # Photographs that cannot be decoded here: they are named, so that nobody wonders where they went.
 FOREIGN_SUFFIXES = {".heic", ".heif", ".avif", ".jxl", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf"}

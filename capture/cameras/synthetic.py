@@ -1,7 +1,7 @@
 """A camera that needs no camera: hand-held photographs of a procedural place, with everything known about them.
 
 The frames carry no intrinsics, as those of an unknown camera do. What is known is for tests and benchmarks:
-scene_cameras, held_out_cameras and depth. The place is made by capture.diorama; this file photographs it.
+scene_cameras, held_out_cameras and depth. The place is made by splatnode.capture.diorama; this file photographs it.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from capture.diorama.cast import Camera, Matrix, cast
-from capture.diorama.layout import place
-from capture.diorama.solids import Solid
-from capture.frame import Frame
-from capture.pace import FramesPerSecond
+from splatnode.capture.diorama.cast import Camera, Matrix, cast
+from splatnode.capture.diorama.layout import place
+from splatnode.capture.diorama.solids import Solid
+from splatnode.capture.frame import Frame
+from splatnode.capture.pace import FramesPerSecond
 
 TARGET = np.array([1.05, 1.05, 0.82])  # what the photographer looks at: the table in the corner, metres
 
@@ -48,7 +48,7 @@ def frame_name(index: int) -> str:
 
 
 def scene_cameras(config: Config) -> list[Camera]:
-    """The cameras of the stream, in its order; world axes as in capture.diorama.layout."""
+    """The cameras of the stream, in its order; world axes as in splatnode.capture.diorama.layout."""
     return [_camera_on_path(config, float(index)) for index in range(config.views)]
 
 

@@ -13,12 +13,12 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from capture.frame import DroppedFrame, Frame, Intrinsics
-from capture.image_file import UnusableImage, decode_image
-from capture.pace import FramesPerSecond
-from capture.unavailable import CameraUnavailable
-from capture.video4linux import locks
-from capture.video4linux.device import Device, Format, RawFrame, System
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.image_file import UnusableImage, decode_image
+from splatnode.capture.pace import FramesPerSecond
+from splatnode.capture.unavailable import CameraUnavailable
+from splatnode.capture.video4linux import locks
+from splatnode.capture.video4linux.device import Device, Format, RawFrame, System
 
 LIVE = True
 

@@ -10,8 +10,8 @@ import cv2
 import msgspec
 import numpy as np
 
-from capture.frame import DroppedFrame, Frame, Intrinsics
-from capture.pace import Pace, paced
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.pace import Pace, paced
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

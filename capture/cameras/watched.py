@@ -10,10 +10,10 @@ from typing import Annotated
 
 import msgspec
 
-from capture.cameras.folder import foreign_file, frame_name, image_paths
-from capture.frame import DroppedFrame, Frame, Intrinsics
-from capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_header
-from capture.unavailable import CameraUnavailable
+from splatnode.capture.cameras.folder import foreign_file, frame_name, image_paths
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_header
+from splatnode.capture.unavailable import CameraUnavailable
 
 _TEMPORARY_SUFFIXES = {".tmp", ".part", ".partial", ".crdownload", ".filepart"}
 

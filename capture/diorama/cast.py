@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from capture.diorama.solids import Array, Solid, ray_interval, surface_coordinates
+from splatnode.capture.diorama.solids import Array, Solid, ray_interval, surface_coordinates
 
 Matrix = npt.NDArray[np.float64]
 Camera = tuple[Matrix, Matrix]  # T_world_camera (4, 4); K (3, 3), centre of the top-left pixel at (0.5, 0.5)

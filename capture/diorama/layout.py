@@ -11,10 +11,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from capture.diorama import prints
-from capture.diorama import textures as paint
-from capture.diorama.light import Light, lit
-from capture.diorama.solids import Shape, Solid, face_size
+from splatnode.capture.diorama import prints
+from splatnode.capture.diorama import textures as paint
+from splatnode.capture.diorama.light import Light, lit
+from splatnode.capture.diorama.solids import Shape, Solid, face_size
 
 TOWARDS_CAMERAS = 45.0  # yaw in degrees: round things turn the seam of their skin to the corner
 

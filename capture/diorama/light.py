@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from capture.diorama.solids import Array, Solid, face_points, face_size, ray_interval
+from splatnode.capture.diorama.solids import Array, Solid, face_points, face_size, ray_interval
 
 
 @dataclass(frozen=True)

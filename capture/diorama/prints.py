@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from capture.diorama.textures import Colour, Image, Painter, noise, shaded, texels, to_image
+from splatnode.capture.diorama.textures import Colour, Image, Painter, noise, shaded, texels, to_image
 
 _VOCABULARY = (
     "light field view scene depth north river orbit lens sun paper garden stone harbour window signal atlas motion "

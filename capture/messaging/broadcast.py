@@ -12,9 +12,9 @@ import msgspec
 import numpy.typing as npt
 import zmq
 
-from capture.messaging.network import Endpoint, Network
-from capture.messaging.services import Service
-from capture.messaging.wire import Message, WireError, decode, encode
+from splatnode.capture.messaging.network import Endpoint, Network
+from splatnode.capture.messaging.services import Service
+from splatnode.capture.messaging.wire import Message, WireError, decode, encode
 
 
 class Publisher(Endpoint):

@@ -11,9 +11,9 @@ from typing import Any
 import msgspec
 import zmq
 
-from capture.messaging.network import REQUEST_LIMITS, Endpoint, Network
-from capture.messaging.services import Service
-from capture.messaging.wire import WireError, decode, encode
+from splatnode.capture.messaging.network import REQUEST_LIMITS, Endpoint, Network
+from splatnode.capture.messaging.services import Service
+from splatnode.capture.messaging.wire import WireError, decode, encode
 
 
 class NoAnswer(RuntimeError):

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from capture.image_file import UnusableImage, decode_image
-from capture.messaging.wire import WireError
+from splatnode.capture.image_file import UnusableImage, decode_image
+from splatnode.capture.messaging.wire import WireError
 
 
 def to_jpeg(image: npt.NDArray[np.uint8], quality: int) -> npt.NDArray[np.uint8]:

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import msgspec
 
-from capture.frame import DroppedFrame, Frame, Intrinsics
-from capture.messaging.spool import Key
-from capture.messaging.wire import Header, Message, Numbering, Part, Sequential, SessionId, WireError, encode
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.messaging.spool import Key
+from splatnode.capture.messaging.wire import Header, Message, Numbering, Part, Sequential, SessionId, WireError, encode
 
 _LONGEST_NAME = 255
 

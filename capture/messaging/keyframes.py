@@ -23,8 +23,8 @@ from dataclasses import dataclass, field
 
 import zmq
 
-from capture.frame import DroppedFrame, Frame
-from capture.messaging.keyframe_messages import (
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.messaging.keyframe_messages import (
     Acknowledge,
     DroppedHeader,
     FrameHeader,
@@ -33,10 +33,10 @@ from capture.messaging.keyframe_messages import (
     received,
     to_message,
 )
-from capture.messaging.network import REQUEST_LIMITS, Endpoint, Network
-from capture.messaging.services import CAPTURE_KEYFRAMES
-from capture.messaging.spool import Key, Spool
-from capture.messaging.wire import Numbering, WireError, decode, encode
+from splatnode.capture.messaging.network import REQUEST_LIMITS, Endpoint, Network
+from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES
+from splatnode.capture.messaging.spool import Key, Spool
+from splatnode.capture.messaging.wire import Numbering, WireError, decode, encode
 
 log = logging.getLogger(__name__)
 

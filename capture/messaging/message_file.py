@@ -7,8 +7,8 @@ import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from capture.durable import write_whole
-from capture.messaging.wire import Part
+from splatnode.capture.messaging.wire import Part
+from splatnode.capture.process.durable import write_whole
 
 _HEAD = struct.Struct("<8sIQI")  # magic, parts, bytes of the body, its CRC-32
 _MAGIC = b"SPLSPOOL"

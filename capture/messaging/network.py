@@ -23,10 +23,10 @@ import msgspec
 import zmq
 from zmq.utils.monitor import recv_monitor_message
 
-from capture.lock import Held, exclusive
-from capture.messaging import wire
-from capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
-from capture.messaging.services import Service
+from splatnode.capture.messaging import wire
+from splatnode.capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
+from splatnode.capture.messaging.services import Service
+from splatnode.capture.process.lock import Held, exclusive
 
 log = logging.getLogger(__name__)
 

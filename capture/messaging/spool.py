@@ -15,16 +15,16 @@ from typing import Annotated, NamedTuple
 
 import msgspec
 
-from capture.lock import exclusive
-from capture.messaging.message_file import read_message, size_in_file, write_message
-from capture.messaging.wire import Part
-from capture.state_directory import state_directory
+from splatnode.capture.messaging.message_file import read_message, size_in_file, write_message
+from splatnode.capture.messaging.wire import Part
+from splatnode.capture.process.lock import exclusive
+from splatnode.capture.process.state_directory import state_directory
 
 log = logging.getLogger(__name__)
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    directory: Path | None = None  # None: capture.state_directory
+    directory: Path | None = None  # None: splatnode.capture.process.state_directory
     max_frames: Annotated[int, msgspec.Meta(ge=1)] = 200
     max_mb: Annotated[int, msgspec.Meta(ge=1)] = 1024
 

@@ -17,9 +17,9 @@ import msgspec
 import numpy.typing as npt
 import zmq
 
-from capture.messaging.network import REQUEST_LIMITS, Endpoint, Network
-from capture.messaging.services import Service
-from capture.messaging.wire import Message, Part, Sequential, SessionId, WireError, decode, encode
+from splatnode.capture.messaging.network import REQUEST_LIMITS, Endpoint, Network
+from splatnode.capture.messaging.services import Service
+from splatnode.capture.messaging.wire import Message, Part, Sequential, SessionId, WireError, decode, encode
 
 ASK_EVERY_S = 1.0
 

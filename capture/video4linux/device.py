@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from capture.video4linux import layout as v4l2
+from splatnode.capture.video4linux import layout as v4l2
 
 BUFFERS = 4
 

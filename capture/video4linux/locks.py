@@ -6,8 +6,8 @@ import errno
 import logging
 from dataclasses import dataclass
 
-from capture.logs import event
-from capture.video4linux.device import Device
+from splatnode.capture.process.logs import event
+from splatnode.capture.video4linux.device import Device
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from recon.core.compile import INSTRUCTION_SETS, library_path, machine
+from splatnode.recon.core.compile import INSTRUCTION_SETS, library_path, machine
 
 # What /proc/cpuinfo must list before a library may be loaded.
 _REQUIRED_FLAGS = {

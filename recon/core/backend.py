@@ -17,7 +17,7 @@ from setuptools.build_meta import (
     prepare_metadata_for_build_wheel,
 )
 
-from recon.core.compile import compile_core, find_compiler, platform_tag
+from splatnode.recon.core.compile import compile_core, find_compiler, platform_tag
 
 __all__ = [
     "build_editable",

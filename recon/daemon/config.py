@@ -7,9 +7,9 @@ from typing import Annotated
 
 import msgspec
 
-from capture.messaging.network import Network
-from recon.config import Config as Reconstruction
-from recon.daemon.tracking import Config as Tracking
+from splatnode.capture.messaging.network import Network
+from splatnode.recon.config import Config as Reconstruction
+from splatnode.recon.daemon.tracking import Config as Tracking
 
 Positive = Annotated[int, msgspec.Meta(ge=1)]
 
@@ -18,7 +18,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     network: Network = Network()
     reconstruction: Reconstruction = Reconstruction()
     tracking: Tracking = Tracking()  # of the live camera against a finished scene
-    checkpoint: Path | None = None  # None: recon/ in capture.state_directory
+    checkpoint: Path | None = None  # None: recon/ in splatnode.capture.process.state_directory
     out: Path = Path("out")  # each place becomes a folder in it
     max_views: Annotated[int, msgspec.Meta(ge=4)] = 30  # beyond, those that others show too are given up
     max_gaussians: Positive = 300_000

@@ -6,10 +6,10 @@ import argparse
 
 import msgspec
 
-from capture.config import load_config
-from capture.messaging.commands import ask
-from capture.messaging.services import RECON_CONTROL
-from recon.daemon.config import Config
+from splatnode.capture.messaging.commands import ask
+from splatnode.capture.messaging.services import RECON_CONTROL
+from splatnode.capture.process.config import load_config
+from splatnode.recon.daemon.config import Config
 
 
 class Retract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="retract"):

@@ -2,8 +2,8 @@
 
 intake    capture.keyframes -> checkpoint, acknowledged -> inbox
 worker    inbox -> scenes, saved and exported
-watcher   capture.preview -> has the camera moved?
-main      recon.scene, recon.status, recon.control; the service manager; signals
+watcher   splatnode.capture.preview -> has the camera moved?
+main      splatnode.recon.scene.scene, recon.status, splatnode.recon.optimize.control; the service manager; signals
 """
 
 from __future__ import annotations
@@ -19,27 +19,27 @@ from pathlib import Path
 
 import msgspec
 
-from capture.config import load_config
-from capture.logs import event, use_structured_lines
-from capture.messaging.broadcast import Publisher
-from capture.messaging.commands import CommandServer
-from capture.messaging.services import RECON_CONTROL, RECON_SCENE, RECON_STATUS
-from capture.messaging.state import StateServer
-from capture.messaging.wire import Numbering
-from capture.service_manager import ServiceManager
-from capture.state_directory import state_directory
-from capture.status import own_rss_mb
-from capture.stop_signals import on_first
-from recon.daemon.config import Config
-from recon.daemon.control import Answer, Retract
-from recon.daemon.inbox import Inbox, LeftOut
-from recon.daemon.intake import Intake
-from recon.daemon.output import Shown
-from recon.daemon.scene_message import camera_record, to_message
-from recon.daemon.status import ReconStatus, State
-from recon.daemon.store import Store
-from recon.daemon.watcher import Watcher
-from recon.daemon.worker import Worker
+from splatnode.capture.messaging.broadcast import Publisher
+from splatnode.capture.messaging.commands import CommandServer
+from splatnode.capture.messaging.services import RECON_CONTROL, RECON_SCENE, RECON_STATUS
+from splatnode.capture.messaging.state import StateServer
+from splatnode.capture.messaging.wire import Numbering
+from splatnode.capture.process.config import load_config
+from splatnode.capture.process.logs import event, use_structured_lines
+from splatnode.capture.process.service_manager import ServiceManager
+from splatnode.capture.process.state_directory import state_directory
+from splatnode.capture.process.stop_signals import on_first
+from splatnode.capture.status import own_rss_mb
+from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.config import Config
+from splatnode.recon.daemon.control import Answer, Retract
+from splatnode.recon.daemon.inbox import Inbox, LeftOut
+from splatnode.recon.daemon.intake import Intake
+from splatnode.recon.daemon.output import Shown
+from splatnode.recon.daemon.status import ReconStatus, State
+from splatnode.recon.daemon.watcher import Watcher
+from splatnode.recon.daemon.worker import Worker
+from splatnode.recon.result.message import camera_record, to_message
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ import threading
 from collections import deque
 from dataclasses import dataclass
 
-from recon.keyframe import Keyframe
+from splatnode.recon.frames.keyframe import Keyframe
 
 CAPACITY = 32  # events in memory; further keyframes wait with their sender
 

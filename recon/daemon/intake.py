@@ -6,13 +6,13 @@ import logging
 import threading
 import time
 
-from capture.messaging.keyframe_messages import ReceivedFrame
-from capture.messaging.keyframes import KeyframeClient
-from capture.messaging.network import Network
-from recon.config import Config
-from recon.daemon.inbox import Arrived, Inbox, LeftOut
-from recon.daemon.store import Store, StoredFrame
-from recon.pipeline import prepare
+from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
+from splatnode.capture.messaging.keyframes import KeyframeClient
+from splatnode.capture.messaging.network import Network
+from splatnode.recon.config import Config
+from splatnode.recon.daemon.checkpoint.store import Store, StoredFrame
+from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
+from splatnode.recon.pipeline import prepare
 
 log = logging.getLogger(__name__)
 

@@ -6,14 +6,14 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from capture.logs import event
-from recon.daemon import checkpoint
-from recon.daemon.config import Config
-from recon.daemon.reconstruction import LiveReconstruction
-from recon.daemon.store import Store
-from recon.metric import in_metres
-from recon.result import finish
-from recon.snapshot import Snapshot
+from splatnode.capture.process.logs import event
+from splatnode.recon.daemon.checkpoint import checkpoint
+from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.config import Config
+from splatnode.recon.daemon.reconstruction import LiveReconstruction
+from splatnode.recon.metric import in_metres
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.write import finish
 
 log = logging.getLogger(__name__)
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 
-from recon.config import Config
-from recon.judging import Judgement
-from recon.keyframe import Keyframe
-from recon.pipeline import Reconstruction
-from recon.registration.two_view import TwoView
-from recon.screening import look
+from splatnode.recon.config import Config
+from splatnode.recon.estimation import Judgement
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.frames.screening import look
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.pipeline import Reconstruction
 
 
 class LiveReconstruction(Reconstruction):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import enum
 
-from capture.messaging.wire import Header
-from recon.daemon.scene_message import CameraRecord
+from splatnode.capture.messaging.wire import Header
+from splatnode.recon.result.message import CameraRecord
 
 
 class State(enum.Enum):

@@ -17,10 +17,10 @@ import poselib
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from recon.keyframe import Keyframe
-from recon.picture import take_picture
-from recon.registration import features, matching
-from recon.snapshot import Snapshot
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.matching import features, nearest_neighbours
+from splatnode.recon.result.picture import take_picture
+from splatnode.recon.result.snapshot import Snapshot
 
 Array = npt.NDArray[np.float64]
 
@@ -107,7 +107,8 @@ def locate(
     """
     found = features.extract(image, _feature_config(config))
     chosen = [place for place in known if place.name in likely] if likely else list(known)
-    matches = [matching.match(found.descriptors, place.descriptors, matching.Config()) for place in chosen]
+    ratio_test = nearest_neighbours.Config()
+    matches = [nearest_neighbours.match(found.descriptors, place.descriptors, ratio_test) for place in chosen]
     best = sorted(range(len(chosen)), key=lambda i: -len(matches[i]))[: config.keyframes]
     if not best or sum(len(matches[i]) for i in best) < config.min_inliers:
         return None

@@ -10,15 +10,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from capture.logs import event
-from capture.messaging.broadcast import Subscriber
-from capture.messaging.network import Network
-from capture.messaging.services import CAPTURE_PREVIEW
-from capture.messaging.wire import WireError
-from capture.preview import PreviewHeader, decode_preview
-from recon.daemon.tracking import Config, Motion, Watch, landmarks
-from recon.keyframe import Keyframe
-from recon.snapshot import CameraEstimate, Snapshot
+from splatnode.capture.messaging.broadcast import Subscriber
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.services import CAPTURE_PREVIEW
+from splatnode.capture.messaging.wire import WireError
+from splatnode.capture.preview import PreviewHeader, decode_preview
+from splatnode.capture.process.logs import event
+from splatnode.recon.daemon.tracking import Config, Motion, Watch, landmarks
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
 log = logging.getLogger(__name__)
 

@@ -11,17 +11,18 @@ from functools import partial
 
 import msgspec
 
-from capture.logs import event
-from recon.daemon import checkpoint, place
-from recon.daemon.config import Config
-from recon.daemon.inbox import Arrived, Inbox, LeftOut
-from recon.daemon.output import Output, Shown
-from recon.daemon.reconstruction import LiveReconstruction
-from recon.daemon.status import State
-from recon.daemon.store import Store
-from recon.daemon.watcher import Finished
-from recon.keyframe import Keyframe
-from recon.snapshot import Snapshot
+from splatnode.capture.process.logs import event
+from splatnode.recon.daemon import membership
+from splatnode.recon.daemon.checkpoint import checkpoint
+from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.config import Config
+from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
+from splatnode.recon.daemon.output import Output, Shown
+from splatnode.recon.daemon.reconstruction import LiveReconstruction
+from splatnode.recon.daemon.status import State
+from splatnode.recon.daemon.watcher import Finished
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.result.snapshot import Snapshot
 
 log = logging.getLogger(__name__)
 
@@ -107,7 +108,7 @@ class Worker:
             self._show_grown(arrived)
         if strangers and self._receive(strangers):
             self._show_grown(arrived)
-        self.state = State.LOST if place.strangers(self._work) else State.GROWING
+        self.state = State.LOST if membership.strangers(self._work) else State.GROWING
 
     def _show_grown(self, arrived: Sequence[Arrived]) -> None:
         """The scene with the keyframes that have come to belong to it."""
@@ -135,7 +136,7 @@ class Worker:
     def _added(self, keyframes: list[Keyframe]) -> set[str]:
         """Adds keyframes to the view graph; names those that do not fit at once, which are set aside."""
         try:
-            return place.add(self._work, keyframes)
+            return membership.add(self._work, keyframes)
         except Exception as error:  # one bad frame must not keep others out
             self._work.retract([keyframe.name for keyframe in keyframes])
             if len(keyframes) > 1:
@@ -150,11 +151,11 @@ class Worker:
         They are judged thoroughly with all others, as long as what waits can wait; if they are too many, in any case.
         If that does not help them, another place begins with them.
         """
-        lost = len(place.strangers(self._work)) >= self._config.lost_after
+        lost = len(membership.strangers(self._work)) >= self._config.lost_after
         pause = partial(self._pause, math.inf if lost else time.monotonic() + PATIENCE_S)
         aside = [keyframe.name for keyframe in self._work.aside]
-        joined = place.connected(self._work, pause) and (
-            place.join(self._work, aside, pause) or (not lost and place.join(self._work, newest, pause))
+        joined = membership.connected(self._work, pause) and (
+            membership.join(self._work, aside, pause) or (not lost and membership.join(self._work, newest, pause))
         )
         for keyframe in self._work.aside[: -max(MOST_ASIDE, self._config.lost_after)]:
             self._forget(keyframe.name, "it does not fit the scene")
@@ -162,7 +163,7 @@ class Worker:
 
     def _lost(self, newest: Collection[str]) -> bool:
         """Says which of the newest keyframes do not fit; where too many in a row do not, another place begins."""
-        strangers = place.strangers(self._work)
+        strangers = membership.strangers(self._work)
         for keyframe in strangers:
             if keyframe.name in newest:
                 event(log, logging.WARNING, "does_not_fit", frame=keyframe.name, scene=self._store.scene_id)
@@ -185,9 +186,9 @@ class Worker:
     def _make_room(self, coming: int) -> None:
         """Gives up views that can be spared, so that there are not more than configured."""
         for _ in range(len(self._work.names) + coming - self._config.max_views):
-            if len(self._work.names) <= place.NEWEST:
+            if len(self._work.names) <= membership.NEWEST:
                 return
-            name = place.most_redundant(self._work.graph)
+            name = membership.most_redundant(self._work.graph)
             event(log, logging.INFO, "given_up", frame=name)
             self._forget(name, "given up for newer views that show the same")
 
@@ -213,8 +214,8 @@ class Worker:
         config = self._recipe.optimize
         steps = msgspec.structs.replace(config, checkpoints=tuple(range(STEP, config.iterations, STEP)))
         fitted = set(self._work.names)
-        place.prove(self._work, self._pause)
-        for keyframe in place.contradicting(self._work):
+        membership.prove(self._work, self._pause)
+        for keyframe in membership.contradicting(self._work):
             self._forget(keyframe.name, "it contradicts the scene")
         self._lost(fitted)
         self._work.estimate(self._pause)
@@ -231,7 +232,7 @@ class Worker:
         if shown:
             exported = self._output.export(snapshot)
             self._output.save(self._work, final=exported)  # what is kept as final is not exported after a restart
-        self.state = State.WAITING if not shown else State.LOST if place.strangers(self._work) else State.IDLE
+        self.state = State.WAITING if not shown else State.LOST if membership.strangers(self._work) else State.IDLE
 
     def _pause(self, until_s: float = 0.0) -> None:
         """Raises _Abandoned if the daemon stops, and from `until_s` (monotonic) on if something has come."""

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 
 import msgspec
 
-from recon import density, pixelwise
-from recon.config import Config
-from recon.regularise import Term
+from splatnode.recon.config import Config
+from splatnode.recon.optimize.regularise import Term
+from splatnode.recon.scene import pixelwise, seeding
 
 BASE, WHOLE = "instantsplat-xl", "paper"
 _LOSSES = {"point-render": "point_render", "depth": "depth", "normal": "normal", "semantic": "semantic"}
 _SETTINGS = ("pseudo-views", "down-sampling", "pose-refinement")
-_NO_THINNING = density.Config(depth_tolerance=0.0)
+_NO_THINNING = seeding.Config(depth_tolerance=0.0)
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recon.export import viewer_safe
-from recon.export.ply import ply_bytes
-from recon.preview import render_rgb
-from recon.rasterize.render import Render
-from recon.snapshot import GaussianArrays, Snapshot
+from splatnode.recon.rasterize.render import Render
+from splatnode.recon.result.export import viewer_safe
+from splatnode.recon.result.export.ply import ply_bytes
+from splatnode.recon.result.preview import render_rgb
+from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 
 Array = npt.NDArray[np.float64]
 Rasterize = Callable[..., Render]

@@ -12,19 +12,19 @@ from pathlib import Path
 
 import msgspec
 
-from capture.frame import Frame
-from recon.config import Config
-from recon.evaluate.appearance import Rasterize
-from recon.evaluate.process import call_alone, run_alone
-from recon.evaluate.protocol import STAGES, Networks, Poses, Row, Run, Settings, evaluate, shown_to_nobody
-from recon.evaluate.records import Bench, bench_files, read_bench, run_of, this_machine
-from recon.evaluate.renders import Renders
-from recon.evaluate.report import report_files
-from recon.evaluate.splits import Split, load_split
-from recon.evaluate.start import Start, find_start
-from recon.evaluate.truth import EvaluationScene, load_scene
-from recon.export.staged import write_files
-from recon.snapshot import Snapshot
+from splatnode.capture.frame import Frame
+from splatnode.recon.config import Config
+from splatnode.recon.evaluate.appearance import Rasterize
+from splatnode.recon.evaluate.process import call_alone, run_alone
+from splatnode.recon.evaluate.protocol import STAGES, Networks, Poses, Row, Run, Settings, evaluate, shown_to_nobody
+from splatnode.recon.evaluate.records import Bench, bench_files, read_bench, run_of, this_machine
+from splatnode.recon.evaluate.renders import Renders
+from splatnode.recon.evaluate.report import report_files
+from splatnode.recon.evaluate.splits import Split, load_split
+from splatnode.recon.evaluate.start import Start, find_start
+from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.result.export.staged import write_files
+from splatnode.recon.result.snapshot import Snapshot
 
 # Photographs, a method's name, a seed and what it may start from; it is sent to another process.
 Reconstruct = Callable[[Sequence[Frame], str, int, Start | None], Iterator[Snapshot]]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from recon.geometry import Similarity, align_cameras
+from splatnode.recon.geometry import Similarity, align_cameras
 
 Array = npt.NDArray[np.float64]
 

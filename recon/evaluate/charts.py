@@ -14,10 +14,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from recon.evaluate.ablation import is_variant, variants
-from recon.evaluate.protocol import Row, mean
-from recon.evaluate.summary import Point, points, shared
-from recon.evaluate.tables import PSNR, SSIM, Measure, lpips, paired
+from splatnode.recon.evaluate.ablation import is_variant, variants
+from splatnode.recon.evaluate.protocol import Row, mean
+from splatnode.recon.evaluate.summary import Point, points, shared
+from splatnode.recon.evaluate.tables import PSNR, SSIM, Measure, lpips, paired
 
 # Okabe and Ito's colours, which people with any colour vision tell apart, and a marker each for print without colour.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#7F7F7F")

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from capture.cameras import synthetic
-from capture.image_file import encode_png
-from recon.evaluate.splits import Split
-from recon.export.cameras import encode_cameras
-from recon.export.staged import write_file, write_files
-from recon.snapshot import CameraEstimate
+from splatnode.capture.cameras import synthetic
+from splatnode.capture.image_file import encode_png
+from splatnode.recon.evaluate.splits import Split
+from splatnode.recon.result.export.cameras import encode_cameras
+from splatnode.recon.result.export.staged import write_file, write_files
+from splatnode.recon.result.snapshot import CameraEstimate
 
 
 def write_capture(folder: Path, place: synthetic.Config) -> Split:

@@ -12,19 +12,20 @@ from importlib import import_module
 
 import msgspec
 
-from capture.frame import Frame
-from recon import optimize, pixelwise, regularise
-from recon.config import PRESETS, Config
-from recon.evaluate import ablation
-from recon.evaluate.start import Start, continued, foundation
-from recon.pipeline import reconstruct
-from recon.snapshot import Snapshot
+from splatnode.capture.frame import Frame
+from splatnode.recon.config import PRESETS, Config
+from splatnode.recon.evaluate import ablation
+from splatnode.recon.evaluate.start import Start, continued, foundation
+from splatnode.recon.optimize import refinement, regularise
+from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.scene import pixelwise
 
 CHECKPOINTS = (50, 150, 500)  # iterations at which a configuration shows its scene, besides its end
 
 # InstantSplat's released settings (2025): a Gaussian a pixel, nothing added or taken away; colours, scales and turns
 # ten times as fast as in 3DGS; steps that do not fall, but for the poses', which fall to a hundredth.
-_INSTANTSPLAT_RATES = optimize.Rates(
+_INSTANTSPLAT_RATES = refinement.Rates(
     means=1.6e-4,
     quats=1e-2,
     log_scales=5e-2,
@@ -41,7 +42,7 @@ _INSTANTSPLAT_RATES = optimize.Rates(
 def _instantsplat(iterations: int, terms: regularise.Config) -> Config:
     return Config(
         pixelwise=pixelwise.Config(),
-        optimize=optimize.Config(
+        optimize=refinement.Config(
             iterations=iterations,
             half_resolution_share=0.0,
             rates=_INSTANTSPLAT_RATES,
@@ -77,8 +78,8 @@ def _configured(config: Config, frames: Sequence[Frame], seed: int) -> Iterator[
 
 
 def _rival(name: str, frames: Sequence[Frame], seed: int) -> Iterator[Snapshot]:
-    """The method of the module of recon.rivals that is called like it."""
-    return import_module(f"recon.rivals.{name.replace('-', '_')}").reconstruct(frames, seed)
+    """The method of the module of splatnode.recon.evaluate.rivals that is called like it."""
+    return import_module(f"splatnode.recon.evaluate.rivals.{name.replace('-', '_')}").reconstruct(frames, seed)
 
 
 RIVALS = ("colmap-3dgs", "colmap-fsgs", "cf-3dgs", "nerfmm", "nope-nerf")  # these make their own cameras

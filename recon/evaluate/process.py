@@ -13,10 +13,10 @@ from multiprocessing.context import ForkServerContext, SpawnContext
 from pathlib import Path
 from typing import TypeVar
 
-from recon.evaluate.protocol import STAGES
-from recon.export.staged import write_file
-from recon.report import peak_rss_mb
-from recon.snapshot import Snapshot
+from splatnode.recon.evaluate.protocol import STAGES
+from splatnode.recon.result.export.staged import write_file
+from splatnode.recon.result.report import peak_rss_mb
+from splatnode.recon.result.snapshot import Snapshot
 
 T = TypeVar("T")
 Context = SpawnContext | ForkServerContext

@@ -11,17 +11,17 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recon import rim
-from recon.evaluate.alignment import align_test_pose
-from recon.evaluate.appearance import Appearance, Rasterize, appearance_of
-from recon.evaluate.camera_errors import CameraErrors, camera_errors
-from recon.evaluate.metrics import psnr, ssim
-from recon.evaluate.splits import Split
-from recon.evaluate.truth import EvaluationScene
-from recon.geometry import align_cameras
-from recon.keyframe import modelled_image
-from recon.losses.lpips import Lpips, load_lpips
-from recon.snapshot import CameraEstimate, Snapshot
+from splatnode.recon.evaluate.appearance import Appearance, Rasterize, appearance_of
+from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
+from splatnode.recon.evaluate.metrics import psnr, ssim
+from splatnode.recon.evaluate.splits import Split
+from splatnode.recon.evaluate.test_pose import align_test_pose
+from splatnode.recon.evaluate.truth import EvaluationScene
+from splatnode.recon.frames import border
+from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.geometry import align_cameras
+from splatnode.recon.networks.lpips import Lpips, load_lpips
+from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
 STAGES = ("poses", "points", "optimise")
 _FIRST_RATE, _CONTINUED_RATE = 3e-3, 5e-4  # of the search for a test view's pose, in radians and parts of the depth
@@ -191,10 +191,10 @@ def _score_test_views(
     names = [name for name in split.test if name in scene.cameras]
     photographs = [modelled_image(scene.image(name), settings.longer_side) for name in names]
     scores = []
-    for name, photograph, shown in zip(names, photographs, rim.shown(photographs), strict=True):
+    for name, photograph, shown in zip(names, photographs, border.shown(photographs), strict=True):
         whole = torch.from_numpy(photograph).float() / 255.0
         whole_K = mean_intrinsics(cameras, photograph.shape[1], photograph.shape[0])
-        rows, columns = rim.rectangle(shown)
+        rows, columns = border.rectangle(shown)
         truth = whole[rows, columns]
         K = whole_K - np.array([[0.0, 0.0, columns.start], [0.0, 0.0, rows.start], [0.0, 0.0, 0.0]])
         if name in found:

@@ -13,9 +13,9 @@ from typing import Any
 
 import msgspec
 
-from recon.evaluate.protocol import Row, Settings
-from recon.export.staged import json_bytes
-from recon.report import versions
+from splatnode.recon.evaluate.protocol import Row, Settings
+from splatnode.recon.result.export.staged import json_bytes
+from splatnode.recon.result.report import versions
 
 
 class Bench(msgspec.Struct, frozen=True):

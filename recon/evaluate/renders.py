@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from recon.evaluate.protocol import Row
-from recon.export.staged import write_files
+from splatnode.recon.evaluate.protocol import Row
+from splatnode.recon.result.export.staged import write_files
 
 FOLDER = "renders"
 PHOTOGRAPH = "photograph.jpg"

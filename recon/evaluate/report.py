@@ -8,11 +8,11 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from recon.evaluate.protocol import Row
-from recon.evaluate.records import Bench, bench_files
-from recon.evaluate.renders import PHOTOGRAPH, kept
-from recon.evaluate.tables import Table, number, tables
-from recon.export.staged import write_files
+from splatnode.recon.evaluate.protocol import Row
+from splatnode.recon.evaluate.records import Bench, bench_files
+from splatnode.recon.evaluate.renders import PHOTOGRAPH, kept
+from splatnode.recon.evaluate.tables import Table, number, tables
+from splatnode.recon.result.export.staged import write_files
 
 logger = logging.getLogger(__name__)
 
@@ -39,7 +39,7 @@ def redraw(bench: Bench, out_dir: Path) -> None:
 def _charts(bench: Bench) -> dict[str, bytes]:
     """Those that there are numbers for; none without matplotlib to draw them."""
     try:
-        from recon.evaluate import charts
+        from splatnode.recon.evaluate import charts
     except ImportError:
         logger.warning("no charts: matplotlib is not installed. Run: pip install 'splatnode[bench]'")
         return {}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.evaluate.truth import scene_folder
+from splatnode.recon.evaluate.truth import scene_folder
 
 _PAPER_FRAMES, _PAPER_TEST = 24, 12
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from capture.frame import Frame
-from recon.config import Config
-from recon.pipeline import Reconstruction, finished
-from recon.report import peak_rss_mb
-from recon.snapshot import Snapshot
+from splatnode.capture.frame import Frame
+from splatnode.recon.config import Config
+from splatnode.recon.pipeline import Reconstruction, finished
+from splatnode.recon.result.report import peak_rss_mb
+from splatnode.recon.result.snapshot import Snapshot
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,9 +26,11 @@ def foundation(config: Config) -> Config:
     return Config(
         size=config.size,
         prior=config.prior,
+        matching=config.matching,
+        registration=config.registration,
         screening=config.screening,
         verification=config.verification,
-        judge=config.judge,
+        decision=config.decision,
     )
 
 

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from recon.evaluate.protocol import Row, mean
+from splatnode.recon.evaluate.protocol import Row, mean
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import stdev
 
-from recon.evaluate import ablation
-from recon.evaluate.protocol import Row, mean
-from recon.evaluate.summary import Point, points, shared
+from splatnode.recon.evaluate import ablation
+from splatnode.recon.evaluate.protocol import Row, mean
+from splatnode.recon.evaluate.summary import Point, points, shared
 
 
 @dataclass(frozen=True)

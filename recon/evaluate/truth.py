@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from capture.frame import Frame
-from capture.image_file import SUFFIXES
-from recon.export import read_cameras
+from splatnode.capture.frame import Frame
+from splatnode.capture.image_file import SUFFIXES
+from splatnode.recon.result.export import read_cameras
 
 _CHOSEN = "24_views"  # of InstantSplat's data sets: the frames that its protocol uses
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])

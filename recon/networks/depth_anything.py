@@ -16,11 +16,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from recon.networks import checkpoint, dinov2
-from recon.networks.crop import Crop, crop, cropped
-from recon.networks.dinov2 import PATCH, Dinov2, normalised
-from recon.networks.fusion import Scratch, enlarged, resizers
-from recon.weights import located
+from splatnode.recon.networks import dinov2, weight_files
+from splatnode.recon.networks.crop import Crop, crop, cropped
+from splatnode.recon.networks.dinov2 import PATCH, Dinov2, normalised
+from splatnode.recon.networks.fusion import Scratch, enlarged, resizers
+from splatnode.recon.networks.weights import located
 
 RELATIVE = "depth_anything_v2/depth_anything_v2_vits.pth"
 METRIC = "depth_anything_v2/depth_anything_v2_metric_hypersim_vits.pth"
@@ -86,7 +86,7 @@ class _HeadScratch(Scratch):
 def load_network(path: Path, size: Size = SMALL, *, most_m: float | None = None) -> DepthAnythingV2:
     """Raises ValueError where the file is damaged, holds another model or anything but data, and FileNotFoundError."""
     build = partial(DepthAnythingV2, size, most_m=most_m)
-    return checkpoint.load_network(build, checkpoint.read_weights(path), path, "Depth Anything V2 Small")
+    return weight_files.load_network(build, weight_files.read_weights(path), path, "Depth Anything V2 Small")
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from recon.networks.transformer import Block, PatchEmbedding
+from splatnode.recon.networks.transformer import Block, PatchEmbedding
 
 PATCH = 14
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of the images that it was trained with

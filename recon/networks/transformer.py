@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from recon.networks.rotary import Rotary
+from splatnode.recon.networks.rotary import Rotary
 
 
 class PatchEmbedding(nn.Module):

@@ -9,19 +9,18 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from recon.keyframe import Keyframe
-from recon.priors import stereo
-from recon.priors.fusion import DepthMap
-from recon.priors.pointmap import Pointmap
-from recon.registration import register
-from recon.registration.register import Registration
-from recon.view_graph import Matcher, ViewGraph
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.matching.view_graph import Matcher, ViewGraph
+from splatnode.recon.priors import stereo
+from splatnode.recon.priors.fusion import DepthMap
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors.prior import Prior
+from splatnode.recon.registration.register import RegisteredCamera, Registration
 
 Array = npt.NDArray[np.float64]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    registration: register.Config = register.Config()
     stereo: stereo.Config = stereo.Config()
     seed: int = 0
     # Few sparse points lie on what is far, so stereo searches this many times further than they reach; in inverse
@@ -43,16 +42,13 @@ class DepthMaps(Protocol):
     ) -> list[DepthMap]: ...
 
 
-class ClassicalPrior:
-    """Cameras by `recon.registration`, depth by `recon.priors.stereo` or what takes its place."""
+class ClassicalPrior(Prior):
+    """Depth by `recon.priors.stereo`, or by another function in its place."""
 
     def __init__(
         self, config: Config, depth_maps: DepthMaps = stereo.depth_maps, matcher: Matcher | None = None
     ) -> None:
         self._config, self._depth_maps, self.matcher = config, depth_maps, matcher
-
-    def register(self, graph: ViewGraph, pause: Callable[[], None] = lambda: None) -> Registration | None:
-        return register.register(graph.keyframes, graph.pairs, self._config.registration, pause)
 
     def pointmaps(
         self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
@@ -109,16 +105,14 @@ def load(config: Config) -> ClassicalPrior:
     return ClassicalPrior(config)
 
 
-def modelled_K(graph: ViewGraph, camera: register.RegisteredCamera) -> Array:
+def modelled_K(graph: ViewGraph, camera: RegisteredCamera) -> Array:
     """(3, 3) intrinsics of a registered camera for its image at modelled size."""
     keyframe = graph.keyframes[camera.index]
     (sx, sy), (cx, cy) = keyframe.scale, camera.principal
     return np.array([[camera.focal * sx, 0.0, cx * sx], [0.0, camera.focal * sy, cy * sy], [0.0, 0.0, 1.0]])
 
 
-def sparse_points(
-    registration: Registration, camera: register.RegisteredCamera, scale: tuple[float, float]
-) -> stereo.Sparse:
+def sparse_points(registration: Registration, camera: RegisteredCamera, scale: tuple[float, float]) -> stereo.Sparse:
     """The registered points that a camera sees, at the modelled size that `scale` leads to."""
     mine = registration.observed_by == camera.index
     world = registration.points[registration.observed_point[mine]]

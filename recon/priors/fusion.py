@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from recon.core import library, pointer
-from recon.priors.patchmatch import Level, Matching, Planes, Transfer, transfer
+from splatnode.recon.core import library, pointer
+from splatnode.recon.priors.patchmatch import Level, Matching, Planes, Transfer, transfer
 
 Float32 = npt.NDArray[np.float32]
 

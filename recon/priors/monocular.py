@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon.networks.crop import Crop
-from recon.priors.depth_normals import normals_of_depth
-from recon.priors.pointmap import Pointmap
+from splatnode.recon.networks.crop import Crop
+from splatnode.recon.priors.depth_normals import normals_of_depth
+from splatnode.recon.priors.pointmap import Pointmap
 
 Map = npt.NDArray[np.float32]
 Network = Callable[[npt.NDArray[np.uint8]], tuple[Map, Crop]]  # image (h, w, 3) -> values (H, W), and their crop

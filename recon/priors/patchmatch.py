@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon.core import library, pointer
+from splatnode.recon.core import library, pointer
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon.keyframe import Keyframe
-from recon.networks.crop import Crop
-from recon.priors.classical import modelled_K, sparse_points
-from recon.priors.depth_normals import normals_of_depth
-from recon.priors.pointmap import Pointmap
-from recon.registration.register import RegisteredCamera, Registration
-from recon.view_graph import ViewGraph
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.networks.crop import Crop
+from splatnode.recon.priors.classical import modelled_K, sparse_points
+from splatnode.recon.priors.depth_normals import normals_of_depth
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.registration.register import RegisteredCamera, Registration
 
 Map = npt.NDArray[np.float32]
 

@@ -1,35 +1,26 @@
-"""The interface of priors: what gives cameras and points before there is a scene."""
+"""The interface of priors: a prior proposes matches that plain features miss, and gives depth to registered cameras."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from recon.priors.pointmap import Pointmap
-from recon.registration.register import Registration
-from recon.view_graph import Matcher, ViewGraph
+from splatnode.recon.matching.view_graph import Matcher, ViewGraph
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.registration.register import Registration
 
 
 class Prior(Protocol):
-    """A loaded prior. A prior file has `Config`, with at least `registration` and `seed`, and `load(config)`.
+    """A loaded prior. Its module has `Config`, with at least `seed`, and `load(config)`.
 
-    The two steps are apart because the verdict stands between them: refused cameras cost no dense points.
+    Cameras come from `recon.registration` whatever the prior is; the verdict stands between them and the depth:
+    cameras that were refused cost no depth.
     """
 
-    @property
-    def matcher(self) -> Matcher | None:
-        """What the view graph shall ask where plain features find few matches."""
-        ...
-
-    def register(self, graph: ViewGraph, pause: Callable[[], None] = ...) -> Registration | None:
-        """Cameras of the keyframes that hang together, with the evidence for them; None when no two do.
-
-        `pause` is called about once a second; it may raise to abandon the work.
-        """
-        ...
+    matcher: Matcher | None  # what the view graph asks where plain features find few matches
 
     def pointmaps(
-        self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = ...
+        self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
     ) -> tuple[Pointmap, ...]:
         """A point map for each registered camera, in the same order and the same world.
 
@@ -41,4 +32,4 @@ class Prior(Protocol):
         self, graph: ViewGraph, registration: Registration, known: Mapping[str, Pointmap]
     ) -> tuple[Pointmap, ...]:
         """Point maps of the registered cameras that `known` (by name, in the same world) does not have, in order."""
-        ...
+        return tuple(found for found in self.pointmaps(graph, registration) if found.name not in known)

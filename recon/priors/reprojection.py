@@ -7,8 +7,8 @@ import ctypes
 import numpy as np
 import numpy.typing as npt
 
-from recon.core import library, pointer
-from recon.priors.pointmap import Pointmap
+from splatnode.recon.core import library, pointer
+from splatnode.recon.priors.pointmap import Pointmap
 
 Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]

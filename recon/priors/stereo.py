@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon.priors import fusion
-from recon.priors.fusion import DepthMap
-from recon.priors.patchmatch import Level, Matching, Planes, Search, improve, make_level, resized
+from splatnode.recon.priors import fusion
+from splatnode.recon.priors.fusion import DepthMap
+from splatnode.recon.priors.patchmatch import Level, Matching, Planes, Search, improve, make_level, resized
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]

@@ -7,7 +7,7 @@ from collections.abc import Collection
 import torch
 from torch import Tensor
 
-from recon.rasterize.reference import CHANNELS
+from splatnode.recon.rasterize.reference import CHANNELS
 
 SH_BASES = (1, 4, 9, 16)
 MAX_SIDE = 16384  # pixels

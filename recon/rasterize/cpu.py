@@ -14,10 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from recon.rasterize.check import check_input
-from recon.rasterize.native import CHANNEL_BITS, RasterGradients, RasterImages, raster_forward, raster_input
-from recon.rasterize.reference import CHANNELS, NEAR
-from recon.rasterize.render import Render
+from splatnode.recon.rasterize.check import check_input
+from splatnode.recon.rasterize.native import CHANNEL_BITS, RasterGradients, RasterImages, raster_forward, raster_input
+from splatnode.recon.rasterize.reference import CHANNELS, NEAR
+from splatnode.recon.rasterize.render import Render
 
 
 def rasterize(

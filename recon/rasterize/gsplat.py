@@ -17,10 +17,10 @@ from collections.abc import Collection
 import torch
 from torch import Tensor
 
-from recon.rasterize import reference
-from recon.rasterize.check import check_input
-from recon.rasterize.reference import CHANNELS, LOW_PASS, NEAR
-from recon.rasterize.render import Render
+from splatnode.recon.rasterize import reference
+from splatnode.recon.rasterize.check import check_input
+from splatnode.recon.rasterize.reference import CHANNELS, LOW_PASS, NEAR
+from splatnode.recon.rasterize.render import Render
 
 
 def rasterize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Collection, Sequence
 
-from recon.core import library
+from splatnode.recon.core import library
 
 CHANNEL_BITS = {"rgb": 1, "depth": 2, "normal": 4, "alpha": 8}
 STAGES = ("project", "bin", "blend", "blend_backward", "project_backward")

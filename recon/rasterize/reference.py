@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from recon.rasterize.render import Render
+from splatnode.recon.rasterize.render import Render
 
 CHANNELS = ("rgb", "depth", "normal", "alpha")
 LOW_PASS = 0.3  # px^2, added to the variance of every splat: none is thinner than a pixel

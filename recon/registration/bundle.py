@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from recon.core import library, pointer
+from splatnode.recon.core import library, pointer
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]

@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from recon.keyframe import Keyframe
-from recon.registration import bundle, finishing, growth, lenses, mapper, register, survey
-from recon.registration.config import Config
-from recon.registration.lenses import Grouping
-from recon.registration.register import RegisteredCamera, Registration
-from recon.registration.survey import Growth, Lens
-from recon.registration.two_view import TwoView
+from splatnode.recon.frames.keyframe import Keyframe, principal_point
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.registration import bundle, finishing, incremental, lenses, mapper, mapping_problem, register
+from splatnode.recon.registration.config import Config
+from splatnode.recon.registration.lenses import Grouping
+from splatnode.recon.registration.mapping_problem import Growth, Lens
+from splatnode.recon.registration.register import RegisteredCamera, Registration
 
 Array = npt.NDArray[np.float64]
 
@@ -38,11 +38,11 @@ def extended(
     known = lenses.lenses(keyframes, grouping, pairs, config.lenses)
     views, in_lens = register.views_of(keyframes, grouping), register.in_pixels_of_lens(pairs, grouping)
     tracks = config.mapper.growing_tracks
-    of = survey.survey(views, known, in_lens, tracks, tracks)
-    begun = growth.quickly_adjusted(of, _begun(keyframes, grouping, known, start), 2.0, config.mapper.growth)
-    if len(begun.problem.points) < config.mapper.growth.min_points:
+    of = mapping_problem.survey(views, known, in_lens, tracks, tracks)
+    begun = incremental.quickly_adjusted(of, _begun(keyframes, grouping, known, start), 2.0, config.mapper.incremental)
+    if len(begun.problem.points) < config.mapper.incremental.min_points:
         return None
-    grown = growth.extend(of, begun, config.mapper.growth)
+    grown = incremental.extend(of, begun, config.mapper.incremental)
     finished = finishing.finish(of, grown, (), config.mapper.finishing)
     if finished is None:
         return None
@@ -73,7 +73,7 @@ def _begun(
         translations[index] = -rotations[index] @ camera.T_world_camera[:3, 3]
         log_focals[lens] = np.log(grouping.enlarged[index] * camera.focal)
         radials[lens] = camera.radial
-        nominal = lenses.principal_point(keyframes[index].frame)
+        nominal = principal_point(keyframes[index].frame)
         shifts[lens] = grouping.enlarged[index] * (camera.principal - nominal)
     problem = bundle.Problem(
         rotations=rotations,

@@ -9,9 +9,9 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from recon.registration import bundle, growth, refinement, triangulation
-from recon.registration.refinement import Picture
-from recon.registration.survey import Growth, Survey
+from splatnode.recon.registration import bundle, incremental, subpixel, triangulation
+from splatnode.recon.registration.mapping_problem import Growth, Survey
+from splatnode.recon.registration.subpixel import Picture
 
 Array = npt.NDArray[np.float64]
 
@@ -21,7 +21,7 @@ _LEAST_NOISE_PX = 0.05  # at 1024 px: what no observation is believed to be bett
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     triangulation: triangulation.Config = triangulation.Config()
-    refinement: refinement.Config = refinement.Config()
+    subpixel: subpixel.Config = subpixel.Config()
     min_points: int = 15
     robust_range_px: tuple[float, float] = (0.15, 1.5)  # three times the median error, within these limits
     # Errors are not independent: what the lens, the shutter and the scene do otherwise than the model moves whole
@@ -34,7 +34,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class Finished:
-    growth: Growth
+    incremental: Growth
     loss: bundle.Config
     rms_px: float  # of the observations, at 1024 px on the longer side
 
@@ -47,12 +47,12 @@ def finish(of: Survey, grown: Growth, pictures: Sequence[Picture], config: Confi
     grown = replace(grown, prior=_free_lenses(of, grown.prior, config))
     loss = _loss(of, grown, config)
     for widen in (3.0, 2.0, 1.0):
-        grown = growth.adjusted(of, grown, of.fine, loss, widen, config.triangulation)
+        grown = incremental.adjusted(of, grown, of.fine, loss, widen, config.triangulation)
         if len(grown.problem.points) < config.min_points:
             return None
         loss = _loss(of, grown, config)
     if pictures:
-        refined = refinement.refine(grown.problem, grown.registered, pictures, config.refinement)
+        refined = subpixel.refine(grown.problem, grown.registered, pictures, config.subpixel)
         if len(refined.points) >= config.min_points and _all_observed(refined, grown.registered):
             grown = replace(grown, problem=refined)
             for _ in range(3):

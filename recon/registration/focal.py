@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from recon.registration.two_view import TwoView
+from splatnode.recon.matching.two_view import TwoView
 
 TYPICAL_RATIO = 1.0  # focal length over the longer side of phones and webcams (53 degrees field of view)
 _GRID = np.geomspace(0.3, 5.0, 240)

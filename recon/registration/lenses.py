@@ -13,11 +13,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from capture.frame import Frame
-from recon.keyframe import Keyframe
-from recon.registration import bundle, focal
-from recon.registration.survey import Lens
-from recon.registration.two_view import TwoView
+from splatnode.recon.frames.keyframe import Keyframe, longer_side
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.registration import bundle, focal
+from splatnode.recon.registration.mapping_problem import Lens
 
 Array = npt.NDArray[np.float64]
 
@@ -39,17 +38,6 @@ class Grouping:
     lens_of: tuple[int, ...]  # of each frame
     longer_sides: tuple[int, ...]  # of each lens: that of its largest frame
     enlarged: tuple[float, ...]  # of each frame: pixels of its lens over pixels of its own
-
-
-def longer_side(frame: Frame) -> int:
-    return max(frame.width, frame.height)
-
-
-def principal_point(frame: Frame) -> Array:
-    """(2,) pixels: as given, else the middle of the image."""
-    if frame.intrinsics is not None:
-        return np.array([frame.intrinsics.cx, frame.intrinsics.cy])
-    return np.array([frame.width / 2.0, frame.height / 2.0])
 
 
 def group(keyframes: Sequence[Keyframe], across_sizes: bool) -> Grouping:
@@ -92,7 +80,7 @@ def lenses(
 ) -> list[Lens]:
     """What is known of each lens: what came with its frames, or what the pairs of its frames vote for."""
     found = []
-    for lens, longer_side in enumerate(grouping.longer_sides):
+    for lens, side in enumerate(grouping.longer_sides):
         members = [i for i, member in enumerate(grouping.lens_of) if member == lens]
         given = keyframes[members[0]].frame.intrinsics
         if given is not None:
@@ -102,7 +90,7 @@ def lenses(
             continue
         inside = [pair for key, pair in pairs.items() if key[0] in members and key[1] in members]
         ratios = focal.vote(inside, num_candidates=3)
-        found.append(Lens(tuple(ratio * longer_side for ratio in ratios), config.voted_sigma))
+        found.append(Lens(tuple(ratio * side for ratio in ratios), config.voted_sigma))
     return found
 
 

@@ -14,15 +14,15 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from recon.registration import bundle, finishing, growth, survey, triangulation
-from recon.registration.refinement import Picture
-from recon.registration.survey import Growth, Lens, Pairs, Survey, View
+from splatnode.recon.registration import bundle, finishing, incremental, mapping_problem, triangulation
+from splatnode.recon.registration.mapping_problem import Growth, Lens, Pairs, Survey, View
+from splatnode.recon.registration.subpixel import Picture
 
 Array = npt.NDArray[np.float64]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    growth: growth.Config = growth.Config()
+    incremental: incremental.Config = incremental.Config()
     finishing: finishing.Config = finishing.Config()
     growing_tracks: int = 350  # a view, while views are added: more cost time and change no decision
     final_tracks: int = 1500  # a view, in the end
@@ -78,22 +78,24 @@ def build_map(
 
     `pictures`, one a view, make its observations exact. `pause` is called between attempts and may raise.
     """
-    of = survey.survey(views, lenses, pairs, config.growing_tracks, config.final_tracks)
+    of = mapping_problem.survey(views, lenses, pairs, config.growing_tracks, config.final_tracks)
     attempts: list[tuple[float, Growth]] = []
     for pair, focals in _attempts(lenses, pairs, config.max_attempts):
         pause()
-        grown = growth.grow(of, focals, pair, config.growth)
+        grown = incremental.grow(of, focals, pair, config.incremental)
         if grown is None:
             continue
         found_again = bool(attempts) and _same(max(attempts, key=_score)[1], grown, config)
-        attempts.append((growth.score(of, grown, config.score_px), grown))
+        attempts.append((incremental.score(of, grown, config.score_px), grown))
         if found_again and len(grown.registered) == len(views):
             break
     if not attempts:
         return None
     pause()
     best = max(attempts, key=_score)
-    rivals = [score for score, grown in attempts if survey.difference(best[1], grown)[0] > config.rival_rotation_deg]
+    rivals = [
+        score for score, grown in attempts if mapping_problem.difference(best[1], grown)[0] > config.rival_rotation_deg
+    ]
     finished = finishing.finish(of, best[1], pictures, config.finishing)
     return None if finished is None else as_map(of, finished, max(rivals, default=0.0) / max(best[0], 1e-9), config)
 
@@ -105,7 +107,7 @@ def _score(attempt: tuple[float, Growth]) -> float:
 def _same(one: Growth, other: Growth, config: Config) -> bool:
     if set(one.registered) != set(other.registered):
         return False
-    turned, zoomed = survey.difference(one, other)
+    turned, zoomed = mapping_problem.difference(one, other)
     return turned < config.same_rotation_deg and zoomed < config.same_focal
 
 
@@ -131,7 +133,7 @@ def _first_pairs(pairs: Pairs) -> list[tuple[int, int]]:
 
 def as_map(of: Survey, finished: finishing.Finished, rival: float, config: Config) -> Map:
     """The finished growth with what is known of it."""
-    grown, problem = finished.growth, finished.growth.problem
+    grown, problem = finished.incremental, finished.incremental.problem
     centres = -np.einsum("cji,cj->ci", problem.rotations, problem.translations)
     angles = triangulation.largest_angles(centres, problem.points, problem.camera_of, problem.point_of)
     return Map(
@@ -139,7 +141,7 @@ def as_map(of: Survey, finished: finishing.Finished, rival: float, config: Confi
         problem=problem,
         prior=grown.prior,
         loss=finished.loss,
-        agreement=survey.agreement(of, grown, config.growth.triangulation.max_error_px),
+        agreement=mapping_problem.agreement(of, grown, config.incremental.triangulation.max_error_px),
         median_angle_deg=float(np.median(angles)),
         rms_px=finished.rms_px,
         rival=rival,

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from recon.keyframe import Keyframe
-from recon.registration import bundle, lenses, mapper, refinement, uncertainty
-from recon.registration.config import Config
-from recon.registration.lenses import Grouping, principal_point
-from recon.registration.survey import View
-from recon.registration.two_view import TwoView
+from splatnode.recon.frames.keyframe import Keyframe, content_key, principal_point
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.registration import bundle, lenses, mapper, subpixel, uncertainty
+from splatnode.recon.registration.config import Config
+from splatnode.recon.registration.lenses import Grouping
+from splatnode.recon.registration.mapping_problem import View
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -49,11 +49,6 @@ class Registration:
     rival: float = 0.0  # matches that the best other set of cameras explained, over those that this one does
 
 
-def place_in_order(keyframe: Keyframe) -> bytes:
-    """Sorts keyframes by what they show: with it, an answer does not depend on the order in which they came."""
-    return keyframe.features.points[:64].tobytes()
-
-
 def register(
     keyframes: Sequence[Keyframe],
     pairs: Mapping[tuple[int, int], TwoView],
@@ -67,7 +62,7 @@ def register(
     """
     if not pairs:
         return None
-    order = sorted(range(len(keyframes)), key=lambda index: place_in_order(keyframes[index]))
+    order = sorted(range(len(keyframes)), key=lambda index: content_key(keyframes[index]))
     ordered = [keyframes[index] for index in order]
     built = _build(ordered, _renumbered(pairs, np.argsort(order)), config, pause)
     if built is None:
@@ -112,9 +107,9 @@ def _map(
     pause: Callable[[], None],
 ) -> mapper.Map | None:
     enlarged = grouping.enlarged
-    of_refinement = config.mapper.finishing.refinement
+    of_refinement = config.mapper.finishing.subpixel
     pictures = [
-        refinement.picture(keyframe.frame.image, principal_point(keyframe.frame), of_refinement).enlarged(enlarged[i])
+        subpixel.picture(keyframe.frame.image, principal_point(keyframe.frame), of_refinement).enlarged(enlarged[i])
         for i, keyframe in enumerate(keyframes)
     ]
     known = lenses.lenses(keyframes, grouping, pairs, config.lenses)

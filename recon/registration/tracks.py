@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from recon.registration.two_view import TwoView
+from splatnode.recon.matching.two_view import TwoView
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]

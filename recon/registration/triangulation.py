@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from recon.registration import bundle, placement
-from recon.registration.tracks import Tracks
+from splatnode.recon.registration import bundle, resection
+from splatnode.recon.registration.tracks import Tracks
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -64,7 +64,7 @@ def retriangulate(
     """
     mine = np.isin(all_tracks.camera_of, registered)
     camera, track, pixels = all_tracks.camera_of[mine], all_tracks.track_of[mine], all_tracks.pixels[mine]
-    rays = placement.normalise(problem, camera, pixels)
+    rays = resection.normalise(problem, camera, pixels)
     matrices = np.concatenate([problem.rotations, problem.translations[:, :, None]], 2)
     limit = widen * config.max_error_px * scale
     errors = np.zeros(0)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from recon.registration import bundle
+from splatnode.recon.registration import bundle
 
 Array = npt.NDArray[np.float64]
 

@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from recon.keyframe import Keyframe
-from recon.registration import placement
-from recon.registration.register import Registration
-from recon.registration.two_view import TwoView
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.registration import resection
+from splatnode.recon.registration.register import Registration
 
 Array = npt.NDArray[np.float64]
 
@@ -48,7 +48,7 @@ def measure(
         scale = max(max(keyframes[k].frame.width, keyframes[k].frame.height) for k in (i, j)) / 1024.0
         thinned = _thinned(pairs[i, j], config.max_matches)
         limit = config.max_error_px * scale
-        rotation, direction, num_inliers = placement.relative_pose(thinned, cameras[i].focal, cameras[j].focal, limit)
+        rotation, direction, num_inliers = resection.relative_pose(thinned, cameras[i].focal, cameras[j].focal, limit)
         if 2 * num_inliers < len(thinned.matches):
             continue  # The pair has no rigid answer for these focal lengths; agreement says so too.
         rotations[i, j] = rotation

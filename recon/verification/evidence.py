@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.verification.cycles import Cycles
-from recon.verification.jackknife import Spread
-from recon.verification.joints import Joint
-from recon.verification.lens import Distortion, FreedLens
-from recon.verification.photometric import Score
-from recon.verification.reflection import Reflection
+from splatnode.recon.verification.cycles import Cycles
+from splatnode.recon.verification.epipolar_consistency import Score
+from splatnode.recon.verification.jackknife import Spread
+from splatnode.recon.verification.lens import Distortion, FreedLens
+from splatnode.recon.verification.reflection import Reflection
+from splatnode.recon.verification.weakest_link import Joint
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from recon.registration.register import Registration
+from splatnode.recon.registration.register import Registration
 
 DARK, BRIGHT = 12.0, 243.0  # grey levels; what is near black or white says nothing about a gain
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from recon.registration import bundle
-from recon.verification import refit
+from splatnode.recon.registration import bundle
+from splatnode.recon.verification import refit
 
 Array = npt.NDArray[np.float64]
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recon.keyframe import Keyframe
-from recon.registration import focal
-from recon.registration.two_view import TwoView
-from recon.verification import refit
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.registration import focal
+from splatnode.recon.verification import refit
 
 FREE_RADIAL = 0.3  # sigma of the radial coefficient
 STEPS = (0.0, 0.35, -0.35)  # of log focal, from which it is set free: a wrong one can be a local minimum

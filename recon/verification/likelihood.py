@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from recon.verification.evidence import CameraEvidence, Evidence
+from splatnode.recon.verification.evidence import CameraEvidence, Evidence
 
 PRIOR = 1.5  # a registration that got so far is mostly right
 CAMERA_PRIOR = 2.5  # and so is a single camera of it

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from recon.geometry import align_cameras
-from recon.keyframe import Keyframe
-from recon.registration import bundle
-from recon.registration.register import Registration
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.geometry import align_cameras
+from splatnode.recon.registration import bundle
+from splatnode.recon.registration.register import Registration
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]

@@ -13,8 +13,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from recon.keyframe import Features, Keyframe
-from recon.registration import matching
+from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.matching import nearest_neighbours
 
 Array = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]
@@ -24,7 +24,7 @@ Flags = npt.NDArray[np.bool_]
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     num_features: int = 1500  # of each frame, the strongest
     by_chance: float = 50.0  # matches of frames that have nothing in common, which say nothing
-    matching: matching.Config = matching.Config()
+    nearest_neighbours: nearest_neighbours.Config = nearest_neighbours.Config()
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def measure(keyframes: Sequence[Keyframe], config: Config) -> Reflection:
     for j in range(len(plain)):
         for i in range(j):
             found, expected = (
-                len(matching.match(plain[i], other[j], config.matching)) + config.by_chance
+                len(nearest_neighbours.match(plain[i], other[j], config.nearest_neighbours)) + config.by_chance
                 for other in (mirrored, plain)
             )
             gains[i, j] = gains[j, i] = np.log(found / expected)

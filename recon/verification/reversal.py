@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from recon.registration import bundle
-from recon.verification import refit
+from splatnode.recon.registration import bundle
+from splatnode.recon.verification import refit
 
 SAME_DEG, SAME_REL = 1.0, 0.03  # of rotations and centres: the mirrored start has found the way back
 NO_RIVAL = 100.0

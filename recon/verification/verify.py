@@ -9,28 +9,28 @@ import cv2
 import msgspec
 import numpy as np
 
-from recon.registration.register import Registration
-from recon.verification import (
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.registration.register import Registration
+from splatnode.recon.verification import (
     cycles,
+    epipolar_consistency,
     exposure,
     flatness,
     jackknife,
-    joints,
     lens,
-    photometric,
     refit,
     reflection,
     reversal,
+    weakest_link,
 )
-from recon.verification.evidence import CameraEvidence, Evidence
-from recon.verification.photometric import Picture
-from recon.verification.reflection import Reflection
-from recon.view_graph import ViewGraph
+from splatnode.recon.verification.epipolar_consistency import Picture
+from splatnode.recon.verification.evidence import CameraEvidence, Evidence
+from splatnode.recon.verification.reflection import Reflection
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tracks_per_camera: int = 300  # with which answers are found again
-    photometric: photometric.Config = photometric.Config()
+    epipolar_consistency: epipolar_consistency.Config = epipolar_consistency.Config()
     cycles: cycles.Config = cycles.Config()
     reflection: reflection.Config = reflection.Config()
 
@@ -46,14 +46,14 @@ def verify(
         return None
     fit = refit.fit(graph.keyframes, registration, config.tracks_per_camera)
     registered = [camera.index for camera in registration.cameras]
-    views = pictures(graph, registration, config.photometric, registered)
+    views = pictures(graph, registration, config.epipolar_consistency, registered)
     cameras = _of_cameras(graph, registration, views, config, views)
     pause()
     return Evidence(
         cameras=cameras,
         agreement=_agreement(graph, registration, None),
-        joint=joints.weakest(registration, graph.pairs, views, config.photometric),
-        loose=tuple(graph.keyframes[index].name for index in joints.loose(registration, graph.pairs)),
+        joint=weakest_link.weakest(registration, graph.pairs, views, config.epipolar_consistency),
+        loose=tuple(graph.keyframes[index].name for index in weakest_link.loose(registration, graph.pairs)),
         reflection=_reflection(graph, registration, config.reflection),
         flatness=flatness.share_on_plane(registration.points),
         spread=jackknife.by_regions(fit),
@@ -77,8 +77,9 @@ def verify_further(graph: ViewGraph, registration: Registration, known: Evidence
     before = {camera.name: camera for camera in known.cameras}
     names = {camera.index: graph.keyframes[camera.index].name for camera in registration.cameras}
     further = {index for index, name in names.items() if name not in before}
-    partners = (photometric.partners(index, names, registration, config.photometric) for index in further)
-    views = pictures(graph, registration, config.photometric, further.union(*partners))
+    dense = config.epipolar_consistency
+    partners = (epipolar_consistency.partners(index, names, registration, dense) for index in further)
+    views = pictures(graph, registration, dense, further.union(*partners))
     measured = {camera.name: camera for camera in _of_cameras(graph, registration, views, config, further)}
     sharper = [
         (
@@ -101,8 +102,8 @@ def verify_further(graph: ViewGraph, registration: Registration, known: Evidence
             for camera in registration.cameras
         ),
         agreement=_agreement(graph, registration, None),
-        joint=joints.weakest(registration, graph.pairs, views, config.photometric),
-        loose=tuple(graph.keyframes[index].name for index in joints.loose(registration, graph.pairs)),
+        joint=weakest_link.weakest(registration, graph.pairs, views, config.epipolar_consistency),
+        loose=tuple(graph.keyframes[index].name for index in weakest_link.loose(registration, graph.pairs)),
         flatness=flatness.share_on_plane(registration.points),
         median_angle_deg=registration.median_angle_deg,
         rms_px=registration.rms_px,
@@ -129,7 +130,7 @@ def _of_cameras(
             agreement=_agreement(graph, registration, camera.index),
             confirmed=int(confirmed[camera.index]),
             gain=gains[camera.index],
-            patches=photometric.in_partners(camera.index, views, registration, config.photometric),
+            patches=epipolar_consistency.in_partners(camera.index, views, registration, config.epipolar_consistency),
             rotation_sigma_deg=camera.rotation_sigma_deg,
             centre_sigma_rel=camera.centre_sigma_rel,
         )
@@ -151,8 +152,8 @@ def _agreement(graph: ViewGraph, registration: Registration, index: int | None) 
 
 
 def pictures(
-    graph: ViewGraph, registration: Registration, config: photometric.Config, asked: Collection[int]
-) -> dict[int, photometric.Picture]:
+    graph: ViewGraph, registration: Registration, config: epipolar_consistency.Config, asked: Collection[int]
+) -> dict[int, epipolar_consistency.Picture]:
     """The registered views among the keyframes `asked`, at modelled size, by keyframe."""
     views = {}
     for camera in (camera for camera in registration.cameras if camera.index in asked):
@@ -162,7 +163,7 @@ def pictures(
         mine = registration.observed_by == camera.index
         to_camera = np.linalg.inv(camera.T_world_camera)
         points = registration.points[registration.observed_point[mine]]
-        views[camera.index] = photometric.picture(
+        views[camera.index] = epipolar_consistency.picture(
             cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY).astype(np.float32),
             np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
             camera.T_world_camera,

@@ -22,8 +22,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from tests.node import Node, Viewer, processor_s, running
-from tests.screen import Screen
+from tests.support.node import Node, Viewer, processor_s, running
+from tests.support.screen import Screen
 
 CASES = ("alone", "viewer", "stopped viewer")
 RATES = ("intake_per_s", "iterations_per_s", "final_per_s")

@@ -15,9 +15,9 @@ from itertools import pairwise
 
 from msgspec.structs import replace
 
-from recon.config import Config, preset
-from recon.evaluate.start import continued
-from recon.snapshot import Snapshot
+from splatnode.recon.config import Config, preset
+from splatnode.recon.evaluate.start import continued
+from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.parts.held_out import Case, Scoring, load_case, parsed, parser_of
 
 CASES = ("fountain_p11:6", "llff_fern:6")

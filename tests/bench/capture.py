@@ -20,15 +20,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from capture.image_file import decode_image
-from capture.memory import keep_freed
-from capture.messaging.broadcast import Subscriber
-from capture.messaging.keyframes import KeyframeClient
-from capture.messaging.network import Network
-from capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
-from capture.preview import PreviewHeader
-from capture.status import CaptureStatus
-from tests.node import processor_s
+from splatnode.capture.image_file import decode_image
+from splatnode.capture.messaging.broadcast import Subscriber
+from splatnode.capture.messaging.keyframes import KeyframeClient
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
+from splatnode.capture.preview import PreviewHeader
+from splatnode.capture.process.memory import keep_freed
+from splatnode.capture.status import CaptureStatus
+from tests.support.node import processor_s
 
 RATE, WIDTH, HEIGHT = 30, 1280, 720
 FRAMES = 480  # so that the wall goes by at an eighth of the picture a second

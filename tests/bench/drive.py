@@ -18,23 +18,23 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from capture.frame import DroppedFrame
-from capture.messaging.broadcast import Publisher
-from capture.messaging.network import Network
-from capture.messaging.services import RECON_SCENE, RECON_STATUS
-from capture.messaging.state import StateServer
-from capture.messaging.wire import Numbering
-from recon.daemon.scene_message import to_message
-from recon.export.prepare import take
-from recon.snapshot import Snapshot
-from recon.verdict import Code, Verdict
-from tests.node import heartbeat
-from tests.screen import Screen
-from viewer.analysis import analyse
-from viewer.canvas import project
-from viewer.moment import Moment
-from viewer.sources import load_result
-from viewer.viewpoint import overview
+from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.messaging.broadcast import Publisher
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.services import RECON_SCENE, RECON_STATUS
+from splatnode.capture.messaging.state import StateServer
+from splatnode.capture.messaging.wire import Numbering
+from splatnode.recon.result.export.prepare import take
+from splatnode.recon.result.message import to_message
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.viewer.analysis import analyse
+from splatnode.viewer.canvas import project
+from splatnode.viewer.moment import Moment
+from splatnode.viewer.sources import load_result
+from splatnode.viewer.viewpoint import overview
+from tests.support.node import heartbeat
+from tests.support.screen import Screen
 
 WINDOW = 1280, 800
 PICTURE = 928, 800  # the part of it that is not the panel

@@ -17,9 +17,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from capture.messaging.wire import Limits, Message, WireError, decode, encode
-from capture.preview import PreviewHeader, decode_preview
-from capture.status import own_rss_mb
+from splatnode.capture.messaging.wire import Limits, Message, WireError, decode, encode
+from splatnode.capture.preview import PreviewHeader, decode_preview
+from splatnode.capture.status import own_rss_mb
 from tests.bench.parts.attacked import TENTHS, fuzz_ports, fuzz_sockets
 from tests.bench.parts.malformed import Parts, good_messages, malformed
 

@@ -19,17 +19,17 @@ from pathlib import Path
 
 import numpy as np
 
-from capture.messaging.broadcast import Subscriber
-from capture.messaging.services import CAPTURE_PREVIEW
-from capture.preview import PreviewHeader
-from recon.config import Config
-from recon.evaluate.protocol import Networks, Run, Settings, evaluate
-from recon.evaluate.splits import Split, load_split
-from recon.evaluate.truth import EvaluationScene, load_scene
-from recon.pipeline import reconstruct
-from recon.rasterize.cpu import rasterize
-from recon.snapshot import Snapshot
-from tests.node import PATIENCE_S, Node, Viewer, processor_s, running
+from splatnode.capture.messaging.broadcast import Subscriber
+from splatnode.capture.messaging.services import CAPTURE_PREVIEW
+from splatnode.capture.preview import PreviewHeader
+from splatnode.recon.config import Config
+from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate
+from splatnode.recon.evaluate.splits import Split, load_split
+from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.result.snapshot import Snapshot
+from tests.support.node import PATIENCE_S, Node, Viewer, processor_s, running
 
 SETTINGS = Settings(alignment_steps=150)
 ALONE_S = 5.0  # of recon, before the camera starts: it loads torch

@@ -17,15 +17,15 @@ from pathlib import Path
 
 from msgspec.structs import replace
 
-from recon import pixelwise
-from recon.config import Config, preset
-from recon.control import prune, relocate
-from recon.control.control import ControlChoice
-from recon.evaluate.protocol import Settings
-from recon.evaluate.start import Start, continued
-from recon.export.prepare import viewer_safe
-from recon.export.spz import encode_spz
-from recon.report import peak_rss_mb
+from splatnode.recon.config import Config, preset
+from splatnode.recon.evaluate.protocol import Settings
+from splatnode.recon.evaluate.start import Start, continued
+from splatnode.recon.optimize.control import prune, relocate
+from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.result.export.prepare import viewer_safe
+from splatnode.recon.result.export.spz import encode_spz
+from splatnode.recon.result.report import peak_rss_mb
+from splatnode.recon.scene import pixelwise
 from tests.bench.parts.held_out import Case, Folders, Scoring, load_case, parsed, parser_of
 from tests.bench.parts.parsimony_chart import PIXEL, RIVAL, SELF, draw, summary
 
@@ -56,12 +56,12 @@ def configurations(chosen: int) -> dict[str, Config]:
     """By method, with `chosen` the size that splatnode chose."""
     ours = preset("balanced")
     ours = replace(ours, optimize=replace(ours.optimize, iterations=ITERATIONS, checkpoints=()))
-    fine = replace(ours.density, most_error=1e-4, smallest_px=1.0)
+    fine = replace(ours.seeding, most_error=1e-4, smallest_px=1.0)
     by_size = replace(ours.optimize, control=ControlChoice("prune", prune.Config(least_change=0.0)))
     by_pixel = replace(ours, pixelwise=pixelwise.Config(), optimize=replace(ours.optimize, control=None))
     relocating = replace(ours.optimize, control=ControlChoice("relocate", relocate.Config()))
     forced = {
-        f"x{factor:g}": replace(ours, density=fine, optimize=by_size, max_gaussians=round(factor * chosen))
+        f"x{factor:g}": replace(ours, seeding=fine, optimize=by_size, max_gaussians=round(factor * chosen))
         for factor in FACTORS
     }
     rival = replace(by_pixel, optimize=relocating, max_gaussians=chosen, surplus=1.0)

@@ -16,16 +16,17 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.config import Config
-from recon.evaluate.camera_errors import camera_errors
-from recon.evaluate.splits import load_split
-from recon.evaluate.truth import EvaluationScene, load_scene
-from recon.judge import hopeless, judge
-from recon.keyframe import Keyframe, modelled_image
-from recon.registration import features, register
-from recon.registration.register import Registration
-from recon.verification.verify import verify
-from recon.view_graph import ViewGraph
+from splatnode.recon.config import Config
+from splatnode.recon.evaluate.camera_errors import camera_errors
+from splatnode.recon.evaluate.splits import load_split
+from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.frames.keyframe import Keyframe, modelled_image
+from splatnode.recon.matching import features
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.registration import register
+from splatnode.recon.registration.register import Registration
+from splatnode.recon.verification.decision import hopeless, judge
+from splatnode.recon.verification.verify import verify
 
 RIGHT_ROTATION_DEG = 2.0
 RIGHT_CENTRE_PCT = 1.5
@@ -57,19 +58,18 @@ class Row:
 def measure(scene: EvaluationScene, names: tuple[str, ...], config: Config) -> Row:
     """One set of photographs from pixels to a verdict."""
     frames = scene.frames(names)
-    registering = config.prior.config.registration
-    graph = ViewGraph(registering)
+    graph = ViewGraph(config.matching)
     processor, laps = time.process_time(), [time.perf_counter()]
-    found = [features.extract(frame.image, registering.features) for frame in frames]
+    found = [features.extract(frame.image, config.matching.features) for frame in frames]
     laps.append(time.perf_counter())
     for frame, of_frame in zip(frames, found, strict=True):
         graph.add(Keyframe(frame, modelled_image(frame.image, config.size), of_frame))
     laps.append(time.perf_counter())
-    registration = register.register(graph.keyframes, graph.pairs, registering)
+    registration = register.register(graph.keyframes, graph.pairs, config.registration)
     laps.append(time.perf_counter())
     evidence = verify(graph, registration, config.verification)
     laps.append(time.perf_counter())
-    verdict = hopeless(graph, (), config.judge) or judge(graph, registration, evidence, config.judge)
+    verdict = hopeless(graph, (), config.decision) or judge(graph, registration, evidence, config.decision)
     seconds = np.diff(laps).tolist()
     errors = against_truth(scene, names, registration)
     return Row(

@@ -1,9 +1,9 @@
 """What learned priors take and how good they are: `python -m tests.bench priors --scene fountain_p11 --json FILE`.
 
 MASt3R at full size has weights generated from their names: its time and its memory are real, its answers are not. The
-alignment is that of synthetic pair predictions (tests/test_mast3r_alignment.py). PatchmatchNet has its own weights and
-the true cameras of a scene; the reference are triangulated SIFT points (tests/bench/stereo.py). Each part is a process
-of its own, so that its memory is its own.
+alignment is that of synthetic pair predictions (tests/recon/priors/test_mast3r_global_alignment.py). PatchmatchNet has
+its own weights and the true cameras of a scene; the reference are triangulated SIFT points (tests/bench/stereo.py).
+Each part is a process of its own, so that its memory is its own.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from recon.evaluate.camera_errors import camera_errors
-from recon.priors.mast3r.alignment import align
-from recon.priors.mast3r.network import Mast3r
-from recon.priors.stereo import Config
-from recon.report import peak_rss_mb
+from splatnode.recon.evaluate.camera_errors import camera_errors
+from splatnode.recon.priors.mast3r.global_alignment import align
+from splatnode.recon.priors.mast3r.network import Mast3r
+from splatnode.recon.priors.stereo import Config
+from splatnode.recon.result.report import peak_rss_mb
 from tests.bench.stereo import METHODS, make_case, run
-from tests.generated import generated_weights
-from tests.test_mast3r_alignment import cameras, intrinsics, predictions
+from tests.recon.priors.test_mast3r_global_alignment import cameras, intrinsics, predictions
+from tests.support.generated import generated_weights
 
 BARS = {
     "mast3r": {"seconds_pair": 15.0, "peak_rss_mb": 4000.0},

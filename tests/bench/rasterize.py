@@ -22,17 +22,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from capture.cameras import folder, synthetic
-from capture.frame import DroppedFrame, Frame
-from recon import core
-from recon.adam import Adam
-from recon.config import preset
-from recon.gaussians import SH_C0
-from recon.geometry import exp_se3, twist_gradient
-from recon.photometric import PhotometricLoss
-from recon.pipeline import reconstruct
-from recon.rasterize import cpu
-from recon.rasterize.reference import CHANNELS
+from splatnode.capture.cameras import folder, synthetic
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.recon import core
+from splatnode.recon.config import preset
+from splatnode.recon.geometry import exp_se3, twist_gradient
+from splatnode.recon.optimize.adam import Adam
+from splatnode.recon.optimize.photometric_loss import PhotometricLoss
+from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.rasterize import cpu
+from splatnode.recon.rasterize.reference import CHANNELS
+from splatnode.recon.scene.gaussians import SH_C0
 
 FLOPS_PER_PAIR = 117
 LRS = {"means": 1.6e-3, "quats": 1e-2, "log_scales": 1e-2, "logit_opacities": 5e-2, "sh": 1e-1, "twist": 1e-4}

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from capture.messaging.broadcast import Subscriber
-from capture.messaging.services import CAPTURE_PREVIEW
-from capture.preview import PreviewHeader
-from capture.status import heartbeats
-from tests.node import Node, descriptors, memory_mb, running
+from splatnode.capture.messaging.broadcast import Subscriber
+from splatnode.capture.messaging.services import CAPTURE_PREVIEW
+from splatnode.capture.preview import PreviewHeader
+from splatnode.capture.status import heartbeats
+from tests.support.node import Node, descriptors, memory_mb, running
 
 SAMPLE_S = 5.0
 

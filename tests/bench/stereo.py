@@ -19,13 +19,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon.keyframe import modelled_image
-from recon.priors.classical import DepthMaps
-from recon.priors.fusion import DepthMap
-from recon.priors.patchmatchnet import WEIGHTS, load_network
-from recon.priors.patchmatchnet.stereo import NetworkStereo
-from recon.priors.stereo import Config, Sparse, View, depth_maps, depth_range
-from recon.weights import find
+from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.networks.weights import find
+from splatnode.recon.priors.classical import DepthMaps
+from splatnode.recon.priors.fusion import DepthMap
+from splatnode.recon.priors.patchmatchnet import WEIGHTS, load_network
+from splatnode.recon.priors.patchmatchnet.stereo import NetworkStereo
+from splatnode.recon.priors.stereo import Config, Sparse, View, depth_maps, depth_range
 
 Float64 = npt.NDArray[np.float64]
 LONGER_SIDE = 512  # of the images that stereo works on

@@ -22,15 +22,15 @@ from pathlib import Path
 
 import numpy as np
 
+from splatnode.viewer.moment import Moment
+from splatnode.viewer.probe import probe_window
+from splatnode.viewer.session import Session
+from splatnode.viewer.sources import Finished, load_result
+from splatnode.viewer.state import Engine, State
+from splatnode.viewer.viewpoint import orbited
 from tests.bench.parts.viewer_agreement import agreement
 from tests.bench.parts.viewer_live import thinned, watch
 from tests.bench.rasterize import processor_name
-from viewer.moment import Moment
-from viewer.probe import probe_window
-from viewer.session import Session
-from viewer.sources import Finished, load_result
-from viewer.state import Engine, State
-from viewer.viewpoint import orbited
 
 GAUSSIANS = 30_000
 VIEWS = 24  # pictures that are timed
@@ -115,7 +115,7 @@ class Tour(Session):
 
 def time_pictures(result: Path, engine: Engine, as_points: bool, window: tuple[int, int]) -> dict:
     """Seconds from picture to picture while the viewpoint moves, the first ones left out."""
-    from viewer.window import show
+    from splatnode.viewer.window import show
 
     tour = Tour(thinned(load_result(result), GAUSSIANS), State(as_points=as_points))
     with contextlib.suppress(TourOver):

@@ -3,7 +3,7 @@
 //   check_core CASE      renders the case and compares with the images and gradients stored in it
 //   check_core           without a case: odd sizes, no Gaussians, bad input, the loss and Adam; prints nothing if well
 //
-// A case is written by tests/test_native_core.py from the float64 reference.
+// A case is written by tests/recon/core/test_native_core.py from the float64 reference.
 #include <cmath>
 #include <cstdio>
 #include <cstring>

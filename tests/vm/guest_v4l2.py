@@ -10,13 +10,13 @@ from typing import Any
 
 import msgspec
 
-from capture.cameras.v4l2 import Config, find, stream
-from capture.frame import Frame
-from capture.reader import Config as ReaderConfig
-from capture.reader import Reader, State
-from capture.unavailable import CameraUnavailable
-from capture.video4linux import layout, locks
-from capture.video4linux.device import Device
+from splatnode.capture.cameras.v4l2 import Config, find, stream
+from splatnode.capture.frame import Frame
+from splatnode.capture.reader import Config as ReaderConfig
+from splatnode.capture.reader import Reader, State
+from splatnode.capture.unavailable import CameraUnavailable
+from splatnode.capture.video4linux import layout, locks
+from splatnode.capture.video4linux.device import Device
 
 DISCONNECT = 0x00F0F000 + 65  # vivid's control of that name
 VIVID = "/tmp/modules/vivid.ko"

@@ -12,11 +12,11 @@ import time
 import numpy as np
 import pytest
 
-from capture.frame import Frame
-from capture.messaging import keys
-from capture.messaging.keyframes import KeyframeServer
-from capture.messaging.network import Network
-from capture.messaging.spool import Config, Spool
+from splatnode.capture.frame import Frame
+from splatnode.capture.messaging import keys
+from splatnode.capture.messaging.keyframes import KeyframeServer
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.spool import Config, Spool
 from tests.conftest import ROOT
 
 HERE, THERE = "10.213.7.1", "10.213.7.2"
@@ -25,8 +25,8 @@ IMAGE = np.random.default_rng(0).integers(0, 256, (240, 320, 3)).astype(np.uint8
 
 RECON = """
 import sys, pathlib
-from capture.messaging.keyframes import KeyframeClient
-from capture.messaging.network import Network
+from splatnode.capture.messaging.keyframes import KeyframeClient
+from splatnode.capture.messaging.network import Network
 folder = pathlib.Path(sys.argv[1])
 network = Network(directory=folder / "there", tcp=sys.argv[2], keys=folder / "laptop")
 with KeyframeClient(network) as client:

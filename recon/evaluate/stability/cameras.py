@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from capture.cameras import synthetic
-from recon.evaluate.stability.case import Case, accepted, either, refused, row, world
-from recon.evaluate.stability.places import Photo, Stage, far_apart, parallel, renamed
-from recon.evaluate.stability.probes import same_cameras
-from recon.evaluate.truth import TrueCamera
-from recon.verdict import Code
+from splatnode.capture.cameras import synthetic
+from splatnode.recon.evaluate.stability.case import Case, accepted, either, refused, row, world
+from splatnode.recon.evaluate.stability.places import Photo, Stage, far_apart, parallel, renamed
+from splatnode.recon.evaluate.stability.probes import same_cameras
+from splatnode.recon.evaluate.truth import TrueCamera
+from splatnode.recon.result.verdict import Code
 
 
 @row(1, "clean")

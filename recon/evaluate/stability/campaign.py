@@ -9,12 +9,12 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from recon.evaluate.records import this_machine
-from recon.evaluate.stability.case import Row
-from recon.evaluate.stability.places import Places, Stage
-from recon.evaluate.stability.summary import report
-from recon.evaluate.stability.trial import Trial, run_trial
-from recon.export.staged import json_bytes, write_file
+from splatnode.recon.evaluate.records import this_machine
+from splatnode.recon.evaluate.stability.case import Row
+from splatnode.recon.evaluate.stability.places import Places, Stage
+from splatnode.recon.evaluate.stability.summary import report
+from splatnode.recon.evaluate.stability.trial import Trial, run_trial
+from splatnode.recon.result.export.staged import json_bytes, write_file
 
 logger = logging.getLogger(__name__)
 

@@ -7,13 +7,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from capture.frame import DroppedFrame, Frame
-from recon import optimize
-from recon.config import Config
-from recon.evaluate.stability.places import Photo, Stage
-from recon.evaluate.truth import TrueCamera
-from recon.snapshot import Snapshot
-from recon.verdict import Code
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.recon.config import Config
+from splatnode.recon.evaluate.stability.places import Photo, Stage
+from splatnode.recon.evaluate.truth import TrueCamera
+from splatnode.recon.optimize import refinement
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.verdict import Code
 
 Source = Callable[[], Iterable[Frame | DroppedFrame]]
 World = Mapping[str, TrueCamera]  # by the name of the frame
@@ -22,8 +22,8 @@ World = Mapping[str, TrueCamera]  # by the name of the frame
 # They leave the cameras as they were judged: a handful of steps would move them without improving them.
 LIGHT = Config(
     size=320,
-    preview=optimize.Config(iterations=2, checkpoints=(), half_resolution_share=1.0, refine_poses=False),
-    optimize=optimize.Config(iterations=6, checkpoints=(), half_resolution_share=1.0, refine_poses=False),
+    preview=refinement.Config(iterations=2, checkpoints=(), half_resolution_share=1.0, refine_poses=False),
+    optimize=refinement.Config(iterations=6, checkpoints=(), half_resolution_share=1.0, refine_poses=False),
 )
 
 

@@ -1,4 +1,4 @@
-"""stability.png, drawn from stability.json alone: `python -m recon.evaluate.stability.chart stability.json --out DIR`.
+"""Draws stability.json: `python -m splatnode.recon.evaluate.stability.chart stability.json --out DIR`.
 
 Needs matplotlib (pip install 'splatnode[bench]').
 """
@@ -15,9 +15,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
-from recon.evaluate.stability.case import Demand
-from recon.evaluate.stability.outcome import Outcome
-from recon.export.staged import write_file
+from splatnode.recon.evaluate.stability.case import Demand
+from splatnode.recon.evaluate.stability.outcome import Outcome
+from splatnode.recon.result.export.staged import write_file
 
 _INK, _MUTED, _GRID = "#222222", "#6B6B6B", "#E4E4E4"
 # Blue is right and vermilion is dangerous, as in the charts of the benchmark: told apart with any colour vision.

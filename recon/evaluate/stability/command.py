@@ -7,11 +7,11 @@ import logging
 import shlex
 import sys
 
-from recon.evaluate.stability.campaign import Plan, run_campaign
-from recon.evaluate.stability.matrix import chosen
-from recon.evaluate.stability.methods import by_name
-from recon.evaluate.stability.places import load_places
-from recon.evaluate.stability.summary import Rate, summarise
+from splatnode.recon.evaluate.stability.campaign import Plan, run_campaign
+from splatnode.recon.evaluate.stability.matrix import chosen
+from splatnode.recon.evaluate.stability.methods import by_name
+from splatnode.recon.evaluate.stability.places import load_places
+from splatnode.recon.evaluate.stability.summary import Rate, summarise
 
 logger = logging.getLogger(__name__)
 
@@ -30,7 +30,7 @@ def stability(args: argparse.Namespace) -> int:
     command = shlex.join(["splatnode", *sys.argv[1:]])
     trials = run_campaign(plan, load_places(args.scenes, args.out), args.out, command)
     try:
-        from recon.evaluate.stability import chart
+        from splatnode.recon.evaluate.stability import chart
     except ImportError:
         logger.warning("no chart: matplotlib is not installed. Run: pip install 'splatnode[bench]'")
     else:

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from recon.evaluate.stability.case import Case, refused, row
-from recon.evaluate.stability.pixels import patchwork, static_noise
-from recon.evaluate.stability.places import Photo, Stage
-from recon.evaluate.stability.warps import poster_views, turned_crops
-from recon.verdict import Code
+from splatnode.recon.evaluate.stability.case import Case, refused, row
+from splatnode.recon.evaluate.stability.pixels import patchwork, static_noise
+from splatnode.recon.evaluate.stability.places import Photo, Stage
+from splatnode.recon.evaluate.stability.warps import poster_views, turned_crops
+from splatnode.recon.result.verdict import Code
 
 _NOTHING = (Code.NO_OVERLAP, Code.LOW_TEXTURE, Code.SPLIT, Code.TOO_FEW_VIEWS, Code.AMBIGUOUS)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from capture.frame import Intrinsics
-from recon.evaluate.stability import warps
-from recon.evaluate.stability.case import Case, accepted, either, refused, row
-from recon.evaluate.stability.places import Photo, Stage
-from recon.verdict import Code
+from splatnode.capture.frame import Intrinsics
+from splatnode.recon.evaluate.stability import warps
+from splatnode.recon.evaluate.stability.case import Case, accepted, either, refused, row
+from splatnode.recon.evaluate.stability.places import Photo, Stage
+from splatnode.recon.result.verdict import Code
 
 _DOUBTS = (Code.FOCAL_SUSPECT, Code.MIXED_CAMERAS, Code.AMBIGUOUS, Code.BASELINE_TOO_SMALL)
 

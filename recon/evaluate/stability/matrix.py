@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from recon.evaluate.stability import cameras, degenerate, lenses, mixtures, photometric, streams
-from recon.evaluate.stability.case import Row
+from splatnode.recon.evaluate.stability import cameras, degenerate, imaging, lenses, mixtures, streams
+from splatnode.recon.evaluate.stability.case import Row
 
-_FAMILIES = (cameras, degenerate, photometric, lenses, mixtures, streams)
+_FAMILIES = (cameras, degenerate, imaging, lenses, mixtures, streams)
 
 ROWS: tuple[Row, ...] = tuple(
     sorted(

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable
 
-from capture.frame import DroppedFrame, Frame
-from recon.config import Config
-from recon.pipeline import reconstruct
-from recon.snapshot import Snapshot
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.recon.config import Config
+from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.result.snapshot import Snapshot
 
 Method = Callable[[Iterable[Frame | DroppedFrame], Config], Snapshot]
 
@@ -28,7 +28,7 @@ def by_name(name: str) -> Method:
     if name not in NAMES:
         raise ValueError(f"no method {name!r}; there are: {', '.join(NAMES)}")
     try:
-        from recon.evaluate.stability import stock
+        from splatnode.recon.evaluate.stability import stock
     except ImportError as error:
         raise ValueError(f"method {name!r} needs pycolmap. Run: pip install 'splatnode[bench]'") from error
     return stock.colmap if name == "colmap" else stock.glomap

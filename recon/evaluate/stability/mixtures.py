@@ -7,10 +7,10 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from recon.evaluate.stability import pixels, warps
-from recon.evaluate.stability.case import Case, accepted, either, refused, row, world
-from recon.evaluate.stability.places import Photo, Stage, far_apart, renamed
-from recon.verdict import Code
+from splatnode.recon.evaluate.stability import pixels, warps
+from splatnode.recon.evaluate.stability.case import Case, accepted, either, refused, row, world
+from splatnode.recon.evaluate.stability.places import Photo, Stage, far_apart, renamed
+from splatnode.recon.result.verdict import Code
 
 _AMBIGUOUS = (
     Code.AMBIGUOUS,

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from recon.evaluate.camera_errors import camera_errors
-from recon.evaluate.stability.case import Demand, World
-from recon.snapshot import CameraEstimate
+from splatnode.recon.evaluate.camera_errors import camera_errors
+from splatnode.recon.evaluate.stability.case import Demand, World
+from splatnode.recon.result.snapshot import CameraEstimate
 
 RIGHT_ROTATION_DEG = 2.0  # of every relative rotation
 RIGHT_CENTRE_PCT = 1.5  # of the spread of the centres

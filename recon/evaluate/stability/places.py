@@ -12,11 +12,11 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from capture.cameras import synthetic
-from capture.frame import Intrinsics
-from recon.evaluate.camera_errors import angles_deg
-from recon.evaluate.demo import write_capture
-from recon.evaluate.truth import EvaluationScene, TrueCamera, load_scene
+from splatnode.capture.cameras import synthetic
+from splatnode.capture.frame import Intrinsics
+from splatnode.recon.evaluate.camera_errors import angles_deg
+from splatnode.recon.evaluate.demo import write_capture
+from splatnode.recon.evaluate.truth import EvaluationScene, TrueCamera, load_scene
 
 T = TypeVar("T")
 Image = npt.NDArray[np.uint8]

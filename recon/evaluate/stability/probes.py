@@ -8,17 +8,17 @@ from functools import partial
 import msgspec
 import numpy as np
 
-from capture.frame import Frame
-from recon.config import Config
-from recon.evaluate.camera_errors import camera_errors
-from recon.evaluate.protocol import Networks, Run, Settings, evaluate
-from recon.evaluate.splits import Split
-from recon.evaluate.stability.case import Measured, Probe, frames
-from recon.evaluate.stability.methods import splatnode
-from recon.evaluate.stability.places import Photo
-from recon.evaluate.truth import EvaluationScene
-from recon.rasterize.cpu import rasterize
-from recon.snapshot import Snapshot
+from splatnode.capture.frame import Frame
+from splatnode.recon.config import Config
+from splatnode.recon.evaluate.camera_errors import camera_errors
+from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate
+from splatnode.recon.evaluate.splits import Split
+from splatnode.recon.evaluate.stability.case import Measured, Probe, frames
+from splatnode.recon.evaluate.stability.methods import splatnode
+from splatnode.recon.evaluate.stability.places import Photo
+from splatnode.recon.evaluate.truth import EvaluationScene
+from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.result.snapshot import Snapshot
 
 _OVERFIT_DB = 0.3  # that ten times the iterations may lose
 _MORE_GAUSSIANS = 0.2  # of the count, that ten times the budget may add

@@ -1,14 +1,14 @@
-"""The cameras of stock COLMAP and GLOMAP (recon/rivals/colmap.py) as a snapshot without Gaussians."""
+"""The cameras of stock COLMAP and GLOMAP (recon/evaluate/rivals/colmap.py) as a snapshot without Gaussians."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from capture.frame import DroppedFrame, Frame
-from recon.config import Config
-from recon.rivals.colmap import Mapper, Placed, global_, incremental, mapped
-from recon.rivals.outcome import verdict
-from recon.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.recon.config import Config
+from splatnode.recon.evaluate.rivals.colmap import Mapper, Placed, global_, incremental, mapped
+from splatnode.recon.evaluate.rivals.outcome import verdict
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 
 
 def colmap(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:

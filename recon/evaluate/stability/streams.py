@@ -12,12 +12,11 @@ import cv2
 import msgspec
 import numpy as np
 
-from capture.cameras import folder
-from capture.frame import DroppedFrame, Frame
-from capture.quality import Limits, novelty, why_redundant
-from recon import optimize
-from recon.config import Config
-from recon.evaluate.stability.case import (
+from splatnode.capture.cameras import folder
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.quality import Limits, novelty, why_redundant
+from splatnode.recon.config import Config
+from splatnode.recon.evaluate.stability.case import (
     LIGHT,
     Case,
     Demand,
@@ -29,23 +28,24 @@ from recon.evaluate.stability.case import (
     row,
     world,
 )
-from recon.evaluate.stability.methods import splatnode
-from recon.evaluate.stability.places import Image, Photo, Stage
-from recon.evaluate.stability.probes import (
+from splatnode.recon.evaluate.stability.methods import splatnode
+from splatnode.recon.evaluate.stability.places import Image, Photo, Stage
+from splatnode.recon.evaluate.stability.probes import (
     as_good_as_a_batch,
     ignores_a_bigger_budget,
     keeps_quality_when_trained_longer,
     repeatable,
 )
-from recon.evaluate.stability.warps import resized
-from recon.evaluate.truth import EvaluationScene
-from recon.report import peak_rss_mb
-from recon.snapshot import Snapshot
-from recon.verdict import Code
+from splatnode.recon.evaluate.stability.warps import resized
+from splatnode.recon.evaluate.truth import EvaluationScene
+from splatnode.recon.optimize import refinement
+from splatnode.recon.result.report import peak_rss_mb
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.verdict import Code
 
 # Enough steps for a picture whose quality means something, at a size at which they are cheap.
 _FITTED = msgspec.structs.replace(
-    LIGHT, optimize=optimize.Config(iterations=80, checkpoints=(), half_resolution_share=0.25)
+    LIGHT, optimize=refinement.Config(iterations=80, checkpoints=(), half_resolution_share=0.25)
 )
 _SOAK_FRAMES, _SOAK_VIEWS, _SOAK_MARGIN_MB, _SOAK_GAUSSIANS = 500, 4, 60.0, 8000
 

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from recon.evaluate.stability.case import Demand
-from recon.evaluate.stability.outcome import Outcome
+from splatnode.recon.evaluate.stability.case import Demand
+from splatnode.recon.evaluate.stability.outcome import Outcome
 
 _Z95 = 1.959963984540054  # normal quantile of a two-sided 95 % interval
 

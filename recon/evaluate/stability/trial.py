@@ -11,13 +11,13 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing.context import ForkServerContext
 
-from recon.evaluate.process import call_alone
-from recon.evaluate.stability.case import Case, Measured
-from recon.evaluate.stability.methods import by_name
-from recon.evaluate.stability.outcome import Outcome, compare, outcome
-from recon.report import peak_rss_mb
-from recon.snapshot import CameraEstimate
-from recon.verdict import Verdict
+from splatnode.recon.evaluate.process import call_alone
+from splatnode.recon.evaluate.stability.case import Case, Measured
+from splatnode.recon.evaluate.stability.methods import by_name
+from splatnode.recon.evaluate.stability.outcome import Outcome, compare, outcome
+from splatnode.recon.result.report import peak_rss_mb
+from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.result.verdict import Verdict
 
 FAILED = "FAILED"
 

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from recon.evaluate.stability.places import Image, Photo
-from recon.evaluate.truth import TrueCamera
+from splatnode.recon.evaluate.stability.places import Image, Photo
+from splatnode.recon.evaluate.truth import TrueCamera
 
 Array = npt.NDArray[np.float64]
 

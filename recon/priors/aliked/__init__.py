@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recon.priors import classical
-from recon.priors.aliked.matcher import AlikedMatcher
-from recon.priors.aliked.network import load_aliked
-from recon.priors.classical import ClassicalPrior
-from recon.weights import find
+from splatnode.recon.networks.weights import find
+from splatnode.recon.priors import classical
+from splatnode.recon.priors.aliked.matcher import AlikedMatcher
+from splatnode.recon.priors.aliked.network import load_aliked
+from splatnode.recon.priors.classical import ClassicalPrior
 
 WEIGHTS = "aliked/aliked-n16.pth"
 

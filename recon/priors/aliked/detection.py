@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from recon.priors.aliked.deformable import window
+from splatnode.recon.priors.aliked.deformable import window
 
 _REACH = 2  # pixels: no two keypoints are as close, and the place of one is measured within it
 _LEAST = 0.2  # score

@@ -10,14 +10,14 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from capture.frame import Frame
-from recon.keyframe import Keyframe
-from recon.networks.crop import crop, cropped
-from recon.priors.aliked.network import STRIDE, Aliked, Found
+from splatnode.capture.frame import Frame
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.networks.crop import crop, cropped
+from splatnode.recon.priors.aliked.network import STRIDE, Aliked, Found
 
 
 class AlikedMatcher:
-    """A `recon.view_graph.Matcher`. The keypoints of a keyframe are its last points."""
+    """A `recon.matching.view_graph.Matcher`. The keypoints of a keyframe are its last points."""
 
     def __init__(self, network: Aliked, longer_side: int, num_keypoints: int) -> None:
         self._network, self._longer_side, self._count = network, longer_side, num_keypoints

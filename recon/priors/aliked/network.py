@@ -13,9 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from recon.networks.checkpoint import load_network, read_weights
-from recon.priors.aliked.deformable import DeformableConv, DeformableDescriptor
-from recon.priors.aliked.detection import detected
+from splatnode.recon.networks.weight_files import load_network, read_weights
+from splatnode.recon.priors.aliked.deformable import DeformableConv, DeformableDescriptor
+from splatnode.recon.priors.aliked.detection import detected
 
 STRIDE = 32  # of the coarsest features: an image has sides that this divides
 _STRIDES = (1, 2, 8, STRIDE)

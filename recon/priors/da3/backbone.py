@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from recon.networks import dinov2
-from recon.networks.dinov2 import Dinov2
-from recon.networks.rotary import Rotary, grid_positions
+from splatnode.recon.networks import dinov2
+from splatnode.recon.networks.dinov2 import Dinov2
+from splatnode.recon.networks.rotary import Rotary, grid_positions
 
 _VIEWS_TO_CHOOSE_FROM = 3  # with fewer, the first view is the reference
 

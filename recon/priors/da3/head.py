@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from recon.networks.dinov2 import PATCH
-from recon.networks.fusion import Scratch, enlarged, resizers
-from recon.networks.transformer import Block, Mlp
-from recon.priors.da3.backbone import Size
+from splatnode.recon.networks.dinov2 import PATCH
+from splatnode.recon.networks.fusion import Scratch, enlarged, resizers
+from splatnode.recon.networks.transformer import Block, Mlp
+from splatnode.recon.priors.da3.backbone import Size
 
 _DETAIL = 32  # channels at full resolution
 _POSITION_BASE, _POSITION_WEIGHT = 100.0, 0.1

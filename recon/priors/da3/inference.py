@@ -11,10 +11,10 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recon.keyframe import Keyframe
-from recon.networks.crop import Crop, crop, cropped
-from recon.networks.dinov2 import PATCH, normalised
-from recon.priors.da3.network import Estimate, PlacedCamera
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.networks.crop import Crop, crop, cropped
+from splatnode.recon.networks.dinov2 import PATCH, normalised
+from splatnode.recon.priors.da3.network import Estimate, PlacedCamera
 
 
 class Network(Protocol):

@@ -13,11 +13,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from recon.keyframe import Keyframe
-from recon.networks.crop import cropped
-from recon.priors.da3.inference import Answer, Network, ask
-from recon.registration import matching
-from recon.registration.features import describe
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.matching import nearest_neighbours
+from splatnode.recon.matching.features import describe
+from splatnode.recon.networks.crop import cropped
+from splatnode.recon.priors.da3.inference import Answer, Network, ask
 
 Array = npt.NDArray[np.float64]
 
@@ -27,7 +27,7 @@ _NEAR = 1.0  # pixel: a point is drawn where the drawing has a pixel that comes 
 
 @dataclass(frozen=True, eq=False)
 class WarpMatcher:
-    """A `recon.view_graph.Matcher` of the points that keyframes have."""
+    """A `recon.matching.view_graph.Matcher` of the points that keyframes have."""
 
     network: Network
     longer_side: int
@@ -50,7 +50,7 @@ class WarpMatcher:
         # Upright and of one size: both pictures are from one viewpoint.
         described1 = describe(drawn, where1, _PATCH_SIZE)
         described2 = describe(grey2, where2[chosen2], _PATCH_SIZE)
-        found = matching.match(described1, described2, matching.Config())
+        found = nearest_neighbours.match(described1, described2, nearest_neighbours.Config())
         return np.stack([chosen1[found[:, 0]], chosen2[found[:, 1]]], 1)
 
 

@@ -16,9 +16,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from recon.networks import checkpoint
-from recon.priors.da3.backbone import SMALL, Backbone, Size
-from recon.priors.da3.head import CameraEncoder, CameraHead, DepthHead
+from splatnode.recon.networks import weight_files
+from splatnode.recon.priors.da3.backbone import SMALL, Backbone, Size
+from splatnode.recon.priors.da3.head import CameraEncoder, CameraHead, DepthHead
 
 Array = npt.NDArray[np.float64]
 
@@ -67,9 +67,9 @@ class DepthAnything3(nn.Module):
 
 def load_network(path: Path, size: Size = SMALL) -> DepthAnything3:
     """Raises ValueError where the file is damaged, holds another model or anything but data, and FileNotFoundError."""
-    weights = {name.removeprefix("model."): tensor for name, tensor in checkpoint.read_weights(path).items()}
+    weights = {name.removeprefix("model."): tensor for name, tensor in weight_files.read_weights(path).items()}
     needed = {name: tensor for name, tensor in weights.items() if not name.startswith(_UNUSED)}
-    return checkpoint.load_network(partial(DepthAnything3, size), needed, path, "Depth Anything 3 Small")
+    return weight_files.load_network(partial(DepthAnything3, size), needed, path, "Depth Anything 3 Small")
 
 
 def _brought_near(cameras: Sequence[PlacedCamera]) -> list[PlacedCamera]:

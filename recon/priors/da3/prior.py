@@ -2,33 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 
-from recon.priors.da3.inference import KnownCamera, Network, ask
-from recon.priors.da3.matcher import WarpMatcher
-from recon.priors.da3.network import load_network
-from recon.priors.placed import pointmap_of
-from recon.priors.pointmap import Pointmap
-from recon.registration import register
-from recon.registration.register import Registration
-from recon.view_graph import ViewGraph
-from recon.weights import find
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.networks.weights import find
+from splatnode.recon.priors.da3.inference import KnownCamera, Network, ask
+from splatnode.recon.priors.da3.matcher import WarpMatcher
+from splatnode.recon.priors.da3.network import load_network
+from splatnode.recon.priors.placed import pointmap_of
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors.prior import Prior
+from splatnode.recon.registration.register import Registration
 
 WEIGHTS = "da3/da3-small.safetensors"
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     weights: Path | None = None  # None: where `splatnode weights` puts them
-    registration: register.Config = register.Config()
     longer_side: int = 504  # of the network's images: what it was published with
     views_at_once: int = 12  # all of them look at each other: memory and time grow with their square
     seed: int = 0
 
 
-class Da3Prior:
+class Da3Prior(Prior):
     """Its own cameras and depth draw one photograph from another's viewpoint, for matches that are then verified.
 
     The cameras are `recon.registration`'s. Depth comes from the network that was told these cameras, brought to the
@@ -38,9 +37,6 @@ class Da3Prior:
     def __init__(self, network: Network, config: Config) -> None:
         self._network, self._config = network, config
         self.matcher = WarpMatcher(network, config.longer_side)
-
-    def register(self, graph: ViewGraph, pause: Callable[[], None] = lambda: None) -> Registration | None:
-        return register.register(graph.keyframes, graph.pairs, self._config.registration, pause)
 
     def pointmaps(
         self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
@@ -58,11 +54,6 @@ class Da3Prior:
                 found.append(pointmap_of(graph, registration, camera, answer.crop, depth, sure))
             pause()
         return tuple(found)
-
-    def further_pointmaps(
-        self, graph: ViewGraph, registration: Registration, known: Mapping[str, Pointmap]
-    ) -> tuple[Pointmap, ...]:
-        return tuple(found for found in self.pointmaps(graph, registration) if found.name not in known)
 
 
 def load(config: Config) -> Da3Prior:

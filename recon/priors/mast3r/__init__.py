@@ -1,5 +1,5 @@
 """MASt3R (Leroy et al. 2024), the paper's prior: matches and point maps from a network, for non-commercial use."""
 
-from recon.priors.mast3r.prior import Config, load
+from splatnode.recon.priors.mast3r.prior import Config, load
 
 __all__ = ["Config", "load"]

@@ -12,11 +12,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from recon.keyframe import Keyframe
-from recon.networks.crop import Crop, crop, cropped
-from recon.networks.recent import Recent
-from recon.priors.mast3r.alignment import PairPoints
-from recon.priors.mast3r.network import Encoded, Prediction
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.networks.crop import Crop, crop, cropped
+from splatnode.recon.networks.recent import Recent
+from splatnode.recon.priors.mast3r.global_alignment import PairPoints
+from splatnode.recon.priors.mast3r.network import Encoded, Prediction
 
 PATCH = 16
 _KEPT_IMAGES = 32

@@ -3,7 +3,7 @@
 "Grounding Image Matching in 3D with MASt3R" (Leroy et al. 2024) on "DUSt3R" (Wang et al. 2024) and "CroCo v2"
 (Weinzaepfel et al. 2023): a ViT encodes each image, two decoders look at their own and at the other's tokens, and each
 image's head gives points, confidence and descriptors. Written from the papers; modules carry the names of the official
-checkpoint, which `recon.priors.mast3r.checkpoint` reads.
+checkpoint, which `recon.priors.mast3r.weight_files` reads.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from recon.networks.rotary import Rotary, grid_positions
-from recon.networks.transformer import Attention, Block, Mlp, PatchEmbedding, attend, by_head
-from recon.priors.mast3r.dpt import DensePrediction
+from splatnode.recon.networks.rotary import Rotary, grid_positions
+from splatnode.recon.networks.transformer import Attention, Block, Mlp, PatchEmbedding, attend, by_head
+from splatnode.recon.priors.mast3r.dpt import DensePrediction
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,18 +12,18 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from recon.keyframe import Keyframe
-from recon.networks.crop import Crop
-from recon.priors.mast3r.alignment import align
-from recon.priors.mast3r.checkpoint import LICENCE, load_network
-from recon.priors.mast3r.inference import Asked, Network
-from recon.priors.mast3r.network import Prediction
-from recon.priors.placed import pointmap_of
-from recon.priors.pointmap import Pointmap
-from recon.registration import register
-from recon.registration.register import Registration
-from recon.view_graph import ViewGraph
-from recon.weights import find
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.networks.crop import Crop
+from splatnode.recon.networks.weights import find
+from splatnode.recon.priors.mast3r.global_alignment import align
+from splatnode.recon.priors.mast3r.inference import Asked, Network
+from splatnode.recon.priors.mast3r.network import Prediction
+from splatnode.recon.priors.mast3r.weight_files import LICENCE, load_network
+from splatnode.recon.priors.placed import pointmap_of
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors.prior import Prior
+from splatnode.recon.registration.register import Registration
 
 log = logging.getLogger(__name__)
 
@@ -32,13 +32,12 @@ WEIGHTS = "mast3r/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth"
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     weights: Path | None = None  # None: where `splatnode weights` puts them
-    registration: register.Config = register.Config()
     longer_side: int = 512  # of the network's images: what it was trained with
     max_neighbours: int = 6  # places: with up to 13 frames every pair is asked about
     seed: int = 0
 
 
-class Mast3rPrior:
+class Mast3rPrior(Prior):
     """Matches by descriptors, cameras by `recon.registration` from them, depth by global alignment.
 
     A match is one between two detected features, and counts only where a pair's epipolar geometry holds it: what the
@@ -49,9 +48,6 @@ class Mast3rPrior:
         self._config = config
         self._asked = Asked(network, config.longer_side)
         self.matcher = DescriptorMatcher(self._asked)
-
-    def register(self, graph: ViewGraph, pause: Callable[[], None] = lambda: None) -> Registration | None:
-        return register.register(graph.keyframes, graph.pairs, self._config.registration, pause)
 
     def pointmaps(
         self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
@@ -66,15 +62,10 @@ class Mast3rPrior:
             for camera, view, to in zip(registration.cameras, views, crops, strict=True)
         )
 
-    def further_pointmaps(
-        self, graph: ViewGraph, registration: Registration, known: Mapping[str, Pointmap]
-    ) -> tuple[Pointmap, ...]:
-        return tuple(found for found in self.pointmaps(graph, registration) if found.name not in known)
-
 
 @dataclass(frozen=True, eq=False)
 class DescriptorMatcher:
-    """A `recon.view_graph.Matcher` by the network's descriptors at the features that keyframes have."""
+    """A `recon.matching.view_graph.Matcher` by the network's descriptors at the features that keyframes have."""
 
     asked: Asked
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recon.networks import checkpoint
-from recon.priors import classical
-from recon.priors.classical import ClassicalPrior
-from recon.priors.patchmatchnet.network import PatchmatchNet
-from recon.priors.patchmatchnet.stereo import NetworkStereo
-from recon.weights import find
+from splatnode.recon.networks import weight_files
+from splatnode.recon.networks.weights import find
+from splatnode.recon.priors import classical
+from splatnode.recon.priors.classical import ClassicalPrior
+from splatnode.recon.priors.patchmatchnet.network import PatchmatchNet
+from splatnode.recon.priors.patchmatchnet.stereo import NetworkStereo
 
 WEIGHTS = "patchmatchnet/patchmatchnet_dtu.pth"
 
@@ -25,4 +25,4 @@ def load(config: Config) -> ClassicalPrior:
 
 def load_network(path: Path) -> PatchmatchNet:
     """Raises ValueError where the file is damaged or another network's, and FileNotFoundError."""
-    return checkpoint.load_network(PatchmatchNet, checkpoint.read_weights(path), path, "PatchmatchNet")
+    return weight_files.load_network(PatchmatchNet, weight_files.read_weights(path), path, "PatchmatchNet")

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from recon.priors.patchmatchnet.sampling import (
+from splatnode.recon.priors.patchmatchnet.sampling import (
     Source,
     sampled_at,
     sampling_grid,

@@ -10,12 +10,12 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from recon.priors import fusion, stereo
-from recon.priors.fusion import DepthMap
-from recon.priors.patchmatch import Planes, make_level
-from recon.priors.patchmatchnet.network import PatchmatchNet
-from recon.priors.patchmatchnet.sampling import Source
-from recon.priors.stereo import Sparse, View
+from splatnode.recon.priors import fusion, stereo
+from splatnode.recon.priors.fusion import DepthMap
+from splatnode.recon.priors.patchmatch import Planes, make_level
+from splatnode.recon.priors.patchmatchnet.network import PatchmatchNet
+from splatnode.recon.priors.patchmatchnet.sampling import Source
+from splatnode.recon.priors.stereo import Sparse, View
 
 Float32 = npt.NDArray[np.float32]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from recon.priors import classical
-from recon.priors.classical import ClassicalPrior
-from recon.weights import WeightsError, find
+from splatnode.recon.networks.weights import WeightsError, find
+from splatnode.recon.priors import classical
+from splatnode.recon.priors.classical import ClassicalPrior
 
 
 class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
@@ -18,8 +18,8 @@ class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
 def load(config: Config) -> ClassicalPrior:
     """Raises WeightsError where onnxruntime or the weights are missing, or are not XFeat's."""
     try:
-        from recon.priors.xfeat.matcher import XfeatMatcher
-        from recon.priors.xfeat.network import load_network
+        from splatnode.recon.priors.xfeat.matcher import XfeatMatcher
+        from splatnode.recon.priors.xfeat.network import load_network
     except ModuleNotFoundError as error:
         raise WeightsError("the prior xfeat needs onnxruntime: pip install 'splatnode[xfeat]'") from error
     features = config.features or find("xfeat/xfeat_640x640.onnx")

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from recon.keyframe import Keyframe
-from recon.priors.xfeat.network import Keypoints, Xfeat
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.priors.xfeat.network import Keypoints, Xfeat
 
 _REMEMBERED = 64  # keyframes
 
@@ -24,7 +24,7 @@ class _Added:
 
 
 class XfeatMatcher:
-    """A `recon.view_graph.Matcher`."""
+    """A `recon.matching.view_graph.Matcher`."""
 
     def __init__(self, network: Xfeat, num_keypoints: int) -> None:
         self._network, self._count = network, num_keypoints

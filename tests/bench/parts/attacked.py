@@ -13,20 +13,20 @@ from typing import Any
 
 import zmq
 
-from capture.frame import DroppedFrame
-from capture.messaging import keys
-from capture.messaging.broadcast import Publisher, Subscriber
-from capture.messaging.commands import CommandServer
-from capture.messaging.keyframe_messages import DroppedHeader
-from capture.messaging.keyframes import KeyframeClient, KeyframeServer
-from capture.messaging.network import Network, runtime_directory
-from capture.messaging.services import CAPTURE_KEYFRAMES, CAPTURE_PREVIEW, RECON_CONTROL, RECON_SCENE, Service
-from capture.messaging.spool import Config as SpoolConfig
-from capture.messaging.spool import Spool
-from capture.messaging.state import StateClient, StateServer, Want
-from capture.messaging.wire import Numbering
-from capture.preview import PreviewHeader
-from capture.status import own_rss_mb
+from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.messaging import keys
+from splatnode.capture.messaging.broadcast import Publisher, Subscriber
+from splatnode.capture.messaging.commands import CommandServer
+from splatnode.capture.messaging.keyframe_messages import DroppedHeader
+from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging.network import Network, runtime_directory
+from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES, CAPTURE_PREVIEW, RECON_CONTROL, RECON_SCENE, Service
+from splatnode.capture.messaging.spool import Config as SpoolConfig
+from splatnode.capture.messaging.spool import Spool
+from splatnode.capture.messaging.state import StateClient, StateServer, Want
+from splatnode.capture.messaging.wire import Numbering
+from splatnode.capture.preview import PreviewHeader
+from splatnode.capture.status import own_rss_mb
 from tests.bench.parts.malformed import FRAME, IMAGE, Parts, good_messages, malformed
 
 TENTHS = 10

@@ -8,11 +8,11 @@ import signal
 import subprocess
 import time
 
-from capture.messaging.services import RECON_SCENE
-from capture.messaging.state import StateClient
-from capture.status import heartbeats
-from recon.daemon.scene_message import SceneHeader
-from recon.daemon.store import MADE_ANEW, Store
+from splatnode.capture.messaging.services import RECON_SCENE
+from splatnode.capture.messaging.state import StateClient
+from splatnode.capture.status import heartbeats
+from splatnode.recon.daemon.checkpoint.store import MADE_ANEW, Store
+from splatnode.recon.result.message import SceneHeader
 from tests.bench.parts.trial import (
     VIEWS,
     NotTried,
@@ -23,7 +23,7 @@ from tests.bench.parts.trial import (
     expect_whole,
     wait_for,
 )
-from tests.node import Viewer, finished, memory_mb, running
+from tests.support.node import Viewer, finished, memory_mb, running
 
 
 def kill_recon(trial: Trial) -> None:

@@ -8,14 +8,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from recon.config import preset
-from recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
-from recon.evaluate.protocol import Row as Scored
-from recon.evaluate.splits import Split, load_split
-from recon.evaluate.start import find_start
-from recon.evaluate.truth import EvaluationScene, load_scene
-from recon.rasterize.cpu import rasterize
-from recon.snapshot import Snapshot
+from splatnode.recon.config import preset
+from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
+from splatnode.recon.evaluate.protocol import Row as Scored
+from splatnode.recon.evaluate.splits import Split, load_split
+from splatnode.recon.evaluate.start import find_start
+from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.result.snapshot import Snapshot
 
 
 @dataclass(frozen=True, eq=False)

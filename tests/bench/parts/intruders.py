@@ -6,14 +6,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-from capture.config import typed
-from capture.messaging.keys import create_keys, expect_server
-from capture.messaging.network import Network, NotAllowed
-from capture.messaging.services import RECON_SCENE
-from capture.messaging.state import StateClient
-from recon.daemon.scene_message import SceneHeader
+from splatnode.capture.messaging.keys import create_keys, expect_server
+from splatnode.capture.messaging.network import Network, NotAllowed
+from splatnode.capture.messaging.services import RECON_SCENE
+from splatnode.capture.messaging.state import StateClient
+from splatnode.capture.process.config import typed
+from splatnode.recon.result.message import SceneHeader
 from tests.bench.parts.trial import RECON, Trial, expect, expect_whole, wait_for
-from tests.node import Node, running
+from tests.support.node import Node, running
 
 
 def unauthorised(trial: Trial) -> None:

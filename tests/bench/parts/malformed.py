@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from capture.frame import Frame, Intrinsics
-from capture.messaging.keyframe_messages import Acknowledge, DroppedHeader, FrameHeader, Ready
-from capture.messaging.state import Want
-from capture.messaging.wire import Numbering, encode
-from capture.preview import Config as PreviewConfig
-from capture.preview import PreviewHeader, encode_preview
+from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.messaging.keyframe_messages import Acknowledge, DroppedHeader, FrameHeader, Ready
+from splatnode.capture.messaging.state import Want
+from splatnode.capture.messaging.wire import Numbering, encode
+from splatnode.capture.preview import Config as PreviewConfig
+from splatnode.capture.preview import PreviewHeader, encode_preview
 
 LENS = Intrinsics(16, 12, 20.0, 20.0, 8.0, 6.0, "calibration", (0.1, -0.1))
 IMAGE = np.random.default_rng(0).integers(0, 256, (12, 16, 3)).astype(np.uint8)

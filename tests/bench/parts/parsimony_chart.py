@@ -13,7 +13,7 @@ from typing import Any
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
-from recon.evaluate.charts import pareto_front
+from splatnode.recon.evaluate.charts import pareto_front
 
 SELF, PIXEL, RIVAL = "chosen", "pixel", "mcmc"
 MEASURES = {"psnr": 1, "ssim": 1, "lpips": -1}  # and whether more is better

@@ -12,8 +12,8 @@ from typing import Any
 
 import cv2
 
-from tests.node import PATIENCE_S, Node, Viewer, finished
-from tests.synthetic import photographs
+from tests.support.node import PATIENCE_S, Node, Viewer, finished
+from tests.support.synthetic import photographs
 
 VIEWS = 6
 # All that costs time and tells nothing about faults is small: a whole replay takes 5 seconds of a processor.

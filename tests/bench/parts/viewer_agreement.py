@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from recon.picture import take_picture
-from viewer.sources import load_result
-from viewer.state import State
+from splatnode.recon.result.picture import take_picture
+from splatnode.viewer.sources import load_result
+from splatnode.viewer.state import State
 
 
 def agreement(result: Path) -> dict:
     """Differences between the engines' pictures on black, in levels of 255, at the result's cameras."""
     from open3d.visualization import rendering  # pyright: ignore[reportMissingImports]
 
-    from viewer.scene3d import Scene3D
+    from splatnode.viewer.scene3d import Scene3D
 
     moment = load_result(result)
     cameras, gaussians = moment.snapshot.cameras, moment.snapshot.gaussians

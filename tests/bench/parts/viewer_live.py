@@ -11,17 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
-from capture.messaging.network import Network
-from capture.messaging.services import RECON_SCENE
-from capture.messaging.state import StateServer
-from capture.messaging.wire import Numbering
-from recon.daemon.scene_message import to_message
-from recon.export.prepare import SH_C0, take
-from tests.node import memory_mb, processor_s
-from tests.screen import Screen
-from viewer.moment import Moment
-from viewer.sources import load_result
-from viewer.viewpoint import scene_pivot
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.services import RECON_SCENE
+from splatnode.capture.messaging.state import StateServer
+from splatnode.capture.messaging.wire import Numbering
+from splatnode.recon.result.export.prepare import SH_C0, take
+from splatnode.recon.result.message import to_message
+from splatnode.viewer.moment import Moment
+from splatnode.viewer.sources import load_result
+from splatnode.viewer.viewpoint import scene_pivot
+from tests.support.node import memory_mb, processor_s
+from tests.support.screen import Screen
 
 PIXEL = 130, 110  # of a screen of 1280 x 800, where a scene's colour is looked for: within the window, beside cameras
 COLOURS = [(1.0, 0.3, 0.5), (0.3, 1.0, 0.5), (0.3, 0.5, 1.0), (0.9, 0.9, 0.2), (0.2, 0.9, 0.9)]  # of scenes, in turn

@@ -1,0 +1,1 @@
+"""What every process of the node needs: verbs, configuration files, logs, locks, signals, durable files."""

@@ -1,0 +1,185 @@
+"""YAML and changes to it -> a typed, frozen Struct. What the Struct does not know fails, with what it does know.
+
+Defaults and units live in the Structs; a file and the changes hold only what differs. A field whose type is a Plugin
+names a module by its `kind`: `camera: {kind: folder, folder: photos}` is capture.cameras.folder and its Config.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import typing
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+from types import ModuleType
+from typing import Any, ClassVar, TypeVar
+
+import msgspec
+import yaml
+
+T = TypeVar("T")
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be used; the message names the key, what was expected and what came."""
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """A module of `package`, chosen by `kind`, with its Config. A room subclasses it and names the package.
+
+    Modules of the package that lack what `needs` names are no plug-ins. `usual` is the kind where none is named.
+    """
+
+    package: ClassVar[str]
+    needs: ClassVar[tuple[str, ...]] = ("Config",)
+    usual: ClassVar[str | None] = None
+    kind: str
+    config: Any  # the module's Config
+
+    @property
+    def module(self) -> ModuleType:
+        return import_module(f"{self.package}.{self.kind}")
+
+    @classmethod
+    def kinds(cls) -> list[str]:
+        """All there are. It imports every module of the package, to see what each has."""
+        return [name for name in cls._names() if cls.is_kind(name)]
+
+    @classmethod
+    def is_kind(cls, name: object) -> bool:
+        """Whether there is a plug-in of this name; no other module is imported."""
+        if name not in cls._names():
+            return False
+        module = import_module(f"{cls.package}.{name}")
+        return all(hasattr(module, needed) for needed in cls.needs)
+
+    @classmethod
+    def _names(cls) -> list[str]:
+        return sorted(module.name for module in iter_modules(import_module(cls.package).__path__))
+
+
+def load_config(path: Path, schema: type[T], changes: Sequence[str] = ()) -> T:
+    """The YAML file at `path` with `changes`, such as ["camera.folder=photos"], as a `schema`. Raises ConfigError."""
+    return typed(merged(read_yaml(path), parse_changes(changes)), schema)
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """The mapping in a YAML file; empty for an empty file. Raises ConfigError."""
+    try:
+        content = _parse_yaml(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}; give a YAML file") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not YAML: {error}") from error
+    if content is not None and not isinstance(content, dict):
+        raise ConfigError(f"{path}: expected keys and values, got {type(content).__name__}")
+    return content or {}
+
+
+def parse_changes(changes: Sequence[str]) -> dict[str, Any]:
+    """["camera.loops=2", "camera.frames-per-second=5"] -> {"camera": {"loops": 2, "frames_per_second": 5}}."""
+    tree: dict[str, Any] = {}
+    for change in changes:
+        key, equals, value = change.partition("=")
+        if not (key and equals):
+            raise ConfigError(f"expected KEY=VALUE such as camera.loops=2, got {change!r}")
+        try:
+            leaf: Any = _parse_yaml(value)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{key}: {value!r} is not a YAML value: {error}") from error
+        for name in reversed(key.replace("-", "_").split(".")):
+            leaf = {name: leaf}
+        tree = merged(tree, leaf)
+    return tree
+
+
+def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with `changes` laid over it, key by key."""
+    result = dict(base)
+    for key, value in changes.items():
+        old = result.get(key)
+        result[key] = merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return result
+
+
+def typed(raw: Mapping[str, Any], schema: type[T], where: str = "") -> T:
+    """`raw` as a `schema` (Struct or dataclass); `where` is the key under which it stands. Raises ConfigError."""
+    try:
+        return msgspec.convert(_checked(raw, schema, where), schema, dec_hook=_decode)
+    except msgspec.ValidationError as error:
+        message, _, place = str(error).partition(" - at `$")
+        key = _join(where, place.rstrip("`").lstrip("."))
+        raise ConfigError(f"{key or 'configuration'}: {message[0].lower()}{message[1:].replace('`', '')}") from error
+
+
+def _checked(raw: Any, schema: Any, where: str) -> Any:
+    """`raw` after all its keys were found in `schema`, its plug-ins made; types are msgspec's to check."""
+    if not isinstance(raw, Mapping):
+        return raw
+    if isinstance(schema, type) and issubclass(schema, Plugin):
+        return _plugin(raw, schema, where)
+    if not _has_fields(schema):
+        return raw
+    types = typing.get_type_hints(schema)
+    unknown = [str(key) for key in raw if key not in types]
+    if unknown:
+        raise ConfigError(f"{_join(where, unknown[0])}: unknown key; allowed here: {', '.join(types)}")
+    missing = [name for name in _required(schema) if name not in raw]
+    if missing:
+        raise ConfigError(f"{_join(where, missing[0])}: missing; it has no default")
+    return {key: _checked(value, _struct_in(types[key]), _join(where, key)) for key, value in raw.items()}
+
+
+def _plugin(raw: Mapping[str, Any], schema: type[Plugin], where: str) -> Plugin:
+    kind = raw.get("kind", schema.usual)
+    if not schema.is_kind(kind):
+        raise ConfigError(f"{_join(where, 'kind')}: expected one of {', '.join(schema.kinds())}, got {kind!r}")
+    module = import_module(f"{schema.package}.{kind}")
+    rest = {key: value for key, value in raw.items() if key != "kind"}
+    return schema(kind, typed(rest, module.Config, where))
+
+
+def _has_fields(schema: Any) -> bool:
+    return isinstance(schema, type) and (issubclass(schema, msgspec.Struct) or dataclasses.is_dataclass(schema))
+
+
+def _required(schema: Any) -> list[str]:
+    if issubclass(schema, msgspec.Struct):
+        return [field.name for field in msgspec.structs.fields(schema) if field.required]
+    none = dataclasses.MISSING
+    return [field.name for field in dataclasses.fields(schema) if field.default is none is field.default_factory]
+
+
+def _struct_in(annotation: Any) -> Any:
+    """The Struct or dataclass in `annotation`, also where it may be None; otherwise the annotation."""
+    return next((choice for choice in typing.get_args(annotation) if _has_fields(choice)), annotation)
+
+
+def _decode(kind: type, value: Any) -> Any:
+    """Types that msgspec does not know."""
+    if isinstance(value, kind):
+        return value
+    if kind is Path and isinstance(value, str):
+        return Path(value).expanduser()
+    raise ValueError(f"Expected {kind.__name__.lower()}, got {type(value).__name__}")
+
+
+def _join(where: str, key: str) -> str:
+    return f"{where}.{key}" if where and key and not key.startswith("[") else where + key
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.1 as PyYAML reads it, but 1e-3 is a number, as it is in YAML 1.2."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float", re.compile(r"^[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
+)
+
+
+def _parse_yaml(text: str) -> Any:
+    return yaml.load(text, Loader=_Loader)  # a SafeLoader

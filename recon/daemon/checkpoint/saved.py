@@ -1,0 +1,126 @@
+"""What the reconstruction knows, as messages for the checkpoint: the view graph and the scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from splatnode.capture.messaging.wire import Message
+from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.scene.gaussians import Gaussians
+from splatnode.recon.scene.scene import Scene, View
+
+T = TypeVar("T")
+Numbers = dict[str, bool | int | float | None]
+
+
+class GraphRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Arrays: those of each keyframe's features, then those of each pair, in the order of their fields."""
+
+    names: list[str]
+    features: list[Numbers]
+    pairs: list[tuple[int, int, Numbers]]
+    pending: list[tuple[int, int]]  # that have not been compared
+
+
+class ViewRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    name: str
+    rotation_sigma_deg: float | None
+    centre_sigma_rel: float | None
+
+
+class SceneRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Arrays: Ts_world_camera (C, 4, 4), Ks (C, 3, 3), then those of the Gaussians in the order of their fields."""
+
+    views: list[ViewRecord]
+    iterations: int
+    final: bool
+
+
+def graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
+    features = [taken_apart(keyframe.features) for keyframe in graph.keyframes]
+    pairs = {key: taken_apart(pair) for key, pair in graph.pairs.items()}
+    header = GraphRecord(
+        names=[keyframe.name for keyframe in graph.keyframes],
+        features=[numbers for numbers, _ in features],
+        pairs=[(*key, numbers) for key, (numbers, _) in pairs.items()],
+        pending=sorted(graph.pending),
+    )
+    return header, [array for _, arrays in (*features, *pairs.values()) for array in arrays]
+
+
+@dataclass(frozen=True, eq=False)
+class SavedGraph:
+    """By the names of the keyframes."""
+
+    features: dict[str, Features]
+    pairs: dict[tuple[str, str], TwoView]
+    pending: list[tuple[str, str]]
+
+
+def graph_from(message: Message[GraphRecord]) -> SavedGraph:
+    """What `graph_message` was given. Raises ValueError where another version wrote the message."""
+    names, arrays = message.header.names, iter(message.arrays)
+    features = [put_together(Features, numbers, arrays) for numbers in message.header.features]
+    pairs = {(names[i], names[j]): put_together(TwoView, numbers, arrays) for i, j, numbers in message.header.pairs}
+    pending = [(names[i], names[j]) for i, j in message.header.pending]
+    return SavedGraph(dict(zip(names, features, strict=True)), pairs, pending)
+
+
+def scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDArray]]:
+    views = [ViewRecord(view.name, view.rotation_sigma_deg, view.centre_sigma_rel) for view in scene.views]
+    cameras = [torch.stack([view.T_world_camera for view in scene.views]), torch.stack([v.K for v in scene.views])]
+    gaussians = [getattr(scene.gaussians, field.name) for field in fields(Gaussians)]
+    return SceneRecord(views, scene.iterations, final), [tensor.numpy() for tensor in (*cameras, *gaussians)]
+
+
+def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe]) -> Scene | None:
+    """The scene that was saved; None where a frame of it is gone. Raises ValueError as `graph_from`."""
+    header = message.header
+    if any(view.name not in keyframes for view in header.views):
+        return None
+    if len(message.arrays) != 2 + len(fields(Gaussians)):
+        raise ValueError(f"a scene of {len(message.arrays)} arrays is of another version")
+    Ts_world_camera, Ks, *gaussians = (torch.from_numpy(np.array(array)) for array in message.arrays)
+    views = tuple(
+        View(
+            name=record.name,
+            frame_id=keyframes[record.name].frame.frame_id,
+            image=keyframes[record.name].image,
+            T_world_camera=T_world_camera,
+            K=K,
+            rotation_sigma_deg=record.rotation_sigma_deg,
+            centre_sigma_rel=record.centre_sigma_rel,
+        )
+        for record, T_world_camera, K in zip(header.views, Ts_world_camera, Ks, strict=True)
+    )
+    return Scene(views, Gaussians(*gaussians), header.iterations)
+
+
+def taken_apart(value: Any) -> tuple[Numbers, list[npt.NDArray]]:
+    """A flat dataclass as its numbers and its arrays."""
+    content = {field.name: getattr(value, field.name) for field in fields(value)}
+    arrays = [part for part in content.values() if isinstance(part, np.ndarray)]
+    return {name: _plain(part) for name, part in content.items() if not isinstance(part, np.ndarray)}, arrays
+
+
+def _plain(number: Any) -> bool | int | float | None:
+    return number.item() if isinstance(number, np.generic) else number
+
+
+def put_together(kind: type[T], numbers: Numbers, arrays: Any) -> T:
+    names = [field.name for field in fields(kind)]  # pyright: ignore[reportArgumentType]
+    if not set(numbers) <= set(names):
+        raise ValueError(f"a {kind.__name__} with {', '.join(sorted(numbers))} is of another version")
+    try:
+        return kind(**numbers, **{name: next(arrays) for name in names if name not in numbers})
+    except (StopIteration, RuntimeError) as error:
+        raise ValueError(f"arrays of a {kind.__name__} are missing") from error

@@ -1,0 +1,117 @@
+"""What is known of a scene's cameras and depths, as messages for the checkpoint: a restart need not find it again."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.messaging.wire import Message
+from splatnode.recon.daemon.checkpoint.saved import Numbers, put_together, taken_apart
+from splatnode.recon.estimation import Judgement
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.registration.register import RegisteredCamera, Registration
+from splatnode.recon.result.verdict import Verdict
+from splatnode.recon.verification.evidence import Evidence
+
+OF_REGISTRATION = ("points", "observed_by", "observed_point", "observed_pixels")
+OF_POINTMAP = ("depth", "confidence", "normal", "T_world_camera", "K")
+
+
+class JudgementRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Arrays: those of each camera in the order of their fields, then OF_REGISTRATION."""
+
+    names: list[str]  # of the keyframes, as the cameras number them
+    proven: list[str]
+    verdict: Verdict
+    evidence: Evidence
+    cameras: list[Numbers]
+    agreement: list[tuple[int, int, float]]
+    numbers: Numbers  # of the registration
+
+
+class PointmapsRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Arrays: OF_POINTMAP for each; depths as half floats, confidence and normals in 256 steps."""
+
+    names: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class SavedJudgement:
+    names: tuple[str, ...]
+    proven: frozenset[str]
+    judgement: Judgement
+
+
+def judgement_message(
+    judged: Judgement, names: Sequence[str], proven: Collection[str]
+) -> tuple[JudgementRecord, list[npt.NDArray]]:
+    """Of a judgement that has cameras and evidence, on the keyframes `names`. Raises ValueError for another."""
+    registration, evidence = judged.registration, judged.evidence
+    if registration is None or evidence is None:
+        raise ValueError("only a judgement with cameras and evidence is kept")
+    cameras = [taken_apart(camera) for camera in registration.cameras]
+    kept = {field.name: getattr(registration, field.name) for field in fields(registration)}
+    record = JudgementRecord(
+        names=list(names),
+        proven=sorted(proven),
+        verdict=judged.verdict,
+        evidence=msgspec.convert(msgspec.to_builtins(evidence, enc_hook=lambda number: number.item()), Evidence),
+        cameras=[numbers for numbers, _ in cameras],
+        agreement=[(int(i), int(j), float(share)) for (i, j), share in registration.agreement.items()],
+        numbers={name: float(value) for name, value in kept.items() if isinstance(value, (int, float))},
+    )
+    arrays = [array for _, of_camera in cameras for array in of_camera]
+    return record, [*arrays, *(kept[name] for name in OF_REGISTRATION)]
+
+
+def judgement_from(message: Message[JudgementRecord]) -> SavedJudgement:
+    """What `judgement_message` was given. Raises ValueError where another version wrote the message."""
+    header, arrays = message.header, iter(message.arrays)
+    cameras = tuple(put_together(RegisteredCamera, numbers, arrays) for numbers in header.cameras)
+    agreement = {(i, j): share for i, j, share in header.agreement}
+    content: dict[str, Any] = {"cameras": cameras, "agreement": agreement, **header.numbers}
+    try:
+        registration = Registration(**content, **dict(zip(OF_REGISTRATION, arrays, strict=True)))
+    except TypeError as error:
+        raise ValueError("a judgement of another version") from error
+    return SavedJudgement(
+        tuple(header.names), frozenset(header.proven), Judgement(registration, header.evidence, header.verdict)
+    )
+
+
+def pointmaps_message(pointmaps: Mapping[str, Pointmap]) -> tuple[PointmapsRecord, list[npt.NDArray]]:
+    arrays = []
+    for pointmap in pointmaps.values():
+        depth = pointmap.depth.astype(np.float16).view(np.uint16)
+        confidence = np.rint(255 * pointmap.confidence).astype(np.uint8)
+        normal = np.rint(127 * pointmap.normal + 128).astype(np.uint8)
+        arrays += [depth, confidence, normal, pointmap.T_world_camera, pointmap.K]
+    return PointmapsRecord(list(pointmaps)), arrays
+
+
+def pointmaps_from(message: Message[PointmapsRecord], keyframes: Mapping[str, Keyframe]) -> dict[str, Pointmap]:
+    """The point maps of those keyframes that there are. Raises ValueError as `judgement_from`."""
+    names, arrays = message.header.names, message.arrays
+    if len(arrays) != len(OF_POINTMAP) * len(names):
+        raise ValueError(f"{len(names)} point maps with {len(arrays)} arrays are of another version")
+    found = {}
+    for index, name in enumerate(names):
+        if name not in keyframes:
+            continue
+        depth, confidence, normal, T_world_camera, K = arrays[len(OF_POINTMAP) * index :][: len(OF_POINTMAP)]
+        found[name] = Pointmap(
+            name=name,
+            frame_id=keyframes[name].frame.frame_id,
+            depth=np.asarray(depth.view(np.float16), np.float32),
+            confidence=np.asarray(confidence / 255, np.float32),
+            normal=np.asarray((normal - 128.0) / 127, np.float32),
+            T_world_camera=np.array(T_world_camera),
+            K=np.array(K),
+        )
+    return found

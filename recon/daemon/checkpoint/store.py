@@ -1,0 +1,242 @@
+"""The checkpoint: all that a killed daemon needs to go on where it was.
+
+    ledger              which frames there are to know about, and where the present place begins
+    frames/<number>     a keyframe as it came; the number is its position in all that ever came
+    graph               features and matches
+    judgement           the cameras that they lead to, the evidence and the verdict
+    scene               cameras and Gaussians as they are shown
+    pointmaps           depths of its views, from which it grows
+
+The last four are made anew where they are missing. A keyframe is the daemon's as soon as its file is there. Every file
+is whole or not there, and has a checksum.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
+from splatnode.capture.messaging.message_file import read_message, write_message
+from splatnode.capture.messaging.wire import Limits, Message, WireError, decode, encode
+from splatnode.capture.process.lock import Held, exclusive
+
+log = logging.getLogger(__name__)
+
+VERSION = 1
+MADE_ANEW = ("graph", "judgement", "scene", "pointmaps")
+REMEMBERED = 1000  # frames that are gone, in case their sender has not heard that they came
+REMEMBERED_DROPPED = 100  # names and reasons
+FILE = "{:012d}.frame"
+LIMITS = Limits(header_bytes=64 << 20, arrays=1 << 20, total_bytes=4 << 30)  # of what this process wrote itself
+
+
+class CheckpointError(ValueError):
+    """The checkpoint cannot be used; the text says what to do."""
+
+
+class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A stored keyframe; its image is the only array."""
+
+    version: int
+    session: str
+    sequence: int
+    name: str
+    stamp_ns: int
+    intrinsics: Intrinsics | None
+
+
+class Ledger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    version: int = VERSION
+    place: int = 1  # counts from the first place that was ever seen
+    first: int = 0  # number of the present place's first frame
+    next: int = 0  # at least this is the number of the next frame
+    gone: tuple[tuple[str, int], ...] = ()  # session and sequence of frames that are no longer stored
+    dropped: tuple[tuple[str, str], ...] = ()  # name and reason, newest last
+
+
+@dataclass(frozen=True, eq=False)
+class StoredFrame:
+    number: int
+    key: tuple[str, int]  # session and sequence
+    frame: Frame  # its frame_id is the number
+
+
+class Store:
+    """One process at a time uses a directory; any of its threads may call."""
+
+    def __init__(self, directory: Path) -> None:
+        """Raises CheckpointError where another process uses it, or where it is of another version or damaged."""
+        self.directory = directory
+        self._frames = directory / "frames"
+        self._frames.mkdir(mode=0o700, parents=True, exist_ok=True)
+        self._resources = contextlib.ExitStack()
+        try:
+            self._resources.enter_context(exclusive(directory / "lock"))
+        except Held as error:
+            raise CheckpointError(
+                f"another process uses the checkpoint in {directory}; stop it, or give another --checkpoint"
+            ) from error
+        for leftover in (*directory.glob(".*.tmp"), *self._frames.glob(".*.tmp")):
+            leftover.unlink()
+        self.ledger = self._read_ledger()
+        self._keys: dict[int, tuple[str, int]] = {}
+        self._names: dict[str, int] = {}
+        self._next = self.ledger.next
+        self._writing = threading.RLock()
+        self._found = deque(self._read_frames())
+
+    def close(self) -> None:
+        self._resources.close()
+
+    @property
+    def scene_id(self) -> str:
+        return f"scene-{self.ledger.place:04d}"
+
+    @property
+    def names(self) -> set[str]:
+        """Of the frames that are stored."""
+        return set(self._names)
+
+    @property
+    def dropped(self) -> list[DroppedFrame]:
+        return [DroppedFrame(*entry) for entry in self.ledger.dropped]
+
+    @property
+    def seen(self) -> list[tuple[str, int]]:
+        """Session and sequence of the frames that were taken, which need not be sent again."""
+        return [*self.ledger.gone, *self._keys.values()]
+
+    def frames(self) -> Iterator[StoredFrame]:
+        """The present place's frames that an earlier process stored, in the order in which they came, each once."""
+        while self._found:
+            yield self._found.popleft()
+
+    def _read_frames(self) -> Iterator[StoredFrame]:
+        """The stored frames; a damaged one is put aside and named. All are known before another is added."""
+        for path in sorted(self._frames.glob("*.frame")):
+            try:
+                number = int(path.stem)
+                self._next = max(self._next, number + 1)
+                if number < self.ledger.first:
+                    path.unlink()
+                    continue
+                stored = _stored(number, read_message(path))
+            except (OSError, ValueError) as error:
+                log.error("a keyframe is lost on the disk, put aside: %s", error)
+                path.rename(path.with_suffix(".damaged"))
+                continue
+            self._remember(stored)
+            yield stored
+
+    def put(self, received: ReceivedFrame) -> StoredFrame | None:
+        """Returns when the frame is on the disk, under a name that no other has; None for one that was dropped.
+
+        Raises OSError where the disk does not take it.
+        """
+        key, frame = (received.session, received.sequence), received.frame
+        with self._writing:
+            if isinstance(frame, DroppedFrame):
+                self._leave_out({}, key, (frame.name, frame.reason))
+                return None
+            number = self._next
+            name = frame.name if frame.name not in self._names else f"{number:06d}-{frame.name}"
+            header = FrameRecord(VERSION, *key, name, frame.stamp_ns, frame.intrinsics)
+            write_message(self._frames / FILE.format(number), encode(header, [frame.image]))
+            stored = StoredFrame(number, key, Frame(number, name, frame.stamp_ns, frame.image, frame.intrinsics))
+            self._next = number + 1
+            self._remember(stored)
+            return stored
+
+    def forget(self, name: str, reason: str) -> None:
+        """Removes a frame for good, if it is there; that it was there stays known. Raises OSError."""
+        with self._writing:
+            if name in self._names:
+                number = self._names[name]
+                self._leave_out({number: name}, self._keys[number], (name, reason))
+
+    def begin_place(self, first: int) -> None:
+        """Another place begins with frame `first`; what was before is given up."""
+        with self._writing:
+            before = {number: name for name, number in self._names.items() if number < first}
+            gone = (*self.ledger.gone, *(self._keys[number] for number in before))
+            place = self.ledger.place + 1
+            self._write(Ledger(VERSION, place, first, self._next, gone[-REMEMBERED:]))
+            self._unlink(before)
+            for name in MADE_ANEW:
+                (self.directory / name).unlink(missing_ok=True)
+
+    def save(self, name: str, header: msgspec.Struct, arrays: list[Any]) -> None:
+        """Keeps what could be made anew. Raises OSError."""
+        write_message(self.directory / name, encode(header, arrays))
+
+    def load(self, name: str, schema: Any) -> Message[Any] | None:
+        """What was kept under this name; None where it is missing or cannot be used."""
+        try:
+            return decode(read_message(self.directory / name), schema, LIMITS)
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError) as error:
+            log.warning("%s of the checkpoint is made anew: %s", name, error)
+            return None
+
+    def _leave_out(self, frames: dict[int, str], key: tuple[str, int], dropped: tuple[str, str]) -> None:
+        ledger = self.ledger
+        self._write(
+            msgspec.structs.replace(
+                ledger,
+                next=self._next,
+                gone=(*ledger.gone, key)[-REMEMBERED:],
+                dropped=(*ledger.dropped, dropped)[-REMEMBERED_DROPPED:],
+            )
+        )
+        self._unlink(frames)
+
+    def _unlink(self, frames: dict[int, str]) -> None:
+        for number, name in frames.items():
+            (self._frames / FILE.format(number)).unlink(missing_ok=True)
+            del self._names[name], self._keys[number]
+
+    def _remember(self, stored: StoredFrame) -> None:
+        self._names[stored.frame.name] = stored.number
+        self._keys[stored.number] = stored.key
+
+    def _write(self, ledger: Ledger) -> None:
+        write_message(self.directory / "ledger", encode(ledger))
+        self.ledger = ledger
+
+    def _read_ledger(self) -> Ledger:
+        path = self.directory / "ledger"
+        try:
+            found = decode(read_message(path), Ledger).header
+        except FileNotFoundError:
+            return Ledger()
+        except (OSError, ValueError) as error:
+            raise CheckpointError(
+                f"the checkpoint in {self.directory} is damaged ({error}). Move the folder away to begin anew; "
+                "its keyframes are in frames/"
+            ) from error
+        if found.version != VERSION:
+            raise CheckpointError(
+                f"the checkpoint in {self.directory} is of version {found.version}, this is version {VERSION}. "
+                "Use the splatnode that wrote it, or move the folder away to begin anew"
+            )
+        return found
+
+
+def _stored(number: int, parts: Any) -> StoredFrame:
+    message = decode(parts, FrameRecord, LIMITS)
+    header = message.header
+    if header.version != VERSION or len(message.arrays) != 1:
+        raise WireError(f"frame {number} is of version {header.version} with {len(message.arrays)} images")
+    frame = Frame(number, header.name, header.stamp_ns, message.arrays[0], header.intrinsics)
+    return StoredFrame(number, (header.session, header.sequence), frame)

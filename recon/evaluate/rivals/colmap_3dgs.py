@@ -1,0 +1,96 @@
+"""COLMAP's cameras and points, then 3D Gaussian splatting (Kerbl et al. 2023) with adaptive density control.
+
+As published: initial sizes and opacities, step sizes and their fall, loss, thresholds, and the share of the run in
+which Gaussians are added and taken away. Compact: 1500 iterations for 30 000, two resets of the opacities for four, at
+most 100 000 Gaussians, photographs of 512 pixels, and colours that do not depend on the direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import torch
+
+from splatnode.capture.frame import Frame
+from splatnode.recon.clock import Clock
+from splatnode.recon.evaluate.rivals import outcome
+from splatnode.recon.evaluate.rivals.colmap import Model, Placed, mapped
+from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.frames.undistort import undistorted
+from splatnode.recon.optimize import refinement
+from splatnode.recon.optimize.control import adaptive
+from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.scene.points import gaussians_at
+from splatnode.recon.scene.scene import Scene, View
+
+SIZE = 512  # longer side of the photographs, pixels
+_OPACITY = 0.1  # of a Gaussian that starts from a point
+
+RATES = refinement.Rates(
+    means=1.6e-4,  # times the extent of the scene
+    quats=1e-3,
+    log_scales=5e-3,
+    logit_opacities=5e-2,
+    sh=2.5e-3,
+    final_means=0.01,
+    final=1.0,
+)
+OPTIMIZE = refinement.Config(
+    iterations=1500,
+    checkpoints=(250, 900),
+    half_resolution_share=0.0,
+    refine_poses=False,
+    rates=RATES,
+    control=ControlChoice("adaptive", adaptive.Config()),
+)
+
+
+def reconstruct(frames: Sequence[Frame], seed: int, config: refinement.Config = OPTIMIZE) -> Iterator[Snapshot]:
+    """Snapshots of the scene while it is optimised; one refusal where COLMAP places fewer than three frames."""
+    yield from optimised(frames, seed, config, begin)
+
+
+def optimised(
+    frames: Sequence[Frame], seed: int, config: refinement.Config, beginning: Callable[[Model, int], Scene]
+) -> Iterator[Snapshot]:
+    """The same from what `beginning` makes of COLMAP's model and the seed."""
+    clock = Clock()
+    model = mapped(frames, seed)
+    clock.lap("poses")
+    if model is None or len(model.placed) < outcome.MIN_CAMERAS:
+        yield outcome.refused(frames, clock)
+        return
+    scene = beginning(model, seed)
+    clock.lap("points")
+    refined = refinement.refine(scene, in_extent(config, scene), seed=seed)
+    yield from outcome.told((outcome.of_scene(frames, each) for each in refined), clock)
+
+
+def begin(model: Model, _seed: int) -> Scene:
+    """The model's cameras, and a Gaussian for each of its points."""
+    rgb = (model.colours / 255.0).astype(np.float32)
+    first_seen = np.zeros(len(model.points), np.int32)
+    for placed, seen in reversed(list(zip(model.placed, model.seen_by, strict=True))):
+        first_seen[seen] = placed.frame.frame_id
+    gaussians = gaussians_at(model.points.astype(np.float32), rgb, first_seen, _OPACITY)
+    return Scene(tuple(map(view, model.placed)), gaussians)
+
+
+def view(placed: Placed) -> View:
+    """A placed frame without its lens' distortion, at modelled size."""
+    frame = undistorted(replace(placed.frame, intrinsics=placed.intrinsics))
+    assert frame.intrinsics is not None  # COLMAP's
+    image = modelled_image(frame.image, SIZE)
+    K = frame.intrinsics.resized(image.shape[1], image.shape[0]).K
+    T_world_camera = torch.from_numpy(placed.T_world_camera).float()
+    return View(frame.name, frame.frame_id, image, T_world_camera, torch.from_numpy(K).float(), None, None)
+
+
+def in_extent(config: refinement.Config, scene: Scene) -> refinement.Config:
+    """The configuration with the means' step size in parts of the extent of the scene."""
+    means = config.rates.means * adaptive.extent([view.T_world_camera for view in scene.views])
+    return msgspec.structs.replace(config, rates=msgspec.structs.replace(config.rates, means=means))

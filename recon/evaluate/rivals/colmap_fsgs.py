@@ -1,0 +1,60 @@
+"""COLMAP's cameras and points, then FSGS (Zhu et al. 2024): Gaussians are grown into the gaps between few points.
+
+As published: the weight of the correlation with a known depth, on training and on pseudo views, the threshold of
+adaptive density control, three neighbours, and Gaussians added from a twentieth of the run on until shortly before its
+end. Compact: 1500 iterations for 10 000, and no resets of opacities. Where FSGS asks a monocular network, our
+multi-view depth serves, with COLMAP's cameras; a pseudo view's is that of its points. How far apart points must be is
+given without units, so that ours is in parts of the scene's extent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import msgspec
+
+from splatnode.capture.frame import Frame
+from splatnode.recon.evaluate.rivals import colmap_3dgs
+from splatnode.recon.evaluate.rivals.colmap import Model
+from splatnode.recon.optimize import refinement, regularise
+from splatnode.recon.optimize.control import adaptive, proximity
+from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.priors import classical, stereo
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.scene.scene import Scene
+
+_WHOLE = 1_000_000  # pixels of a patch: all of an image is one, as FSGS correlates it
+_DEPTH = regularise.Config(
+    depth=regularise.Term(0.05, 0.2, 0.95), depth_patch=_WHOLE, depth_share=1.0, min_confidence=0.1
+)
+_CONTROL = proximity.Config(adaptive.Config(gradient=5e-4, start=0.05, end=0.95, reset_every=adaptive.NEVER))
+OPTIMIZE = msgspec.structs.replace(
+    colmap_3dgs.OPTIMIZE, regularise=_DEPTH, control=ControlChoice("proximity", _CONTROL)
+)
+
+
+def reconstruct(frames: Sequence[Frame], seed: int, config: refinement.Config = OPTIMIZE) -> Iterator[Snapshot]:
+    """Snapshots of the scene while it is optimised; one refusal where COLMAP places fewer than three frames."""
+    yield from colmap_3dgs.optimised(frames, seed, config, with_depth)
+
+
+def with_depth(model: Model, seed: int) -> Scene:
+    """The scene that 3DGS starts from, with a depth for every view."""
+    scene = colmap_3dgs.begin(model, seed)
+    Ts, Ks = ([getattr(view, name).double().numpy() for view in scene.views] for name in ("T_world_camera", "K"))
+    views, sparse = [], []
+    for view, T, K, seen in zip(scene.views, Ts, Ks, model.seen_by, strict=True):
+        points = (model.points[seen] - T[:3, 3]) @ T[:3, :3]
+        points = points[points[:, 2] > 0]
+        pixels = points @ K.T
+        near, far = stereo.depth_range(points[:, 2])
+        views.append(stereo.View(view.image, K, T, (near, classical.Config().far_margin * far)))
+        sparse.append(stereo.Sparse(pixels[:, :2] / pixels[:, 2:], points[:, 2]))
+    maps = stereo.depth_maps(views, stereo.Config(), seed=seed, sparse=sparse)
+    known = [
+        replace(view, pointmap=Pointmap(view.name, view.frame_id, found.depth, found.confidence, found.normal, T, K))
+        for view, found, T, K in zip(scene.views, maps, Ts, Ks, strict=True)
+    ]
+    return replace(scene, views=tuple(known))

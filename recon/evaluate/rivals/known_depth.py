@@ -1,0 +1,73 @@
+"""A depth for every pixel of a photograph, where a rival's publication has a monocular network.
+
+What serves is splatnode's own multi-view depth, its gaps filled from their surroundings, and the focal length that was
+estimated with it. Unlike a network's, these depths are right up to one scale that all views share: that helps a rival.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import Frame
+from splatnode.recon.clock import Clock
+from splatnode.recon.config import Config
+from splatnode.recon.evaluate.rivals import outcome
+from splatnode.recon.pipeline import Reconstruction
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.scene import completion
+
+_SERVED_BY = {"depth": "multi-view depth"}
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A photograph with its depth. Where its camera stood is not said."""
+
+    name: str
+    frame_id: int
+    image: npt.NDArray[np.uint8]  # (h, w, 3) RGB at modelled size
+    depth: npt.NDArray[np.float32]  # (h, w) z, everywhere
+    K: npt.NDArray[np.float64]  # (3, 3)
+
+
+def optimised(
+    frames: Sequence[Frame], seed: int, learnt: Callable[[tuple[Sight, ...], Clock], Iterable[Snapshot]]
+) -> Iterator[Snapshot]:
+    """The snapshots that `learnt` makes of the sights; one refusal where fewer than three frames have a depth.
+
+    The clock is for what `learnt` does before its first snapshot.
+    """
+    clock = Clock()
+    known = sights(frames, seed)
+    clock.lap("points")
+    if len(known) < outcome.MIN_CAMERAS:
+        yield outcome.refused(frames, clock)
+    else:
+        yield from outcome.told(learnt(known, clock), clock, _SERVED_BY)
+
+
+def sights(frames: Sequence[Frame], seed: int) -> tuple[Sight, ...]:
+    """The frames whose depth is known, in their order; none where our own verdict is that they make no scene."""
+    work = Reconstruction(Config(seed=seed))
+    for frame in frames:
+        work.take(frame)
+    work.estimate()
+    if work.begun is None:
+        return ()
+    views = sorted(work.begun.views, key=lambda view: view.frame_id)
+    return tuple(
+        Sight(view.name, view.frame_id, view.image, _everywhere(view.pointmap, view.image), view.K.double().numpy())
+        for view in views
+        if view.pointmap is not None
+    )
+
+
+def _everywhere(pointmap: Pointmap, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
+    settings = completion.Config()
+    known = completion.only(pointmap, pointmap.confidence >= settings.min_confidence)
+    return np.where(known.depth > 0, known.depth, completion.smooth_depth(known, image, settings)).astype(np.float32)

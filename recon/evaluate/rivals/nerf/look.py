@@ -1,0 +1,86 @@
+"""How a radiance field looks, and what is published of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from splatnode.capture.frame import Frame
+from splatnode.recon.evaluate.appearance import FieldSnapshot
+from splatnode.recon.evaluate.rivals import outcome
+from splatnode.recon.evaluate.rivals.nerf.field import Field
+from splatnode.recon.evaluate.rivals.nerf.fit import Learnt
+from splatnode.recon.evaluate.rivals.nerf.volume import see
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+
+Array = npt.NDArray[np.float64]
+LATTICE = 128  # pixels on which an image is compared
+_CHUNK = 1024  # rays that are rendered at a time
+
+
+class FieldLook:
+    """`recon.evaluate.appearance.Appearance` of a field, whose parameters are constants here."""
+
+    num_gaussians = None
+
+    def __init__(self, field: Field) -> None:
+        self._field = field.requires_grad_(False)
+
+    @property
+    def num_bytes(self) -> int:
+        return sum(parameter.nbytes for parameter in self._field.parameters())
+
+    def depth(self, T_world_camera: Array) -> float:
+        """The median depth of an image with an angle of view of 53 degrees."""
+        K = torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+        with torch.no_grad():
+            return float(
+                see(self._field, torch.from_numpy(T_world_camera).float(), K, lattice(100, 100)).depth.median()
+            )
+
+    def difference(self, image: Tensor, T_world_camera: Tensor, K: Tensor) -> Tensor:
+        """On the same pixels whenever it is asked, evenly spread over the image."""
+        pixels = lattice(image.shape[1], image.shape[0])
+        columns, rows = pixels.long().unbind(1)
+        return (see(self._field, T_world_camera, K, pixels).rgb - image[rows, columns]).abs().mean()
+
+    def picture(self, T_world_camera: Array, K: Array, width: int, height: int) -> Tensor:
+        v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+        T, intrinsics = torch.from_numpy(T_world_camera).float(), torch.from_numpy(K).float()
+        with torch.no_grad():
+            parts = torch.stack([u, v], -1).view(-1, 2).split(_CHUNK)
+            rgb = torch.cat([see(self._field, T, intrinsics, part).rgb for part in parts])
+        return rgb.view(height, width, 3)
+
+
+def lattice(width: int, height: int, count: int = LATTICE) -> Tensor:
+    """(M, 2) centres of pixels that cover an image evenly: the additive sequence of the plastic number."""
+    plastic = 1.32471795724474602596
+    shares = torch.arange(1, count + 1)[:, None] * torch.tensor([1 / plastic, 1 / plastic**2]) % 1.0
+    return (shares * torch.tensor([width, height])).floor() + 0.5
+
+
+def of_field(frames: Sequence[Frame], placed: Sequence[Frame], learnt: Learnt) -> FieldSnapshot:
+    """A field and the cameras that were learnt with it, those of the frames `placed`."""
+    return FieldSnapshot(
+        sequence=0,
+        verdict=outcome.verdict(frames, {frame.name for frame in placed}),
+        cameras=tuple(_camera(frame, T, learnt.focal) for frame, T in zip(placed, learnt.Ts_world_camera, strict=True)),
+        gaussians=GaussianArrays.empty(),
+        images={},
+        dropped=(),
+        iterations=learnt.iterations,
+        appearance=FieldLook(learnt.field),
+    )
+
+
+def _camera(frame: Frame, T_world_camera: Tensor, focal: float) -> CameraEstimate:
+    width, height = frame.width, frame.height
+    pixels = focal * max(width, height)
+    K = np.array([[pixels, 0, width / 2], [0, pixels, height / 2], [0, 0, 1.0]])
+    T = T_world_camera.double().numpy()
+    return CameraEstimate(frame.name, frame.frame_id, T, K, width, height, None, None)

@@ -1,0 +1,37 @@
+"""NeRF-- (Wang et al. 2021): cameras, their focal length and a radiance field learnt together from nothing else.
+
+As published: all cameras start at the origin and look ahead, the focal length starts as the image's size, samples are
+spaced as in normalised device coordinates, without a hierarchy. Compact: 1500 iterations of 384 rays, where 10 000
+epochs take 1024 rays of every photograph, and step sizes of 5e-3 and 3e-3 for 1e-3 in their stead; 32 samples a ray for
+128; three layers of 64 for eight of 128; photographs of 256 pixels. Our first camera stays at the origin. Twice as many
+iterations change nothing: on llff_fern the cameras stand after 600, where their focal length and turns are wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import torch
+
+from splatnode.capture.frame import Frame
+from splatnode.recon.clock import Clock
+from splatnode.recon.evaluate.rivals import outcome
+from splatnode.recon.evaluate.rivals.nerf import fit
+from splatnode.recon.evaluate.rivals.nerf.cameras import Focal
+from splatnode.recon.evaluate.rivals.nerf.look import of_field
+from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.result.snapshot import Snapshot
+
+SIZE = 256  # longer side of the photographs, pixels
+OPTIMIZE = fit.Config()
+
+
+def reconstruct(frames: Sequence[Frame], seed: int, config: fit.Config = OPTIMIZE) -> Iterator[Snapshot]:
+    """Snapshots of the field while it is learnt."""
+    clock = Clock()
+    if len(frames) < outcome.MIN_CAMERAS:
+        yield outcome.refused(frames, clock)
+        return
+    images = [torch.from_numpy(modelled_image(frame.image, SIZE)).float() / 255.0 for frame in frames]
+    learnt = fit.learn(images, Focal(1.0), config, seed=seed)
+    yield from outcome.told((of_field(frames, frames, each) for each in learnt), clock)

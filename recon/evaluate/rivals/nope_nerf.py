@@ -1,0 +1,118 @@
+"""NoPe-NeRF (Bian et al. 2023): as NeRF--, held by depth maps whose scale and offset are learnt view by view.
+
+As published: the weights of the losses (depth 0.04; point clouds 1 and surface colours 1 between consecutive frames,
+until the relative poses stand), and a focal length that is known. Compact as nerfmm is. A monocular network's place
+takes `known_depth`, each map divided by its median so that its scale has to be found; it also gives the focal length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from splatnode.capture.frame import Frame
+from splatnode.recon.evaluate.rivals import known_depth
+from splatnode.recon.evaluate.rivals.known_depth import Sight
+from splatnode.recon.evaluate.rivals.nerf import fit
+from splatnode.recon.evaluate.rivals.nerf.cameras import Focal
+from splatnode.recon.evaluate.rivals.nerf.look import lattice, of_field
+from splatnode.recon.evaluate.rivals.nerfmm import OPTIMIZE, SIZE
+from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.result.snapshot import Snapshot
+
+_DEPTH, _CLOUD, _SURFACE = 0.04, 1.0, 1.0  # weights
+_PAIRS_UNTIL = 0.6  # of the run
+_POINTS = 384  # of each view's cloud
+
+
+def reconstruct(frames: Sequence[Frame], seed: int, config: fit.Config = OPTIMIZE) -> Iterator[Snapshot]:
+    """Snapshots of the field while it is learnt; one refusal where fewer than three frames have a depth."""
+    return known_depth.optimised(frames, seed, lambda known, _clock: _learnt(frames, known, seed, config))
+
+
+def _learnt(frames: Sequence[Frame], known: Sequence[Sight], seed: int, config: fit.Config) -> Iterator[Snapshot]:
+    by_name = {frame.name: frame for frame in frames}
+    placed = [by_name[sight.name] for sight in known]
+    views = [_look(sight) for sight in known]
+    focal = Focal(float(np.mean([sight.K[0, 0] / max(sight.image.shape) for sight in known]))).requires_grad_(False)
+    terms = Terms(views, focal)
+    learnt = fit.learn(
+        [view.image for view in views], focal, config, seed=seed, further=terms, beside=(terms.scales, terms.offsets)
+    )
+    yield from (of_field(frames, placed, each) for each in learnt)
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    image: Tensor  # (h, w, 3)
+    depth: Tensor  # (h, w), whose median is 1
+
+
+def _look(sight: Sight) -> Look:
+    image = modelled_image(sight.image, SIZE)
+    depth = cv2.resize(sight.depth, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_NEAREST)
+    return Look(torch.from_numpy(image).float() / 255.0, torch.from_numpy(depth / np.float32(np.median(depth))).float())
+
+
+class Terms:
+    """The losses beside the colours', with the scale and offset of each view's depth; the first one's is the unit."""
+
+    def __init__(self, views: Sequence[Look], focal: Focal) -> None:
+        self._views, self._focal = views, focal
+        self.scales = nn.Parameter(torch.ones(len(views) - 1))
+        self.offsets = nn.Parameter(torch.zeros(len(views) - 1))
+
+    def __call__(self, glance: fit.Glance) -> Tensor:
+        columns, rows = glance.pixels.long().unbind(1)
+        loss = _DEPTH * (glance.seen.depth - self._depth(glance.view)[rows, columns]).abs().mean()
+        if glance.progress >= _PAIRS_UNTIL:
+            return loss
+        first = min(glance.view, len(self._views) - 2)
+        Ts = [glance.cameras.T_world_camera(index) for index in (first, first + 1)]
+        T_second_first = torch.linalg.inv(Ts[1]) @ Ts[0]
+        cloud = self.cloud(first) @ T_second_first[:3, :3].T + T_second_first[:3, 3]
+        return loss + _CLOUD * chamfer(cloud, self.cloud(first + 1)) + _SURFACE * self.surface(first, cloud)
+
+    def surface(self, first: int, cloud: Tensor) -> Tensor:
+        """Mean difference between a view's colours and the next one's where that sees them, `cloud` (M, 3)."""
+        view, other = self._views[first], self._views[first + 1]
+        pixels = (cloud @ self._K(other).T)[:, :2] / cloud[:, 2:].clamp_min(1e-3)
+        size = torch.tensor([other.image.shape[1], other.image.shape[0]])
+        inside = (cloud[:, 2] > 1e-3) & (pixels > 0).all(1) & (pixels < size).all(1)
+        grid = (2 * pixels / size - 1)[None, None]
+        colours = other.image.permute(2, 0, 1)[None]
+        shown = functional.grid_sample(colours, grid, padding_mode="border", align_corners=False)[0, :, 0].T
+        columns, rows = _pixels(view).long().unbind(1)
+        difference = (shown - view.image[rows, columns]).abs().mean(1)
+        return (difference * inside).sum() / inside.sum().clamp_min(1)
+
+    def cloud(self, index: int) -> Tensor:
+        """(M, 3) points of a view in its camera's frame."""
+        view = self._views[index]
+        pixels, K = _pixels(view), self._K(view)
+        columns, rows = pixels.long().unbind(1)
+        rays = torch.cat([(pixels - K[:2, 2]) / torch.diagonal(K)[:2], torch.ones_like(pixels[:, :1])], 1)
+        return rays * self._depth(index)[rows, columns][:, None]
+
+    def _depth(self, index: int) -> Tensor:
+        depth = self._views[index].depth
+        return depth if index == 0 else self.scales[index - 1] * depth + self.offsets[index - 1]
+
+    def _K(self, view: Look) -> Tensor:
+        return self._focal.K(view.image.shape[1], view.image.shape[0])
+
+
+def chamfer(a: Tensor, b: Tensor) -> Tensor:
+    """Mean distance of points (M, 3) to the nearest of the others (N, 3), and the other way round."""
+    distances = torch.cdist(a, b)
+    return distances.amin(1).mean() + distances.amin(0).mean()
+
+
+def _pixels(view: Look) -> Tensor:
+    return lattice(view.image.shape[1], view.image.shape[0], _POINTS)

@@ -1,0 +1,70 @@
+"""What a rival tells. It publishes whatever it finds: its only refusal is to find nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
+
+from splatnode.capture.frame import Frame
+from splatnode.recon.clock import Clock
+from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
+from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.recon.scene.scene import Scene
+
+MIN_CAMERAS = 3  # a model of two cameras counts as no answer, for every method
+
+
+def verdict(frames: Sequence[Frame], placed: Collection[str]) -> Verdict:
+    """What to say when cameras of the frames named `placed` were found."""
+    missing = tuple(frame.name for frame in frames if frame.name not in placed)
+    told = f"{len(placed)} of {len(frames)} frames were placed."
+    if len(placed) < MIN_CAMERAS:
+        return Verdict(Code.NO_OVERLAP, told, "", missing)
+    return Verdict(Code.OK_PARTIAL if missing else Code.OK, told, "", missing, publishable=True)
+
+
+def refused(frames: Sequence[Frame], clock: Clock) -> Snapshot:
+    """No scene, because too few cameras were found."""
+    return Snapshot(
+        sequence=1,
+        verdict=verdict(frames, ()),
+        cameras=(),
+        gaussians=GaussianArrays.empty(),
+        images={},
+        dropped=(),
+        iterations=0,
+        seconds=clock.booked,
+        final=True,
+    )
+
+
+def of_scene(frames: Sequence[Frame], scene: Scene) -> Snapshot:
+    """What is published of Gaussians and the cameras that they were fitted with."""
+    return Snapshot(
+        sequence=0,
+        verdict=verdict(frames, {view.name for view in scene.views}),
+        cameras=scene.cameras(),
+        gaussians=scene.arrays(),
+        images={},
+        dropped=(),
+        iterations=scene.iterations,
+        served_by=scene.served_by,
+    )
+
+
+def told(
+    snapshots: Iterable[Snapshot], clock: Clock, served_by: Mapping[str, str] = MappingProxyType({})
+) -> Iterator[Snapshot]:
+    """The snapshots that an optimisation gives, numbered and timed as "optimise", and the last one again as final.
+
+    `served_by` names what took the place of networks that the publication has.
+    """
+    last = None
+    for sequence, snapshot in enumerate(snapshots, 1):
+        clock.lap("optimise")
+        last = replace(snapshot, sequence=sequence, seconds=clock.booked, served_by={**snapshot.served_by, **served_by})
+        yield last
+        clock.lap("wait")
+    assert last is not None  # an optimisation gives its end
+    yield replace(last, sequence=last.sequence + 1, final=True)

@@ -1,0 +1,1 @@
+"""Single frames: keyframes with their features, screening, given distortion removed, black borders."""

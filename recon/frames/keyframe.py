@@ -1,0 +1,68 @@
+"""Keyframe: an accepted frame with its features and its image at modelled size."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import Frame
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """Local features of a frame at full size. A point may have several descriptors: how it looks from elsewhere."""
+
+    points: npt.NDArray[np.float64]  # (M, 2) pixels of the full-size image, top-left pixel centre at (0.5, 0.5)
+    descriptors: npt.NDArray[np.uint8]  # (D, 128) as matching/nearest_neighbours.py quantises them
+    point_of: npt.NDArray[np.int64]  # (D,) the point that a descriptor describes
+    squeeze: npt.NDArray[np.float64]  # (D,) how much narrower than the frame the image was that it was found in
+
+
+@dataclass(frozen=True, eq=False)
+class Keyframe:
+    frame: Frame
+    image: npt.NDArray[np.uint8]  # (h, w, 3) RGB at modelled size
+    features: Features
+
+    @property
+    def name(self) -> str:
+        return self.frame.name
+
+    @property
+    def scale(self) -> tuple[float, float]:
+        """Modelled size over full size, horizontally and vertically."""
+        return self.image.shape[1] / self.frame.width, self.image.shape[0] / self.frame.height
+
+
+def content_key(keyframe: Keyframe) -> bytes:
+    """Sorts keyframes by what they show: with it, an answer does not depend on the order in which they came."""
+    return keyframe.features.points[:64].tobytes()
+
+
+def longer_side(frame: Frame) -> int:
+    """Pixels."""
+    return max(frame.width, frame.height)
+
+
+def principal_point(frame: Frame) -> npt.NDArray[np.float64]:
+    """(2,) pixels: as given, else the middle of the image."""
+    if frame.intrinsics is not None:
+        return np.array([frame.intrinsics.cx, frame.intrinsics.cy])
+    return np.array([frame.width / 2.0, frame.height / 2.0])
+
+
+def modelled_size(width: int, height: int, longer_side: int) -> tuple[int, int]:
+    """(width, height) with the longer side at most `longer_side`; images are never enlarged."""
+    scale = min(1.0, longer_side / max(width, height))
+    return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def modelled_image(image: npt.NDArray[np.uint8], longer_side: int) -> npt.NDArray[np.uint8]:
+    """`image` (H, W, 3) area-resampled to its modelled size."""
+    width, height = modelled_size(image.shape[1], image.shape[0], longer_side)
+    if (width, height) == (image.shape[1], image.shape[0]):
+        return image
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)

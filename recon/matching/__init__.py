@@ -1,0 +1,1 @@
+"""Pairs of frames: features, descriptor matches, two-view geometry, and the view graph that holds them."""

@@ -1,0 +1,54 @@
+"""Mutual nearest-neighbour matches with the ratio test, in one native sweep."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.core import library, pointer
+
+Bytes = npt.NDArray[np.uint8]
+Index = npt.NDArray[np.int64]
+
+QUANTISED_NORM = 175.0  # of a descriptor in bytes: with rounding at most 181, so that products fit 16 bits
+_SCORE_OFFSET = 16320  # as in recon/core/match.cpp
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    ratio: float = 0.85  # nearest over second-nearest distance; looser than usual, geometry decides later
+
+
+def quantise(descriptors: npt.NDArray[np.float32]) -> Bytes:
+    """(M, 128) non-negative descriptors of unit length as bytes below 128; costs 2 % of a descriptor's length."""
+    return np.minimum(np.rint(descriptors * QUANTISED_NORM), 127).astype(np.uint8)
+
+
+def match(descriptors1: Bytes, descriptors2: Bytes, config: Config) -> Index:
+    """(M, 2) indices into both sets: each is the other's nearest neighbour and clearly nearer than the next.
+
+    The most distinct matches come first. Both are `quantise`d, (*, 128), of at most 65535 rows.
+    """
+    for descriptors in (descriptors1, descriptors2):
+        if descriptors.dtype != np.uint8 or descriptors.ndim != 2 or descriptors.shape[1] != 128:
+            raise ValueError(f"descriptors must be (M, 128) uint8, got {descriptors.shape} {descriptors.dtype}")
+        if len(descriptors) > 65535:
+            raise ValueError(f"at most 65535 descriptors can be matched, got {len(descriptors)}")
+    count1, count2 = len(descriptors1), len(descriptors2)
+    if count1 < 2 or count2 < 2:
+        return np.zeros((0, 2), np.int64)
+    first, second = np.ascontiguousarray(descriptors1), np.ascontiguousarray(descriptors2)
+    nearest, score, second_score = (np.empty(count1, np.int32) for _ in range(3))
+    back = np.empty(count2, np.int32)
+    library().core_match(
+        *(pointer(first), count1, pointer(second), count2),
+        *(pointer(nearest), pointer(score), pointer(second_score), pointer(back)),
+    )
+    squared_norm = (first.astype(np.int32) ** 2).sum(1)
+    nearest_squared, second_squared = (
+        np.maximum(squared_norm + 2 * (_SCORE_OFFSET - value), 0) for value in (score, second_score)
+    )
+    good = (nearest_squared < config.ratio**2 * second_squared) & (back[nearest] == np.arange(count1))
+    (chosen,) = np.nonzero(good)
+    chosen = chosen[np.argsort(nearest_squared[chosen] / np.maximum(second_squared[chosen], 1), kind="stable")]
+    return np.stack([chosen, nearest[chosen]], 1).astype(np.int64)

@@ -1,0 +1,110 @@
+"""LPIPS, the learned perceptual distance of Zhang et al. 2018 (version 0.1), without torchvision.
+
+It is a metric of the benchmark and, with gradients, the perceptual loss of equation 7. The weights are data that the
+user supplies (`recon/networks/weights.py`); without them nothing is measured. Images are mapped to [-1, 1], as the
+metric is defined. The 3DGS and InstantSplat code feeds it [0, 1], so published figures of that family are not exactly
+comparable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from splatnode.recon.networks.weights import located
+
+
+@dataclass(frozen=True)
+class Layer:
+    """A convolution and its ReLU, after a pooling (kernel of `pool`, stride 2) where that is not 0."""
+
+    stride: int = 1
+    padding: int = 1
+    pool: int = 0
+    tap: bool = False  # the features after this layer are compared
+
+
+_ALEX = (
+    Layer(stride=4, padding=2, tap=True),
+    Layer(padding=2, pool=3, tap=True),
+    Layer(pool=3, tap=True),
+    Layer(tap=True),
+    Layer(tap=True),
+)
+_VGG = (
+    Layer(),
+    Layer(tap=True),
+    Layer(pool=2),
+    Layer(tap=True),
+    *(Layer(pool=2), Layer(), Layer(tap=True)) * 3,
+)
+_NETWORKS = {"alex": (_ALEX, "lpips_alex.pth"), "vgg": (_VGG, "lpips_vgg_fp16.pth")}
+_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+
+
+@dataclass(frozen=True, eq=False)
+class Lpips:
+    """A loaded network."""
+
+    layers: tuple[Layer, ...]
+    weights: Mapping[str, Tensor]  # net.I.weight, net.I.bias: convolutions; linK.weight (1, C, 1, 1): heads
+
+    @torch.no_grad()
+    def __call__(self, image: Tensor, truth: Tensor) -> float:
+        """The distance of two images (H, W, 3) in [0, 1]; 0 for equal ones. Sides must be at least 32 pixels."""
+        return float(self.distance(image, self.features(truth)))
+
+    def features(self, image: Tensor) -> tuple[Tensor, ...]:
+        """What the network sees in an image (H, W, 3) in [0, 1]: unit vectors (1, C, h, w) of each tapped layer."""
+        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 32:
+            raise ValueError(f"image must be (H, W, 3) of at least 32x32, got {tuple(image.shape)}")
+        x = image.to(torch.float32).permute(2, 0, 1)[None] * 2 - 1
+        x = (x - x.new_tensor(_SHIFT).view(3, 1, 1)) / x.new_tensor(_SCALE).view(3, 1, 1)
+        tapped = []
+        for i, layer in enumerate(self.layers):
+            if layer.pool:
+                x = functional.max_pool2d(x, layer.pool, stride=2)
+            weight, bias = self.weights[f"net.{i}.weight"].float(), self.weights[f"net.{i}.bias"].float()
+            x = functional.relu(functional.conv2d(x, weight, bias, layer.stride, layer.padding))
+            if layer.tap:
+                tapped.append(x / ((x * x).sum(1, keepdim=True) + 1e-20).sqrt())
+        return tuple(tapped)
+
+    def distance(self, image: Tensor, truth: Sequence[Tensor]) -> Tensor:
+        """Scalar distance of `image` (H, W, 3) from the image whose `features` are `truth`, with gradients."""
+        found = self.features(image)
+        if [layer.shape for layer in found] != [layer.shape for layer in truth]:
+            raise ValueError(f"images must have equal sizes, got features {found[0].shape} and {truth[0].shape}")
+        parts = [
+            functional.conv2d((mine - true) ** 2, self.weights[f"lin{head}.weight"].float()).mean()
+            for head, (mine, true) in enumerate(zip(found, truth, strict=True))
+        ]
+        return torch.stack(parts).sum()
+
+
+def load_lpips(network: str, weights_dir: Path | None = None) -> Lpips | None:
+    """The network "alex" or "vgg" with its weights, or None where there are none: the metric is not measured then.
+
+    VGG16's weights stay in half precision; each layer is widened when it is used. Raises ValueError where the file is
+    there but holds something else.
+    """
+    layers, file_name = _NETWORKS[network]
+    if weights_dir is None:
+        path = located(f"lpips/{file_name}")
+    else:
+        candidates = (weights_dir / "lpips" / file_name, weights_dir / file_name)
+        path = next((candidate for candidate in candidates if candidate.is_file()), None)
+    if path is None:
+        return None
+    weights = torch.load(path, map_location="cpu", weights_only=True)
+    expected = {f"net.{i}.{part}" for i in range(len(layers)) for part in ("weight", "bias")}
+    expected |= {f"lin{i}.weight" for i in range(sum(layer.tap for layer in layers))}
+    if set(weights) != expected:
+        missing = sorted(expected - set(weights))[:3]
+        raise ValueError(f"{path} must hold the complete LPIPS network {network!r}; it lacks {missing}")
+    return Lpips(layers, weights)

@@ -1,0 +1,1 @@
+"""Joint refinement of Gaussians and cameras: losses, regularisation, density control, divergence."""

@@ -1,0 +1,143 @@
+"""Adam over all parameters of a scene at once, whose rows come and go."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from splatnode.recon.core import library
+
+
+class Adam:
+    """Adam (Kingma and Ba 2015, algorithm 1) in one native call; `torch.optim.Adam` in values, but for rounding.
+
+    Parameters are named; rows are Gaussians (or cameras). `lrs` may be changed between steps. A row that is added
+    starts with moments of 0 but shares its parameter's count of steps, so its first steps are about three times as
+    long as a new parameter's, as in 3DGS.
+    """
+
+    def __init__(
+        self,
+        params: Mapping[str, Tensor],  # float32 leaves on the CPU, contiguous, any shape
+        lrs: Mapping[str, float],  # by the same names
+        betas: tuple[float, float] = (0.9, 0.999),
+        eps: float = 1e-15,
+    ):
+        if set(params) != set(lrs):
+            raise ValueError(f"params and lrs must have the same names, got {sorted(params)} and {sorted(lrs)}")
+        self.lrs = dict(lrs)
+        self.betas = betas
+        self.eps = eps
+        self._groups = {name: _new_group(name, param) for name, param in params.items()}
+
+    @property
+    def params(self) -> dict[str, Tensor]:
+        return {name: group.param for name, group in self._groups.items()}
+
+    def zero_grad(self) -> None:
+        for group in self._groups.values():
+            group.param.grad = None
+
+    @torch.no_grad()
+    def step(self, lr_factors: Mapping[str, Tensor] | None = None) -> None:
+        """One update of every parameter that has a gradient.
+
+        `lr_factors[name]`, one number a row (N,), multiplies the learning rate; of names left out it is 1.
+        """
+        factors = {name: _row_factors(name, value, self._groups) for name, value in (lr_factors or {}).items()}
+        moving = {name: group for name, group in self._groups.items() if group.param.grad is not None}
+        gradients = {name: _gradient(name, group.param) for name, group in moving.items()}
+        native = (_NativeGroup * len(moving))()
+        for slot, (name, group) in zip(native, moving.items(), strict=True):
+            group.steps += 1
+            slot.parameter, slot.gradient = group.param.data_ptr(), gradients[name].data_ptr()
+            slot.first, slot.second = group.first.data_ptr(), group.second.data_ptr()
+            slot.row_factors = factors[name].data_ptr() if name in factors else None
+            slot.count = group.param.numel()
+            slot.row_size = group.param[0].numel() if len(group.param) else 1
+            slot.step_size = self.lrs[name] / (1 - self.betas[0] ** group.steps)
+            slot.root_correction = (1 - self.betas[1] ** group.steps) ** -0.5
+        library().core_adam(native, len(moving), *map(ctypes.c_double, (*self.betas, self.eps)))
+        for group in moving.values():
+            torch.autograd.graph.increment_version(group.param)
+
+    def follow(self, params: Mapping[str, Tensor], origin: Tensor) -> None:
+        """Goes on with `params`, of M rows each, in place of the old ones.
+
+        `origin` (M,) is the old row whose state each goes on with; one of -1 starts with moments of 0.
+        """
+        if set(params) != set(self._groups):
+            raise ValueError(f"params must have the names {sorted(self._groups)}, got {sorted(params)}")
+        fresh = origin < 0
+        for name, param in params.items():
+            group = self._groups[name]
+            if param.shape != (len(origin), *group.param.shape[1:]):
+                shape = (len(origin), *group.param.shape[1:])
+                raise ValueError(f"{name} must be {shape} for these origins, got {tuple(param.shape)}")
+            first, second = (moment[origin].masked_fill_(_beside(fresh, moment), 0) for moment in group.moments)
+            self._groups[name] = _Group(_checked(name, param), first, second, group.steps)
+
+
+@dataclass(eq=False)
+class _Group:
+    param: Tensor
+    first: Tensor  # moment: running mean of the gradient
+    second: Tensor  # and of its square
+    steps: int
+
+    @property
+    def moments(self) -> tuple[Tensor, Tensor]:
+        return self.first, self.second
+
+
+class _NativeGroup(ctypes.Structure):
+    """AdamGroup of recon/core/adam.cpp."""
+
+    _fields_ = [
+        *((name, ctypes.c_void_p) for name in ("parameter", "first", "second", "gradient", "row_factors")),
+        ("count", ctypes.c_int64),
+        ("row_size", ctypes.c_int64),
+        ("step_size", ctypes.c_float),
+        ("root_correction", ctypes.c_float),
+    ]
+
+
+def _beside(rows: Tensor, values: Tensor) -> Tensor:
+    """`rows` (N,) in a shape that broadcasts with `values` (N, ...)."""
+    return rows.view(-1, *[1] * (values.dim() - 1))
+
+
+def _new_group(name: str, param: Tensor) -> _Group:
+    zeros = torch.zeros_like(_checked(name, param), requires_grad=False)
+    return _Group(param, zeros, zeros.clone(), 0)
+
+
+def _checked(name: str, param: Tensor) -> Tensor:
+    if param.dtype != torch.float32 or param.device.type != "cpu" or not param.is_contiguous() or param.dim() == 0:
+        raise ValueError(
+            f"{name} must be a contiguous float32 tensor on the CPU with at least one dimension, "
+            f"got {param.dtype} on {param.device} of shape {tuple(param.shape)} and strides {param.stride()}"
+        )
+    if not (param.is_leaf and param.requires_grad):
+        raise ValueError(f"{name} must be a leaf that requires its gradient (call .requires_grad_())")
+    return param
+
+
+def _gradient(name: str, param: Tensor) -> Tensor:
+    assert param.grad is not None
+    if param.grad.is_sparse:
+        raise ValueError(f"the gradient of {name} must be dense")
+    return param.grad.contiguous()
+
+
+def _row_factors(name: str, factors: Tensor, groups: Mapping[str, _Group]) -> Tensor:
+    if name not in groups:
+        raise ValueError(f"lr_factors names {name!r}; there are {sorted(groups)}")
+    rows = len(groups[name].param)
+    if tuple(factors.shape) != (rows,):
+        raise ValueError(f"lr_factors[{name!r}] must be ({rows},), got {tuple(factors.shape)}")
+    return factors.to(torch.float32).contiguous()

@@ -1,0 +1,41 @@
+"""Whether the refinement ruined a scene: then it is no result, however right its cameras were at the start."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from splatnode.recon.optimize.refinement import PARAMETERS
+from splatnode.recon.optimize.target import target
+from splatnode.recon.rasterize.gaussian_render import seen
+from splatnode.recon.result.verdict import Verdict
+from splatnode.recon.scene.scene import Scene, View
+from splatnode.recon.verification import refusals
+
+WORSE = 1.1  # times the misfit that the scene began with; refinements that work end between .2 and .8 of it
+_LOOKED_AT = 4  # views at most
+_SCALE = 0.5  # of the photographs' size
+_DSSIM = 0.2
+
+
+def refusal(before: float, scene: Scene) -> Verdict | None:
+    """The verdict on `scene` where its misfit is worse than the one `before` the refinement; else None."""
+    after = misfit(scene)
+    return None if after <= WORSE * before else refusals.diverged([view.name for view in scene.views], before, after)
+
+
+def misfit(scene: Scene) -> float:
+    """The mean photometric loss over some views; infinite where the scene has become numbers that none can show."""
+    if not all(bool(getattr(scene.gaussians, name).isfinite().all()) for name in PARAMETERS):
+        return math.inf
+    views = scene.views[:: math.ceil(len(scene.views) / _LOOKED_AT)]
+    return sum(_misfit(scene, view) for view in views) / len(views)
+
+
+def _misfit(scene: Scene, view: View) -> float:
+    photograph = target(view, np.ones((view.height, view.width), np.bool_), _SCALE, _DSSIM)
+    size = photograph.width, photograph.height
+    rgb = seen(scene.gaussians, scene.gaussians.opacities, view.T_world_camera, photograph.K, *size).rgb
+    assert rgb is not None  # it was asked for
+    return float(photograph.loss(rgb))

@@ -1,0 +1,222 @@
+"""Joint refinement of Gaussians and camera poses against the photographs."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Annotated
+
+import msgspec
+import numpy as np
+import torch
+from msgspec import Meta
+from torch import Tensor
+
+from splatnode.recon.frames import border
+from splatnode.recon.geometry import exp_se3, twist_gradient
+from splatnode.recon.optimize import dropout, regularise
+from splatnode.recon.optimize.adam import Adam
+from splatnode.recon.optimize.control.control import Control, ControlChoice, Step
+from splatnode.recon.optimize.pseudo_views import PseudoView
+from splatnode.recon.optimize.regularise import Regularisation
+from splatnode.recon.optimize.target import Target, target
+from splatnode.recon.rasterize.gaussian_render import seen
+from splatnode.recon.rasterize.render import Render
+from splatnode.recon.scene.gaussians import Gaussians
+from splatnode.recon.scene.scene import Scene
+
+Share = Annotated[float, Meta(ge=0, le=1)]
+Rate = Annotated[float, Meta(ge=0, le=1)]
+PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # of Gaussians, that are optimised
+
+
+class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Adam's step sizes at the start. Lengths are relative to the median depth of the scene, which is 1."""
+
+    means: Rate = 8e-4
+    quats: Rate = 2e-2
+    log_scales: Rate = 1e-1
+    logit_opacities: Rate = 1e-1
+    sh: Rate = 3e-2
+    translation: Rate = 2e-4
+    rotation: Rate = 2e-4  # radians
+    final_means: Share = 0.1  # those of the means have fallen to this part at the end, exponentially
+    final: Share = 0.3  # the Gaussians' others to this
+    final_pose: Share = 0.1  # and those of the cameras to this
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    iterations: Annotated[int, Meta(ge=0)] = 500
+    checkpoints: tuple[int, ...] = (150,)  # iterations after which the scene is shown, besides the last one
+    half_resolution_share: Share = 0.25  # of the iterations, at the start
+    dssim: Share = 0.2  # lambda of (1 - lambda) L1 + lambda D-SSIM
+    dropout: dropout.Config = dropout.Config()
+    refine_poses: bool = True
+    rates: Rates = Rates()
+    regularise: regularise.Config = regularise.Config()  # losses beside the photometric one; none by default
+    control: ControlChoice | None = None  # what adds and takes away Gaussians meanwhile
+
+
+def refine(
+    scene: Scene, config: Config, *, seed: int, deadline: float | None = None, max_gaussians: int | None = None
+) -> Iterator[Scene]:
+    """The scene at every checkpoint and at the end, after at most `config.iterations` steps of one view each.
+
+    `deadline` is a time of `time.monotonic()`: the step sizes fall so that they are at their end by then.
+    `max_gaussians` is how many there may be at the end; it is for the control to see to that.
+    The first view stays where it is: it is the world.
+    """
+    with _single_torch_thread():
+        fit = _Fit(scene, config, seed, max_gaussians)
+        order = np.random.default_rng(seed)
+        started = time.monotonic()
+        queue: list[int] = []
+        for iteration in range(config.iterations):
+            progress = iteration / config.iterations
+            if deadline is not None:
+                now = time.monotonic()
+                if now >= deadline:
+                    break
+                progress = max(progress, (now - started) / max(deadline - started, 1e-9))
+            queue = queue or order.permutation(len(scene.views)).tolist()
+            fit.step(queue.pop(), progress)
+            if iteration + 1 in config.checkpoints and iteration + 1 < config.iterations:
+                yield fit.scene()
+        yield replace(fit.scene(), losses=tuple(fit.losses))
+
+
+@contextmanager
+def _single_torch_thread() -> Iterator[None]:
+    """The core has its own threads; torch's would only wait for each other over the little that is left to them."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+class _Fit:
+    """Parameters, targets and optimisers of one refinement."""
+
+    def __init__(self, scene: Scene, config: Config, seed: int, max_gaussians: int | None = None) -> None:
+        self._scene, self._config, self._max_gaussians = scene, config, max_gaussians
+        gaussians = scene.gaussians.map(lambda tensor: tensor.clone())
+        self._gaussians = gaussians
+        rates = config.rates
+        self._rates = {name: getattr(rates, name) for name in PARAMETERS}
+        self._finals = dict.fromkeys(PARAMETERS, rates.final) | {"means": rates.final_means}
+        self._adam = Adam(_leaves(gaussians), self._rates)
+        self._control: Control | None = None
+        if config.control is not None:
+            self._control = config.control.module.load(config.control.config, seed)
+        self._dropout = dropout.Dropout(config.dropout, gaussians, scene.views, seed)
+        self._Ts_world_camera = [view.T_world_camera.clone() for view in scene.views]
+        self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
+        self._pose_moments = [(torch.zeros(6), torch.zeros(6), 0) for _ in scene.views]
+        shown = border.shown([view.image for view in scene.views])
+        self._targets = [
+            [target(*each, scale, config.dssim) for each in zip(scene.views, shown, strict=True)]
+            for scale in (1.0, 0.5)
+        ]
+        self._terms = _terms(scene, config.regularise, seed)
+        self._iterations = scene.iterations
+        self.losses: list[float] = []  # photometric, of each step
+
+    def step(self, index: int, progress: float) -> None:
+        """One iteration on view `index`; `progress` in [0, 1] sets resolution and step sizes."""
+        half = progress < self._config.half_resolution_share
+        photograph = self._targets[half][index]
+        refine_pose = self._config.refine_poses and index > 0
+        T_world_camera = self._Ts_world_camera[index].requires_grad_(refine_pose)
+        channels = self._terms.channels(progress) if self._terms else ("rgb",)
+        opacities = self._dropout(self._gaussians.opacities, progress)
+        size = photograph.width, photograph.height
+        render = seen(self._gaussians, opacities, T_world_camera, photograph.K, *size, channels)
+        assert render.rgb is not None  # it was asked for
+        loss = photograph.loss(render.rgb)
+        self.losses.append(float(loss.detach()))
+        if self._terms is not None:
+            loss = loss + self._regularisation(self._terms, index, render, progress)
+        loss.backward()
+        self._adam.lrs = {name: rate * self._finals[name] ** progress for name, rate in self._rates.items()}
+        self._adam.step()
+        if refine_pose and T_world_camera.grad is not None:
+            gradient = twist_gradient(T_world_camera.detach(), T_world_camera.grad)
+            self._move_camera(index, gradient, self._config.rates.final_pose**progress)
+        self._iterations += 1
+        self._control_density(index, self._targets[half], progress)
+        self._adam.zero_grad()
+
+    def _control_density(self, index: int, targets: Sequence[Target], progress: float) -> None:
+        if self._control is None:
+            return
+        cameras = tuple(T.detach() for T in self._Ts_world_camera)
+        change = self._control.after_step(
+            Step(
+                iteration=self._iterations - self._scene.iterations,
+                iterations=self._config.iterations,
+                progress=progress,
+                view=index,
+                gaussians=self._gaussians,
+                Ts_world_camera=cameras,
+                targets=targets,
+                max_gaussians=self._max_gaussians,
+            )
+        )
+        if change is not None:
+            self._gaussians = change.gaussians
+            self._adam.follow(_leaves(change.gaussians), change.origin)
+            self._dropout.follow(change.gaussians)
+
+    def _regularisation(self, terms: Regularisation, index: int, render: Render, progress: float) -> Tensor | float:
+        """The terms on training view `index`, as rendered, and on a pseudo view."""
+
+        def draw(view: PseudoView, channels: Collection[str]) -> Render:
+            camera = torch.from_numpy(view.T_world_camera).float(), torch.from_numpy(view.K).float()
+            return seen(self._gaussians, self._gaussians.opacities, *camera, view.width, view.height, channels)
+
+        parts = (terms.training_loss(index, render, progress), terms.pseudo_loss(draw, progress))
+        return sum((part for part in parts if part is not None), 0.0)
+
+    def _move_camera(self, index: int, gradient: Tensor, decay: float) -> None:
+        """An Adam step of the camera in its own frame."""
+        first, second, count = self._pose_moments[index]
+        first, second, count = 0.9 * first + 0.1 * gradient, 0.99 * second + 0.01 * gradient**2, count + 1
+        self._pose_moments[index] = (first, second, count)
+        direction = (first / (1 - 0.9**count)) / ((second / (1 - 0.99**count)).sqrt() + 1e-15)
+        T_world_camera = self._Ts_world_camera[index].detach()
+        self._Ts_world_camera[index] = T_world_camera @ exp_se3(-decay * self._pose_rates * direction)
+
+    def scene(self) -> Scene:
+        """What has been learnt so far."""
+        views = tuple(
+            replace(view, T_world_camera=T.detach().clone())
+            for view, T in zip(self._scene.views, self._Ts_world_camera, strict=True)
+        )
+        learnt = self._gaussians.map(lambda tensor: tensor.detach().clone())
+        served_by = {} if self._terms is None else self._terms.served_by
+        return Scene(views, learnt, self._iterations, served_by=served_by)
+
+
+def _leaves(gaussians: Gaussians) -> dict[str, Tensor]:
+    """What Adam moves, by name."""
+    return {name: getattr(gaussians, name).requires_grad_(True) for name in PARAMETERS}
+
+
+def _terms(scene: Scene, config: regularise.Config, seed: int) -> Regularisation | None:
+    """The losses beside the photometric one; None where all weights are 0.
+
+    Raises ValueError where they would compare with what is known of a view, and nothing is.
+    """
+    if not any(term.weight for term in config.terms):
+        return None
+    pointmaps = []
+    for view in scene.views:
+        if view.pointmap is None:
+            raise ValueError(f"{view.name} has no point map, which the losses in `regularise` compare with")
+        T_world_camera = view.T_world_camera.double().numpy()
+        pointmaps.append(replace(view.pointmap, T_world_camera=T_world_camera, K=view.K.double().numpy()))
+    return Regularisation(pointmaps, [view.image for view in scene.views], config, seed=seed)

@@ -1,0 +1,1 @@
+"""What a reconstruction gives: snapshot, verdict, report, pictures, messages, files. It runs without torch."""

@@ -1,0 +1,20 @@
+"""Scenes and cameras as files. NumPy only: a result can be read, converted and written where there is no torch."""
+
+from splatnode.recon.result.export.convert import FORMATS, export_scene, read_cameras, read_gaussians
+from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.export.prepare import viewer_safe
+from splatnode.recon.result.export.result import write_result
+from splatnode.recon.result.export.staged import ResultWriteError, write_file, write_files
+
+__all__ = [
+    "FORMATS",
+    "ResultWriteError",
+    "SceneFileError",
+    "export_scene",
+    "read_cameras",
+    "read_gaussians",
+    "viewer_safe",
+    "write_file",
+    "write_files",
+    "write_result",
+]

@@ -1,0 +1,12 @@
+"""The verb export."""
+
+from __future__ import annotations
+
+import argparse
+
+from splatnode.recon.result.export.convert import export_scene
+
+
+def export(args: argparse.Namespace) -> int:
+    print(export_scene(args.scene, args.to, args.out))
+    return 0

@@ -1,0 +1,79 @@
+"""write_result: a snapshot as the folder that `splatnode replay` leaves."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from splatnode.recon.result.export.cameras import encode_cameras, encode_colmap, encode_nerfstudio, encode_tum
+from splatnode.recon.result.export.ply import encode_ply
+from splatnode.recon.result.export.prepare import viewer_safe
+from splatnode.recon.result.export.staged import json_bytes, write_files
+from splatnode.recon.result.snapshot import Snapshot
+
+MANIFEST = "manifest.json"
+
+
+def write_result(
+    snapshot: Snapshot, out_dir: Path, report: Mapping[str, object], *, preview: bytes | None = None
+) -> Path:
+    """Writes scene.ply, the cameras in four formats, preview.png, report.json and manifest.json; returns its path.
+
+    A scene that its verdict does not let be published leaves report.json and manifest.json only. The folder holds one
+    result: files that an earlier manifest lists, that are unchanged since, and that this result does not have are
+    removed once the new manifest is there. `report` is that of `build_report`. Raises ResultWriteError, with an
+    earlier result intact, where the files cannot be written.
+    """
+    files = {"report.json": json_bytes(report)}
+    if snapshot.verdict.publishable:
+        files = _scene_files(snapshot, preview) | files
+    previous = _read_manifest(out_dir)
+    manifest = {
+        **snapshot.scale.record(),
+        "verdict": snapshot.verdict.code.value,
+        "files": {name: {"bytes": len(data), "sha256": _sha256(data)} for name, data in files.items()},
+    }
+    write_files(out_dir, files | {MANIFEST: json_bytes(manifest)})
+    _remove_superseded(out_dir, previous, set(files))
+    return out_dir / MANIFEST
+
+
+def _scene_files(snapshot: Snapshot, preview: bytes | None) -> dict[str, bytes]:
+    gaussians = viewer_safe(snapshot.gaussians)
+    cameras, scale = snapshot.cameras, snapshot.scale
+    colmap = encode_colmap(cameras, gaussians, scale)
+    return {
+        "scene.ply": encode_ply(gaussians, scale),
+        "cameras.json": encode_cameras(cameras, scale),
+        **{f"colmap/{name}": data for name, data in colmap.items()},
+        "trajectory.tum": encode_tum(cameras, scale),
+        "transforms.json": encode_nerfstudio(cameras, scale),
+        **({"preview.png": preview} if preview is not None else {}),
+    }
+
+
+def _read_manifest(out_dir: Path) -> dict[str, str]:
+    """sha256 by file of the result that is there; empty where there is none that can be read."""
+    try:
+        files = json.loads((out_dir / MANIFEST).read_bytes())["files"]
+        return {str(name): str(entry["sha256"]) for name, entry in files.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+def _remove_superseded(out_dir: Path, previous: Mapping[str, str], current: set[str]) -> None:
+    for name, digest in previous.items():
+        path = out_dir / name
+        inside = path.resolve().is_relative_to(out_dir.resolve())  # a manifest is input, too
+        if name not in current and inside and path.is_file() and _sha256(path.read_bytes()) == digest:
+            path.unlink()
+            with contextlib.suppress(OSError):  # others' files may be beside it
+                if path.parent != out_dir:
+                    path.parent.rmdir()
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()

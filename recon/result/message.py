@@ -1,0 +1,173 @@
+"""A snapshot as a message, for viewers: without torch on either side.
+
+Arrays: means, quats, scales, opacities, sh, source_frame of the Gaussians, then of each camera, in their order, a small
+photograph (JPEG).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.messaging.jpeg import from_jpeg, to_jpeg
+from splatnode.capture.messaging.wire import Header, Message, WireError
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.recon.result.verdict import Code, Verdict
+
+THUMBNAIL_SIDE = 320  # pixels
+THUMBNAIL_QUALITY = 85  # of 100, as JPEG
+MAX_CAMERAS = 1000
+FIELDS = ("means", "quats", "scales", "opacities", "sh", "source_frame")
+
+Finite = Annotated[float, msgspec.Meta(ge=-1e12, le=1e12)]
+Pixels = Annotated[int, msgspec.Meta(ge=1, le=65536)]
+Matrix4 = Annotated[tuple[Finite, ...], msgspec.Meta(min_length=16, max_length=16)]
+Matrix3 = Annotated[tuple[Finite, ...], msgspec.Meta(min_length=9, max_length=9)]
+
+
+class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A CameraEstimate."""
+
+    name: str
+    frame_id: int
+    T_world_camera: Matrix4  # row by row
+    K: Matrix3  # row by row
+    width: Pixels
+    height: Pixels
+    rotation_sigma_deg: float | None
+    centre_sigma_rel: float | None
+
+
+class SceneHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    scene_id: str  # another one is another place
+    code: str
+    message: str
+    advice: str
+    frames: tuple[str, ...]
+    publishable: bool
+    provisional: bool  # evidence is still to be looked at
+    cameras: Annotated[tuple[CameraRecord, ...], msgspec.Meta(max_length=MAX_CAMERAS)]
+    dropped: tuple[tuple[str, str], ...]  # name, reason
+    iterations: int
+    seconds: dict[str, float]
+    final: bool
+
+
+@dataclass(frozen=True, eq=False)
+class LiveScene:
+    """What a viewer receives. The snapshot's `images` are thumbnails, its `sequence` counts the snapshots."""
+
+    snapshot: Snapshot
+    scene_id: str
+    session: str
+    mono_ns: int  # of the sender
+
+
+def to_message(
+    snapshot: Snapshot, scene_id: str, numbering: Mapping[str, object]
+) -> tuple[SceneHeader, list[npt.NDArray]]:
+    """The header and the arrays of a snapshot; `numbering` is session, sequence and mono_ns."""
+    verdict = snapshot.verdict
+    header = SceneHeader(
+        **numbering,  # pyright: ignore[reportArgumentType]
+        scene_id=scene_id,
+        code=verdict.code.value,
+        message=verdict.message,
+        advice=verdict.advice,
+        frames=verdict.frames,
+        publishable=verdict.publishable,
+        provisional=verdict.provisional,
+        cameras=tuple(camera_record(camera) for camera in snapshot.cameras),
+        dropped=tuple((frame.name, frame.reason) for frame in snapshot.dropped),
+        iterations=snapshot.iterations,
+        seconds=snapshot.seconds,
+        final=snapshot.final,
+    )
+    thumbnails = [to_jpeg(thumbnail(snapshot.images[camera.name]), THUMBNAIL_QUALITY) for camera in snapshot.cameras]
+    return header, [*(getattr(snapshot.gaussians, name) for name in FIELDS), *thumbnails]
+
+
+def from_message(message: Message[SceneHeader]) -> LiveScene:
+    """The scene in a message. Raises WireError where arrays and header do not belong together."""
+    header = message.header
+    gaussians = _gaussians(message.arrays[: len(FIELDS)])
+    thumbnails = message.arrays[len(FIELDS) :]
+    if len(thumbnails) != len(header.cameras):
+        raise WireError(f"{len(header.cameras)} cameras with {len(thumbnails)} thumbnails")
+    if header.code not in Code.__members__:
+        raise WireError(f"no verdict is called {header.code[:40]!r}")
+    snapshot = Snapshot(
+        sequence=header.sequence,
+        verdict=Verdict(
+            Code[header.code],
+            header.message,
+            header.advice,
+            header.frames,
+            publishable=header.publishable,
+            provisional=header.provisional,
+        ),
+        cameras=tuple(camera_from(record) for record in header.cameras),
+        gaussians=gaussians,
+        images={
+            record.name: from_jpeg(jpeg, THUMBNAIL_SIDE)
+            for record, jpeg in zip(header.cameras, thumbnails, strict=True)
+        },
+        dropped=tuple(DroppedFrame(name, reason) for name, reason in header.dropped),
+        iterations=header.iterations,
+        seconds=header.seconds,
+        final=header.final,
+    )
+    return LiveScene(snapshot, header.scene_id, header.session, header.mono_ns)
+
+
+def thumbnail(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
+    """(h, w, 3) with the longer side at most THUMBNAIL_SIDE."""
+    scale = min(1.0, THUMBNAIL_SIDE / max(image.shape[:2]))
+    size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def camera_record(camera: CameraEstimate) -> CameraRecord:
+    return CameraRecord(
+        name=camera.name,
+        frame_id=camera.frame_id,
+        T_world_camera=tuple(camera.T_world_camera.ravel().tolist()),
+        K=tuple(camera.K.ravel().tolist()),
+        width=camera.width,
+        height=camera.height,
+        rotation_sigma_deg=camera.rotation_sigma_deg,
+        centre_sigma_rel=camera.centre_sigma_rel,
+    )
+
+
+def camera_from(record: CameraRecord) -> CameraEstimate:
+    return CameraEstimate(
+        name=record.name,
+        frame_id=record.frame_id,
+        T_world_camera=np.array(record.T_world_camera).reshape(4, 4),
+        K=np.array(record.K).reshape(3, 3),
+        width=record.width,
+        height=record.height,
+        rotation_sigma_deg=record.rotation_sigma_deg,
+        centre_sigma_rel=record.centre_sigma_rel,
+    )
+
+
+def _gaussians(arrays: tuple[npt.NDArray, ...]) -> GaussianArrays:
+    if len(arrays) != len(FIELDS):
+        raise WireError(f"{len(arrays)} arrays of Gaussians, expected {', '.join(FIELDS)}")
+    count = len(arrays[0]) if arrays[0].ndim else 0
+    bases = arrays[4].shape[1] if arrays[4].ndim == 3 else 0
+    expected = [(count, 3), (count, 4), (count, 3), (count,), (count, bases, 3), (count,)]
+    for name, array, shape in zip(FIELDS, arrays, expected, strict=True):
+        kind = np.int32 if name == "source_frame" else np.float32
+        if array.dtype != kind or array.shape != shape:
+            raise WireError(f"{name} must be {np.dtype(kind)} {shape}, got {array.dtype} {array.shape}")
+    return GaussianArrays(*arrays)

@@ -1,0 +1,83 @@
+"""report.json: what happened in a reconstruction, for people and for programs."""
+
+from __future__ import annotations
+
+import platform
+from importlib import metadata
+from pathlib import Path
+
+from splatnode.recon.result.export.cameras import camera_record
+from splatnode.recon.result.export.ply import ply_bytes
+from splatnode.recon.result.export.prepare import viewer_safe
+from splatnode.recon.result.snapshot import Snapshot
+
+_PACKAGES = ("splatnode", "numpy", "torch", "opencv-contrib-python-headless", "pycolmap", "poselib")
+
+
+def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: float | None) -> dict[str, object]:
+    """The report of `snapshot`, ready for `json.dumps`; a value that was not measured is None.
+
+    `scene_bytes` is the size of scene.ply, and `num_gaussians` what it holds, where the verdict lets it be published.
+    """
+    gaussians = viewer_safe(snapshot.gaussians)
+    verdict = snapshot.verdict
+    stages = {stage: seconds for stage, seconds in snapshot.seconds.items() if stage != "total"}
+    return {
+        **snapshot.scale.record(),
+        "verdict": {
+            "code": verdict.code.value,
+            "message": verdict.message,
+            "advice": verdict.advice,
+            "frames": list(verdict.frames),
+            "publishable": verdict.publishable,
+        },
+        "evidence": snapshot.evidence,
+        "seconds": {**stages, "total": snapshot.seconds.get("total", sum(stages.values()))},
+        "peak_rss_mb": peak_rss_mb,
+        "num_gaussians": len(gaussians),
+        "scene_bytes": ply_bytes(len(gaussians), gaussians.sh.shape[1], snapshot.scale) if verdict.publishable else 0,
+        "iterations": snapshot.iterations,
+        "budget": [dict(hit) for hit in snapshot.budget],
+        "served_by": dict(snapshot.served_by),
+        "cameras": [camera_record(camera) for camera in snapshot.cameras],
+        "frames_used": [camera.name for camera in snapshot.cameras],
+        "frames_dropped": [{"name": frame.name, "reason": frame.reason} for frame in snapshot.dropped],
+        "seed": seed,
+        "preset": preset,
+        "versions": versions(),
+    }
+
+
+def versions() -> dict[str, str | None]:
+    """What ran: Python, the platform and the packages that decide the numbers (None: not installed)."""
+    return {
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        **{package: _version(package) for package in _PACKAGES},
+    }
+
+
+def peak_rss_mb() -> float | None:
+    """The most memory that this process has held, in MB (10^6 bytes); None where the system does not tell.
+
+    /proc is asked first: getrusage also counts what the parent held when it started this process.
+    """
+    try:
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024 / 1e6
+    except OSError:
+        pass
+    try:
+        import resource
+    except ImportError:
+        return None
+    unit = 1 if platform.system() == "Darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6
+
+
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

@@ -1,0 +1,72 @@
+"""What the reconstruction tells the world: plain NumPy, so that viewers and exporters need no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import DroppedFrame
+from splatnode.recon.result.scale import RELATIVE, Scale
+from splatnode.recon.result.verdict import Verdict
+
+Array = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraEstimate:
+    """An estimated camera, for its image at modelled size (`width` x `height`)."""
+
+    name: str
+    frame_id: int
+    T_world_camera: npt.NDArray[np.float64]  # (4, 4)
+    K: npt.NDArray[np.float64]  # (3, 3), centre of the top-left pixel at (0.5, 0.5)
+    width: int
+    height: int
+    rotation_sigma_deg: float | None  # standard deviation after bundle adjustment; None: not estimated
+    centre_sigma_rel: float | None  # the same for the centre, relative to the spread of all centres
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianArrays:
+    """N Gaussians, activated: scales are lengths, opacities are in (0, 1), quats (wxyz) have unit length."""
+
+    means: Array  # (N, 3)
+    quats: Array  # (N, 4)
+    scales: Array  # (N, 3)
+    opacities: Array  # (N,)
+    sh: Array  # (N, B, 3)
+    source_frame: npt.NDArray[np.int32]  # (N,)
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @classmethod
+    def empty(cls) -> GaussianArrays:
+        """No Gaussians."""
+
+        def zeros(*shape: int) -> Array:
+            return np.zeros(shape, np.float32)
+
+        return cls(zeros(0, 3), zeros(0, 4), zeros(0, 3), zeros(0), zeros(0, 1, 3), np.zeros(0, np.int32))
+
+
+@dataclass(frozen=True, eq=False)
+class Snapshot:
+    """The scene after a step of the reconstruction. The world is the first camera's frame."""
+
+    sequence: int
+    verdict: Verdict
+    cameras: tuple[CameraEstimate, ...]
+    gaussians: GaussianArrays
+    images: dict[str, npt.NDArray[np.uint8]]  # (H, W, 3) RGB by camera name, as modelled
+    dropped: tuple[DroppedFrame, ...]
+    iterations: int
+    seconds: dict[str, float] = field(default_factory=dict)  # by stage
+    budget: tuple[Mapping[str, object], ...] = ()  # recon.budget.Hit.record of each limit that bound the final scene
+    final: bool = False
+    served_by: Mapping[str, str] = field(default_factory=dict)  # network or measure, by regularisation that was used
+    evidence: Mapping[str, object] | None = None  # recon.verification.likelihood.record; None: nothing to verify
+    scale: Scale = RELATIVE  # the unit of all lengths

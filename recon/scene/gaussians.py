@@ -1,0 +1,67 @@
+"""The Gaussians of a scene, in the unconstrained parameters that the optimiser moves."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+
+import torch
+from torch import Tensor
+
+from splatnode.recon.geometry import multiply_quats, quat_from_matrix
+
+SH_C0 = 0.28209479177387814  # the constant basis function of the real spherical harmonics
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """N anisotropic Gaussians (equation 1). Raw parameters carry their space; activated values are properties."""
+
+    means: Tensor  # (N, 3) world
+    quats: Tensor  # (N, 4) wxyz, not necessarily of unit length
+    log_scales: Tensor  # (N, 3)
+    logit_opacities: Tensor  # (N,)
+    sh: Tensor  # (N, B, 3) spherical harmonics, B = 1, 4, 9 or 16; colour = 0.5 + sum of basis * sh
+    source_frame: Tensor  # (N,) int32: frame_id of the keyframe whose pixels started it
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    @property
+    def scales(self) -> Tensor:
+        return self.log_scales.exp()
+
+    @property
+    def opacities(self) -> Tensor:
+        return self.logit_opacities.sigmoid()
+
+    @property
+    def rgb(self) -> Tensor:
+        """(N, 3) colour without its view-dependent part."""
+        return self.sh[:, 0] * SH_C0 + 0.5
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> Gaussians:
+        """`function` applied to every tensor."""
+        return Gaussians(*(function(getattr(self, field.name)) for field in fields(self)))
+
+    def subset(self, index: Tensor) -> Gaussians:
+        """The Gaussians at `index` (integers or a mask)."""
+        return self.map(lambda tensor: tensor[index])
+
+    def transformed(self, scale: float, rotation: Tensor, translation: Tensor) -> Gaussians:
+        """After the similarity x -> scale * rotation @ x + translation. View-dependent colour is not rotated."""
+        rotation = rotation.to(self.means)
+        return replace(
+            self,
+            means=scale * self.means @ rotation.T + translation.to(self.means),
+            quats=multiply_quats(quat_from_matrix(rotation), self.quats),
+            log_scales=self.log_scales + math.log(scale),
+        )
+
+
+def concatenate(parts: list[Gaussians]) -> Gaussians:
+    """All Gaussians of `parts` in order. Lower SH degrees are padded with zeros."""
+    bases = max(part.sh.shape[1] for part in parts)
+    padded = [replace(part, sh=torch.nn.functional.pad(part.sh, (0, 0, 0, bases - part.sh.shape[1]))) for part in parts]
+    return Gaussians(*(torch.cat([getattr(part, field.name) for part in padded]) for field in fields(Gaussians)))

@@ -1,0 +1,227 @@
+"""Where Gaussians start: the paper's confidence-ranked down-sampling, then one Gaussian per piece of equal colour.
+
+A piece is as large as what it leaves unexplained allows (`partition`): the same visible error everywhere is the
+best use of a number of Gaussians (`contrast_masking`). What a Gaussian has to explain to be worth having is told in
+photographs of a fixed size, so that the number follows from what there is to see and not from how many pixels show it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from splatnode.recon.geometry import quat_from_matrix
+from splatnode.recon.priors import reprojection
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.scene.contrast_masking import visibility
+from splatnode.recon.scene.gaussians import SH_C0, Gaussians, concatenate
+from splatnode.recon.scene.partition import partition
+
+Mask = npt.NDArray[np.bool_]
+Array = npt.NDArray[np.float64]
+REFERENCE_PX = 512  # longer side of the photographs that the configuration's pixels are of
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    depth_tolerance: float = 0.02  # theta of equation 16, relative to the depth
+    coarser: float = 1.5  # a point replaces a pixel only if its own pixel covers at most this many times the surface
+    min_confidence: float = 0.05  # pixels below get no Gaussian
+    largest_px: int = 64  # side of a square beyond which no piece reaches
+    smallest_px: float = 3.0  # area of a piece that is not divided
+    most_error: float = 0.0021  # squared visible deviation of colours in [0, 1], over a piece's pixels and channels
+    depth_weight: float = 1.0  # a relative difference of depth counts as this many times the difference of colour
+    noise: float = 0.01  # standard deviation of colours in [0, 1] that is not worth a Gaussian
+    footprint: float = 1.2  # standard deviations of a new Gaussian in units of its piece's
+    thickness: float = 0.15  # standard deviation along the normal, in units of the smaller across
+    opacity: float = 0.5
+
+
+def redundant(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
+    """For each point map the pixels (h, w) that a more confident one already covers (equations 14 to 17).
+
+    Beyond the paper, a pixel is not given up for a point that was seen from so much further away that detail is lost.
+    """
+    score = [float(pointmap.confidence.mean()) for pointmap in pointmaps]  # equation 14
+    masks = []
+    for j, target in enumerate(pointmaps):
+        covered = np.zeros(target.depth.shape, bool)
+        for i, source in enumerate(pointmaps):
+            if (score[i], -i) > (score[j], -j):
+                projected, footprint = reprojection.nearest(source, target)
+                near = np.abs(projected - target.depth) < config.depth_tolerance * target.depth
+                own = target.depth / target.K[0, 0]
+                covered |= near & (footprint < config.coarser * own)
+        masks.append(covered & (target.depth > 0))
+    return masks
+
+
+def gaussians_from_pointmap(
+    pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, config: Config
+) -> Gaussians:
+    """One Gaussian for each piece of the pixels `wanted` (h, w) of a keyframe's `image` (h, w, 3).
+
+    Each has its piece's mean colour, and lies on its surface with its position and extent there (moment matching).
+    """
+    labels, count = _pieces(pointmap, image, wanted & (pointmap.depth > 0), config)
+    wanted = labels >= 0
+    piece = labels[wanted]
+    pixels = np.bincount(piece, minlength=count)
+    rows, columns = np.nonzero(wanted)
+    u, v = columns + 0.5, rows + 0.5
+
+    def mean(values: npt.NDArray) -> Array:
+        return np.bincount(piece, values, minlength=count) / pixels
+
+    centre = np.column_stack([mean(u), mean(v)])
+    inverse_depth = mean(1.0 / pointmap.depth[wanted])
+    colour = np.column_stack([mean(image[..., channel][wanted] / 255.0) for channel in range(3)])
+    normal = np.column_stack([mean(pointmap.normal[..., axis][wanted]) for axis in range(3)])
+    # A pixel is a square of variance 1/12, not a point.
+    uu, vv = (mean(x * x) - centre[:, i] ** 2 + 1 / 12 for i, x in enumerate((u, v)))
+    uv = mean(u * v) - centre[:, 0] * centre[:, 1]
+    spread = np.stack([np.stack([uu, uv], 1), np.stack([uv, vv], 1)], 1)
+    return _on_surface(pointmap, centre, spread, inverse_depth, normal, colour, config)
+
+
+def _pieces(
+    pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, config: Config
+) -> tuple[npt.NDArray[np.int32], int]:
+    """(h, w) the number of the piece that each pixel belongs to, -1 for unwanted ones, and how many there are.
+
+    Larger images are cut where they are at the reference's size: what only more pixels show is no reason for more
+    Gaussians.
+    """
+    scale = max(wanted.shape) / REFERENCE_PX
+    if scale > 1:
+        height, width = wanted.shape
+        size = (max(1, round(width / scale)), max(1, round(height / scale)))
+        depth = np.asarray(cv2.resize(pointmap.depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
+        there = cv2.resize(wanted.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+        colour = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+        labels, _ = _cut(depth, colour, there, 1.0, config)
+        labels = np.asarray(cv2.resize(labels, (width, height), interpolation=cv2.INTER_NEAREST), np.int32)
+        found, numbers = np.unique(labels[wanted], return_inverse=True)
+        labels = np.full(wanted.shape, -1, np.int32)
+        labels[wanted] = numbers - (1 if len(found) and found[0] < 0 else 0)
+        return labels, int(labels.max(initial=-1)) + 1
+    return _cut(pointmap.depth, image, wanted, scale, config)
+
+
+def _cut(
+    depth: npt.NDArray[np.float32], image: npt.NDArray[np.uint8], wanted: Mask, scale: float, config: Config
+) -> tuple[npt.NDArray[np.int32], int]:
+    """The pieces of an image at `scale` of the reference's size."""
+    log_depth = np.log(np.maximum(depth, 1e-9))
+    middle = np.float32(np.median(log_depth[wanted])) if wanted.any() else np.float32(0)
+    colour = np.asarray(image / np.float32(255), np.float32)
+    features = np.empty((*wanted.shape, 4), np.float32)
+    features[..., :3] = colour - np.float32(0.5)
+    features[..., 3] = config.depth_weight * (log_depth - middle)
+    return partition(
+        features,
+        visibility(colour, scale) ** 2,
+        wanted,
+        tile_px=max(1, round(config.largest_px * scale)),
+        smallest_px=max(1, round(config.smallest_px * scale**2)),
+        most_error=config.most_error * scale**2,
+        noise=3 * config.noise**2,
+    )
+
+
+def _on_surface(
+    pointmap: Pointmap,
+    centre: Array,  # (N, 2) pixels
+    spread: Array,  # (N, 2, 2) covariance in the image, pixels squared
+    inverse_depth: Array,  # (N,)
+    normal: Array,  # (N, 3) camera frame, of any length
+    colour: Array,  # (N, 3) in [0, 1]
+    config: Config,
+) -> Gaussians:
+    """Gaussians in the tangent planes at these pixels, with the images' covariances carried there."""
+    K, T_world_camera = pointmap.K, pointmap.T_world_camera
+    count = len(centre)
+    focal = np.array([K[0, 0], K[1, 1]])
+    ray = np.column_stack([(centre - K[:2, 2]) / focal, np.ones(count)])
+    mean = ray / np.maximum(inverse_depth, 1e-9)[:, None]
+    normal = _facing(normal, ray)
+    # On the plane n . X = d a pixel's point is ray * d / (n . ray); these are its derivatives by u and by v.
+    along_ray = (normal * ray).sum(1)
+    depth = (normal * mean).sum(1) / along_ray
+    steps = np.stack([np.eye(3)[axis] - ray * (normal[:, axis] / along_ray)[:, None] for axis in (0, 1)], 2)
+    steps = steps * (depth[:, None] / focal)[:, None, :]
+    first = steps[:, :, 0] / np.linalg.norm(steps[:, :, 0], axis=1, keepdims=True)
+    second = np.cross(normal, first)
+    in_plane = np.stack([first, second], 1) @ steps  # (N, 2, 2)
+    shape: Array = in_plane @ spread @ in_plane.transpose(0, 2, 1)
+    variances, axes = np.linalg.eigh(shape)
+    extents = config.footprint * np.sqrt(np.maximum(variances, 1e-18))
+    along: Array = first * axes[:, :1, 1] + second * axes[:, 1:, 1]
+    rotation: Array = T_world_camera[:3, :3] @ np.stack([along, np.cross(normal, along), normal], 2)
+    scales: Array = np.column_stack([extents[:, 1], extents[:, 0], config.thickness * extents[:, 0]])
+
+    def tensor(array: Array) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).float()
+
+    return Gaussians(
+        means=tensor(mean @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]),
+        quats=quat_from_matrix(tensor(rotation)),
+        log_scales=tensor(np.log(scales)),
+        logit_opacities=torch.full((count,), float(np.log(config.opacity / (1 - config.opacity)))),
+        sh=tensor((colour - 0.5) / SH_C0)[:, None],
+        source_frame=torch.full((count,), pointmap.frame_id, dtype=torch.int32),
+    )
+
+
+def _facing(normal: Array, ray: Array, least_cosine: float = 0.25) -> Array:
+    """(N, 3) unit normals that face the camera; the line of sight's where there is none, and not far from edge-on.
+
+    A surface seen at a grazing angle is known badly: its Gaussians would be stretched out along the line of sight.
+    """
+    direction = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    unit = np.where(length > 0.3, normal / np.maximum(length, 1e-9), -direction)
+    cosine = -(unit * direction).sum(1, keepdims=True)
+    sideways = unit + cosine * direction
+    sideways *= np.sqrt(1 - least_cosine**2) / np.maximum(np.linalg.norm(sideways, axis=1, keepdims=True), 1e-9)
+    return np.where(cosine < least_cosine, sideways - least_cosine * direction, unit)
+
+
+def initial_gaussians(
+    pointmaps: Sequence[Pointmap],
+    images: Sequence[npt.NDArray[np.uint8]],
+    config: Config,
+    max_gaussians: int | None = None,
+) -> Gaussians:
+    """The Gaussians of a scene that has not been optimised: every surface once, from its best view.
+
+    With `max_gaussians` pieces are coarsened, everywhere alike, until there are at most that many.
+    """
+    wanted = [
+        ~covered & (pointmap.confidence >= config.min_confidence)
+        for pointmap, covered in zip(pointmaps, redundant(pointmaps, config), strict=True)
+    ]
+    for _ in range(12):
+        gaussians = concatenate(
+            [gaussians_from_pointmap(*view, config) for view in zip(pointmaps, images, wanted, strict=True)]
+        )
+        if max_gaussians is None or len(gaussians) <= max_gaussians:
+            return gaussians
+        config = _coarser(config, len(gaussians) / max(max_gaussians, 1))
+    assert max_gaussians is not None  # else the first was returned
+    return gaussians.subset(torch.linspace(0, len(gaussians) - 1, max_gaussians).round().long())
+
+
+def _coarser(config: Config, times: float) -> Config:
+    """For about `times` fewer pieces."""
+    times = max(times, 1.1)
+    return msgspec.structs.replace(
+        config,
+        most_error=times**1.3 * config.most_error,
+        smallest_px=times * config.smallest_px,
+        largest_px=min(round(times**0.5 * config.largest_px), REFERENCE_PX),  # a whole photograph
+    )

@@ -1,0 +1,75 @@
+"""A viewer beside an offline run: a process of its own that gets the newest snapshot whenever it is ready for one."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.services import RECON_SCENE
+from splatnode.capture.messaging.state import StateServer
+from splatnode.capture.messaging.wire import Numbering
+from splatnode.recon.result.message import to_message
+from splatnode.recon.result.snapshot import Snapshot
+
+Show = Callable[[Snapshot], None]
+
+_SERVE_S = 0.05
+
+
+@contextlib.contextmanager
+def viewer(pictures: Path, command: tuple[str, ...] = (sys.executable, "-m", "splatnode", "view")) -> Iterator[Show]:
+    """Starts a viewer and gives the function that shows it a snapshot; at the end, waits until it is closed.
+
+    Showing never waits: a snapshot that the viewer has not taken is replaced by the next. Where no window can be
+    opened, the viewer keeps a picture in the folder `pictures` up to date and closes itself after the last snapshot.
+    """
+    with tempfile.TemporaryDirectory(prefix="splatnode-") as folder:
+        config = Path(folder, "node.yaml")
+        config.write_text(json.dumps({"network": {"directory": folder}}))  # YAML, whatever the folder's name is
+        with _Stage(Network(directory=Path(folder))) as stage:
+            child = subprocess.Popen([*command, str(config), "--until-final", "--out", str(pictures)])
+            try:
+                yield stage.show
+                child.wait()
+            finally:
+                child.terminate()
+                child.wait()
+
+
+class _Stage:
+    """Publishes the newest of the snapshots that it is shown, and answers a viewer that comes late, in a thread."""
+
+    def __init__(self, network: Network) -> None:
+        self._server = StateServer(RECON_SCENE, network)
+        self._newest: Snapshot | None = None
+        self._closing = False
+        self._thread = threading.Thread(target=self._serve, name="audience", daemon=True)
+
+    def __enter__(self) -> _Stage:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._closing = True
+        self._thread.join()
+        self._server.close()
+
+    def show(self, snapshot: Snapshot) -> None:
+        self._newest = snapshot
+
+    def _serve(self) -> None:
+        numbering = Numbering()
+        published = None
+        while not self._closing:
+            newest = self._newest
+            if newest is not None and newest is not published:
+                self._server.publish(*to_message(newest, numbering.session, numbering.next()))
+                published = newest
+            self._server.serve(_SERVE_S)

@@ -1,0 +1,125 @@
+"""The command line. Each room lists its verbs in its `verbs.py`; the rest of a room is imported when one of them runs.
+
+Exit codes: 0 good; 2 usage or configuration; 65 the frames cannot be reconstructed (the verdict says why);
+69 camera or package unavailable; 70 internal; 73, 74 cannot write; 75 try again; 77 not allowed; 130 interrupted.
+SIGTERM is a clean stop with 0; the second one ends the process at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import io
+import logging
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Sequence
+
+import splatnode.capture.verbs
+import splatnode.recon.verbs
+import splatnode.viewer.verbs
+from splatnode.capture.process.stop_signals import on_first
+
+# libgomp's threads spin while they wait. On a robot's busy processor that doubles the time of torch's operations.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+# So do OpenBLAS's, over matrices of three columns that one thread is through with before the others wake.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# What OpenCV warns of, a damaged photograph, is said with the name of that photograph.
+os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+
+VERBS = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode.capture.verbs.VERBS)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the verb that `argv` names and returns the exit code. Raises SystemExit for usage errors and SIGTERM."""
+    parser = build_parser()
+    args = parser.parse_args(argv)
+    if args.verb is None:
+        parser.print_help(sys.stderr)
+        return 2
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")  # a name that a terminal cannot show costs no result
+    logging.basicConfig(format="%(message)s", stream=sys.stderr)
+    logging.getLogger("splatnode").setLevel(logging.INFO)
+    stopping = threading.Event()
+
+    def stop() -> None:
+        stopping.set()
+        sys.exit(0)
+
+    on_first((signal.SIGTERM,), stop)
+    try:
+        code = args.run(args)
+        print(end="", flush=True)  # where there is a standard output
+        return code
+    except (Exception, KeyboardInterrupt) as error:
+        if stopping.is_set():  # a package that was being imported makes an ImportError of the exit
+            return 0
+        if args.debug:
+            traceback.print_exc()
+        code = exit_code(error)
+        print(f"splatnode: {explain(error, code)}", file=sys.stderr)
+        return code
+
+
+def build_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="splatnode",
+        description="Photographs in, camera poses and a 3D Gaussian scene out, on a CPU.",
+        allow_abbrev=False,
+    )
+    parser.set_defaults(verb=None)
+    verbs = parser.add_subparsers(metavar="VERB")
+    for verb in VERBS:
+        subparser = verbs.add_parser(verb.name, help=verb.summary, description=verb.summary, allow_abbrev=False)
+        verb.add_arguments(subparser)
+        subparser.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        subparser.set_defaults(verb=verb.name, run=verb.run)
+    return parser
+
+
+def exit_code(error: BaseException) -> int:
+    """What an exception that ended a verb tells the shell. Rooms raise ValueError for what the user can put right.
+
+    An exception of a room that knows better has an `exit_code` of its own.
+    """
+    if isinstance(error, KeyboardInterrupt):
+        return 130
+    if (own := getattr(error, "exit_code", None)) is not None:
+        return own
+    if isinstance(error, OSError):
+        return _os_exit_code(error)
+    if isinstance(error, ModuleNotFoundError):
+        return 69
+    return 2 if isinstance(error, ValueError) else 70
+
+
+def explain(error: BaseException, code: int) -> str:
+    """One line, or the error's own text where that has more."""
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted"
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.strerror}: {error.filename}" if error.filename is not None else error.strerror
+    if isinstance(error, ModuleNotFoundError):
+        return f"{error}. ./run in place of splatnode installs what it needs; or run: pip install 'splatnode[bench]'"
+    if code == 70:
+        return f"internal error: {type(error).__name__}: {error} (--debug shows where; splatnode doctor may tell why)"
+    return str(error)
+
+
+def _os_exit_code(error: OSError) -> int:
+    if _is_write_error(error):
+        no_room = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE}
+        return 74 if error.errno in no_room else 73
+    if isinstance(error, (FileNotFoundError, NotADirectoryError, IsADirectoryError)):
+        return 2
+    return 77 if isinstance(error, PermissionError) else 74
+
+
+def _is_write_error(error: OSError) -> bool:
+    """ResultWriteError can only have been raised by a room that has been imported."""
+    staged = sys.modules.get("splatnode.recon.result.export.staged")
+    return staged is not None and isinstance(error, staged.ResultWriteError)

@@ -1,0 +1,221 @@
+"""The OAK camera: DepthAI's own replay node stands for the stream; the device itself is a stand-in made of Python."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import subprocess
+import sys
+from datetime import timedelta
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode.capture.cameras import depthai as oak
+from splatnode.capture.cameras.depthai import Config, find, read, stream, to_frame
+from splatnode.capture.frame import Intrinsics
+from splatnode.capture.unavailable import CameraUnavailable
+from tests.conftest import ROOT
+
+PERSPECTIVE = "CameraModel.Perspective"
+LENS = [[800.0, 0, 639.5], [0, 801.0, 359.5], [0, 0, 1]]
+
+
+class QueueException(RuntimeError):
+    pass
+
+
+def message(index=0, K=LENS, distortion=(), model=PERSPECTIVE):
+    transformation = SimpleNamespace(
+        getIntrinsicMatrix=lambda: K,
+        getDistortionCoefficients=lambda: list(distortion),
+        getDistortionModel=lambda: model,
+    )
+    return SimpleNamespace(
+        getTimestamp=lambda: timedelta(seconds=100_000, microseconds=index),
+        getCvFrame=lambda: np.full((720, 1280, 3), (1, 2, 3), np.uint8),
+        getTransformation=lambda: transformation,
+        getExposureTime=lambda: timedelta(milliseconds=8),
+        getSensitivity=lambda: 200,
+    )
+
+
+class FakeDepthai:
+    """As much of `dai` as the camera uses; remembers what it was told."""
+
+    def __init__(self, devices=(), messages=()):
+        self.told: list[Any] = []
+        infos = [
+            SimpleNamespace(
+                getDeviceId=lambda name=name: name,
+                name=f"usb-{name}",
+                platform=SimpleNamespace(name="RVC2"),
+                state=SimpleNamespace(name="UNBOOTED"),
+            )
+            for name in devices
+        ]
+        supply = iter(messages)
+        queue = SimpleNamespace(get=lambda timeout: self._next(supply))
+        output = SimpleNamespace(createOutputQueue=lambda **how: self.told.append(how) or queue)
+        camera = SimpleNamespace(
+            build=lambda socket: camera,
+            requestOutput=lambda size, *rest, **how: self.told.append((size, how)) or output,
+            inputControl=SimpleNamespace(createInputQueue=lambda: SimpleNamespace(send=self.told.append)),
+        )
+        pipeline = SimpleNamespace(create=lambda node: camera, start=lambda: self.told.append("start"))
+        self.Device = _Opened(lambda info: self.told.append(info.getDeviceId()), None)
+        self.Device.getAllAvailableDevices = lambda: infos
+        self.Pipeline = _Opened(lambda device: None, pipeline)
+        self.node = SimpleNamespace(Camera="Camera")
+        self.CameraBoardSocket = SimpleNamespace(CAM_A="A")
+        self.ImgFrame = SimpleNamespace(Type=SimpleNamespace(BGR888i="BGR"))
+        self.ImgResizeMode = SimpleNamespace(CROP="crop")
+        self.MessageQueue = SimpleNamespace(QueueException=QueueException)
+        self.CameraControl = _Control
+
+    @staticmethod
+    def _next(supply):
+        item = next(supply, None)
+        if isinstance(item, Exception):
+            raise item
+        return item
+
+
+class _Opened:
+    """A class whose instances are context managers around `inside`."""
+
+    getAllAvailableDevices: Any
+
+    def __init__(self, on_open, inside):
+        self._on_open, self._inside = on_open, inside
+
+    def __call__(self, argument):
+        self._on_open(argument)
+        return self
+
+    def __enter__(self):
+        return self._inside
+
+    def __exit__(self, *_):
+        return None
+
+
+class _Control:
+    def __init__(self):
+        self.calls = []
+
+    def __getattr__(self, name):
+        return lambda *values: self.calls.append((name, *values))
+
+
+def use(monkeypatch, fake):
+    monkeypatch.setattr(oak, "_depthai", lambda: fake)
+    return fake
+
+
+def test_a_frame_has_its_own_calibration():
+    frame = to_frame(message(7, distortion=(0.1, -0.2, 0, 0, 0.05)), 3)
+    assert (frame.frame_id, frame.stamp_ns, frame.name) == (3, 100_000_000_007_000, "100000.000007")
+    assert frame.image[0, 0].tolist() == [3, 2, 1]
+    expected = Intrinsics(1280, 720, 800.0, 801.0, 640.0, 360.0, "calibration", (0.1, -0.2, 0, 0, 0.05))
+    assert frame.intrinsics == expected
+    assert to_frame(message(distortion=(0.0,) * 14), 0).intrinsics.distortion == ()
+
+
+@pytest.mark.parametrize(
+    ("K", "distortion", "model"),
+    [(np.eye(3).tolist(), (), PERSPECTIVE), ([], (), PERSPECTIVE), (LENS, (0.1, 0, 0, 0), "CameraModel.Fisheye")],
+)
+def test_what_is_no_pinhole_calibration_is_unknown(K, distortion, model):
+    assert to_frame(message(K=K, distortion=distortion, model=model), 0).intrinsics is None
+
+
+def test_without_a_camera_it_says_so_at_once(monkeypatch):
+    use(monkeypatch, FakeDepthai())
+    with pytest.raises(CameraUnavailable, match="no OAK camera is connected.*udev"):
+        next(stream(Config()))
+
+
+@pytest.mark.parametrize("device", ["", "third"])
+def test_which_of_several_must_be_said(monkeypatch, device):
+    use(monkeypatch, FakeDepthai(["first", "second"]))
+    with pytest.raises(CameraUnavailable, match="must name one of: first at usb-first, second at usb-second"):
+        next(stream(Config(device=device)))
+
+
+def test_what_the_camera_is_asked_for(monkeypatch):
+    fake = use(monkeypatch, FakeDepthai(["first", "second"], map(message, range(9))))
+    config = Config(device="second", settle_s=0, focus=120, frames_per_second=15, undistort=False)
+    frames = list(itertools.islice(stream(config), 2))
+    name, (size, how), queue, start, focus, hold = fake.told
+    assert (name, size, start) == ("second", (1280, 720), "start")
+    assert how == {"fps": 15, "enableUndistortion": False} and queue == {"maxSize": 2, "blocking": False}
+    assert focus.calls == [("setManualFocus", 120)]
+    assert hold.calls == [("setAutoExposureLock", True), ("setAutoWhiteBalanceLock", True)]
+    assert [frame.name for frame in frames] == ["100000.000001", "100000.000002"]  # the first was exposed before
+
+
+def test_a_given_exposure_is_set(monkeypatch):
+    fake = use(monkeypatch, FakeDepthai(["only"], map(message, range(9))))
+    next(stream(Config(settle_s=0, exposure_us=5000, iso=200)))
+    assert fake.told[-1].calls == [("setManualExposure", 5000, 200), ("setAutoWhiteBalanceLock", True)]
+
+
+@pytest.mark.parametrize(
+    ("end", "reason"),
+    [
+        (None, "no frame for 4 s"),
+        (QueueException("closed"), "ended its stream: closed"),
+        (RuntimeError("X_LINK_ERROR"), "the camera only failed: X_LINK_ERROR"),
+    ],
+)
+def test_a_lost_camera_says_why(monkeypatch, end, reason):
+    use(monkeypatch, FakeDepthai(["only"], [message(0), message(1), end]))
+    frames = stream(Config(lock=False))
+    assert [next(frames).name, next(frames).name] == ["100000.000000", "100000.000001"]
+    with pytest.raises(CameraUnavailable, match=reason):
+        next(frames)
+
+
+def test_found_cameras_are_named_as_the_configuration_wants_them(monkeypatch):
+    pytest.importorskip("depthai", reason="find() asks only where depthai is installed")
+    use(monkeypatch, FakeDepthai(["first"]))
+    assert find() == [{"device": "first", "description": "RVC2 at usb-first (UNBOOTED)"}]
+
+
+def test_the_real_library_is_asked_and_prints_nothing():
+    pytest.importorskip("depthai", reason="needs the extra oak")
+    program = "from splatnode.capture.cameras import depthai; assert isinstance(depthai.find(), list)"
+    environment = {key: value for key, value in os.environ.items() if key != "DEPTHAI_LEVEL"}
+    result = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, env=environment)
+    assert (result.returncode, result.stdout, result.stderr) == (0, "", "")
+
+
+def test_depthais_own_replay(tmp_path, monkeypatch):
+    """The messages and queues are DepthAI's; only the camera is a file."""
+    monkeypatch.setenv("DEPTHAI_LEVEL", "off")
+    dai = pytest.importorskip("depthai", reason="needs the extra oak")
+    file = tmp_path / "walk.mp4"
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), 20, (160, 120))
+    for index in range(12):
+        writer.write(np.full((120, 160, 3), (20 * index, 100, 50), np.uint8))
+    writer.release()
+    with dai.Pipeline(False) as pipeline:
+        replay = pipeline.create(dai.node.ReplayVideo)
+        replay.setReplayVideoFile(file)
+        replay.setOutFrameType(dai.ImgFrame.Type.BGR888i)
+        replay.setLoop(False)
+        replay.setFps(20)
+        queue = replay.out.createOutputQueue(maxSize=30, blocking=True)
+        pipeline.start()
+        frames = []
+        with pytest.raises(CameraUnavailable, match="ended its stream"):
+            for frame in read(dai, queue, Config(lock=False), hold=lambda: None):
+                frames.append(frame)
+    assert len(frames) >= 10
+    assert all(frame.image.shape == (120, 160, 3) and frame.intrinsics is None for frame in frames)
+    assert np.allclose([frame.image[60, 80, 2] for frame in frames], 20 * np.arange(len(frames)), atol=6)
+    assert (np.diff([frame.stamp_ns for frame in frames]) > 0).all()

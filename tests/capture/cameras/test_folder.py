@@ -1,0 +1,286 @@
+import math
+import os
+import struct
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode.capture.cameras.folder import Config, stream
+from splatnode.capture.exif import exif_intrinsics, read_tags
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.image_file import UnusableImage, read_header
+
+# Left half red, right half blue, the top left corner white: tells every orientation and channel order apart.
+PICTURE = np.zeros((48, 64, 3), np.uint8)
+PICTURE[:, :32], PICTURE[:, 32:], PICTURE[:16, :16] = (200, 20, 30), (20, 40, 210), (250, 250, 250)
+
+ORIENTATION = 0x0112
+
+
+def encoded(suffix=".jpg", image=PICTURE, *options):
+    channels = {2: None, 3: cv2.COLOR_RGB2BGR, 4: cv2.COLOR_RGBA2BGRA}[image.shape[-1] if image.ndim == 3 else 2]
+    ok, data = cv2.imencode(suffix, image if channels is None else cv2.cvtColor(image, channels), options)
+    assert ok
+    return data.tobytes()
+
+
+def tiff(tags, exif_tags=None, order=">"):
+    """A TIFF structure: tag -> int (SHORT) or (numerator, denominator) (RATIONAL), in one or two directories."""
+    directories = [dict(tags)] + ([exif_tags] if exif_tags else [])
+    if exif_tags:
+        directories[0][0x8769] = 8 + 2 + 12 * len(directories[0]) + 12 + 4
+    entries, values = b"", b""
+    end = 8 + sum(2 + 12 * len(directory) + 4 for directory in directories)
+    for directory in directories:
+        entries += struct.pack(order + "H", len(directory))
+        for tag, value in sorted(directory.items()):
+            if isinstance(value, tuple):
+                entries += struct.pack(order + "HHII", tag, 5, 1, end + len(values))
+                values += struct.pack(order + "II", *value)
+            elif tag == 0x8769:
+                entries += struct.pack(order + "HHII", tag, 4, 1, value)
+            else:
+                entries += struct.pack(order + "HHIHH", tag, 3, 1, value, 0)
+        entries += bytes(4)
+    return (b"MM\0*" if order == ">" else b"II*\0") + struct.pack(order + "I", 8) + entries + values
+
+
+def with_exif(jpeg, tags, exif_tags=None, order=">"):
+    segment = b"Exif\0\0" + tiff(tags, exif_tags, order)
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + jpeg[2:]
+
+
+def read_one(folder, name, data, **options):
+    (folder / name).write_bytes(data)
+    (result,) = stream(Config(folder, **options))
+    assert result.name == name
+    return result
+
+
+def read_frame(folder, name, data):
+    frame = read_one(folder, name, data)
+    assert isinstance(frame, Frame)
+    return frame
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".JPEG", ".png", ".bmp", ".tif", ".webp"])
+def test_every_format_gives_the_same_rgb(tmp_path, suffix):
+    frame = read_frame(tmp_path, "a" + suffix, encoded(suffix.lower()))
+    assert frame.intrinsics is None
+    assert np.abs(frame.image[24:46:4, 4:28:4].astype(int) - [200, 20, 30]).max() < 12
+    assert np.abs(frame.image[4:46:4, 40:60:4].astype(int) - [20, 40, 210]).max() < 12
+
+
+def test_progressive_and_grey_jpeg(tmp_path):
+    progressive = read_frame(tmp_path, "a.jpg", encoded(".jpg", PICTURE, cv2.IMWRITE_JPEG_PROGRESSIVE, 1))
+    assert progressive.image.shape == (48, 64, 3)
+    grey = read_frame(tmp_path, "a.jpg", encoded(".jpg", PICTURE[..., 0]))
+    assert grey.image.shape == (48, 64, 3)
+    assert np.array_equal(grey.image[..., 0], grey.image[..., 2])
+
+
+def test_sixteen_bits_become_eight(tmp_path):
+    deep = PICTURE.astype(np.uint16) * 257
+    assert np.array_equal(read_frame(tmp_path, "a.png", encoded(".png", deep)).image, PICTURE)
+    deep_grey = read_frame(tmp_path, "a.png", encoded(".png", deep[..., 0]))
+    assert np.array_equal(deep_grey.image, np.repeat(PICTURE[..., :1], 3, 2))
+
+
+def test_alpha_is_dropped(tmp_path):
+    transparent = np.dstack([PICTURE, np.zeros_like(PICTURE[..., 0])])
+    assert np.array_equal(read_frame(tmp_path, "a.png", encoded(".png", transparent)).image, PICTURE)
+
+
+@pytest.mark.parametrize("order", [">", "<"])
+def test_exif_orientation_is_applied(tmp_path, order):
+    upright = {1: PICTURE, 3: PICTURE[::-1, ::-1], 6: np.rot90(PICTURE, -1), 8: np.rot90(PICTURE)}
+    for orientation, expected in upright.items():
+        frame = read_frame(tmp_path, "a.jpg", with_exif(encoded(), {ORIENTATION: orientation}, order=order))
+        assert frame.image.shape == expected.shape
+        assert np.abs(frame.image.astype(int) - expected).mean() < 4
+
+
+def test_focal_length_from_35mm_equivalent_compares_diagonals(tmp_path):
+    frame = read_frame(tmp_path, "a.jpg", with_exif(encoded(), {ORIENTATION: 6}, {0xA405: 28}))
+    expected = 28 * 80 / math.hypot(36, 24)  # a diagonal of 80 pixels
+    assert frame.intrinsics.fx == pytest.approx(expected)
+    focal = frame.intrinsics.fx
+    assert frame.intrinsics == Intrinsics(48, 64, focal, focal, 24.0, 32.0, source="exif")
+
+
+def test_focal_length_from_sensor_resolution_follows_a_resized_image():
+    # 8 mm on a sensor of 500 pixels a centimetre is 400 pixels at the taken size of 640, 40 pixels at 64.
+    tags = {0x920A: (8, 1), 0xA20E: (500, 1), 0xA210: 3, 0xA002: 640, 0xA003: 480}
+    intrinsics = exif_intrinsics(read_tags(tiff({}, tags)), 64, 48)
+    assert intrinsics is not None
+    assert intrinsics.fx == pytest.approx(40.0)
+
+
+@pytest.mark.parametrize(
+    ("tags", "why"),
+    [
+        ({0xA405: 0}, "zero means unknown"),
+        ({0xA405: 2000}, "no lens is that long"),
+        ({0xA405: 28, 0xA002: 640, 0xA003: 640}, "cropped after it was taken"),
+        ({0x920A: (8, 0), 0xA20E: (500, 1)}, "0 in a denominator"),
+        ({0x920A: (8, 1)}, "a focal length without a sensor"),
+        ({0x920A: (8, 1), 0xA20E: (500, 1), 0xA210: 9}, "an unknown unit"),
+    ],
+)
+def test_focal_lengths_that_are_not_believed(tags, why):
+    assert exif_intrinsics(read_tags(tiff({}, tags)), 64, 48) is None, why
+
+
+def test_damaged_exif_is_ignored(tmp_path):
+    broken = tiff({}, {0xA405: 28})[:-8]
+    for data in (broken, b"MM\0*\xff\xff\xff\xff", b"nonsense"):
+        assert exif_intrinsics(read_tags(data), 64, 48) is None
+
+
+def test_zero_over_zero_in_a_pointer_or_a_size_is_no_number():
+    nothing_over_nothing = tiff({0x8769: (0, 0)}, {})
+    assert 0x8769 in read_tags(nothing_over_nothing)
+    with pytest.raises(UnusableImage, match="no image directory"):
+        read_header(tiff({0x0100: (0, 0), 0x0101: 48}, {}))
+
+
+def test_given_intrinsics_are_scaled_to_images_of_their_shape(tmp_path):
+    (tmp_path / "a.png").write_bytes(encoded(".png"))
+    (tmp_path / "b.png").write_bytes(encoded(".png", PICTURE[:40]))
+    given = Intrinsics(640, 480, 600.0, 600.0, 320.0, 240.0, source="given")
+    same, other = stream(Config(tmp_path, intrinsics=given))
+    assert isinstance(same, Frame) and same.intrinsics == given.resized(64, 48)
+    assert isinstance(other, Frame) and other.intrinsics is None
+
+
+def test_natural_order_ids_stamps_and_choice(tmp_path):
+    for name in ("img10.png", "img2.png", "IMG1.png", "img2b.png", "b.png"):
+        (tmp_path / name).write_bytes(encoded(".png"))
+    frames = [frame for frame in stream(Config(tmp_path, frames_per_second=4)) if isinstance(frame, Frame)]
+    assert [frame.name for frame in frames] == ["b.png", "IMG1.png", "img2.png", "img2b.png", "img10.png"]
+    assert [frame.frame_id for frame in frames] == [0, 1, 2, 3, 4]
+    assert [frame.stamp_ns for frame in frames] == [0, 250_000_000, 500_000_000, 750_000_000, 1_000_000_000]
+    assert [frame.name for frame in stream(Config(tmp_path, names=("img10", "img2.png")))] == ["img2.png", "img10.png"]
+
+
+def truncated(suffix):
+    data = encoded(suffix)
+    return {"half": data[: len(data) // 2], "last bytes": data[:-2], "zero tail": data[:-40] + bytes(40)}
+
+
+@pytest.mark.parametrize("cut", ["half", "last bytes"])
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp", ".bmp"])
+def test_truncated_files_are_named_and_left_out(tmp_path, suffix, cut):
+    dropped = read_one(tmp_path, "a" + suffix, truncated(suffix)[cut])
+    assert isinstance(dropped, DroppedFrame)
+    assert "truncated" in dropped.reason or "damaged" in dropped.reason
+
+
+def test_a_jpeg_whose_end_was_never_written(tmp_path):
+    dropped = read_one(tmp_path, "a.jpg", truncated(".jpg")["zero tail"])
+    assert dropped == DroppedFrame("a.jpg", "truncated: the JPEG has no end-of-image marker")
+
+
+def test_an_end_marker_inside_a_thumbnail_does_not_hide_truncation(tmp_path):
+    jpeg = encoded()
+    thumbnail = b"\xff\xec" + struct.pack(">H", 2 + len(jpeg)) + jpeg
+    whole = jpeg[:2] + thumbnail + jpeg[2:]
+    assert isinstance(read_one(tmp_path, "a.jpg", whole), Frame)
+    assert isinstance(read_one(tmp_path, "a.jpg", whole[:-40]), DroppedFrame)
+    assert isinstance(read_one(tmp_path, "a.jpg", whole + b"camera's own data"), Frame)
+
+
+def test_a_damaged_png_chunk(tmp_path):
+    data = bytearray(encoded(".png"))
+    data[len(data) // 2] ^= 0x55
+    assert isinstance(read_one(tmp_path, "a.png", bytes(data)), DroppedFrame)
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "reason"),
+    [
+        ("empty.jpg", b"", "empty file"),
+        ("text.png", b"hello, this is text", "not an image"),
+        ("sound.webp", b"RIFF\x10\0\0\0WAVEfmt \0\0\0\0", "not an image"),
+        ("headless.jpg", b"\xff\xd8\xff\xe0\0\x04ab\xff\xd9", "without an image"),
+        ("short.png", b"\x89PNG\r\n\x1a\n", "truncated"),
+        ("short.tif", b"II*\0\xff\0\0\0", "truncated"),
+        ("short.bmp", b"BM123", "truncated"),
+    ],
+)
+def test_foreign_content_is_named_and_left_out(tmp_path, name, data, reason):
+    dropped = read_one(tmp_path, name, data)
+    assert isinstance(dropped, DroppedFrame)
+    assert reason in dropped.reason
+
+
+def test_a_photograph_in_a_foreign_format_is_named_beside_others(tmp_path):
+    (tmp_path / "1.jpg").write_bytes(encoded())
+    (tmp_path / "2.heic").write_bytes(b"\0\0\0\x18ftypheic")
+    _, dropped = stream(Config(tmp_path))
+    assert dropped == DroppedFrame("2.heic", ".heic files cannot be read; convert it to JPEG or PNG")
+
+
+def test_too_many_pixels_are_refused_before_they_are_decoded(tmp_path):
+    huge = bytearray(encoded(".png"))
+    huge[16:24] = struct.pack(">II", 200_000, 200_000)
+    dropped = read_one(tmp_path, "a.png", bytes(huge))
+    assert isinstance(dropped, DroppedFrame)
+    assert "200000 x 200000" in dropped.reason
+    for suffix in (".jpg", ".webp", ".tif", ".bmp"):
+        other = tmp_path / suffix[1:]
+        other.mkdir()
+        dropped = read_one(other, "a" + suffix, encoded(suffix), max_pixels=64 * 48 - 1)
+        assert isinstance(dropped, DroppedFrame)
+        assert "64 x 48" in dropped.reason
+
+
+def test_a_bad_file_takes_no_frame_id(tmp_path):
+    (tmp_path / "1.jpg").write_bytes(encoded())
+    (tmp_path / "2.jpg").write_bytes(b"")
+    (tmp_path / "3.jpg").symlink_to(tmp_path / "nowhere.jpg")
+    (tmp_path / "4.jpg").write_bytes(encoded())
+    first, empty, gone, last = stream(Config(tmp_path))
+    assert isinstance(first, Frame) and isinstance(last, Frame)
+    assert (first.frame_id, last.frame_id) == (0, 1)
+    assert empty == DroppedFrame("2.jpg", "empty file")
+    assert isinstance(gone, DroppedFrame) and "cannot be read" in gone.reason
+
+
+def test_other_files_are_not_for_us(tmp_path):
+    for name in ("cameras.json", "notes.txt", ".hidden.jpg", "._a.jpg"):
+        (tmp_path / name).write_text("{}")
+    (tmp_path / "folder.jpg").mkdir()
+    read_one(tmp_path, "a.jpg", encoded())
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.jpg")
+    read_one(tmp_path, "a.jpg", encoded())
+
+
+def test_names_become_text_of_one_line(tmp_path):
+    for name in (b"\xff\xfe1.jpg", b"2\n.jpg", b"2\\n.jpg", "3 \u5199\u771f.jpg".encode()):
+        (tmp_path / os.fsdecode(name)).write_bytes(encoded())
+    names = {frame.name for frame in stream(Config(tmp_path))}
+    assert names == {"\\udcff\\udcfe1.jpg", "2\\n.jpg", "2\\\\n.jpg", "3 \u5199\u771f.jpg"}
+
+
+def test_nothing_to_stream_says_what_to_do(tmp_path):
+    with pytest.raises(FileNotFoundError, match="is not there; give a folder"):
+        stream(Config(tmp_path / "nowhere"))
+    with pytest.raises(ValueError, match="no photographs"):
+        stream(Config(tmp_path))
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "a.jpg").write_bytes(encoded())
+    with pytest.raises(ValueError, match="give one of its folders: images"):
+        stream(Config(tmp_path))
+    with pytest.raises(FileNotFoundError, match="is a file, not a folder"):
+        stream(Config(tmp_path / "images" / "a.jpg"))
+    (tmp_path / "phone").mkdir()
+    (tmp_path / "phone" / "IMG_1.HEIC").write_bytes(b"\0\0\0\x18ftypheic")
+    with pytest.raises(ValueError, match="holds only .heic files; convert them"):
+        stream(Config(tmp_path / "phone"))
+    with pytest.raises(ValueError, match="no photograph named b.jpg"):
+        stream(Config(tmp_path / "images", names=("b.jpg",)))

@@ -1,0 +1,83 @@
+"""Video files and the pace of recordings."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode.capture.cameras import folder
+from splatnode.capture.cameras.video import Config, stream
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.pace import paced
+
+
+@pytest.fixture(scope="module")
+def walk(tmp_path_factory):
+    """Twelve frames that get bluer, twenty a second."""
+    file = tmp_path_factory.mktemp("video") / "walk.mp4"
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), 20, (160, 120))
+    for index in range(12):
+        writer.write(np.full((120, 160, 3), (20 * index, 100, 50), np.uint8))
+    writer.release()
+    return file
+
+
+def test_frames_at_their_times(walk):
+    lens = Intrinsics(320, 240, 300.0, 300.0, 160.0, 120.0, "calibration")
+    frames: list[Any] = list(stream(Config(walk, intrinsics=lens)))
+    assert [frame.stamp_ns for frame in frames] == [index * 50_000_000 for index in range(12)]
+    assert [frame.name for frame in frames][-1] == "walk_000011.png"
+    assert np.allclose([frame.image[60, 80, 2] for frame in frames], 20 * np.arange(12), atol=6)
+    assert frames[0].intrinsics == lens.resized(160, 120)
+
+
+def test_some_of_the_frames(walk):
+    frames: list[Any] = list(stream(Config(walk, every=5)))
+    assert [(frame.frame_id, frame.name) for frame in frames] == [
+        (0, "walk_000000.png"),
+        (1, "walk_000005.png"),
+        (2, "walk_000010.png"),
+    ]
+    assert frames[2].stamp_ns == 500_000_000
+
+
+@pytest.mark.parametrize("content", [b"", b"no video", None])
+def test_what_is_no_video_says_so(tmp_path, walk, content):
+    file = tmp_path / "x.mp4"
+    file.write_bytes(walk.read_bytes()[:400] if content is None else content)
+    with pytest.raises(ValueError, match="no video|no frame"):
+        list(stream(Config(file)))
+    with pytest.raises(FileNotFoundError, match="give a video"):
+        stream(Config(tmp_path / "nowhere.mp4"))
+
+
+def frame(stamp_ns):
+    return Frame(0, "a", stamp_ns, np.zeros((2, 2, 3), np.uint8), None)
+
+
+def test_the_recorded_pace():
+    items = [DroppedFrame("x", "blurred"), frame(10**12), frame(10**12 + 50_000_000), frame(10**12 + 150_000_000)]
+    start = time.monotonic()
+    assert list(paced(items, "recorded")) == items
+    assert time.monotonic() - start >= 0.15
+    hour = [frame(10**12), frame(10**12 + 3600 * 10**9)]
+    start = time.monotonic()
+    assert list(paced(hour, "fastest")) == hour
+    assert time.monotonic() - start < 60
+
+
+def test_a_folder_can_be_shown_again_and_again(tmp_path):
+    for index in range(2):
+        image = np.random.default_rng(index).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"{index}.png"), image)
+    (tmp_path / "9.jpg").write_bytes(b"")
+    items = list(folder.stream(folder.Config(tmp_path, loops=2, frames_per_second=4)))
+    assert [item.name for item in items] == ["0.png", "1.png", "9.jpg", "loop1_0.png", "loop1_1.png", "loop1_9.jpg"]
+    frames = [item for item in items if isinstance(item, Frame)]
+    assert [item.frame_id for item in frames] == [0, 1, 2, 3]
+    assert [item.stamp_ns for item in frames] == [0, 250_000_000, 500_000_000, 750_000_000]
+    assert np.array_equal(frames[0].image, frames[2].image)

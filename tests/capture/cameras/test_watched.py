@@ -1,0 +1,111 @@
+"""A folder that is written to while it is watched: each photograph once, and only when it is whole."""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode.capture.cameras.watched import Config, stream
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.unavailable import CameraUnavailable
+
+QUICK = {"poll_s": 0.01, "settle_s": 0.05, "give_up_s": 0.4}
+
+
+def photograph(index=0, suffix=".jpg"):
+    image = np.random.default_rng(index).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    return cv2.imencode(suffix, image)[1].tobytes()
+
+
+def watch(folder, **config) -> Any:
+    return stream(Config(folder, **{**QUICK, **config}))
+
+
+def slowly(path, data, pieces=6, pause_s=0.03):
+    def write():
+        with path.open("wb") as file:
+            for start in range(0, len(data), len(data) // pieces + 1):
+                file.write(data[start : start + len(data) // pieces + 1])
+                file.flush()
+                time.sleep(pause_s)
+
+    thread = threading.Thread(target=write)
+    thread.start()
+    return thread
+
+
+def test_photographs_come_once_in_their_order(tmp_path):
+    for index, name in enumerate(["img10.jpg", "img2.png"]):
+        (tmp_path / name).write_bytes(photograph(index, name[-4:]))
+    frames = watch(tmp_path)
+    assert [next(frames).name, next(frames).name] == ["img2.png", "img10.jpg"]
+    (tmp_path / "a.jpg").write_bytes(photograph(2))
+    before = time.monotonic_ns()
+    third = next(frames)
+    assert (third.name, third.frame_id) == ("a.jpg", 2) and before < third.stamp_ns <= time.monotonic_ns()
+
+
+@pytest.mark.parametrize("pause_s", [0.02, 0.1])  # 0.1: it pauses for longer than it takes to settle
+def test_a_file_that_is_being_written_is_waited_for(tmp_path, pause_s):
+    data = photograph()
+    writer = slowly(tmp_path / "slow.jpg", data, pause_s=pause_s)
+    frame = next(watch(tmp_path, give_up_s=10))
+    writer.join()
+    assert isinstance(frame, Frame) and frame.encoded == data
+
+
+def test_a_file_that_never_becomes_whole_is_named(tmp_path, monkeypatch):
+    now = [0.0]
+
+    def sleep(seconds):
+        now[0] += seconds
+
+    clock = SimpleNamespace(monotonic=lambda: now[0], monotonic_ns=lambda: round(now[0] * 1e9), sleep=sleep)
+    monkeypatch.setattr("splatnode.capture.cameras.watched.time", clock)
+    (tmp_path / "half.jpg").write_bytes(photograph()[:-500])
+    (tmp_path / "whole.jpg").write_bytes(photograph(1))
+    frames = watch(tmp_path)
+    assert next(frames).name == "whole.jpg"  # one file does not hold up the others
+    dropped = next(frames)
+    assert isinstance(dropped, DroppedFrame) and dropped.name == "half.jpg"
+    assert "truncated" in dropped.reason and "after 0 s" in dropped.reason and 0.4 <= now[0] < 0.5
+
+
+def test_temporary_and_hidden_files_are_not_looked_at(tmp_path):
+    for name in (".hidden.jpg", "a.jpg.tmp", "b.part.jpg", "c.tmp.png", "notes.txt"):
+        (tmp_path / name).write_bytes(photograph())
+    frames = watch(tmp_path)
+    (tmp_path / "c.tmp.png").rename(tmp_path / "c.png")
+    assert next(frames).name == "c.png"
+
+
+def test_what_lies_there_can_be_left_out(tmp_path):
+    (tmp_path / "old.jpg").write_bytes(photograph())
+    frames = watch(tmp_path, existing=False)
+    (tmp_path / "new.jpg").write_bytes(photograph(1))
+    assert next(frames).name == "new.jpg"
+
+
+def test_what_cannot_be_read_is_named(tmp_path):
+    (tmp_path / "phone.heic").write_bytes(b"\0\0\0\x18ftypheic")
+    assert "convert it to JPEG" in next(watch(tmp_path)).reason
+
+
+def test_a_folder_that_is_not_there_or_goes_is_a_lost_camera(tmp_path):
+    with pytest.raises(CameraUnavailable, match="cannot watch"):
+        next(watch(tmp_path / "nowhere"))
+    folder = tmp_path / "stick"
+    folder.mkdir()
+    (folder / "a.jpg").write_bytes(photograph())
+    frames = watch(folder)
+    next(frames)
+    (folder / "a.jpg").unlink()
+    folder.rmdir()
+    with pytest.raises(CameraUnavailable, match="cannot watch"):
+        next(frames)

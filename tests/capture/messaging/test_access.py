@@ -1,0 +1,139 @@
+"""Who is let in: private folders, keys, the allow list, and what strangers and crowds can do."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import subprocess
+import sys
+
+import msgspec
+import pytest
+
+from splatnode.capture.messaging import keys
+from splatnode.capture.messaging.broadcast import Publisher, Subscriber
+from splatnode.capture.messaging.keyframe_messages import DroppedHeader
+from splatnode.capture.messaging.network import Network, NetworkError, NotAllowed, runtime_directory
+from splatnode.capture.messaging.services import CAPTURE_PREVIEW, RECON_SCENE
+from splatnode.capture.messaging.state import StateClient, StateServer
+from splatnode.capture.messaging.wire import Numbering
+from tests.capture.messaging.test_sockets import Note, heard, ipc, tcp, wait_for
+from tests.conftest import ROOT
+
+SERVES = """
+import pathlib, resource, sys
+from splatnode.capture.messaging.keyframe_messages import DroppedHeader
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.services import RECON_SCENE
+from splatnode.capture.messaging.state import StateServer
+from splatnode.capture.messaging.wire import Numbering
+resource.setrlimit(resource.RLIMIT_NOFILE, (60, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
+with StateServer(RECON_SCENE, Network(directory=pathlib.Path(sys.argv[1]))) as server:
+    server.publish(DroppedHeader(**Numbering().next(), name="a.png", reason="blurred"))
+    while True:
+        server.serve(0.05)
+"""
+
+
+def test_a_crowd_on_a_socket_takes_nothing_from_the_others(tmp_path):
+    network = ipc(tmp_path)
+    directory = runtime_directory(network)
+    process = subprocess.Popen([sys.executable, "-c", SERVES, directory], cwd=ROOT)
+    try:
+        requests = directory / RECON_SCENE.requests.name
+        wait_for(requests.exists)
+        with contextlib.ExitStack() as crowd, StateClient(RECON_SCENE, network, DroppedHeader) as client:
+            for _ in range(100):
+                crowd.enter_context(socket.socket(socket.AF_UNIX)).connect(str(requests))
+            wait_for(lambda: client.poll(0.1))
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_the_directory_must_be_private(tmp_path):
+    directory = runtime_directory(ipc(tmp_path))
+    assert directory.stat().st_mode & 0o777 == 0o700
+    directory.chmod(0o755)
+    with pytest.raises(NetworkError, match="chmod 700"):
+        Publisher(CAPTURE_PREVIEW, ipc(tmp_path))
+    with pytest.raises(NetworkError, match="shorten"):
+        Publisher(CAPTURE_PREVIEW, Network(directory=tmp_path / ("x" * 100)))
+
+
+def test_where_the_directory_is(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path / "user"))
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    assert runtime_directory(Network()) == tmp_path / "user" / "splatnode"
+    monkeypatch.setenv("RUNTIME_DIRECTORY", f"{tmp_path / 'service'}:{tmp_path / 'other'}")
+    assert runtime_directory(Network()) == tmp_path / "service"
+
+
+def test_tcp_needs_keys(tmp_path):
+    with pytest.raises(NetworkError, match="splatnode keys"):
+        Publisher(CAPTURE_PREVIEW, Network(directory=tmp_path / "run", tcp="127.0.0.1"))
+    with pytest.raises(keys.KeyFileError, match="no key"):
+        Subscriber(CAPTURE_PREVIEW, Network(directory=tmp_path, tcp="127.0.0.1", keys=tmp_path), Note)
+
+
+def other_machine(network, folder, knows_server=True):
+    """The network as another machine sees it, and that machine's public key."""
+    public = keys.create_keys(folder / "keys")
+    server = keys.read_keys(network.keys).public if knows_server else keys.create_keys(folder / "wrong")
+    keys.expect_server(folder / "keys", server)
+    return msgspec.structs.replace(network, directory=folder / "run", keys=folder / "keys"), public
+
+
+def test_the_allow_list_decides_at_each_handshake(tmp_path):
+    network, numbering = tcp(tmp_path), Numbering()
+    theirs, public = other_machine(network, tmp_path / "laptop")
+    with Publisher(CAPTURE_PREVIEW, network) as publisher:
+        with Subscriber(CAPTURE_PREVIEW, theirs, Note) as subscriber, pytest.raises(NotAllowed, match="--allow"):
+            heard(publisher, subscriber, numbering)
+        keys.allow(network.keys, "laptop", public)
+        with Subscriber(CAPTURE_PREVIEW, theirs, Note) as subscriber:
+            heard(publisher, subscriber, numbering)
+
+
+def test_a_wrong_server_is_not_spoken_to(tmp_path):
+    network, numbering = tcp(tmp_path), Numbering()
+    theirs, public = other_machine(network, tmp_path / "laptop", knows_server=False)
+    keys.allow(network.keys, "laptop", public)
+    with (
+        Publisher(CAPTURE_PREVIEW, network) as publisher,
+        Subscriber(CAPTURE_PREVIEW, theirs, Note) as subscriber,
+        pytest.raises(NotAllowed, match="server.key"),
+    ):
+        heard(publisher, subscriber, numbering)
+
+
+@pytest.mark.parametrize("junk", [b"\x01\x00\x06\x00hello", b"GET / HTTP/1.0\r\n\r\n", bytes(range(256)) * 40])
+def test_strangers_on_the_port_are_not_heard(tmp_path, junk):
+    network = tcp(tmp_path)
+    with StateServer(RECON_SCENE, network) as server:
+        with socket.create_connection(("127.0.0.1", network.first_port + RECON_SCENE.requests.tcp_port)) as stranger:
+            stranger.sendall(junk)
+            server.serve(0.2)
+        assert server.refused == 0
+
+
+def test_keys_are_private_and_not_overwritten(tmp_path):
+    public = keys.create_keys(tmp_path)
+    assert keys.read_keys(tmp_path) == keys.Keys(public, (tmp_path / "secret.key").read_bytes().strip(), public)
+    with pytest.raises(keys.KeyFileError, match="there already"):
+        keys.create_keys(tmp_path)
+    with pytest.raises(keys.KeyFileError, match="40 characters"):
+        keys.allow(tmp_path, "laptop", b"short")
+    with pytest.raises(ValueError, match="name"):
+        keys.allow(tmp_path, "../laptop", public)
+    (tmp_path / "secret.key").chmod(0o644)
+    with pytest.raises(keys.KeyFileError, match="chmod 600"):
+        keys.read_keys(tmp_path)
+
+
+def test_keys_that_the_disk_did_not_take_are_not_in_the_way_of_the_next(tmp_path):
+    (tmp_path / keys.PUBLIC).mkdir()
+    with pytest.raises(IsADirectoryError):
+        keys.create_keys(tmp_path)
+    (tmp_path / keys.PUBLIC).rmdir()
+    assert keys.create_keys(tmp_path) == keys.read_keys(tmp_path).public

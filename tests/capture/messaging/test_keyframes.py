@@ -1,0 +1,265 @@
+"""No keyframe that was offered is lost, and none is delivered twice, whoever dies in between."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import zmq
+
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.messaging.keyframe_messages import FrameHeader
+from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging.network import AlreadyRunning, Network, runtime_directory
+from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES
+from splatnode.capture.messaging.spool import Config, Key, Spool, SpoolFull, spool_directory
+from splatnode.capture.messaging.wire import WireError, encode
+from splatnode.capture.process.lock import Held
+from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
+from tests.conftest import ROOT
+
+INTRINSICS = Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0, "calibration", (0.1, -0.2))
+KEY = Key("0" * 32, 0)
+
+
+def frame(index, size=(6, 8)):
+    image = np.random.default_rng(index).integers(0, 256, (*size, 3)).astype(np.uint8)
+    return Frame(index, f"{index}.png", index * 1000, image, INTRINSICS if index % 2 else None)
+
+
+def open_spool(folder, **limits):
+    return Spool(Config(folder / "state", **limits))
+
+
+def receive(server, client, count, seconds=30.0):
+    received = []
+    deadline = time.monotonic() + seconds
+    while len(received) < count and time.monotonic() < deadline:
+        server.serve(0.005)
+        if (one := client.receive(0.005)) is not None:
+            received.append(one)
+    return received
+
+
+def settle(server, client, until=lambda: True):
+    """What was said is heard: until this is so, and for a while, in which what must not come could."""
+
+    def serve():
+        server.serve(0.01)
+        assert client.receive(0.005) is None
+        return until()
+
+    wait_for(serve)
+    for _ in range(10):
+        serve()
+
+
+def assert_same(received, sent):
+    assert (received.frame_id, received.name, received.stamp_ns) == (sent.frame_id, sent.name, sent.stamp_ns)
+    assert received.intrinsics == sent.intrinsics and np.array_equal(received.image, sent.image)
+
+
+@pytest.mark.parametrize("make", [ipc, tcp], ids=["ipc", "tcp+curve"])
+def test_frames_arrive_in_order_and_leave_the_spool_when_acknowledged(tmp_path, make):
+    network, spool = make(tmp_path), open_spool(tmp_path)
+    with KeyframeClient(network, capacity=3) as client, KeyframeServer(network, spool) as server:
+        for index in range(6):
+            server.offer(frame(index))
+        server.offer(DroppedFrame("blurred.png", "blurred: its edges are 9 px wide"))
+        received = receive(server, client, 3)
+        assert [one.sequence for one in received] == [0, 1, 2]
+        settle(server, client)
+        assert server.queued == 7 and client.receive(0) is None  # its capacity is used up
+        for one in received:
+            assert_same(one.frame, frame(one.sequence))
+            client.acknowledge(one)
+        received = receive(server, client, 3)
+        assert server.queued == 4 and server.acknowledged == 3
+        for one in received:
+            client.acknowledge(one)
+        (dropped,) = receive(server, client, 1)
+        assert dropped.frame == DroppedFrame("blurred.png", "blurred: its edges are 9 px wide")
+        client.acknowledge(dropped)
+        settle(server, client, lambda: server.queued == 0)
+        assert server.queued == 0 and client.duplicates == client.refused == server.refused == 0
+
+
+def test_a_new_recon_gets_what_the_old_one_had_not_acknowledged(tmp_path):
+    network, spool = ipc(tmp_path), open_spool(tmp_path)
+    with KeyframeServer(network, spool) as server:
+        for index in range(3):
+            server.offer(frame(index))
+        with KeyframeClient(network) as killed:
+            first, second, _third = receive(server, killed, 3)
+            killed.acknowledge(first)
+            settle(server, killed, lambda: server.queued == 2)
+        with KeyframeClient(network, seen=[first.key, second.key]) as client:  # the checkpoint also holds the second
+            assert [one.sequence for one in receive(server, client, 1)] == [2]
+            settle(server, client, lambda: client.duplicates and server.queued == 1)
+            assert client.duplicates == 1 and server.queued == 1
+
+
+def test_a_restarted_capture_does_not_send_again_what_recon_holds(tmp_path):
+    network = ipc(tmp_path)
+    with KeyframeClient(network) as client:
+        with KeyframeServer(network, open_spool(tmp_path)) as server:
+            server.offer(frame(0))
+            server.offer(frame(1))
+            held = receive(server, client, 2)
+        with KeyframeServer(network, open_spool(tmp_path)) as server:
+            server.offer(frame(2))
+            (new,) = receive(server, client, 1)
+            assert new.session != held[0].session and new.sequence == 0
+            settle(server, client)
+            assert client.duplicates == 0
+            for one in (*held, new):
+                client.acknowledge(one)
+            settle(server, client, lambda: server.queued == 0)
+
+
+KILLED = """
+import os, pathlib, sys, numpy
+from splatnode.capture.process.lock import Held
+from splatnode.capture.frame import Frame
+from splatnode.capture.messaging.keyframes import KeyframeServer
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.spool import Config, Spool
+folder = pathlib.Path(sys.argv[1])
+server = KeyframeServer(Network(directory=folder / "run"), Spool(Config(folder / "state")))
+for index in range(3):
+    server.offer(Frame(index, f"{index}.png", index, numpy.full((6, 8, 3), index, numpy.uint8), None))
+os.kill(os.getpid(), 9)
+"""
+
+
+def test_what_was_offered_survives_a_kill(tmp_path):
+    assert subprocess.run([sys.executable, "-c", KILLED, tmp_path], cwd=ROOT).returncode == -9
+    network = ipc(tmp_path)
+    with KeyframeServer(network, open_spool(tmp_path)) as server, KeyframeClient(network) as client:
+        server.offer(frame(3))
+        received = receive(server, client, 4)
+        assert len({one.session for one in received}) == 2
+        assert [one.frame.name for one in received] == ["0.png", "1.png", "2.png", "3.png"]
+        assert [one.frame.image.max() for one in received[:3]] == [0, 1, 2]
+
+
+def test_one_process_offers_keyframes(tmp_path):
+    with KeyframeServer(ipc(tmp_path), open_spool(tmp_path)):
+        with pytest.raises(AlreadyRunning):
+            KeyframeServer(ipc(tmp_path), open_spool(tmp_path / "other"))
+        with pytest.raises(Held):
+            open_spool(tmp_path)
+    open_spool(tmp_path / "other").close()  # the one that came too late has let go of its spool
+
+
+def test_what_is_no_keyframe_is_refused(tmp_path, caplog):
+    header = FrameHeader(
+        session="0" * 32, sequence=0, mono_ns=0, frame_id=0, name="a.png", stamp_ns=0, intrinsics=INTRINSICS
+    )
+    lens = msgspec.structs.replace
+    nan = replace(INTRINSICS)
+    object.__setattr__(nan, "fx", float("nan"))  # that no process of ours makes
+    images = [np.zeros((6, 8, 3), np.uint8)]
+    bad = [
+        encode(header),
+        encode(header, images * 2),
+        encode(header, [images[0][..., 0]]),
+        encode(header, [images[0].astype(np.float32)]),
+        encode(header, [images[0][:0]]),
+        encode(lens(header, intrinsics=nan), images),
+        [b"SPLAT\x01", b"junk"],
+    ]
+    network = ipc(tmp_path)
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as impostor, KeyframeClient(network) as client:
+        impostor.linger = 0
+        impostor.bind(f"ipc://{runtime_directory(network) / CAPTURE_KEYFRAMES.name}")
+        wait_for(lambda: client.receive(0.01) or impostor.poll(10))
+        identity, *_ = impostor.recv_multipart()
+        for parts in [*bad, encode(header, images)]:
+            impostor.send_multipart([identity, *parts])
+        assert client.receive(30).frame.name == "a.png"
+        assert client.refused == len(bad)
+    told = [record for record in caplog.records if "refused a keyframe" in record.message]
+    assert len(told) == len(bad).bit_length()  # the 1st, 2nd, 4th, ...: the journal cannot be filled
+
+
+def test_too_large_is_said_before_it_is_spooled(tmp_path):
+    network = Network(directory=tmp_path / "run", max_message_mb=1)
+    with KeyframeServer(network, open_spool(tmp_path)) as server:
+        with pytest.raises(WireError, match="max_message_mb"):
+            server.offer(frame(0, size=(700, 700)))
+        assert server.queued == 0
+
+
+def test_the_spool_is_bounded(tmp_path):
+    spool = open_spool(tmp_path, max_frames=2)
+    spool.put(KEY, [b"a"])
+    spool.put(KEY._replace(sequence=1), [b"b"])
+    with pytest.raises(SpoolFull, match="is splatnode recon running"):
+        spool.put(KEY._replace(sequence=2), [b"c"])
+    spool.remove(KEY)
+    spool.put(KEY._replace(sequence=2), [b"c"])
+    assert [key.sequence for key in spool] == [1, 2]
+    small = Spool(Config(tmp_path / "other", max_mb=1))
+    with pytest.raises(SpoolFull):
+        small.put(KEY, [bytes(1 << 20)])
+
+
+def test_a_full_disk_is_a_full_spool_and_leaves_nothing(tmp_path, monkeypatch):
+    spool = open_spool(tmp_path)
+
+    def no_space(descriptor):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("splatnode.capture.process.durable.os.fsync", no_space)
+    with pytest.raises(SpoolFull, match="No space left"):
+        spool.put(KEY, [b"a"])
+    assert len(spool) == 0 and not list(spool.directory.iterdir())
+
+
+def test_damaged_files_are_put_aside(tmp_path):
+    spool = open_spool(tmp_path)
+    for sequence in range(4):
+        spool.put(KEY._replace(sequence=sequence), [b"content", b"of the message"])
+    paths = sorted(spool.directory.glob("*.frame"))
+    paths[0].write_bytes(paths[0].read_bytes()[:-1])
+    flipped = bytearray(paths[2].read_bytes())
+    flipped[-1] ^= 1
+    paths[2].write_bytes(bytes(flipped))
+    paths[3].write_bytes(b"")
+    (spool.directory / ".half.tmp").write_bytes(b"half")
+    (spool.directory / "stranger.frame").write_bytes(b"?")
+    spool.close()
+    again = open_spool(tmp_path)
+    assert [key.sequence for key in again] == [1]
+    assert [bytes(part) for part in again.get(KEY._replace(sequence=1))] == [b"content", b"of the message"]
+    assert len(list(spool.directory.glob("*.damaged"))) == 4 and not (spool.directory / ".half.tmp").exists()
+
+
+def test_a_frame_that_the_disk_loses_does_not_block_the_others(tmp_path):
+    network, spool = ipc(tmp_path), open_spool(tmp_path)
+    with KeyframeServer(network, spool) as server, KeyframeClient(network) as client:
+        server.offer(frame(0))
+        server.offer(frame(1))
+        next(iter(spool.directory.glob("000000000000-*"))).write_bytes(b"rot")
+        assert [one.sequence for one in receive(server, client, 1)] == [1]
+        assert server.queued == 1
+
+
+def test_where_the_spool_is(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home"))
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    assert spool_directory(Config()) == tmp_path / "home" / "splatnode" / "spool"
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "service"))
+    assert spool_directory(Config()) == Path(tmp_path, "service", "spool")
+    holder = Spool(Config())
+    with pytest.raises(Held, match=f"held by process {os.getpid()}"):
+        Spool(Config())
+    holder.close()

@@ -1,0 +1,36 @@
+"""Memory that was freed comes back without the kernel."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.conftest import ROOT
+
+FAULTS = """
+import resource, sys
+import numpy as np
+from splatnode.capture.process.memory import keep_freed
+if sys.argv[1] == "kept":
+    keep_freed()
+def frame():
+    pixels = [np.ones((720, 1280, 3), np.uint8) for _ in range(3)]  # as many as are alive at once
+def faults():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+frame()
+before = faults()
+for _ in range(20):
+    frame()
+print((faults() - before) / 20)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="page faults are counted as Linux does")
+def test_frames_of_720p_cost_no_page_faults():
+    per_frame = {
+        kept: float(subprocess.check_output([sys.executable, "-c", FAULTS, kept], cwd=ROOT, text=True))
+        for kept in ("kept", "given back")
+    }
+    assert per_frame["kept"] < 20 < per_frame["given back"]

@@ -1,0 +1,194 @@
+"""The capture process as it is run: what it sends, says, survives and returns."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode.capture.messaging.broadcast import Subscriber
+from splatnode.capture.messaging.keyframes import KeyframeClient
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
+from splatnode.capture.preview import PreviewHeader, decode_preview
+from splatnode.capture.process.logs import _Formatter, event
+from splatnode.capture.status import CaptureStatus
+from tests.capture.messaging.test_sockets import wait_for
+from tests.conftest import ROOT
+
+NO_TORCH = """
+import sys
+sys.modules["torch"] = sys.modules["open3d"] = None
+from splatnode import command_line
+sys.exit(command_line.main())
+"""
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    """Five different places, the third of them twice, and a file that is none."""
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    for index in range(5):
+        noise = np.random.default_rng(index).integers(0, 256, (30, 40, 3)).astype(np.uint8)
+        cv2.imwrite(str(folder / f"{index}.png"), cv2.resize(noise, (320, 240), interpolation=cv2.INTER_CUBIC))
+    (folder / "2b.png").write_bytes((folder / "2.png").read_bytes())
+    (folder / "9.jpg").write_bytes(b"\xff\xd8\xff\xe0 no photograph")
+    return folder
+
+
+@pytest.fixture
+def start(tmp_path, photographs):
+    """Starts `splatnode capture`, and ends it after the test."""
+    running = []
+
+    def run(camera="", spool="", **environment):
+        config = tmp_path / "capture.yaml"
+        config.write_text(
+            f"camera: {{kind: folder, folder: {photographs}, frames_per_second: 8, pace: recorded{camera}}}\n"
+            "selection: {every_frame: true}\n"
+            f"spool: {{{spool}directory: {tmp_path / 'state'}}}\n"
+            f"network: {{directory: {tmp_path / 'run'}}}\n"
+        )
+        command = [sys.executable, "-c", NO_TORCH, "capture", str(config)]
+        process = subprocess.Popen(
+            command, cwd=ROOT, stderr=subprocess.PIPE, text=True, env={**os.environ, **environment}
+        )
+        running.append(process)
+        return process
+
+    yield run
+    for process in running:
+        process.kill()
+        process.communicate()
+
+
+def network(tmp_path):
+    return Network(directory=tmp_path / "run")
+
+
+def take_all(tmp_path, process):
+    """Acts as recon until capture ends."""
+    items = []
+    with KeyframeClient(network(tmp_path)) as client:
+
+        def ended():
+            if (received := client.receive(0.05)) is not None:
+                items.append(received.frame)
+                client.acknowledge(received)
+            return process.poll() is not None
+
+        wait_for(ended)
+    return items
+
+
+def test_a_folder_from_its_first_frame_to_its_last_acknowledgement(tmp_path, photographs, start):
+    process = start()
+    with Subscriber(CAPTURE_STATUS, network(tmp_path), CaptureStatus) as heartbeats:
+        status = wait_for(lambda: (it := heartbeats.latest(0.1)) and it.header.state == "finished" and it.header)
+        assert status.keyframes == 5 and status.frames == 6 and status.dropped == 1 and status.unusable == 1
+        assert status.waiting == 6 and not status.recon_connected and 10 < status.rss_mb < 1000
+    items = take_all(tmp_path, process)
+    assert [item.name for item in items] == ["0.png", "1.png", "2.png", "3.png", "4.png", "9.jpg"]
+    stored = cv2.cvtColor(cv2.imread(str(photographs / "1.png")), cv2.COLOR_BGR2RGB)
+    assert np.array_equal(items[1].image, stored) and items[1].stamp_ns == 125_000_000
+    assert "truncated" in items[5].reason or "damaged" in items[5].reason
+    assert process.returncode == 0
+    log = process.stderr.read()
+    assert log.count("event=keyframe") == 5 and 'reason="every frame is taken"' in log
+    assert not list((tmp_path / "state" / "spool").iterdir())
+
+
+def test_sigterm_is_a_clean_end_and_what_waits_is_kept(tmp_path, start):
+    process = start(", loops: 1000")
+    spool = tmp_path / "state" / "spool"
+    wait_for(lambda: spool.exists() and len(list(spool.glob("*.frame"))) >= 2)
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60) == 0
+    assert "Traceback" not in process.stderr.read()
+    kept = sorted(path.name for path in spool.iterdir())
+    assert all(name.endswith(".frame") for name in kept) and len(kept) >= 2
+    assert not list((tmp_path / "run").glob("*[!k]"))  # the sockets are gone
+
+
+def test_a_killed_capture_is_continued_by_the_next(tmp_path, start):
+    process = start()
+    spool = tmp_path / "state" / "spool"
+    wait_for(lambda: spool.exists() and len(list(spool.glob("*.frame"))) >= 2)
+    process.kill()
+    process.wait()
+    items = take_all(tmp_path, start())
+    names = [item.name for item in items]
+    assert names[:2] == ["0.png", "1.png"] and names.count("0.png") == 2 and names[-1] == "9.jpg"
+
+
+def test_the_second_capture_is_told_who_the_first_is(tmp_path, start):
+    first = start(", loops: 1000")
+    wait_for(lambda: (tmp_path / "run" / "splatnode.capture.preview").exists())
+    second = start()
+    assert second.wait(60) == 75
+    assert f"by process {first.pid}" in second.stderr.read()
+
+
+def test_systemd_is_told(tmp_path, start):
+    address = tmp_path / "notify"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(address))
+        manager.settimeout(60)
+        process = start(", loops: 1000", NOTIFY_SOCKET=str(address), WATCHDOG_USEC="400000")
+        messages = []
+
+        def streams():
+            messages.append(manager.recv(1000).decode())
+            return sum(message.startswith("WATCHDOG=1") for message in messages) >= 3 and "streaming: " in messages[-1]
+
+        wait_for(streams)
+        assert "READY=1" in messages
+        process.send_signal(signal.SIGTERM)
+        while messages[-1] != "STOPPING=1":
+            messages.append(manager.recv(1000).decode())
+
+
+def test_status_says_how_it_is(tmp_path, start):
+    start(", loops: 1000")
+    wait_for(lambda: list(tmp_path.glob("state/spool/*.frame")))
+    command = [sys.executable, "-m", "splatnode", "status", "--json", "--config", str(tmp_path / "capture.yaml")]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    found = json.loads(result.stdout)
+    assert result.returncode == 75 and found["recon"] is None
+    assert found["capture"]["state"] == "streaming" and found["capture"]["camera"] == "folder"
+
+
+def test_a_full_spool_is_said_once_and_stops_nothing(tmp_path, start, photographs):
+    process = start(", loops: 1000", spool="max_frames: 2, ")
+    with (
+        Subscriber(CAPTURE_PREVIEW, network(tmp_path), PreviewHeader) as previews,
+        Subscriber(CAPTURE_STATUS, network(tmp_path), CaptureStatus) as heartbeats,
+    ):
+        status = wait_for(lambda: (beat := heartbeats.latest(0.1)) and beat.header.not_taken > 1 and beat.header)
+        assert status.waiting == 2 and "is splatnode recon running" in status.why
+        preview = wait_for(lambda: previews.latest(0.1))
+        assert decode_preview(preview).shape == (240, 320, 3) and preview.header.name.endswith(".png")
+    process.terminate()
+    assert process.stderr.read().count("event=spool_full") == 1
+
+
+def test_lines_can_be_taken_apart(caplog):
+    import logging
+
+    log = logging.getLogger("capture.test")
+    with caplog.at_level(logging.INFO):
+        event(log, logging.INFO, "keyframe", name="a b.png", share=0.123456, why='say "x"\n', waiting=0, empty="")
+    line = _Formatter(journal=True).format(caplog.records[0])
+    assert line == (
+        '<6>logger=capture.test event=keyframe name="a b.png" share=0.1235 why="say \\"x\\"\\n" waiting=0 empty=""'
+    )
+    assert time.strftime("%Y-") in _Formatter(journal=False).format(caplog.records[0])

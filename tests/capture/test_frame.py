@@ -1,0 +1,42 @@
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatnode.capture.frame import Frame, Intrinsics
+
+
+def test_K_and_its_size_of_a_resized_image():
+    intrinsics = Intrinsics(640, 480, fx=500.0, fy=510.0, cx=320.0, cy=236.0, source="given", distortion=(0.1,))
+    assert np.array_equal(intrinsics.K, [[500, 0, 320], [0, 510, 236], [0, 0, 1]])
+    half = intrinsics.resized(320, 240)
+    assert (half.fx, half.fy, half.cx, half.cy) == (250.0, 255.0, 160.0, 118.0)
+    assert (half.width, half.height, half.source, half.distortion) == (320, 240, "given", (0.1,))
+
+
+@pytest.mark.parametrize("change", [{"width": 0}, {"fy": -1.0}, {"cx": math.nan}, {"distortion": (math.inf,)}], ids=str)
+def test_what_no_lens_can_have_is_refused(change):
+    with pytest.raises(ValueError, match="intrinsics must be finite"):
+        replace(Intrinsics(640, 480, 500.0, 510.0, 320.0, 236.0, source="given"), **change)
+
+
+def test_resizing_keeps_where_a_ray_meets_the_image():
+    # With the top-left pixel's centre at (0.5, 0.5), image coordinates scale without an offset.
+    ray = np.array([0.3, -0.2, 1.0])
+    intrinsics = Intrinsics(640, 480, 500.0, 510.0, 320.0, 236.0, source="given")
+    before, after = intrinsics.K @ ray, intrinsics.resized(960, 360).K @ ray
+    assert np.allclose(after[:2], before[:2] * [1.5, 0.75])
+
+
+@pytest.mark.parametrize(
+    "image", [np.zeros((4, 5)), np.zeros((4, 5, 4), np.uint8), np.zeros((4, 5, 3), np.float32)], ids=str
+)
+def test_a_frame_refuses_what_is_no_rgb_image(image):
+    with pytest.raises(ValueError, match=r"\(H, W, 3\) uint8"):
+        Frame(0, "a.jpg", 0, image, None)
+
+
+def test_frame_size():
+    frame = Frame(0, "a.jpg", 0, np.zeros((4, 5, 3), np.uint8), None)
+    assert (frame.width, frame.height) == (5, 4)

@@ -1,0 +1,90 @@
+"""A reconstruction comes back from the checkpoint with its scene, and goes on growing at once."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
+from splatnode.recon.config import Config
+from splatnode.recon.daemon.checkpoint import checkpoint
+from splatnode.recon.daemon.checkpoint.saved import GraphRecord
+from splatnode.recon.daemon.checkpoint.store import MADE_ANEW, Store
+from splatnode.recon.daemon.reconstruction import LiveReconstruction
+from splatnode.recon.optimize import refinement
+from splatnode.recon.pipeline import prepare
+from tests.support.synthetic import photographs
+
+CONFIG = Config(size=160, preview=refinement.Config(iterations=1, half_resolution_share=1.0))
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory) -> tuple[Path, LiveReconstruction]:
+    """A checkpoint with a scene of three keyframes, and what is in it."""
+    folder = tmp_path_factory.mktemp("checkpoint")
+    store, made = Store(folder), LiveReconstruction(CONFIG)
+    for sequence, frame in enumerate(photographs()[:3]):
+        made.add(prepare(store.put(ReceivedFrame("0" * 32, sequence, frame)).frame, CONFIG))
+    made.work_in()
+    checkpoint.save(store, made, final=True)
+    store.close()
+    return folder, made
+
+
+@pytest.fixture
+def work(saved) -> LiveReconstruction:
+    return saved[1]
+
+
+@pytest.fixture
+def store(saved, tmp_path):
+    opened = Store(shutil.copytree(saved[0], tmp_path / "copy"))
+    yield opened
+    opened.close()
+
+
+def test_what_was_judged_and_measured_comes_back_and_is_not_made_anew(store, work, monkeypatch):
+    again = LiveReconstruction(CONFIG)
+    found = checkpoint.restore(store, again)
+    assert (found.keyframes, found.new, found.final) == (3, [], True)
+
+    def refuse(*_):
+        raise AssertionError("judged thoroughly again")
+
+    monkeypatch.setattr(again, "judge_thoroughly", refuse)
+    before, after = work.judge(), again.judge()
+    assert after.verdict == before.verdict and after.evidence == before.evidence and again.proven == work.proven
+    for one, other in zip(after.registration.cameras, before.registration.cameras, strict=True):
+        assert np.array_equal(one.T_world_camera, other.T_world_camera) and one.lens == other.lens
+    assert after.registration.agreement == before.registration.agreement
+    assert np.array_equal(after.registration.observed_pixels, before.registration.observed_pixels)
+    for name, pointmap in work.pointmaps.items():
+        known = pointmap.depth > 0
+        assert np.array_equal(again.pointmaps[name].depth > 0, known)
+        assert np.abs(again.pointmaps[name].depth[known] / pointmap.depth[known] - 1).max() < 1e-3
+        assert np.abs(again.pointmaps[name].confidence - pointmap.confidence).max() < 0.01
+        assert np.abs(again.pointmaps[name].normal - pointmap.normal).max() < 0.01
+    further = photographs()[3]
+    again.add(prepare(further, CONFIG))
+    assert again.grow() and [view.name for view in again.scene.views] == [*work.names, further.name]
+
+
+def test_what_another_version_wrote_is_made_anew(store, caplog):
+    store.save("graph", GraphRecord(names=["a.png"], features=[{"unknown": 1}], pairs=[], pending=[]), [])
+    found = checkpoint.restore(store, LiveReconstruction(CONFIG))
+    assert (found.keyframes, len(found.new), found.final) == (3, 3, False) and "made anew" in caplog.text
+
+
+@pytest.mark.parametrize("lost", MADE_ANEW)
+def test_what_is_missing_is_made_anew(store, lost):
+    (store.directory / lost).write_bytes(b"damaged")
+    again = LiveReconstruction(CONFIG)
+    found = checkpoint.restore(store, again)
+    assert found.keyframes == 3
+    for keyframe in found.new:
+        again.add(keyframe)
+    again.work_in()
+    assert len(again.scene.views) == 3 and again.judge().verdict.publishable

@@ -1,0 +1,93 @@
+"""The view graph and the scene come back from the checkpoint as they were."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+from splatnode.capture.messaging.wire import Message, decode, encode
+from splatnode.recon.daemon.checkpoint.saved import (
+    GraphRecord,
+    SceneRecord,
+    graph_from,
+    graph_message,
+    scene_from,
+    scene_message,
+)
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.scene.gaussians import Gaussians
+from splatnode.recon.scene.scene import Scene, View
+from tests.support.synthetic import photographs, tiny_scene, view_graph
+
+
+def over_the_disk(header, arrays) -> Message:
+    return decode([bytes(part) for part in encode(header, arrays)], type(header))
+
+
+@pytest.fixture(scope="module")
+def graph():
+    return view_graph(photographs()[:3])
+
+
+@pytest.fixture(scope="module")
+def scene(graph) -> Scene:
+    tiny = tiny_scene()
+    views = tuple(
+        View(keyframe.name, keyframe.frame.frame_id, keyframe.image, T, K, 0.1, 0.02)
+        for keyframe, T, K in zip(graph.keyframes, tiny.Ts_world_camera, tiny.Ks, strict=True)
+    )
+    return Scene(views, replace(tiny.gaussians, source_frame=torch.arange(64, dtype=torch.int32) % 3), 40)
+
+
+def same(one, other) -> bool:
+    """Whether two flat dataclasses are equal to the bit."""
+    return all(np.array_equal(getattr(one, field.name), getattr(other, field.name)) for field in fields(one))
+
+
+def test_features_and_pairs_come_back_to_the_bit(graph):
+    graph.pending = {(0, 2)}
+    found = graph_from(over_the_disk(*graph_message(graph)))
+    features, pairs = found.features, found.pairs
+    names = [keyframe.name for keyframe in graph.keyframes]
+    assert found.pending == [(names[0], names[2])]
+    assert list(features) == names
+    assert all(same(features[keyframe.name], keyframe.features) for keyframe in graph.keyframes)
+    assert len(pairs) == len(graph.pairs) == 3
+    for (i, j), pair in graph.pairs.items():
+        assert isinstance(pairs[names[i], names[j]], TwoView) and same(pairs[names[i], names[j]], pair)
+        assert pairs[names[i], names[j]].turned_only == pair.turned_only
+
+
+def test_the_scene_comes_back_to_the_bit(graph, scene):
+    keyframes = {keyframe.name: keyframe for keyframe in graph.keyframes}
+    found = scene_from(over_the_disk(*scene_message(scene, final=True)), keyframes)
+    assert found.iterations == 40
+    for field in fields(Gaussians):
+        assert torch.equal(getattr(found.gaussians, field.name), getattr(scene.gaussians, field.name))
+    for one, other in zip(found.views, scene.views, strict=True):
+        assert torch.equal(one.T_world_camera, other.T_world_camera) and torch.equal(one.K, other.K)
+        assert (one.name, one.frame_id, one.rotation_sigma_deg) == (other.name, other.frame_id, 0.1)
+        assert np.array_equal(one.image, other.image)
+    found.gaussians.means.add_(1)  # it can be optimised: its memory is its own
+
+
+def test_a_scene_of_which_a_frame_is_gone_is_made_anew(graph, scene):
+    keyframes = {keyframe.name: keyframe for keyframe in graph.keyframes[1:]}
+    assert scene_from(over_the_disk(*scene_message(scene, final=False)), keyframes) is None
+
+
+def test_what_another_version_wrote_is_told(graph, scene):
+    header, arrays = graph_message(graph)
+    strange = GraphRecord(header.names, [{"colour": 1.0}, *header.features[1:]], header.pairs, [])
+    with pytest.raises(ValueError, match="Features with colour"):
+        graph_from(Message(strange, tuple(arrays)))
+    with pytest.raises(ValueError, match="missing"):
+        graph_from(Message(header, tuple(arrays[:-1])))
+    record, arrays = scene_message(scene, final=False)
+    with pytest.raises(ValueError, match="arrays"):
+        scene_from(
+            Message(SceneRecord(record.views, 1, False), tuple(arrays[1:])), {k.name: k for k in graph.keyframes}
+        )

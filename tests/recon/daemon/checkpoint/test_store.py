@@ -1,0 +1,181 @@
+"""The checkpoint: what was taken is there after any death, what is damaged is told, nothing comes twice."""
+
+from __future__ import annotations
+
+import errno
+
+import numpy as np
+import pytest
+
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
+from splatnode.recon.daemon.checkpoint import store as store_module
+from splatnode.recon.daemon.checkpoint.store import REMEMBERED_DROPPED, CheckpointError, Ledger, Store
+
+SESSION = "0123456789abcdef" * 2
+LENS = Intrinsics(8, 6, 7.0, 7.1, 4.0, 3.0, "calibration", (0.1, 0.0))
+
+
+def image(sequence: int) -> np.ndarray:
+    return np.full((6, 8, 3), sequence, np.uint8)
+
+
+def received(sequence: int, name: str | None = None) -> ReceivedFrame:
+    frame = Frame(sequence, name or f"{sequence}.png", 10 * sequence, image(sequence), LENS)
+    return ReceivedFrame(SESSION, sequence, frame)
+
+
+@pytest.fixture
+def open_store(tmp_path):
+    """Opens the checkpoint as a new process would."""
+    opened: list[Store] = []
+
+    def reopen() -> Store:
+        while opened:
+            opened.pop().close()
+        opened.append(Store(tmp_path / "checkpoint"))
+        return opened[0]
+
+    yield reopen
+    for store in opened:
+        store.close()
+
+
+def test_a_frame_survives_the_process_with_all_that_it_had(open_store):
+    put = open_store().put(received(5))
+    (stored,) = open_store().frames()
+    assert (stored.number, stored.key, stored.frame.name) == (put.number, (SESSION, 5), "5.png")
+    assert stored.frame.intrinsics == LENS and stored.frame.stamp_ns == 50
+    assert np.array_equal(stored.frame.image, image(5))
+
+
+def test_numbers_go_on_and_frames_keep_their_order(open_store):
+    for run in range(3):
+        store = open_store()
+        assert [stored.number for stored in store.frames()] == list(range(2 * run))
+        assert [store.put(received(2 * run + i)).number for i in (0, 1)] == [2 * run, 2 * run + 1]
+
+
+def test_what_comes_while_the_frames_are_read_takes_no_number_and_no_name_of_theirs(open_store):
+    for i in range(3):
+        open_store().put(received(i))
+    again = open_store()
+    assert sorted(again.seen) == [(SESSION, i) for i in range(3)] and again.names == {"0.png", "1.png", "2.png"}
+    new = again.put(received(3, "1.png"))
+    assert new.number == 3 and new.frame.name != "1.png"
+    assert [stored.key[1] for stored in again.frames()] == [0, 1, 2]
+    assert [stored.key[1] for stored in open_store().frames()] == [0, 1, 2, 3]
+
+
+def test_frames_of_the_same_name_are_told_apart(open_store):
+    store = open_store()
+    names = [store.put(received(i, "same.png")).frame.name for i in range(3)]
+    assert len(set(names)) == 3 and names[0] == "same.png"
+    assert [stored.frame.name for stored in open_store().frames()] == names
+
+
+def test_what_was_taken_is_known_whatever_became_of_it(open_store):
+    store = open_store()
+    store.put(received(0))
+    store.put(received(1))
+    store.put(ReceivedFrame(SESSION, 2, DroppedFrame("2.png", "blurred")))
+    store.forget("0.png", "retracted")
+    again = open_store()
+    assert [stored.frame.name for stored in again.frames()] == ["1.png"]
+    assert sorted(again.seen) == [(SESSION, 0), (SESSION, 1), (SESSION, 2)]
+    assert again.dropped == [DroppedFrame("2.png", "blurred"), DroppedFrame("0.png", "retracted")]
+    again.forget("nobody.png", "retracted")
+    assert again.put(received(3)).number == 2
+
+
+def test_what_was_left_out_is_bounded(open_store):
+    store = open_store()
+    for i in range(REMEMBERED_DROPPED + 5):
+        store.put(ReceivedFrame(SESSION, i, DroppedFrame(f"{i}.png", "blurred")))
+    assert len(store.dropped) == REMEMBERED_DROPPED and store.dropped[-1].name == f"{REMEMBERED_DROPPED + 4}.png"
+
+
+def test_another_place_keeps_its_own_frames_only(open_store):
+    store = open_store()
+    for i in range(4):
+        store.put(received(i))
+    store.save("scene", Ledger(), [])
+    store.begin_place(first=2)
+    assert store.scene_id == "scene-0002" and store.names == {"2.png", "3.png"}
+    again = open_store()
+    assert [stored.number for stored in again.frames()] == [2, 3]
+    assert again.scene_id == "scene-0002" and again.load("scene", Ledger) is None
+    assert sorted(again.seen) == [(SESSION, i) for i in range(4)]
+
+
+def test_frames_of_a_place_that_was_left_as_the_process_died_are_removed(open_store, monkeypatch):
+    store = open_store()
+    for i in range(3):
+        store.put(received(i))
+    monkeypatch.setattr(store, "_unlink", lambda frames: None)
+    store.begin_place(first=2)
+    assert [stored.number for stored in open_store().frames()] == [2]
+    assert len(list((store.directory / "frames").glob("*.frame"))) == 1
+
+
+def test_a_damaged_frame_is_put_aside_and_the_others_are_there(open_store, caplog):
+    store = open_store()
+    paths = [store.directory / "frames" / f"{store.put(received(i)).number:012d}.frame" for i in range(3)]
+    paths[1].write_bytes(paths[1].read_bytes()[:-9])
+    (store.directory / "frames" / "stranger.frame").write_bytes(b"?")
+    again = open_store()
+    assert [stored.number for stored in again.frames()] == [0, 2]
+    assert "put aside" in caplog.text and paths[1].with_suffix(".damaged").exists()
+    assert again.put(received(9)).number == 3
+
+
+def test_half_written_files_are_removed(open_store):
+    store = open_store()
+    half = store.directory / "frames" / ".000000000000.frame.77.tmp"
+    half.write_bytes(b"half")
+    assert list(open_store().frames()) == [] and not half.exists()
+
+
+def test_a_full_disk_is_told_and_nothing_has_changed(open_store, monkeypatch):
+    store = open_store()
+    store.put(received(0))
+
+    def full(path, parts):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(store_module, "write_message", full)
+        for frame in (received(1), ReceivedFrame(SESSION, 2, DroppedFrame("2.png", "blurred"))):
+            with pytest.raises(OSError, match="No space"):
+                store.put(frame)
+        with pytest.raises(OSError, match="No space"):
+            store.forget("0.png", "retracted")
+    assert store.seen == [(SESSION, 0)] and store.names == {"0.png"}
+    assert store.put(received(1)).number == 1
+
+
+def test_two_processes_do_not_share_a_checkpoint(open_store):
+    store = open_store()
+    with pytest.raises(CheckpointError, match="another process uses"):
+        Store(store.directory)
+
+
+def test_another_version_and_a_damaged_ledger_are_refused_with_what_to_do(open_store):
+    store = open_store()
+    store._write(Ledger(version=99))
+    with pytest.raises(CheckpointError, match="version 99, this is version 1.*move the folder away"):
+        open_store()
+    (store.directory / "ledger").write_bytes(b"rubbish")
+    with pytest.raises(CheckpointError, match=r"damaged.*Move the folder away"):
+        open_store()
+
+
+def test_what_can_be_made_anew_is_missing_rather_than_wrong(open_store, caplog):
+    store = open_store()
+    store.save("graph", Ledger(place=3), [np.arange(3.0)])
+    message = store.load("graph", Ledger)
+    assert message.header.place == 3 and message.arrays[0].tolist() == [0, 1, 2]
+    path = store.directory / "graph"
+    path.write_bytes(path.read_bytes()[:-1])
+    assert store.load("graph", Ledger) is None and "made anew" in caplog.text
+    assert store.load("scene", Ledger) is None

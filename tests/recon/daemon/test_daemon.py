@@ -1,0 +1,244 @@
+"""The daemon as a whole, over its sockets: keyframes in, a scene out, killed and gone on, a frame taken back."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from splatnode.capture.messaging.commands import ask
+from splatnode.capture.messaging.keyframes import KeyframeServer
+from splatnode.capture.messaging.network import AlreadyRunning, Network
+from splatnode.capture.messaging.services import RECON_CONTROL, RECON_SCENE
+from splatnode.capture.messaging.spool import Config as SpoolConfig
+from splatnode.capture.messaging.spool import Spool
+from splatnode.capture.messaging.state import StateClient
+from splatnode.capture.status import heartbeats
+from splatnode.recon.config import Config as Reconstruction
+from splatnode.recon.daemon import membership
+from splatnode.recon.daemon.config import Config
+from splatnode.recon.daemon.control import Answer, Retract
+from splatnode.recon.daemon.daemon import Daemon
+from splatnode.recon.daemon.tracking import Config as Tracking
+from splatnode.recon.optimize import refinement
+from splatnode.recon.result.export import read_cameras
+from splatnode.recon.result.message import LiveScene, SceneHeader, from_message
+from splatnode.recon.result.verdict import Code
+from tests.capture.messaging.test_sockets import wait_for
+from tests.support.synthetic import photographs, places
+
+QUICK = Reconstruction(
+    size=160,
+    preview=refinement.Config(iterations=2, half_resolution_share=1.0),
+    optimize=refinement.Config(iterations=20, checkpoints=(10,)),
+)
+PATIENCE_S = 120.0
+
+
+@pytest.fixture
+def config(tmp_path) -> Config:
+    (tmp_path / "run").mkdir(mode=0o700)
+    return Config(
+        network=Network(directory=tmp_path / "run"),
+        reconstruction=QUICK,
+        tracking=Tracking(every_s=0),
+        checkpoint=tmp_path / "checkpoint",
+        out=tmp_path / "out",
+        settle_s=0.2,
+        status_every_s=0.2,
+    )
+
+
+@contextmanager
+def running(config: Config) -> Iterator[None]:
+    """The daemon in a thread of its own, until the block ends."""
+    stopping, errors = threading.Event(), []
+
+    def run() -> None:
+        try:
+            with Daemon(config, stopping) as daemon:
+                daemon.run()
+        except BaseException as error:
+            errors.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        yield
+    finally:
+        stopping.set()
+        thread.join(PATIENCE_S)
+    assert not thread.is_alive() and not errors, errors
+
+
+class Peer:
+    """Capture and viewer at once: offers keyframes and hears scenes."""
+
+    def __init__(self, config: Config, folder: Path) -> None:
+        self.server = KeyframeServer(config.network, Spool(SpoolConfig(directory=folder)))
+        self.client = StateClient(RECON_SCENE, config.network, SceneHeader)
+        self.heard: list[LiveScene] = []
+
+    def close(self) -> None:
+        self.server.close()
+        self.client.close()
+
+    def wait(self, until: Callable[[LiveScene], bool], what: str) -> LiveScene:
+        """The first scene from now on for which `until` holds."""
+        deadline = time.monotonic() + PATIENCE_S
+        while time.monotonic() < deadline:
+            self.server.serve(0.01)
+            message = self.client.poll(0.02)
+            if message is not None:
+                self.heard.append(from_message(message))
+                if until(self.heard[-1]):
+                    return self.heard[-1]
+        raise AssertionError(
+            f"no scene with {what} in {PATIENCE_S} s; heard {[h.snapshot.verdict for h in self.heard]}"
+        )
+
+    def wait_for_acknowledgements(self) -> None:
+        deadline = time.monotonic() + PATIENCE_S
+        while self.server.queued and time.monotonic() < deadline:
+            self.server.serve(0.02)
+        assert self.server.queued == 0
+
+
+@pytest.fixture
+def peer(config, tmp_path) -> Iterator[Peer]:
+    opened = Peer(config, tmp_path / "spool")
+    yield opened
+    opened.close()
+
+
+def finished(cameras: int) -> Callable[[LiveScene], bool]:
+    return lambda scene: scene.snapshot.final and len(scene.snapshot.cameras) == cameras
+
+
+def test_keyframes_become_a_scene_that_survives_the_process_and_forgets_what_it_must(config, peer):
+    frames = photographs()[:4]
+    with running(config):
+        for frame in frames[:3]:
+            peer.server.offer(frame)
+        first = peer.wait(lambda scene: len(scene.snapshot.cameras) == 3, "three cameras")
+        assert first.scene_id == "scene-0001" and first.snapshot.verdict.code == Code.OK
+        assert len(first.snapshot.gaussians) > 100
+        peer.server.offer(frames[3])
+        scene = peer.wait(finished(4), "four cameras, refined")
+        assert scene.snapshot.iterations == 20
+        peer.wait_for_acknowledgements()
+        with pytest.raises(AlreadyRunning):
+            Daemon(config, threading.Event())
+        assert heartbeats(config.network)["recon"]["keyframes"] == 4
+    exported = read_cameras(config.out / "scene-0001" / "cameras.json")
+    assert [camera.name for camera in exported] == [frame.name for frame in frames]
+
+    with running(config):
+        again = peer.wait(lambda scene: scene.session != first.session, "a new session")
+        assert again.snapshot.final and again.snapshot.iterations == 20
+        assert len(again.snapshot.gaussians) == len(scene.snapshot.gaussians)
+        answer = ask(RECON_CONTROL, config.network, Retract("nobody.png"), Answer)
+        assert not answer.done and frames[0].name in answer.message
+        assert ask(RECON_CONTROL, config.network, Retract(frames[3].name), Answer).done
+        less = peer.wait(finished(3), "three cameras, refined again")
+        assert [dropped.name for dropped in less.snapshot.dropped] == [frames[3].name]
+
+    with running(config):
+        peer.wait(lambda scene: scene.session not in (first.session, again.session), "a third session")
+        assert len(peer.heard[-1].snapshot.cameras) == 3
+        assert peer.heard[-1].snapshot.dropped == less.snapshot.dropped
+
+
+@pytest.mark.parametrize(
+    "error, end",
+    [
+        (SystemExit(), pytest.raises(AssertionError, match="SystemExit")),
+        (OSError(28, "No space left on device"), nullcontext()),
+    ],
+    ids=["death", "full disk"],
+)
+def test_a_result_that_could_not_be_written_is_written_by_the_next_process(config, peer, monkeypatch, error, end):
+    failed = threading.Event()
+
+    def fail(*_, **__):
+        failed.set()
+        raise error
+
+    for frame in photographs()[:3]:
+        peer.server.offer(frame)
+    with monkeypatch.context() as patch, end, running(config):
+        patch.setattr("splatnode.recon.daemon.output.finish", fail)
+        wait_for(lambda: peer.server.serve(0.02) or failed.is_set(), PATIENCE_S)
+    with running(config):
+        wait_for((config.out / "scene-0001" / "manifest.json").exists, PATIENCE_S)
+
+
+def test_a_scene_that_its_refinement_ruined_is_neither_shown_nor_kept(config, peer):
+    wild = replace(QUICK.optimize, rates=refinement.Rates(means=1.0, log_scales=1.0))
+    config = replace(config, reconstruction=replace(QUICK, optimize=wild))
+    for frame in photographs()[:3]:
+        peer.server.offer(frame)
+    for _ in range(2):  # a restarted one does not take it from the checkpoint
+        with running(config):
+            ruined = peer.wait(lambda scene: scene.snapshot.verdict.code is Code.DIVERGED, "a refinement gone wrong")
+            assert not ruined.snapshot.verdict.publishable and not len(ruined.snapshot.gaussians)
+            peer.wait_for_acknowledgements()
+    assert not config.out.exists()
+
+
+def offer_when_three_are_shown(peer, frames) -> None:
+    """The first three frames, and the others once there is a scene of those."""
+    for frame in frames[:3]:
+        peer.server.offer(frame)
+    peer.wait(lambda scene: len(scene.snapshot.cameras) == 3, "a scene of the first three")
+    for frame in frames[3:]:
+        peer.server.offer(frame)
+
+
+def test_another_place_begins_another_scene_and_the_old_one_is_exported(config, peer):
+    frames = places(seeds=(0, 1))
+    with running(replace(config, lost_after=3)):
+        offer_when_three_are_shown(peer, frames)
+        other = peer.wait(lambda scene: scene.scene_id == "scene-0002", "another place")
+        assert {camera.name for camera in other.snapshot.cameras} <= {frame.name for frame in frames[3:]}
+        peer.wait_for_acknowledgements()
+    kept = read_cameras(config.out / "scene-0001" / "cameras.json")
+    assert {camera.name for camera in kept} == {frame.name for frame in frames[:3]}
+    assert len(list((config.checkpoint / "frames").glob("*.frame"))) == 3
+
+
+def test_keyframes_that_do_not_fit_at_once_join_the_scene_when_all_are_judged_together(config, peer, monkeypatch):
+    monkeypatch.setattr("splatnode.recon.estimation.BEYOND_DOUBT", 10**6)  # points: nothing fits at once
+    frames = photographs()
+    with running(replace(config, lost_after=3)):
+        offer_when_three_are_shown(peer, frames)
+        whole = peer.wait(lambda scene: len(scene.snapshot.cameras) == 6, "all cameras")
+        assert whole.scene_id == "scene-0001" and not whole.snapshot.verdict.provisional
+        peer.wait_for_acknowledgements()
+    assert len(list((config.checkpoint / "frames").glob("*.frame"))) == 6
+
+
+def test_a_keyframe_that_cannot_be_worked_in_keeps_no_other_out(config, peer, monkeypatch):
+    add = membership.add
+
+    def failing(work, keyframes):
+        strangers = add(work, keyframes)
+        if any(keyframe.name == frames[1].name for keyframe in keyframes):
+            raise ArithmeticError("for the test")
+        return strangers
+
+    frames = photographs()[:4]
+    monkeypatch.setattr(membership, "add", failing)
+    for frame in frames:
+        peer.server.offer(frame)
+    with running(config):
+        scene = peer.wait(finished(3), "the other three")
+        assert sorted(each.name for each in scene.snapshot.cameras) == [frames[i].name for i in (0, 2, 3)]
+        assert [(each.name, "for the test" in each.reason) for each in scene.snapshot.dropped] == [
+            (frames[1].name, True)
+        ]

@@ -1,0 +1,202 @@
+"""Which keyframes belong to the scene, and which of its views can be spared."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from splatnode.recon.daemon import membership
+from splatnode.recon.matching import config as matching
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.result.verdict import Code, Verdict
+
+
+def keyframe(name: str) -> SimpleNamespace:
+    return SimpleNamespace(name=name, frame=SimpleNamespace(frame_id=int(name.partition("-")[0])))
+
+
+class FakeReconstruction:
+    """Frames are called by when they come and what is the matter with them.
+
+    With a bad one nothing can be published, with a worse one this is found thoroughly only. Late ones are placed when
+    there are two of them, thoroughly only. Far ones are not placed, nor are others, to which no pair leads.
+    """
+
+    def __init__(self, *names: str) -> None:
+        self._all = [keyframe(name) for name in names]
+        self.names = list(names)
+        self.scene = object() if names else None
+        self.proven = frozenset(names)
+        self.refusals: list[frozenset[str]] = []
+
+    @property
+    def graph(self) -> Any:
+        keyframes = [each for each in self._all if each.name in self.names]
+        return SimpleNamespace(keyframes=keyframes, components=self._components, complete=lambda pause: pause())
+
+    @property
+    def aside(self) -> list[SimpleNamespace]:
+        return [each for each in self._all if each.name not in self.names]
+
+    def add(self, added: SimpleNamespace) -> None:
+        self._all.append(added)
+        self.names.append(added.name)
+
+    def set_aside(self, names: Collection[str]) -> None:
+        self.names = [name for name in self.names if name not in names]
+
+    def bring_back(self, names: Collection[str]) -> None:
+        self.names = [each.name for each in self._all if each.name in {*self.names, *names}]
+
+    def refused(self, names: Collection[str]) -> bool:
+        return frozenset(names) in self.refusals
+
+    def judge(self) -> Any:
+        return self.judge_quickly() or self.judge_thoroughly()
+
+    def judge_quickly(self) -> Any:
+        if self.proven == frozenset(self.names):
+            return self._judged(("late", "far", "other") if self._called("late") < 2 else ("far", "other"))
+        judged = self._judged(("late", "far", "other"))
+        all_placed = len(judged.registration.cameras) == len(self.names)
+        return judged if judged.verdict.publishable and all_placed else None
+
+    def judge_thoroughly(self, pause: Callable[[], None] = lambda: None) -> Any:
+        pause()
+        judged = self._judged(("late", "far", "other") if self._called("late") < 2 else ("far", "other"), "worse")
+        if judged.verdict.publishable:
+            self.proven = frozenset(self.names)
+        else:
+            self.refusals.append(frozenset(self.names))
+        return judged
+
+    def _called(self, word: str) -> int:
+        return sum(word in name for name in self.names)
+
+    def _judged(self, not_placed: tuple[str, ...], *spoiling: str) -> Any:
+        cameras = [SimpleNamespace(index=i) for i, name in enumerate(self.names) if not name.endswith(not_placed)]
+        verdict = Verdict(Code.OK, "", "", publishable=not any(map(self._called, ("bad", *spoiling))))
+        return SimpleNamespace(registration=SimpleNamespace(cameras=cameras), verdict=verdict)
+
+    def _components(self) -> list[list[int]]:
+        others = [index for index, name in enumerate(self.names) if "other" in name]
+        return [[index for index in range(len(self.names)) if index not in others], others]
+
+
+def reconstruction(*names: str) -> Any:
+    return FakeReconstruction(*names)
+
+
+def named(keyframes: Iterable[SimpleNamespace]) -> list[str]:
+    return [each.name for each in keyframes]
+
+
+def come(work: Any, *names: str) -> set[str]:
+    return membership.add(work, [keyframe(name) for name in names])  # pyright: ignore[reportArgumentType]
+
+
+def test_before_there_is_a_scene_every_keyframe_is_taken():
+    work = reconstruction()
+    assert come(work, "0", "1-bad", "2-far") == set() and work.names == ["0", "1-bad", "2-far"]
+
+
+def test_of_a_batch_only_the_keyframe_that_does_not_fit_at_once_is_set_aside():
+    work = reconstruction("0", "1", "2")
+    assert come(work, "3", "4-bad", "5", "6-far") == {"4-bad", "6-far"}
+    assert work.names == ["0", "1", "2", "3", "5"] and named(work.aside) == ["4-bad", "6-far"]
+
+
+def test_keyframes_that_only_all_together_have_a_place_join_the_scene():
+    work = reconstruction("0", "1", "2")
+    assert come(work, "3-late") == {"3-late"} and membership.connected(work)
+    assert membership.join(work, ["3-late"]) and named(membership.strangers(work)) == ["3-late"]
+    assert come(work, "4-late") == {"4-late"} and named(membership.strangers(work)) == ["3-late", "4-late"]
+    assert membership.join(work, named(work.aside))
+    assert work.names == ["0", "1", "2", "3-late", "4-late"] and membership.strangers(work) == []
+
+
+def test_what_was_refused_once_is_not_judged_again_and_stays_aside():
+    work = reconstruction("0", "1", "2")
+    come(work, "3-bad")
+    assert not membership.join(work, ["3-bad"]) and len(work.refusals) == 1
+    assert not membership.join(work, ["3-bad"]) and len(work.refusals) == 1
+    assert named(work.aside) == ["3-bad"] and work.names == ["0", "1", "2"]
+
+
+def test_frames_with_which_most_of_the_scene_has_no_place_do_not_join_it():
+    work = reconstruction("0", "1", "2")
+    come(work, "3-far")
+    work.judge_thoroughly = lambda pause: work._judged(("0", "1"))  # of the scene, one of three is left
+    assert not membership.join(work, ["3-far"]) and named(work.aside) == ["3-far"]
+    work.judge_thoroughly = lambda pause: work._judged(("0",))
+    assert membership.join(work, ["3-far"])
+
+
+def test_only_the_last_strangers_in_a_row_count_and_those_before_contradict_the_scene():
+    work = reconstruction("0", "1", "2")
+    come(work, "3-bad")
+    come(work, "4")
+    come(work, "5-other")
+    assert named(membership.strangers(work)) == ["5-other"] and named(membership.contradicting(work)) == ["3-bad"]
+
+
+def test_no_pair_leads_to_another_place():
+    work = reconstruction("0", "1", "2")
+    come(work, "3-other")
+    assert not membership.connected(work) and named(work.aside) == ["3-other"]
+    come(work, "4-bad")
+    assert membership.connected(work)
+
+
+def test_what_was_added_for_now_and_spoils_the_scene_is_found_when_all_is_proven():
+    work = reconstruction("0", "1", "2")
+    assert come(work, "3", "4-worse", "5") == set()
+    membership.prove(work)
+    assert work.names == ["0", "1", "2", "3", "5"] and named(work.aside) == ["4-worse"]
+    assert named(membership.contradicting(work)) == ["4-worse"]
+
+
+def test_proof_brings_in_what_only_all_together_have_a_place_for():
+    work = reconstruction("0", "1", "2")
+    come(work, "3-late")
+    come(work, "4-late")
+    membership.prove(work)
+    assert membership.strangers(work) == [] and not work.aside
+
+
+def test_proof_that_is_abandoned_changes_nothing():
+    def pause() -> None:
+        raise InterruptedError
+
+    work = reconstruction("0", "1", "2")
+    come(work, "3-worse")
+    come(work, "4-bad")
+    with pytest.raises(InterruptedError):
+        membership.prove(work, pause)
+    assert work.names == ["0", "1", "2", "3-worse"] and named(work.aside) == ["4-bad"]
+
+
+def test_a_scene_that_was_never_proven_is_not_taken_apart():
+    work = reconstruction()
+    come(work, "0", "1", "2-worse")
+    membership.prove(work)
+    assert work.names == ["0", "1", "2-worse"]
+
+
+@pytest.mark.parametrize(
+    ("matches", "spared"),
+    [
+        ({(0, 1): 50, (1, 2): 400, (2, 3): 90}, "1"),  # 1 and 2 show the same: the older goes
+        ({(0, 1): 400, (1, 2): 400}, "0"),
+        ({(3, 4): 900, (4, 5): 900, (0, 3): 60}, "0"),  # the newest three stay, whatever they share
+        ({}, "0"),
+    ],
+)
+def test_the_older_of_the_two_most_alike_is_given_up(matches, spared):
+    graph = ViewGraph(matching.Config())
+    graph.keyframes.extend(keyframe(str(i)) for i in range(6))
+    graph.pairs.update({pair: SimpleNamespace(matches=range(count)) for pair, count in matches.items()})
+    assert membership.most_redundant(graph) == spared

@@ -1,0 +1,106 @@
+"""The rows of the stability matrix: the photographs that each makes of its places."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatnode.capture.frame import Frame
+from splatnode.recon.evaluate.stability.case import Demand
+from splatnode.recon.evaluate.stability.matrix import ROWS, chosen
+from splatnode.recon.evaluate.stability.places import (
+    Places,
+    Stage,
+    far_apart,
+    load_places,
+    motion,
+    neighbours,
+    parallel,
+)
+from tests.support.stability_places import on_arc, three_places
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory) -> Places:
+    return three_places(tmp_path_factory.mktemp("places"))
+
+
+def test_how_a_camera_moved():
+    assert motion(np.stack([on_arc(i) for i in range(4)])) == "walked"
+    assert motion(np.stack([on_arc(0, 3.0 + i) for i in range(4)])) == "forward"
+    assert motion(np.stack([on_arc(i, 0.0) for i in range(4)])) == "turned"
+
+
+def test_neighbours_are_as_far_apart_as_they_may_be():
+    every_3 = np.stack([on_arc(3.0 * i) for i in range(12)])
+    assert neighbours(every_3, 3, 12.5) == ([0, 1, 2, 3], 4)
+    assert neighbours(every_3, 3, 7.0)[1] == 2
+    every_18 = np.stack([on_arc(18.0 * i) for i in range(5)])
+    assert neighbours(every_18, 4, 12.0) == ([0, 1], 1), "within what overlaps, where none are as close"
+    assert neighbours(np.stack([on_arc(30.0 * i) for i in range(5)]), 3, 12.0) == ([], 1)
+
+
+def test_seeds_take_turns_through_the_places(places):
+    stages = [Stage(places, "a row", seed) for seed in range(3)]
+    assert {stage.photos(3)[0].place for stage in stages} == {"east", "south", "west"}
+    for stage in stages:
+        here = stage.photos(3)
+        (elsewhere,) = stage.photos(1, here)
+        assert elsewhere.place != here[0].place
+        assert len({photo.place for photo in stage.one_of_each(5)}) == 3
+    with pytest.raises(ValueError, match="row 'a row' needs a place with 13 photographs"):
+        stages[0].photos(13)
+
+
+def test_parallel_views_do_not_turn():
+    def sideways(turn: float) -> np.ndarray:
+        Ts_world_camera = np.stack([on_arc(turn * i) for i in range(6)])
+        Ts_world_camera[:, :3, 3] = [[0.1 * i, 0.0, 0.0] for i in range(6)]
+        return Ts_world_camera
+
+    assert parallel(sideways(1.0), 3) == ([0, 1], 2), "at a stride of 4 they do not fit in"
+    assert neighbours(sideways(1.0), 3, 12.0) == ([], 1)
+    assert parallel(sideways(9.0), 3) == ([], 1) and neighbours(sideways(9.0), 3, 12.0)[0]
+
+
+def test_views_far_apart(places):
+    rng = np.random.default_rng(0)
+    found = far_apart(places.walked[0], 3, 11.9, rng)
+    assert found is not None and np.diff(found).min() >= 2
+    assert far_apart(places.walked[0], 3, 60.0, rng) is None
+
+
+def test_a_folder_that_is_no_scene_is_a_clear_error(tmp_path):
+    with pytest.raises(FileNotFoundError, match="must hold the scene's images"):
+        load_places([tmp_path], tmp_path)
+
+
+def test_every_number_has_a_row_and_every_row_a_name_of_its_own():
+    assert {row.number for row in ROWS} == set(range(1, 31))
+    names = [(row.number, row.name) for row in ROWS]
+    assert len(set(names)) == len(names)
+    assert {row.number for row in chosen((7, 14))} == {7, 14}
+    assert chosen(()) == ROWS
+    with pytest.raises(ValueError, match="no row 31; there are 1 to 30"):
+        chosen((31,))
+
+
+# Rows that photograph the built-in place at full size, or write large files, would take as long as all others.
+SLOW = {"tiny baseline", "forward motion", "clean, parallel views", "a huge file"}
+
+
+@pytest.mark.parametrize("row", [row for row in ROWS if row.name not in SLOW], ids=lambda r: r.name)
+def test_rows_make_the_same_case_again(row, places):
+    first, again = (row.make(Stage(places, row.name, 1)) for _ in range(2))
+    given, same = list(first.source()), list(again.source())
+    assert len(given) > 0 and len({frame.name for frame in given}) == len(given)
+    frames = [frame for frame in given if isinstance(frame, Frame)]
+    for frame, twin in zip(given, same, strict=True):
+        assert frame.name == twin.name and type(frame) is type(twin)
+        if isinstance(frame, Frame) and isinstance(twin, Frame):
+            assert np.array_equal(frame.image, twin.image)
+    assert first.codes and first.note
+    names = {frame.name for frame in frames}
+    assert all(set(known) <= names for known in first.worlds)
+    if first.demand is Demand.ACCEPT:
+        assert sum(map(len, first.worlds)) >= 3

@@ -1,0 +1,73 @@
+"""Rival methods are configurations of the same engine."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from splatnode.recon.config import PRESETS
+from splatnode.recon.evaluate import ablation
+from splatnode.recon.evaluate.methods import CONFIGS, METHODS, RIVALS, chosen, method, start_of
+from splatnode.recon.optimize import regularise
+from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.result.report import build_report
+from tests.support.synthetic import photographs
+
+
+def test_every_preset_is_a_method():
+    assert PRESETS.keys() <= CONFIGS.keys() <= METHODS.keys()
+    for name, config in PRESETS.items():  # nothing but what is shown on the way differs
+        same = msgspec.structs.replace(CONFIGS[name].optimize, checkpoints=config.optimize.checkpoints)
+        assert msgspec.structs.replace(CONFIGS[name], optimize=same) == config
+    with pytest.raises(ValueError, match="no method 'nerf'; there are: .*paper"):
+        method("nerf")
+
+
+def test_the_papers_schedule_and_weights():
+    terms = CONFIGS["paper"].optimize.regularise
+    weights = [term.weight for term in (terms.point_render, terms.depth, terms.normal, terms.semantic)]
+    assert weights == [0.25, 0.05, 0.01, 0.5]
+    assert CONFIGS["paper"].optimize.iterations == 1000
+    assert [term.at(0.1) > 0 for term in (terms.point_render, terms.depth)] == [True, False]
+    without = msgspec.structs.replace(CONFIGS["paper"].optimize, regularise=regularise.Config())
+    assert without == CONFIGS["instantsplat-xl"].optimize
+
+
+def test_sets_are_spelt_out_once():
+    assert chosen(["fast", "presets", "paper"]) == ("fast", *(name for name in PRESETS if name != "fast"), "paper")
+    assert chosen(["rivals"]) == RIVALS
+    with pytest.raises(ValueError, match="and the sets presets, rivals, ablation"):
+        chosen(["paper", "instantsplat"])
+
+
+def test_methods_share_a_start_unless_they_look_at_other_sizes_or_find_their_own():
+    assert start_of("paper") == start_of("instantsplat-s") == start_of("balanced") != start_of("preview")
+    assert all(start_of(name) is None for name in RIVALS)
+
+
+def test_the_ablation_changes_one_part_at_a_time():
+    """Alone on the base, and missing from the whole."""
+    parts = ("point_render", "depth", "normal", "semantic")
+    whole = CONFIGS[ablation.WHOLE]
+    for part in parts:
+        name = part.replace("_", "-")
+        alone, without = (CONFIGS[each].optimize.regularise for each in (f"instantsplat-xl+{name}", f"paper-{name}"))
+        assert [other for other in parts if getattr(alone, other).weight] == [part]
+        assert [other for other in parts if not getattr(without, other).weight] == [part]
+        assert getattr(alone, part) == getattr(whole.optimize.regularise, part)
+    assert not CONFIGS["paper-pose-refinement"].optimize.refine_poses
+    assert CONFIGS["paper-pseudo-views"].optimize.regularise.pseudo_views == 0
+    thick = CONFIGS["paper-down-sampling"]
+    assert thick.optimize == whole.optimize and thick.pixelwise != whole.pixelwise
+    assert set(ablation.names()) <= CONFIGS.keys() and ablation.is_variant("paper-depth")
+    assert not ablation.is_variant("paper")
+
+
+def test_they_start_from_a_gaussian_a_pixel_and_keep_them():
+    few = msgspec.structs.replace(CONFIGS["paper"].optimize, iterations=30, checkpoints=())
+    config = msgspec.structs.replace(CONFIGS["paper"], size=160, optimize=few)
+    last = list(reconstruct(list(photographs()[:3]), config))[-1]
+    assert last.verdict.publishable and last.iterations == 30
+    assert len(last.gaussians) > 160 * 120
+    told = build_report(last, seed=0, preset="paper", peak_rss_mb=None)["served_by"]
+    assert isinstance(told, dict) and list(told) == ["point_render", "depth", "normal", "semantic"]

@@ -1,0 +1,196 @@
+"""Scenes, splits and scores: a perfect reconstruction scores perfectly, a worse one by what is wrong with it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode.recon.evaluate.protocol import Run, evaluate, mean_intrinsics
+from splatnode.recon.evaluate.test_pose import align_test_pose
+from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.frames import border
+from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.result.export import write_result
+from splatnode.recon.result.export.cameras import encode_cameras, encode_colmap, encode_nerfstudio
+from splatnode.recon.result.export.ply import encode_ply
+from splatnode.recon.result.report import build_report
+from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
+from splatnode.recon.result.verdict import Code, Verdict
+from tests.support.blobs import (
+    HEIGHT,
+    NAMES,
+    NO_NETWORKS,
+    QUICK,
+    SPLIT,
+    WIDTH,
+    K,
+    estimate,
+    make_gaussians,
+    perfect_snapshot,
+    true_pose,
+    write_scene,
+)
+
+RUN = Run("exact", 0, None, {"poses": 1.0, "points": None, "optimise": 2.0, "total": 3.5}, 123.0)
+
+
+@pytest.fixture(scope="module")
+def scene_folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes") / "blobs"
+    write_scene(folder)
+    return folder
+
+
+def score(snapshot: Snapshot, folder: Path, found: dict[str, np.ndarray] | None = None, **settings):
+    return evaluate(
+        snapshot,
+        load_scene(folder),
+        SPLIT,
+        RUN,
+        rasterize=rasterize,
+        networks=NO_NETWORKS,
+        settings=replace(QUICK, **settings),
+        found=found,
+    )
+
+
+# --- scenes
+
+
+def test_every_layout_gives_the_same_cameras(scene_folder, tmp_path):
+    pytest.importorskip("pycolmap", reason="pycolmap reads COLMAP models (the extra bench)")
+    expected = load_scene(scene_folder)
+    cameras = [estimate(name, true_pose(int(name[:2]))) for name in NAMES]
+    files = {
+        "ours/cameras.json": encode_cameras(cameras),
+        "nerfstudio/transforms.json": encode_nerfstudio(cameras),
+        **{f"colmap/sparse/0/{name}": data for name, data in encode_colmap(cameras, make_gaussians()).items()},
+    }
+    for name, data in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(data)
+    for layout in ("ours", "nerfstudio", "colmap"):
+        os.symlink(scene_folder / "images", tmp_path / layout / "images")
+        scene = load_scene(tmp_path / layout)
+        assert list(scene.cameras) == NAMES
+        for name in NAMES:
+            found, true = scene.cameras[name], expected.cameras[name]
+            assert np.allclose(found.T_world_camera, true.T_world_camera, atol=1e-12)
+            assert np.allclose(found.K, K) and (found.width, found.height) == (WIDTH, HEIGHT)
+
+
+def test_incomplete_scenes_are_clear_errors(scene_folder, tmp_path):
+    with pytest.raises(FileNotFoundError, match="must hold the scene's images"):
+        load_scene(tmp_path)
+    os.symlink(scene_folder / "images", tmp_path / "images")
+    with pytest.raises(FileNotFoundError, match="must hold the true cameras"):
+        load_scene(tmp_path)
+    (tmp_path / "transforms.json").write_text('{"frames": [{"file_path": "00.png"}]}')
+    with pytest.raises(ValueError, match="must give w, h, fl_x, transform_matrix"):
+        load_scene(tmp_path)
+    frame = {"file_path": "00.png", "w": 1, "h": 1, "fl_x": 1, "k1": 0.1, "transform_matrix": np.eye(4).tolist()}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    with pytest.raises(ValueError, match="undistorted"):
+        load_scene(tmp_path)
+
+
+def test_frames_tell_a_reconstruction_nothing_but_pixels(scene_folder):
+    frames = load_scene(scene_folder).frames(SPLIT.train)
+    assert [frame.name for frame in frames] == list(SPLIT.train)
+    assert [frame.frame_id for frame in frames] == [0, 1, 2]
+    assert all(frame.intrinsics is None for frame in frames)
+    assert frames[0].image.shape == (HEIGHT, WIDTH, 3)
+
+
+# --- scores
+
+
+def test_perfect_reconstruction_scores_perfectly(scene_folder):
+    row = score(perfect_snapshot(), scene_folder)
+    assert row.psnr is not None and row.psnr > 50  # 8-bit images allow 59 dB
+    assert row.ssim is not None and row.ssim > 0.999
+    assert row.rotation_error_deg == pytest.approx(0, abs=1e-6)
+    assert row.centre_error_pct == pytest.approx(0, abs=1e-6)
+    assert row.focal_error_pct == pytest.approx(0, abs=1e-6)
+    assert row.lpips_alex is None and row.lpips_vgg is None
+    assert (row.scene, row.views, row.method, row.iterations, row.final) == ("blobs", 3, "exact", 100, True)
+    assert (row.num_gaussians, row.num_cameras, row.verdict) == (500, 3, "OK")
+    assert row.scene_bytes == len(encode_ply(make_gaussians()))
+    assert row.seconds["total"] == 3.5 and row.peak_rss_mb == 123.0
+
+
+def test_worse_scene_scores_worse_by_what_is_wrong(scene_folder):
+    perfect = perfect_snapshot()
+    faded = replace(perfect, gaussians=replace(perfect.gaussians, opacities=np.full(500, 0.3, np.float32)))
+    good, bad = score(perfect, scene_folder), score(faded, scene_folder)
+    assert good.psnr is not None and bad.psnr is not None and bad.psnr < good.psnr - 15
+    zoomed = replace(perfect, cameras=tuple(replace(c, K=c.K * [[1.04], [1.04], [1]]) for c in perfect.cameras))
+    assert score(zoomed, scene_folder).focal_error_pct == pytest.approx(4.0)
+
+
+def test_another_moment_of_a_run_goes_on_from_the_poses_that_were_found(scene_folder, monkeypatch):
+    searched = []
+
+    def align(*scene_and_view, steps, levels, **rate):
+        searched.append((steps, levels))
+        return align_test_pose(*scene_and_view, steps=steps, levels=levels, **rate)
+
+    monkeypatch.setattr("splatnode.recon.evaluate.protocol.align_test_pose", align)
+    poses: dict[str, np.ndarray] = {}
+    end, earlier = (score(perfect_snapshot(), scene_folder, found=poses, continued_steps=2) for _ in range(2))
+    assert searched == [(QUICK.alignment_steps, 1)] * 2 + [(2, 1)] * 2
+    assert poses.keys() == set(SPLIT.test)
+    assert end.psnr is not None and earlier.psnr is not None and earlier.psnr > 50
+
+
+def test_what_photographs_do_not_show_is_not_scored(scene_folder, tmp_path, monkeypatch):
+    spoilt = tmp_path / scene_folder.parent.name
+    shutil.copytree(scene_folder.parent, spoilt)
+    for path in (spoilt / scene_folder.name / "images").iterdir():
+        image = cv2.imread(str(path))
+        image[:3] = 255
+        cv2.imwrite(str(path), image)
+
+    def below(images):
+        return [np.arange(len(image))[:, None] >= np.array([3] * image.shape[1]) for image in images]
+
+    monkeypatch.setattr(border, "shown", below)
+    row = score(perfect_snapshot(), spoilt / scene_folder.name)
+    assert row.psnr is not None and row.psnr > 50
+    assert row.psnr_with_rim is not None and row.psnr_with_rim < 20
+
+
+def test_refused_scene_is_not_scored_but_its_cameras_are(scene_folder):
+    refused = replace(perfect_snapshot(), verdict=Verdict(Code.NO_PARALLAX, "No.", "Move."))
+    row = score(refused, scene_folder)
+    assert (row.verdict, row.psnr, row.ssim, row.scene_bytes) == ("NO_PARALLAX", None, None, 0)
+    assert row.rotation_error_deg == pytest.approx(0, abs=1e-6)
+
+
+def test_one_camera_cannot_be_aligned(scene_folder):
+    row = score(replace(perfect_snapshot(), cameras=perfect_snapshot().cameras[:1]), scene_folder)
+    assert (row.psnr, row.rotation_error_deg, row.centre_error_pct, row.num_cameras) == (None, None, None, 1)
+    assert row.focal_error_pct == pytest.approx(0, abs=1e-6)
+
+
+def test_intrinsics_are_carried_to_an_image_of_another_size():
+    first = CameraEstimate("a", 0, np.eye(4), np.array([[100.0, 0, 50], [0, 100, 30], [0, 0, 1]]), 100, 60, None, None)
+    second = replace(first, K=np.array([[110.0, 0, 52], [0, 110, 30], [0, 0, 1]]))
+    found = mean_intrinsics([first, second], 200, 120)
+    assert np.allclose(found, [[210, 0, 102], [0, 210, 60], [0, 0, 1]])
+
+
+def test_a_result_is_itself_a_scene_with_known_cameras(scene_folder, tmp_path):
+    """So that two reconstructions can be compared with each other."""
+    snapshot = perfect_snapshot()
+    write_result(snapshot, tmp_path, build_report(snapshot, seed=0, preset="p", peak_rss_mb=None))
+    os.symlink(scene_folder / "images", tmp_path / "images")
+    row = score(snapshot, tmp_path)
+    assert row.rotation_error_deg == pytest.approx(0, abs=1e-6)

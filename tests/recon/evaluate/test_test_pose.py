@@ -1,0 +1,57 @@
+"""A test image's camera is found again."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from splatnode.recon.evaluate.appearance import Splats
+from splatnode.recon.evaluate.camera_errors import angles_deg
+from splatnode.recon.evaluate.test_pose import align_test_pose
+from splatnode.recon.geometry import exp_se3
+from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.result.preview import render_rgb
+from splatnode.recon.result.snapshot import GaussianArrays
+
+WIDTH, HEIGHT = 128, 96
+K = np.array([[110.0, 0, 64], [0, 110.0, 48], [0, 0, 1]])
+
+
+def motion(seed: int, size: float = 1.0) -> np.ndarray:
+    return exp_se3(size * torch.randn(6, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))).numpy()
+
+
+def make_wall(num_gaussians: int = 600) -> GaussianArrays:
+    """Coloured blobs at different depths, so that every direction of motion shows."""
+    rng = np.random.default_rng(0)
+    means = rng.uniform([-3, -2.5, 2.5], [3, 2.5, 6], (num_gaussians, 3))
+    return GaussianArrays(
+        means=means.astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (num_gaussians, 1)),
+        scales=np.full((num_gaussians, 3), 0.12, np.float32),
+        opacities=np.full(num_gaussians, 0.8, np.float32),
+        sh=rng.uniform(-1.5, 1.5, (num_gaussians, 1, 3)).astype(np.float32),
+        source_frame=np.zeros(num_gaussians, np.int32),
+    )
+
+
+@pytest.mark.parametrize(("levels", "steps"), [(1, 150), (3, 250)])
+def test_test_pose_is_found_again(levels, steps):
+    gaussians, true = make_wall(), motion(5, 0.05)
+    image = torch.from_numpy(render_rgb(gaussians, true, K, WIDTH, HEIGHT))
+    start = true @ motion(6, 0.02)
+    found = align_test_pose(Splats(gaussians, rasterize), image, start, K, steps=steps, levels=levels)
+    assert float(np.linalg.norm(start[:3, 3] - true[:3, 3])) > 0.02
+    assert float(np.linalg.norm(found.T_world_camera[:3, 3] - true[:3, 3])) < 0.002
+    assert angles_deg(found.T_world_camera[:3, :3], true[:3, :3]) < 0.03
+    rotation = found.T_world_camera[:3, :3]
+    assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+
+
+def test_search_never_ends_worse_than_it_started():
+    gaussians = make_wall()
+    image = torch.from_numpy(render_rgb(gaussians, np.eye(4), K, WIDTH, HEIGHT))
+    found = align_test_pose(Splats(gaussians, rasterize), image, np.eye(4), K, steps=3, levels=2, learning_rate=0.5)
+    assert found.loss == pytest.approx(0.0, abs=1e-6)
+    assert np.array_equal(found.T_world_camera, np.eye(4))

@@ -1,0 +1,83 @@
+"""Calibrated lenses are taken out of frames before anything is computed from them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.recon.frames.undistort import undistorted
+
+WIDTH, HEIGHT = 320, 240
+
+
+def dots(given: Intrinsics) -> tuple[Frame, np.ndarray]:
+    """A frame with white dots where `given` sees points at depth 1, and these points (M, 2)."""
+    points = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 5), np.linspace(-0.3, 0.3, 5)), -1).reshape(-1, 2)
+    K = given.K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # OpenCV's pixel centres
+    at_depth_1 = np.column_stack([points, np.ones(len(points))])
+    pixels, _ = cv2.projectPoints(
+        at_depth_1, np.zeros(3), np.zeros(3), K, np.array((*given.distortion, 0, 0, 0, 0)[:4], float)
+    )
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    for x, y in pixels[:, 0]:
+        image[np.hypot(columns - x, rows - y) < 3.0] = 255
+    return Frame(0, "a.png", 0, image, given), points
+
+
+def centres(image: np.ndarray) -> np.ndarray:
+    """(M, 2) of white dots, the top-left pixel's centre at (0.5, 0.5)."""
+    return cv2.connectedComponentsWithStats((image[..., 0] > 127).astype(np.uint8))[3][1:] + 0.5
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        Intrinsics(WIDTH, HEIGHT, 300.0, 300.0, 160.0, 120.0, "given", (-0.2, 0.05, 0.001, -0.002)),
+        Intrinsics(WIDTH, HEIGHT, 300.0, 300.0, 150.0, 125.0, "given", (0.15,)),
+        Intrinsics(WIDTH, HEIGHT, 320.0, 260.0, 160.0, 120.0, "calibration"),
+        Intrinsics(2 * WIDTH, 2 * HEIGHT, 640.0, 520.0, 320.0, 240.0, "calibration"),  # of the frame at twice its size
+    ],
+)
+def test_points_are_where_the_pinhole_says(given: Intrinsics):
+    frame, points = dots(given.resized(WIDTH, HEIGHT))
+    frame = Frame(0, "a.png", 0, frame.image, given)
+    straight = undistorted(frame)
+    pinhole = straight.intrinsics
+    assert pinhole is not None and pinhole.fx == pinhole.fy and not pinhole.distortion
+    assert (pinhole.width, pinhole.height) == (WIDTH, HEIGHT) == (straight.width, straight.height)
+    assert pinhole.source == given.source
+    expected = points * pinhole.fx + (pinhole.cx, pinhole.cy)
+    inside = ((expected > 6) & (expected < (WIDTH - 6, HEIGHT - 6))).all(1)
+    found = centres(straight.image)
+    nearest = np.linalg.norm(found[:, None] - expected[inside], axis=2).min(0)
+    assert inside.sum() >= 9
+    assert nearest.max() < 0.6  # a dot's centre moves a little when its shape is stretched
+
+
+def test_no_corner_is_invented():
+    given = Intrinsics(WIDTH, HEIGHT, 300.0, 300.0, 160.0, 120.0, "given", (0.2, 0.0, 0.0, 0.0))
+    grey = Frame(0, "a.png", 0, np.full((HEIGHT, WIDTH, 3), 90, np.uint8), given)
+    assert (undistorted(grey).image == 90).all()
+    pinhole = undistorted(grey).intrinsics
+    assert pinhole is not None
+    corner = np.array([-pinhole.cx / pinhole.fx, -pinhole.cy / pinhole.fy])
+    distorted = corner * (1 + 0.2 * (corner**2).sum()) * 300.0 + (160.0, 120.0)
+    assert (distorted >= -0.01).all()
+
+
+def test_what_is_straight_stays_as_it_is():
+    image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    unknown = Frame(0, "a.png", 0, image, None)
+    assert undistorted(unknown) is unknown
+    pinhole = Frame(0, "a.png", 0, image, Intrinsics(WIDTH, HEIGHT, 300.0, 300.0, 160.0, 120.0, "exif"))
+    assert undistorted(pinhole) is pinhole
+
+
+@pytest.mark.parametrize("distortion", [(-2.0, 0.0, 0.0, 0.0), (0.1,) * 15])
+def test_coefficients_that_cannot_be_are_named(distortion: tuple[float, ...]):
+    given = Intrinsics(WIDTH, HEIGHT, 200.0, 200.0, 160.0, 120.0, "given", distortion)
+    with pytest.raises(ValueError, match="a.png.*alibrat"):
+        undistorted(Frame(0, "a.png", 0, np.zeros((HEIGHT, WIDTH, 3), np.uint8), given))

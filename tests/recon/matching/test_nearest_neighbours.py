@@ -1,0 +1,83 @@
+"""Native matching against brute force, on every instruction set that runs here."""
+
+from __future__ import annotations
+
+import ctypes
+
+import numpy as np
+import pytest
+
+from splatnode.recon.core import instruction_sets, library
+from splatnode.recon.matching import nearest_neighbours
+
+
+def descriptors(count: int, seed: int) -> np.ndarray:
+    raw = np.random.default_rng(seed).exponential(size=(count, 128)).astype(np.float32) ** 2
+    return nearest_neighbours.quantise(raw / np.linalg.norm(raw, axis=1, keepdims=True))
+
+
+def pairs(num_common: int, num_other: int, noise: float = 0.02) -> tuple[np.ndarray, np.ndarray]:
+    """Two sets of which the first `num_common` correspond in reverse order."""
+    raw = np.random.default_rng(0).exponential(size=(num_common, 128)).astype(np.float32) ** 2
+    raw /= np.linalg.norm(raw, axis=1, keepdims=True)
+    seen_again = raw[::-1] + noise * np.random.default_rng(1).random(raw.shape).astype(np.float32)
+    seen_again /= np.linalg.norm(seen_again, axis=1, keepdims=True)
+    others = [descriptors(num_other, seed) for seed in (2, 3)]
+    first, second = nearest_neighbours.quantise(raw), nearest_neighbours.quantise(seen_again)
+    return np.concatenate([first, others[0]]), np.concatenate([second, others[1]])
+
+
+def test_what_corresponds_is_found_and_nothing_else():
+    first, second = pairs(101, 57)
+    found = nearest_neighbours.match(first, second, nearest_neighbours.Config())
+    common = found[(found[:, 0] < 101) & (found[:, 1] < 101)]
+    assert len(common) == 101
+    np.testing.assert_array_equal(common.sum(1), np.full(101, 100))
+    assert len(found) < 101 + 15
+
+
+@pytest.mark.parametrize("sizes", [(2, 2), (3, 130), (97, 33), (260, 259)])
+@pytest.mark.parametrize("instruction_set", instruction_sets())
+def test_it_equals_brute_force(sizes, instruction_set):
+    first, second = descriptors(sizes[0], 0), descriptors(sizes[1], 1)
+    nearest, score, second_score = (np.empty(sizes[0], np.int32) for _ in range(3))
+    back = np.empty(sizes[1], np.int32)
+    arrays = (nearest, score, second_score, back)
+    pointers = [ctypes.c_void_p(array.ctypes.data) for array in (first, second, *arrays)]
+    library(instruction_set).core_match(pointers[0], sizes[0], pointers[1], sizes[1], *pointers[2:])
+    products = first.astype(np.int64) @ second.astype(np.int64).T
+    half_norms1, half_norms2 = ((d.astype(np.int64) ** 2).sum(1) // 2 for d in (first, second))
+    scores = 16320 - half_norms2 + products
+    np.testing.assert_array_equal(nearest, scores.argmax(1))
+    np.testing.assert_array_equal(score, scores.max(1))
+    np.testing.assert_array_equal(second_score, np.sort(scores, axis=1)[:, -2])
+    np.testing.assert_array_equal(back, (products - half_norms1[:, None]).argmax(0))
+
+
+def test_the_most_distinct_matches_come_first():
+    first, second = pairs(60, 40, noise=0.08)
+    found = nearest_neighbours.match(first, second, nearest_neighbours.Config(ratio=1.0))
+    squared = ((first[:, None].astype(int) - second[None].astype(int)) ** 2).sum(2)
+    two_nearest = np.sort(squared[found[:, 0]], axis=1)[:, :2]
+    ratios = two_nearest[:, 0] / two_nearest[:, 1]
+    assert (np.diff(ratios) > -1e-3).all()
+
+
+def test_products_of_the_largest_descriptors_do_not_overflow():
+    even = np.full((2, 128), 1.0 / np.sqrt(128.0), np.float32)
+    peak = np.zeros((2, 128), np.float32)
+    peak[:, :2] = np.sqrt(0.5)
+    for kind in (even, peak):
+        bytes_ = nearest_neighbours.quantise(kind)
+        assert np.linalg.norm(bytes_.astype(float), axis=1).max() <= 181.0
+        assert len(nearest_neighbours.match(bytes_, bytes_, nearest_neighbours.Config())) == 0  # no nearest is distinct
+
+
+def test_too_few_descriptors_give_no_match():
+    assert nearest_neighbours.match(descriptors(1, 0), descriptors(9, 1), nearest_neighbours.Config()).shape == (0, 2)
+
+
+@pytest.mark.parametrize("wrong", [np.zeros((4, 64), np.uint8), np.zeros((4, 128), np.float32)])
+def test_what_is_no_descriptor_is_refused(wrong):
+    with pytest.raises(ValueError, match="uint8"):
+        nearest_neighbours.match(wrong, descriptors(4, 0), nearest_neighbours.Config())

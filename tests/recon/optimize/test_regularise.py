@@ -1,0 +1,169 @@
+"""The terms of equation 13 together: what is asked for, when, and that a right scene is left alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from splatnode.recon.networks.crop import Crop
+from splatnode.recon.optimize.pseudo_views import PseudoView
+from splatnode.recon.optimize.regularise import PAPER, Config, Regularisation, Term
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.rasterize.render import Render
+
+WIDTH, HEIGHT = 96, 64
+K = np.array([[90.0, 0.0, 48.0], [0.0, 90.0, 32.0], [0.0, 0.0, 1.0]])
+
+
+def wall(x: float, frame_id: int) -> tuple[Pointmap, np.ndarray]:
+    """A camera at `x` that looks at a tilted, checkered wall; depth 4 + 0.5 X in the world."""
+    T_world_camera = np.eye(4)
+    T_world_camera[0, 3] = x
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    ray = (u - K[0, 2]) / K[0, 0]
+    depth = (4.0 + 0.5 * x) / (1.0 - 0.5 * ray)
+    world_x, world_y = x + ray * depth, (v - K[1, 2]) / K[1, 1] * depth
+    normal = np.broadcast_to(np.array([0.5, 0.0, -1.0]) / np.sqrt(1.25), (HEIGHT, WIDTH, 3)).astype(np.float32)
+    shade = (np.floor(world_x * 2) + np.floor(world_y * 2)) % 2
+    image = np.repeat((60 + 130 * shade)[..., None], 3, axis=2).astype(np.uint8)
+    confidence = np.ones((HEIGHT, WIDTH), np.float32)
+    pointmap = Pointmap(f"{frame_id}", frame_id, depth.astype(np.float32), confidence, normal, T_world_camera, K)
+    return pointmap, image
+
+
+def truth(x: float) -> Render:
+    """What a right scene renders."""
+    pointmap, image = wall(x, 0)
+    return Render(
+        torch.from_numpy(image).float() / 255.0,
+        torch.from_numpy(pointmap.depth),
+        torch.from_numpy(pointmap.normal),
+        None,
+    )
+
+
+def truth_at(view: PseudoView, shift: float = 0.0) -> Render:
+    """What a right scene renders from a pseudo view; a wrong one is shifted."""
+    assert (view.width, view.height) == (WIDTH, HEIGHT)
+    return truth(view.T_world_camera[0, 3] + shift)
+
+
+def mirrored(render: Render) -> Render:
+    """A scene that is wrong in colour, depth and normals."""
+    assert render.rgb is not None and render.depth is not None and render.normal is not None
+    normal = render.normal.flip(1) * torch.tensor([-1.0, 1.0, 1.0])
+    return Render(render.rgb.flip(1), render.depth.flip(1), normal, None)
+
+
+@pytest.fixture
+def without_networks(monkeypatch, tmp_path):
+    monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
+
+
+def regularisation(config: Config) -> Regularisation:
+    pointmaps, images = zip(*(wall(x, i) for i, x in enumerate((0.0, 0.4, 0.8))), strict=True)
+    return Regularisation(pointmaps, images, config, seed=0)
+
+
+def test_the_papers_schedule(without_networks):
+    terms = regularisation(PAPER)
+    assert terms.channels(0.05) == ("rgb",)
+    assert terms.channels(0.15) == ("rgb",)
+    assert terms.channels(0.2) == ("rgb", "depth", "normal") == terms.channels(0.69)
+    assert terms.channels(0.7) == ("rgb",)
+    assert terms.pseudo_loss(lambda view, _: truth_at(view), 0.05) is None
+    assert terms.pseudo_loss(lambda view, _: truth_at(view), 0.1) is not None
+    assert terms.pseudo_loss(lambda view, _: truth_at(view), 0.8) is None
+    assert terms.training_loss(0, truth(0.0), 0.1) is None
+
+
+def test_training_views_that_agree_with_their_point_maps_cost_nothing(without_networks):
+    terms = regularisation(Config(depth=Term(1.0), normal=Term(1.0)))
+    right = terms.training_loss(0, truth(0.0), 0.5)
+    assert right is not None and right.item() == pytest.approx(0.0, abs=1e-4)
+    against = terms.training_loss(0, mirrored(truth(0.0)), 0.5)
+    assert against is not None and against.item() > 1.0
+
+
+def test_a_right_scene_costs_less_from_a_pseudo_view_than_a_shifted_one(without_networks):
+    def loss(shift: float) -> float:
+        terms = regularisation(Config(point_render=Term(1.0), depth=Term(1.0), normal=Term(1.0), off_path=0.0))
+        return sum(float(terms.pseudo_loss(lambda view, _: truth_at(view, shift), 0.5)) for _ in range(6))
+
+    assert loss(0.0) < 0.6 * loss(0.15)
+
+
+def test_the_total_is_the_weighted_sum_of_its_terms(without_networks):
+    """Equation 13, on training and pseudo views."""
+
+    def loss(**weights: float) -> float:
+        terms = regularisation(Config(depth_share=1.0, **{name: Term(weight) for name, weight in weights.items()}))
+        pseudo = terms.pseudo_loss(lambda view, _: mirrored(truth_at(view)), 0.5)
+        training = terms.training_loss(0, mirrored(truth(0.0)), 0.5)
+        return sum(part.item() for part in (pseudo, training) if part is not None)
+
+    alone = [loss(point_render=1.0), loss(depth=1.0), loss(normal=1.0)]
+    total = 0.25 * alone[0] + 0.05 * alone[1] + 0.01 * alone[2]
+    assert min(alone) > 1e-4 and loss(point_render=0.25, depth=0.05, normal=0.01) == pytest.approx(total, rel=1e-4)
+
+
+def test_half_size_renders_are_compared_with_half_of_what_is_known(without_networks):
+    terms = regularisation(Config(depth=Term(1.0), normal=Term(1.0), depth_patch=16))
+    full = truth(0.0)
+    assert full.depth is not None and full.normal is not None
+    half = Render(None, full.depth[::2, ::2], full.normal[::2, ::2], None)
+    loss = terms.training_loss(0, half, 0.5)
+    assert loss is not None and loss.item() == pytest.approx(0.0, abs=5e-3)
+
+
+def test_which_network_served_is_told(without_networks):
+    assert regularisation(PAPER).served_by == {
+        "point_render": "multi-scale gradient",
+        "depth": "multi-view depth",
+        "normal": "normals of the multi-view depth",
+        "semantic": "nothing: no weights",
+    }
+    assert regularisation(Config()).served_by == {}
+    nothing = regularisation(Config(semantic=Term(1.0)))
+    assert nothing.pseudo_loss(lambda view, _: truth_at(view), 0.5) is None  # no view is rendered for it
+
+
+def test_terms_of_weight_zero_ask_for_nothing(without_networks):
+    terms = regularisation(Config())
+    assert terms.channels(0.5) == ("rgb",)
+    assert terms.training_loss(0, truth(0.0), 0.5) is None
+    assert terms.pseudo_loss(lambda view, channels: truth(0.0), 0.5) is None
+
+
+def test_networks_serve_where_their_weights_are(monkeypatch):
+    """One that sees the true inverse depth up to scale and offset in one view, and its opposite in the other."""
+
+    class Seer:
+        name = "a network"
+
+        def __call__(self, image):
+            at_zero = np.array_equal(image, wall(0.0, 0)[1])
+            inverse = 30.0 / wall(0.0 if at_zero else 0.4, 0)[0].depth + 5.0
+            return inverse if at_zero else 40.0 - inverse, Crop(1.0, 0, 0, WIDTH, HEIGHT)
+
+    class Encoder:
+        name = "an encoder"
+
+        def __call__(self, image):
+            return torch.nn.functional.normalize(image.mean((0, 1)), dim=0)
+
+    monkeypatch.setattr("splatnode.recon.optimize.regularise.load_relative", Seer)
+    monkeypatch.setattr("splatnode.recon.optimize.regularise.load_dino", Encoder)
+    pointmaps, images = zip(*(wall(x, i) for i, x in enumerate((0.0, 0.4))), strict=True)
+    for pointmap in pointmaps:
+        pointmap.depth[:, ::3] = 0  # several views know only a part
+    served = Regularisation(pointmaps, images, PAPER, seed=0)
+    depth = "depth of a network (in 1 of 2 views, scaled by multi-view depth)"
+    assert served.served_by["depth"] == depth and served.served_by["normal"] == f"normals of the {depth}"
+    assert served.served_by["semantic"] == "an encoder"
+    right, progress = truth(0.0), 0.3
+    wrong = Render(right.rgb, right.depth.flip(1), right.normal, None)
+    losses = [float(served.training_loss(0, render, progress)) for render in (right, wrong)]
+    assert losses[0] < 1e-3 < losses[1]
+    assert Regularisation(pointmaps, images, Config(), seed=0).served_by == {}

@@ -1,0 +1,28 @@
+"""A photograph is compared at its size or a smaller one, where it shows the scene."""
+
+import numpy as np
+import pytest
+import torch
+
+from splatnode.recon.optimize.target import target
+from splatnode.recon.scene.scene import View
+
+HEIGHT, WIDTH = 24, 40
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_only_what_shows_the_scene_is_compared(scale):
+    image = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    shown = np.ones((HEIGHT, WIDTH), bool)
+    image[:3], shown[:3] = 0, False
+    K = torch.tensor([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
+    seen = target(View("a", 0, image, torch.eye(4), K, None, None), shown, scale, 0.2)
+    assert (seen.width, seen.height) == (WIDTH * scale, HEIGHT * scale)
+    torch.testing.assert_close(seen.K[:2], scale * K[:2])
+    grey = torch.full((seen.height, seen.width, 3), 128 / 255, requires_grad=True)
+    assert seen.loss(grey).item() == pytest.approx(0, abs=1e-5)
+    brighter = torch.full((seen.height, seen.width, 3), 0.7, requires_grad=True)
+    seen.loss(brighter).backward()
+    rows = 3 if scale == 1 else 2  # a pixel of the smaller photograph that mixes both is left out
+    assert brighter.grad is not None
+    assert not brighter.grad[:rows].any() and bool((brighter.grad[rows:] != 0).all())

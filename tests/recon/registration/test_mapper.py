@@ -1,0 +1,261 @@
+"""From matches to cameras, on points with known answers: noise, wrong matches, an unknown focal length, doubles."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode.recon.geometry import align_cameras
+from splatnode.recon.matching import two_view
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.registration import focal, mapper, resection, tracks, triangulation
+from splatnode.recon.registration.mapping_problem import Lens, View
+
+FOCAL = 900.0
+SIZE = (1024, 768)
+NOISE_PX = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Photographed:
+    """Points seen by cameras on an arc: feature k of every view is point k, or clutter where it is not visible."""
+
+    rotations: np.ndarray  # (C, 3, 3) world to camera
+    translations: np.ndarray  # (C, 3)
+    pixels: list[np.ndarray]  # C times (N, 2) relative to the middle
+    visible: np.ndarray  # (C, N)
+
+    @property
+    def Ts_world_camera(self) -> np.ndarray:
+        return np.stack([_inverse(R, t) for R, t in zip(self.rotations, self.translations, strict=True)])
+
+
+def _inverse(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation.T, -rotation.T @ translation
+    return T
+
+
+def photographed(num_views: int = 5, step_deg: float = 9.0, num_points: int = 400, seed: int = 0) -> Photographed:
+    generator = np.random.default_rng(seed)
+    points = generator.uniform(-1.0, 1.0, (num_points, 3)) * [2.0, 1.4, 1.2]
+    rotations, translations, pixels, visible = [], [], [], []
+    for view in range(num_views):
+        angle = np.radians(step_deg * (view - num_views / 2))
+        rotation = cv2.Rodrigues(np.array([0.03 * view, angle, 0.02]))[0]
+        translation = np.array([0.1 * view, -0.05 * view, 6.0])
+        in_camera = points @ rotation.T + translation
+        seen = FOCAL * in_camera[:, :2] / in_camera[:, 2:] + generator.normal(size=(num_points, 2)) * NOISE_PX
+        inside = (np.abs(seen) < np.array(SIZE) / 2).all(1) & (generator.random(num_points) < 0.8)
+        clutter = (generator.random((num_points, 2)) - 0.5) * SIZE
+        rotations.append(rotation)
+        translations.append(translation)
+        pixels.append(np.where(inside[:, None], seen, clutter))
+        visible.append(inside)
+    return Photographed(np.stack(rotations), np.stack(translations), pixels, np.stack(visible))
+
+
+def compared(taken: Photographed, share_wrong: float = 0.2) -> dict[tuple[int, int], TwoView]:
+    """All pairs, verified, when every common point is matched and a share of the matches is wrong."""
+    generator = np.random.default_rng(5)
+    pairs = {}
+    for i in range(len(taken.pixels)):
+        for j in range(i + 1, len(taken.pixels)):
+            (common,) = np.nonzero(taken.visible[i] & taken.visible[j])
+            wrong = generator.integers(0, len(taken.pixels[i]), (int(share_wrong * len(common)), 2))
+            matches = np.concatenate([np.stack([common, common], 1), wrong])
+            points1, points2 = taken.pixels[i][matches[:, 0]], taken.pixels[j][matches[:, 1]]
+            pair, _ = two_view.examine(points1, points2, matches, SIZE, two_view.Config())
+            if pair is not None:
+                pairs[i, j] = pair
+    return pairs
+
+
+def built(taken: Photographed, pairs: dict[tuple[int, int], TwoView], focals: tuple[float, ...]) -> mapper.Map:
+    views = [View(points, 0, max(SIZE)) for points in taken.pixels]
+    found = mapper.build_map(views, [Lens(focals, 0.3)], pairs, mapper.Config())
+    assert found is not None
+    return found
+
+
+def errors(taken: Photographed, found: mapper.Map) -> tuple[float, float]:
+    """Largest error of a relative rotation, degrees, and the largest of a centre, relative to their spread."""
+    members = sorted(found.views)
+    state = found.problem
+    estimated = np.stack([_inverse(state.rotations[i], state.translations[i]) for i in members])
+    true = taken.Ts_world_camera[members]
+    first, second = np.triu_indices(len(members), 1)
+    relative = [T[first, :3, :3].transpose(0, 2, 1) @ T[second, :3, :3] for T in (estimated, true)]
+    cosine = ((relative[0] * relative[1]).sum((1, 2)) - 1.0) / 2.0
+    alignment = align_cameras(estimated, true)
+    moved = np.stack([alignment.camera(T)[:3, 3] for T in estimated])
+    spread = np.sqrt(((true[:, :3, 3] - true[:, :3, 3].mean(0)) ** 2).sum(1).mean())
+    return (
+        float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max()),
+        float(np.linalg.norm(moved - true[:, :3, 3], axis=1).max() / spread),
+    )
+
+
+@pytest.fixture(scope="module")
+def taken() -> Photographed:
+    return photographed()
+
+
+@pytest.fixture(scope="module")
+def pairs(taken) -> dict[tuple[int, int], TwoView]:
+    return compared(taken)
+
+
+def test_a_pair_keeps_its_matches_and_drops_the_wrong_ones(taken, pairs):
+    assert len(pairs) == 10
+    for (i, j), pair in pairs.items():
+        common = int((taken.visible[i] & taken.visible[j]).sum())
+        right = pair.matches[:, 0] == pair.matches[:, 1]
+        assert right.sum() > 0.9 * common
+        assert right.mean() > 0.97
+        assert not pair.turned_only
+        assert pair.num_homography < 0.7 * len(pair.matches)
+
+
+def test_unrelated_points_are_no_pair():
+    generator = np.random.default_rng(0)
+    points1, points2 = ((generator.random((300, 2)) - 0.5) * SIZE for _ in range(2))
+    matches = np.stack([np.arange(300)] * 2, 1)
+    assert two_view.examine(points1, points2, matches, SIZE, two_view.Config())[0] is None
+
+
+def test_a_camera_that_only_turned_is_told():
+    generator = np.random.default_rng(0)
+    rays = np.column_stack([generator.uniform(-0.4, 0.4, (300, 2)), np.ones(300)])
+    turned = rays @ cv2.Rodrigues(np.array([0.02, 0.15, 0.0]))[0].T
+    points1, points2 = rays[:, :2] * FOCAL, turned[:, :2] / turned[:, 2:] * FOCAL
+    points2 = points2 + generator.normal(size=points2.shape) * NOISE_PX
+    pair, _ = two_view.examine(points1, points2, np.stack([np.arange(300)] * 2, 1), SIZE, two_view.Config())
+    assert pair is not None
+    assert pair.turned_only
+    assert pair.rotation_focal_ratio == pytest.approx(FOCAL / SIZE[0], rel=0.1)
+
+
+def test_false_alarms_fall_with_every_match_that_agrees():
+    assert two_view.log10_number_of_false_alarms(100, 7, 7, 0.01) == 0.0
+    alarms = [two_view.log10_number_of_false_alarms(100, k, 7, 0.01) for k in (10, 20, 40)]
+    assert alarms == sorted(alarms, reverse=True)
+    assert alarms[-1] < -25.0
+
+
+def test_pairs_vote_for_the_focal_length(pairs):
+    votes = focal.vote(list(pairs.values()), num_candidates=3)
+    assert min(abs(np.log(vote * SIZE[0] / FOCAL)) for vote in votes) < 0.08
+
+
+@pytest.mark.parametrize("focals", [(FOCAL,), (1.15 * FOCAL, 0.8 * FOCAL)])
+def test_cameras_are_found_whatever_the_first_focal_length(taken, pairs, focals):
+    found = built(taken, pairs, focals)
+    assert sorted(found.views) == [0, 1, 2, 3, 4]
+    rotation_deg, centre = errors(taken, found)
+    assert rotation_deg < 0.15
+    assert centre < 0.01
+    assert np.exp(found.problem.log_focals[0]) == pytest.approx(FOCAL, rel=0.01)
+    assert found.rms_px == pytest.approx(NOISE_PX * np.sqrt(2.0), rel=0.25)
+    assert min(found.agreement.values()) > 0.95
+
+
+def test_what_is_known_of_a_lens_stays(taken, pairs):
+    views = [View(points, 0, max(SIZE)) for points in taken.pixels]
+    found = mapper.build_map(views, [Lens((FOCAL,), 0.0)], pairs, mapper.Config())
+    assert found is not None
+    assert np.exp(found.problem.log_focals[0]) == pytest.approx(FOCAL, rel=1e-12)
+    assert found.problem.radials[0] == 0.0 and np.abs(found.problem.shifts).max() == 0.0
+
+
+def test_a_pair_that_shows_a_double_does_not_bend_the_map(taken, pairs):
+    """Views 0 and 4 match as strongly as they can on a copy of the scene elsewhere."""
+    elsewhere = photographed(seed=11)
+    lying = compared(elsewhere)[0, 4]
+    points = [np.concatenate([own, other]) for own, other in zip(taken.pixels, elsewhere.pixels, strict=True)]
+    spoiled = {**pairs, (0, 4): replace(lying, matches=lying.matches + len(taken.pixels[0]))}
+    views = [View(of_view, 0, max(SIZE)) for of_view in points]
+    found = mapper.build_map(views, [Lens((FOCAL,), 0.3)], spoiled, mapper.Config())
+    assert found is not None
+    rotation_deg, centre = errors(taken, found)
+    assert rotation_deg < 0.3 and centre < 0.02
+
+
+def test_a_view_that_shares_a_handful_of_points_is_placed_by_its_pair():
+    """Views 0-1 and 1-2 overlap in different points but for about ten, fewer than a pose from points needs."""
+    taken = photographed(num_views=3, num_points=600)
+    point = np.arange(600)
+    seen = taken.visible & np.stack([point < 310, point >= 0, point >= 290])
+    assert 5 <= seen.all(0).sum() < resection.Config().min_points
+    apart = Photographed(taken.rotations, taken.translations, taken.pixels, seen)
+    chain = {key: pair for key, pair in compared(apart, share_wrong=0.0).items() if key != (0, 2)}
+    found = built(taken, chain, (FOCAL,))
+    assert sorted(found.views) == [0, 1, 2]
+    rotation_deg, centre = errors(taken, found)
+    assert rotation_deg < 1.0 and centre < 0.05
+
+
+def test_sampson_errors_are_the_noise_and_infinite_behind(taken, pairs):
+    found = built(taken, pairs, (FOCAL,))
+    ahead = resection.pair_errors(found.problem, (0, 3), pairs[0, 3])
+    assert np.median(ahead) == pytest.approx(0.67 * NOISE_PX, rel=0.4)
+    rotations, translations = found.problem.rotations, found.problem.translations
+    towards = rotations[3] @ rotations[0].T @ translations[0]
+    flipped = resection.with_pose(found.problem, 3, rotations[3], 2 * towards - translations[3])
+    behind = resection.pair_errors(flipped, (0, 3), pairs[0, 3])
+    assert np.isinf(behind).mean() > 0.9
+
+
+def test_no_pair_gives_no_map(taken):
+    views = [View(points, 0, max(SIZE)) for points in taken.pixels]
+    assert mapper.build_map(views, [Lens((FOCAL,), 0.3)], {}, mapper.Config()) is None
+
+
+def test_tracks_join_matches_and_drop_what_contradicts_itself():
+    points = [np.arange(8, dtype=float).reshape(4, 2) + 10 * view for view in range(3)]
+
+    def pair(*matches: tuple[int, int]) -> TwoView:
+        index = np.array(matches)
+        return TwoView(index, points[0][index[:, 0]], points[0][index[:, 1]], 0, 0.0, 0, 0, 1.0, 1.0)
+
+    matched = {(0, 1): pair((0, 0), (1, 1), (2, 2)), (1, 2): pair((0, 0), (1, 3)), (0, 2): pair((1, 1))}
+    joined = tracks.build(points, matched)
+    members = [
+        {int(camera) for camera in joined.camera_of[joined.track_of == track]} for track in range(joined.num_tracks)
+    ]
+    # 0-0-0 is whole; 1-1 reaches two features of view 2, which both go; 2-2 is seen twice.
+    assert sorted(map(sorted, members)) == [[0, 1], [0, 1], [0, 1, 2]]
+    thinned = tracks.thin(joined, 3, per_camera=1)
+    assert thinned.num_tracks == 1
+    assert sorted(thinned.camera_of) == [0, 1, 2]
+
+
+def test_triangulated_points_are_where_they_were(taken):
+    state_matrices = np.concatenate([taken.rotations, taken.translations[:, :, None]], 2)
+    world = np.array([[0.2, -0.3, 0.1], [1.0, 0.5, -0.7]])
+    camera, track = np.tile(np.arange(5), 2), np.repeat(np.arange(2), 5)
+    in_camera = np.einsum("oij,oj->oi", taken.rotations[camera], world[track]) + taken.translations[camera]
+    rays = in_camera[:, :2] / in_camera[:, 2:]
+    points = triangulation.triangulate(state_matrices, rays, camera, track, num_tracks=3)
+    np.testing.assert_allclose(points[:2], world, atol=1e-9)
+    assert np.isnan(points[2]).all()
+    centres = -np.einsum("cji,cj->ci", taken.rotations, taken.translations)
+    widest = triangulation.largest_angles(centres, points[:2], camera, track)
+    first, last = centres[0] - world[0], centres[4] - world[0]
+    expected = np.degrees(np.arccos(first @ last / np.linalg.norm(first) / np.linalg.norm(last)))
+    assert widest[0] == pytest.approx(expected, abs=1e-6)
+
+
+def test_wrong_matches_do_not_hide_how_far_a_pair_moved():
+    """8 of 25 points are right: less than the share that must agree, unless those that fit no length are left out."""
+    generator = np.random.default_rng(4)
+    turned = generator.uniform([-1.0, -1.0, 4.0], [1.0, 1.0, 6.0], (25, 3))
+    direction = np.array([1.0, 0.0, 0.1]) / np.sqrt(1.01)
+    moved = turned + 0.7 * direction
+    rays = moved[:, :2] / moved[:, 2:]
+    rays[8:, 1] += generator.choice([-1.0, 1.0], 17) * generator.uniform(0.05, 0.3, 17)
+    assert resection._scale(turned, direction, rays, 0.002, min_points=5) == pytest.approx(0.7, rel=1e-6)
+    assert resection._scale(turned, direction, rays, 0.002, min_points=9) is None

@@ -1,0 +1,41 @@
+"""Registration of photographs of the built-in place, together with one that shows something else."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from splatnode.capture.cameras import synthetic
+from splatnode.capture.frame import Frame
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.matching import config as matching
+from splatnode.recon.matching import features
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.registration import register
+from tests.support.synthetic import photographs, renumbered, view_graph
+
+
+def test_the_lens_of_a_frame_that_is_left_out_makes_no_focal_length_uncertain():
+    place = synthetic.Config(views=3, width=320, height=240)
+    blank = np.full((200, 300, 3), 128, np.uint8)
+    config, settings = register.Config(), matching.Config()
+    graph = ViewGraph(settings)
+    for frame in [*synthetic.stream(place), Frame(3, "another size", 3, blank, None)]:
+        graph.add(Keyframe(frame, frame.image, features.extract(frame.image, settings.features)))
+    registration = register.register(graph.keyframes, graph.pairs, config)
+    assert registration is not None and [camera.index for camera in registration.cameras] == [0, 1, 2]
+    assert registration.focal_sigma < 0.5 * config.lenses.voted_sigma
+
+
+def test_the_robots_own_body_in_the_picture_is_not_what_moves():
+    """A bumper with much texture that stands still in every picture explains most matches, and says nothing."""
+    bumper = np.random.default_rng(0).integers(0, 256, (60, 160, 3), np.uint8)
+    bumper = cv2.resize(bumper, (320, 120), interpolation=cv2.INTER_CUBIC)
+    images = [frame.image.copy() for frame in photographs()[:2]]
+    for image in images:
+        image[120:] = bumper
+    graph = view_graph(renumbered(images))
+    pair = graph.pairs[0, 1]
+    motion = np.linalg.norm(pair.points2 - pair.points1, axis=1)
+    assert len(motion) > 60 and np.median(motion) > 3.0
+    assert (pair.points1[:, 1] < 0).mean() > 0.9  # above the middle of the image, where the bumper begins

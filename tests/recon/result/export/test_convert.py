@@ -1,0 +1,55 @@
+"""Results exported to other formats, and read back."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatnode.recon.result.export import SceneFileError, export_scene, read_cameras, read_gaussians
+from tests.support.exported import make_gaussians, make_snapshot, write
+
+
+@pytest.mark.parametrize("to", ["ply", "spz", "splat"])
+def test_result_is_exported_as_a_scene_that_reads_back(tmp_path, to):
+    write(make_snapshot(), tmp_path)
+    path = export_scene(tmp_path, to, tmp_path / f"copy.{to}")
+    back = read_gaussians(path)
+    assert len(back) == 50
+    atol = 1e-3 if to == "spz" else 1e-5  # a fiftieth of an extent
+    assert np.allclose(np.sort(back.means[:, 0]), np.sort(make_gaussians().means[:, 0]), atol=atol)
+
+
+def test_result_is_exported_as_cameras(tmp_path):
+    write(make_snapshot(), tmp_path)
+    export_scene(tmp_path, "colmap", tmp_path / "model")
+    assert (tmp_path / "model" / "images.txt").read_bytes() == (tmp_path / "colmap" / "images.txt").read_bytes()
+    export_scene(tmp_path / "scene.ply", "nerfstudio", tmp_path / "ns.json")
+    assert (tmp_path / "ns.json").read_bytes() == (tmp_path / "transforms.json").read_bytes()
+    export_scene(tmp_path, "tum", tmp_path / "t.tum")
+    assert (tmp_path / "t.tum").read_bytes() == (tmp_path / "trajectory.tum").read_bytes()
+
+
+def test_cameras_read_back_exactly(tmp_path):
+    write(make_snapshot(), tmp_path)
+    for read, camera in zip(read_cameras(tmp_path / "cameras.json"), make_snapshot().cameras, strict=True):
+        assert np.array_equal(read.T_world_camera, camera.T_world_camera)
+        assert np.array_equal(read.K, camera.K)
+        assert (read.name, read.frame_id, read.width, read.height) == (camera.name, camera.frame_id, 512, 384)
+        assert (read.rotation_sigma_deg, read.centre_sigma_rel) == (0.1, None)
+
+
+@pytest.mark.parametrize("content", ["", "[]", "{}", '{"cameras": [{"name": "a"}]}', '{"cameras": [1]}'])
+def test_foreign_cameras_file_is_a_clear_error(tmp_path, content):
+    (tmp_path / "cameras.json").write_text(content)
+    with pytest.raises(SceneFileError, match="cameras.json"):
+        read_cameras(tmp_path / "cameras.json")
+
+
+def test_export_of_what_is_not_there(tmp_path):
+    with pytest.raises(FileNotFoundError, match="splatnode replay"):
+        export_scene(tmp_path, "ply", tmp_path / "x.ply")
+    with pytest.raises(ValueError, match="one of ply, spz"):
+        export_scene(tmp_path, "obj", tmp_path / "x.obj")
+    (tmp_path / "scene.txt").write_text("text")
+    with pytest.raises(SceneFileError, match="must end with"):
+        export_scene(tmp_path / "scene.txt", "ply", tmp_path / "x.ply")

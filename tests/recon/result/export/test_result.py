@@ -1,0 +1,122 @@
+"""Result folders: every file with its digest, whole or not at all; a failure leaves nothing behind."""
+
+from __future__ import annotations
+
+import errno
+import hashlib
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatnode.recon.result.export import ResultWriteError, write_file, write_result
+from splatnode.recon.result.export import staged as staged_module
+from splatnode.recon.result.export.ply import encode_ply
+from splatnode.recon.result.report import build_report
+from splatnode.recon.result.verdict import Code
+from tests.support.exported import make_gaussians, make_snapshot, write
+
+
+def test_result_holds_every_file_and_a_manifest_of_them(tmp_path):
+    manifest_path = write(make_snapshot(), tmp_path, preview=b"PNG bytes")
+    manifest = json.loads(manifest_path.read_text())
+    expected = {"scene.ply", "cameras.json", "trajectory.tum", "transforms.json", "preview.png", "report.json"}
+    expected |= {f"colmap/{name}.txt" for name in ("cameras", "images", "points3D")}
+    assert set(manifest["files"]) == expected
+    on_disk = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
+    assert on_disk == expected | {"manifest.json"}
+    for name, entry in manifest["files"].items():
+        data = (tmp_path / name).read_bytes()
+        assert entry == {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    for name in expected - {"scene.ply", "preview.png"}:
+        assert "relative" in (tmp_path / name).read_text(), f"{name} must say that the scale is relative"
+
+
+def test_report_tells_what_happened():
+    report = json.loads(json.dumps(build_report(make_snapshot(), seed=1, preset="fast", peak_rss_mb=100.0)))
+    assert report["verdict"]["code"] == "OK" and report["verdict"]["frames"] == ["0001.jpg"]
+    assert report["seconds"] == {"poses": 1.5, "optimise": 2.0, "total": 3.5}
+    assert report["num_gaussians"] == 50
+    assert report["scene_bytes"] == len(encode_ply(make_gaussians()))
+    assert report["frames_used"] == ["0000.jpg", "0002.jpg"]
+    assert report["frames_dropped"] == [{"name": "0001.jpg", "reason": "blurred"}]
+    assert report["cameras"][0]["uncertainty"] == {"rotation_deg": 0.1, "centre_rel": None}
+    assert (report["seed"], report["preset"], report["peak_rss_mb"]) == (1, "fast", 100.0)
+    assert report["versions"]["numpy"] == np.__version__
+
+
+def test_refused_scene_is_not_published_and_replaces_an_earlier_one(tmp_path):
+    write(make_snapshot(), tmp_path)
+    (tmp_path / "transforms.json").write_text("edited by the user")
+    write(make_snapshot(Code.NO_PARALLAX, publishable=False), tmp_path)
+    left = {path.name for path in tmp_path.rglob("*")}  # and no empty folder
+    assert left == {"report.json", "manifest.json", "transforms.json"}  # what the user changed is the user's
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert (report["verdict"]["code"], report["scene_bytes"]) == ("NO_PARALLAX", 0)
+
+
+def test_manifest_cannot_make_us_remove_a_file_elsewhere(tmp_path):
+    outside = tmp_path / "precious.txt"
+    outside.write_text("mine")
+    folder = tmp_path / "out"
+    folder.mkdir()
+    digest = hashlib.sha256(b"mine").hexdigest()
+    (folder / "manifest.json").write_text(json.dumps({"files": {"../precious.txt": {"sha256": digest}}}))
+    write(make_snapshot(), folder)
+    assert outside.read_text() == "mine"
+
+
+@pytest.mark.parametrize("failing", ["scene.ply", "report.json", "manifest.json"])
+def test_full_disk_leaves_the_earlier_result_and_no_temporary_file(tmp_path, monkeypatch, failing):
+    write(make_snapshot(), tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    real = staged_module._write_through
+
+    def full(path: Path, content: bytes) -> None:
+        if failing in path.name:
+            path.write_bytes(content[: len(content) // 2])
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        real(path, content)
+
+    monkeypatch.setattr(staged_module, "_write_through", full)
+    changed = replace(make_snapshot(), gaussians=make_gaussians(seed=9))
+    with pytest.raises(ResultWriteError, match="Free some space") as caught:
+        write(changed, tmp_path)
+    assert caught.value.errno == errno.ENOSPC and isinstance(caught.value, OSError)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+def test_the_system_reporting_a_full_disk_surfaces(tmp_path, monkeypatch):
+    snapshot = make_snapshot()
+    report = build_report(snapshot, seed=0, preset="fast", peak_rss_mb=None)
+    real_open = Path.open
+
+    def open_full_device(path: Path, mode: str = "r", *rest, **options):
+        return real_open(Path("/dev/full"), "wb") if mode == "xb" else real_open(path, mode, *rest, **options)
+
+    monkeypatch.setattr(Path, "open", open_full_device)
+    with pytest.raises(ResultWriteError) as caught:
+        write_result(snapshot, tmp_path, report)
+    assert caught.value.errno == errno.ENOSPC
+    assert not any(path.is_file() for path in tmp_path.rglob("*"))
+
+
+def test_a_device_or_a_pipe_is_not_replaced_and_a_link_is_followed(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ResultWriteError, match="pipe is a device or a pipe"):
+        write_file(tmp_path / "pipe", b"new")
+    assert (tmp_path / "pipe").is_fifo()
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    write_file(tmp_path / "link", b"new")
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "real").read_bytes() == b"new"
+
+
+def test_file_in_place_of_the_folder_is_a_clear_error(tmp_path):
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(ResultWriteError, match="cannot write"):
+        write(make_snapshot(), tmp_path / "out")
+    assert (tmp_path / "out").read_text() == "a file"

@@ -1,0 +1,113 @@
+"""The scene: what it starts from and what it tells."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from splatnode.capture.process.config import typed
+from splatnode.recon.config import Config
+from splatnode.recon.frames import border
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.registration.register import RegisteredCamera
+from splatnode.recon.scene import background, completion, pixelwise, seeding
+from splatnode.recon.scene.scene import Scene, begin
+from tests.support.synthetic import plane_pointmap
+
+WIDTH, HEIGHT = 32, 24
+
+
+def begun(max_gaussians: int | None = None, by_pixel: pixelwise.Config | None = None) -> Scene:
+    """Two views of a wall of noise, one step apart."""
+    step = np.eye(4)
+    step[0, 3] = 0.3
+    pointmaps = tuple(
+        plane_pointmap(T, confidence=c, frame_id=i) for i, (T, c) in enumerate([(np.eye(4), 0.9), (step, 0.5)])
+    )
+    return scene_of(pointmaps, max_gaussians, by_pixel)
+
+
+def scene_of(
+    pointmaps: tuple[Pointmap, ...], max_gaussians: int | None = None, by_pixel: pixelwise.Config | None = None
+) -> Scene:
+    noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    principal = np.array([WIDTH / 2, HEIGHT / 2])
+    cameras = tuple(
+        RegisteredCamera(i, pointmap.T_world_camera, 0, 1.1 * WIDTH, principal, 0.0, 0.1 + i, 0.01)
+        for i, pointmap in enumerate(pointmaps)
+    )
+    images = {pointmap.name: noise for pointmap in pointmaps}
+    settings = completion.Config(), seeding.Config(), background.Config(), max_gaussians, by_pixel
+    return begin(pointmaps, images, cameras, *settings)
+
+
+def test_a_scene_begins_with_the_registered_cameras_and_a_gaussian_for_what_they_saw():
+    scene = begun()
+    assert [(view.name, view.frame_id, view.rotation_sigma_deg) for view in scene.views] == [
+        ("00.png", 0, 0.1),
+        ("01.png", 1, 1.1),
+    ]
+    assert float(scene.views[1].T_world_camera[0, 3]) == pytest.approx(0.3)
+    sources = scene.gaussians.source_frame
+    # Every pixel of noise from the surer view; from the other what only it sees: 0.3 * 35.2 / 2 = 5.3 of 32 columns.
+    assert int((sources == 0).sum()) == 32 * 24
+    assert 4 * 24 <= int((sources == 1).sum()) <= 6 * 24
+    assert int((sources == background.SHELL).sum()) > 10
+
+
+def test_depths_that_stereo_does_not_believe_in_move_neither_surfaces_nor_the_shell():
+    sure = tuple(plane_pointmap(np.eye(4), confidence=c, frame_id=i) for i, c in enumerate((0.9, 0.8)))
+    doubtful = tuple(replace(pointmap, depth=pointmap.depth.copy()) for pointmap in sure)
+    for pointmap in (sure[1], doubtful[1]):
+        pointmap.confidence[:8] = 0.05
+    doubtful[1].depth[:8] = 50.0
+    assert torch.equal(scene_of(sure).gaussians.means, scene_of(doubtful).gaussians.means)
+
+
+@pytest.mark.parametrize("by_pixel", [None, pixelwise.Config()])
+def test_nothing_begins_where_photographs_do_not_show_the_scene(by_pixel, monkeypatch):
+    right = np.broadcast_to(np.arange(WIDTH) >= 8, (HEIGHT, WIDTH))
+    monkeypatch.setattr(border, "shown", lambda images: [right] * len(images))
+    scene = begun(by_pixel=by_pixel)
+    for view in scene.views:
+        assert view.pointmap is not None and not view.pointmap.depth[~right].any()
+        own = scene.gaussians.means[scene.gaussians.source_frame == view.frame_id]
+        x, _, z = ((own - view.T_world_camera[:3, 3]) @ view.K.T).unbind(1)
+        assert len(own) > 0 and bool((x / z > 7.9).all())
+
+
+@pytest.mark.parametrize("most", [None, 100])
+def test_by_pixel_a_scene_has_what_stereo_knows_and_nothing_else(most):
+    scene = begun(most, pixelwise.Config(opacity=0.1))
+    assert len(scene.views) == 2 and set(scene.gaussians.source_frame.tolist()) == {0, 1}
+    assert len(scene.gaussians) == most or len(scene.gaussians) > WIDTH * HEIGHT
+    torch.testing.assert_close(scene.gaussians.opacities, torch.full((len(scene.gaussians),), 0.1))
+
+
+def test_a_gaussian_a_pixel_is_asked_for_by_naming_it_in_the_configuration():
+    assert Config().pixelwise is None
+    chosen = typed({"pixelwise": {"opacity": 0.2}}, Config).pixelwise
+    assert chosen is not None and chosen.opacity == 0.2
+
+
+@pytest.mark.parametrize("most", [150, 20])
+def test_a_bound_on_gaussians_counts_the_shell(most):
+    scene = begun(most)
+    assert most // 4 <= len(scene.gaussians) <= most
+    assert int((scene.gaussians.source_frame == background.SHELL).sum()) <= most // 10
+
+
+def test_what_is_published_is_activated_and_a_copy():
+    scene = begun()
+    arrays, cameras = scene.arrays(), scene.cameras()
+    np.testing.assert_allclose(np.linalg.norm(arrays.quats, axis=1), 1, rtol=1e-5)
+    np.testing.assert_allclose(arrays.scales, np.exp(scene.gaussians.log_scales.numpy()), rtol=1e-6)
+    assert arrays.opacities.min() > 0 and arrays.opacities.max() < 1
+    assert (cameras[1].name, cameras[1].width, cameras[1].height) == ("01.png", WIDTH, HEIGHT)
+    assert cameras[1].T_world_camera.dtype == np.float64
+    means, centre = scene.gaussians.means.clone(), scene.views[1].T_world_camera.clone()
+    arrays.means[:], cameras[1].T_world_camera[:] = 0, 0
+    assert torch.equal(scene.gaussians.means, means) and torch.equal(scene.views[1].T_world_camera, centre)

@@ -1,0 +1,96 @@
+"""Which limit bound a scene, and what is told about what more would buy."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+import torch
+
+from splatnode.recon.budget import STAYS, hits, loss_fall
+from splatnode.recon.config import Config
+from splatnode.recon.optimize import refinement
+from splatnode.recon.result.export.ply import ply_bytes
+from splatnode.recon.scene.gaussians import Gaussians
+from splatnode.recon.scene.scene import Scene
+
+SECONDS = {"poses": 1.0, "points": 2.0, "optimise": 4.0, "total": 7.0}
+
+
+def gaussians(count: int) -> Gaussians:
+    zeros = torch.zeros(count, 3)
+    return Gaussians(
+        zeros, torch.ones(count, 4), zeros, torch.zeros(count), zeros[:, None], torch.zeros(count, dtype=torch.int32)
+    )
+
+
+def begun(called_for: int = 10_000) -> Scene:
+    return Scene((), gaussians(0), called_for=called_for)
+
+
+def refined(count: int, iterations: int = 500, losses: tuple[float, ...] = ()) -> Scene:
+    return Scene((), gaussians(count), iterations, losses=losses)
+
+
+def test_no_limit_and_limits_that_were_not_reached_bind_nothing():
+    assert hits(Config(), begun(), refined(4500), SECONDS) == ()
+    assert hits(Config(max_gaussians=5000, max_mb=9.0, budget_s=60.0), begun(), refined(4999), SECONDS) == ()
+    assert hits(Config(max_gaussians=1), None, None, SECONDS) == ()
+
+
+def test_a_scene_that_calls_for_just_as_many_is_not_bound():
+    assert hits(Config(max_gaussians=800), begun(800), refined(800), SECONDS) == ()
+
+
+def test_the_limit_on_gaussians_is_named_with_what_the_scene_calls_for():
+    (hit,) = hits(Config(max_gaussians=1000), begun(), refined(1000), SECONDS)
+    assert (hit.limit, hit.given, hit.would_take) == ("max_gaussians", 1000, round(STAYS * 10_000))
+    assert "10000 pieces" in hit.basis
+    record = hit.record()
+    assert record["code"] == "BUDGET_HIT" and str(record["message"]).startswith("BUDGET_HIT: max_gaussians of 1000 ")
+
+
+@pytest.mark.parametrize(
+    ("most", "gain", "words"), [(2500, 0.0, "hardly PSNR"), (1250, 0.6, "about 0.6 dB"), (10, 2.0, "at least 2.0 dB")]
+)
+def test_what_more_gaussians_would_gain_is_told_as_it_was_measured(most, gain, words):
+    (hit,) = hits(Config(max_gaussians=most), begun(), refined(most), SECONDS)  # it would take 5000
+    assert hit.gain_db == gain and words in str(hit.record()["message"])
+
+
+def test_of_two_limits_the_one_that_bound_is_named():
+    config = Config(max_gaussians=5000, max_mb=ply_bytes(1000, 1) / 1e6 + 1e-5)
+    most = config.most_gaussians
+    assert most is not None and most <= 1000
+    (hit,) = hits(config, begun(), refined(most), SECONDS)
+    assert hit.limit == "max_mb" and hit.would_take == round(ply_bytes(round(STAYS * 10_000), 1) / 1e6, 2)
+
+
+def test_without_a_control_all_that_begin_stay():
+    config = Config(max_gaussians=1000, optimize=refinement.Config())
+    assert hits(config, begun(), refined(1000), SECONDS)[0].would_take == 10_000
+
+
+def test_time_that_ran_out_is_told_with_the_seconds_for_the_rest_and_the_slope():
+    # 200 of 500 iterations in 4 s: 300 more take 6 s. The loss falls by a hundredth an iteration, by half a second.
+    losses = tuple(0.99**i for i in range(200))
+    (hit,) = hits(Config(budget_s=7.0), begun(), refined(10, 200, losses), SECONDS)
+    assert (hit.limit, hit.given, hit.would_take) == ("budget_s", 7.0, pytest.approx(13.0))
+    assert "200 of 500" in hit.basis and "a second" in hit.basis and hit.gain_db == 0.2
+
+
+def test_time_that_was_gone_before_the_refinement_is_told():
+    (hit,) = hits(Config(budget_s=1.0), begun(), refined(10, 0), SECONDS)
+    assert "nothing was refined" in hit.basis and hit.would_take == 7.0 and hit.gain_db == 6.1
+
+
+def test_the_fall_of_the_loss():
+    assert loss_fall((1.0,) * 50 + (0.9,) * 50) == 0.0  # it fell long before the end
+    assert loss_fall((1.0,) * 90 + (0.8,) * 10) == pytest.approx(0.02)  # by a fifth from ten iterations to ten
+    assert loss_fall((1.0,) * 90 + (1.2,) * 10) == 0.0
+    assert loss_fall(()) == 0.0
+
+
+def test_both_limits_can_bind():
+    config = msgspec.structs.replace(Config(), max_gaussians=100, budget_s=7.0)
+    found = hits(config, begun(), refined(100, 200, (1.0,) * 200), SECONDS)
+    assert [hit.limit for hit in found] == ["max_gaussians", "budget_s"]

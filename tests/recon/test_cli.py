@@ -1,0 +1,68 @@
+"""`splatnode replay`: what it refuses before it begins, and what it leaves behind where the answer is no."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode import command_line
+from splatnode.capture.cameras.folder import Config, stream
+from splatnode.capture.recording import Recorder
+from splatnode.recon import cli
+
+
+@pytest.fixture
+def photographs(tmp_path):
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    picture = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(folder / name), picture)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["--out", "new", "--baseline", "a.png", "c.png", "0.5"], 2, "'c.png' is not there; there are: a.png, b.png"),
+        (["--out", "new", "--baseline", "a.png", "b.png", "far"], 2, "a distance in metres, got 'far'"),
+        (["--out", "new/../photographs"], 2, "must not be the folder of the photographs"),
+        (["--out", "new", "--seed", str(2**63)], 2, "seed: expected int <="),
+        (["--out", "photographs/a.png"], 73, "Choose another folder"),
+        (["--out", "photographs/a.png/below"], 73, "choose another folder"),
+    ],
+)
+def test_what_cannot_end_well_is_not_begun(photographs, monkeypatch, capsys, arguments, code, said):
+    monkeypatch.chdir(photographs.parent)
+    monkeypatch.setattr(cli, "reconstruct", lambda frames, config: pytest.fail("was begun"))
+    assert command_line.main(["replay", "photographs", *arguments]) == code
+    assert said in capsys.readouterr().err
+    assert {path.name for path in photographs.parent.iterdir()} == {"photographs"}
+    assert {path.name for path in photographs.iterdir()} == {"a.png", "b.png"}
+
+
+def test_a_seed_that_cannot_be_used_is_told_before_the_capture_is_made(tmp_path, capsys):
+    assert command_line.main(["demo", "--seed", str(2**63), "--out", str(tmp_path / "out")]) == 2
+    assert "seed: expected int <=" in capsys.readouterr().err
+    assert not any(tmp_path.iterdir())
+
+
+def test_so_many_views_of_a_recording_go_by_the_names_that_its_frames_had(photographs, capsys):
+    recording, out = photographs.parent / "recording", photographs.parent / "out"
+    with Recorder(recording) as recorder:
+        for frame in stream(Config(folder=photographs)):
+            recorder.write(frame)
+    assert command_line.main(["replay", str(recording), "--views", "1", "--out", str(out)]) == 65
+    assert json.loads((out / "report.json").read_text())["verdict"]["code"] == "TOO_FEW_VIEWS"
+
+
+def test_a_refusal_leaves_a_report_that_says_why(photographs, capsys):
+    out = photographs.parent / "out"
+    assert command_line.main(["replay", str(photographs), "--out", str(out)]) == 65
+    assert {path.name for path in out.iterdir()} == {"report.json", "manifest.json"}
+    verdict = json.loads((out / "report.json").read_text())["verdict"]
+    assert verdict["code"] == "STATIC_CAMERA"
+    assert capsys.readouterr().out.startswith(f"STATIC_CAMERA: {verdict['message']}")

@@ -1,0 +1,56 @@
+"""Limits of a reconstruction: what is asked for together, and what a scene begins with."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from splatnode.capture.process.config import ConfigError
+from splatnode.recon.config import Config, overlaid, preset
+from splatnode.recon.result.export.ply import ply_bytes
+
+
+def test_of_two_limits_the_tighter_one_holds():
+    assert Config().most_gaussians is None
+    assert Config(max_gaussians=900).most_gaussians == 900
+    assert Config(max_gaussians=900, max_mb=1.0).most_gaussians == 900
+    by_size = Config(max_gaussians=90_000, max_mb=1.0).most_gaussians
+    assert by_size is not None and by_size < 90_000
+    assert 0.999e6 < ply_bytes(by_size, 1) <= 1e6
+
+
+def test_more_begin_than_may_stay_only_where_something_takes_them_away():
+    limited = Config(max_gaussians=1000)
+    assert limited.first_gaussians == 2000
+    assert Config().first_gaussians is None
+    free = msgspec.structs.replace(limited.optimize, control=None)
+    assert msgspec.structs.replace(limited, optimize=free).first_gaussians == 1000
+
+
+def test_a_file_changes_a_control_or_leaves_it_out():
+    changed = overlaid(preset("fast"), {"optimize": {"control": {"least_change": 0.5}}})
+    control = changed.optimize.control
+    assert control is not None and (control.kind, control.config.least_change) == ("prune", 0.5)
+    assert changed.optimize.iterations == preset("fast").optimize.iterations
+    assert overlaid(preset("fast"), {"optimize": {"control": None}}).optimize.control is None
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"max_gaussians": 0},
+        {"max_mb": -2.0},
+        {"budget_s": float("nan")},
+        {"size": 63},
+        {"seed": -1},
+        {"seed": 2**63},
+        {"prior": "mast3r"},
+        {"prior": None},
+        {"optimize": {"iterations": -1}},
+        {"optimize": {"dssim": 1.5}},
+    ],
+)
+def test_what_no_scene_can_have_is_refused_by_name(changes):
+    ((name, value),) = changes.items()
+    with pytest.raises(ConfigError, match=name if not isinstance(value, dict) else f"{name}.{next(iter(value))}"):
+        overlaid(Config(), changes)

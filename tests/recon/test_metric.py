@@ -1,0 +1,123 @@
+"""A scene gets metres from a known distance or from a network, and every file says so."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatnode.capture.process.config import ConfigError
+from splatnode.recon.config import Config as ReconConfig
+from splatnode.recon.config import overlaid
+from splatnode.recon.metric import Baseline, Config, MetricDepth, by_network, in_metres
+from splatnode.recon.networks.crop import crop
+from splatnode.recon.result.export import export_scene
+from splatnode.recon.result.export.ply import decode_ply
+from splatnode.recon.result.picture import take_picture
+from splatnode.recon.result.report import build_report
+from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
+from splatnode.recon.result.write import finish
+from tests.recon.result.test_preview import snapshot as ball_snapshot
+
+
+@pytest.fixture
+def seen() -> Snapshot:
+    """Two cameras 0.5 apart before a ball, to 1 % of the spread of their centres."""
+    known = ball_snapshot(1)
+    first = known.cameras[0]
+    apart = first.T_world_camera.copy()
+    apart[:3, 3] += [0.5, 0.0, 0.0]
+    cameras = tuple(
+        replace(first, name=name, T_world_camera=T, centre_sigma_rel=0.01)
+        for name, T in (("a.jpg", first.T_world_camera), ("b.jpg", apart))
+    )
+    wide = replace(known.gaussians, scales=np.full((1, 3), 0.9, np.float32))
+    return replace(known, cameras=cameras, gaussians=wide, images={camera.name: blank(camera) for camera in cameras})
+
+
+def blank(camera: CameraEstimate) -> np.ndarray:
+    return np.zeros((camera.height, camera.width, 3), np.uint8)
+
+
+def test_a_known_distance_gives_the_unit(seen):
+    metric = in_metres(seen, Config(baseline=Baseline("a.jpg", "b.jpg", 2.0)))
+    centres = [camera.T_world_camera[:3, 3] for camera in metric.cameras]
+    assert np.linalg.norm(centres[1] - centres[0]) == pytest.approx(2.0)
+    np.testing.assert_allclose(metric.gaussians.means, 4.0 * seen.gaussians.means, rtol=1e-6)
+    np.testing.assert_allclose(metric.gaussians.scales, 4.0 * seen.gaussians.scales, rtol=1e-6)
+    assert metric.scale.metric and metric.scale.source == "2 m between a.jpg and b.jpg, known to 0.7 %"
+    looks = [
+        take_picture(each.gaussians, camera.T_world_camera, camera.K, camera.width, camera.height).rgb
+        for each, camera in ((seen, seen.cameras[1]), (metric, metric.cameras[1]))
+    ]
+    np.testing.assert_allclose(looks[0], looks[1], atol=2e-3)  # the same scene
+
+
+def test_what_cannot_be_had_is_said_and_the_scene_stays(seen, tmp_path, monkeypatch):
+    assert in_metres(seen, Config()) is seen
+    lost = in_metres(seen, Config(baseline=Baseline("a.jpg", "z.jpg", 2.0)))
+    assert not lost.scale.metric and "z.jpg is not among" in (lost.scale.source or "")
+    np.testing.assert_array_equal(lost.gaussians.means, seen.gaussians.means)
+    unsure = replace(seen, cameras=tuple(replace(camera, centre_sigma_rel=1.0) for camera in seen.cameras))
+    told = in_metres(unsure, Config(baseline=Baseline("a.jpg", "b.jpg", 2.0)))
+    assert not told.scale.metric and "do not tell these two cameras apart" in (told.scale.source or "")
+    monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
+    assert "no weights" in (in_metres(seen, Config(network=True)).scale.source or "")
+
+
+def test_a_network_gives_the_unit_where_its_views_agree(seen):
+    def metres_of(factors: list[float]) -> MetricDepth:
+        asked = iter(zip(factors, seen.cameras, strict=True))
+
+        def depth(image: np.ndarray):
+            factor, camera = next(asked)
+            truth = take_picture(
+                seen.gaussians, camera.T_world_camera, camera.K, camera.width, camera.height, channels=("depth",)
+            )
+            to = crop(camera.width, camera.height, max(camera.width, camera.height), 1)
+            return factor * truth.depth, to
+
+        return MetricDepth("a network", depth)
+
+    factor, source = by_network(seen, metres_of([3.0, 3.1]))
+    assert factor == pytest.approx(3.05, rel=0.01) and source.startswith("a network, 2 views that agree to")
+    factor, source = by_network(seen, metres_of([1.0, 3.0]))
+    assert factor is None and "disagree" in source
+    factor, source = by_network(seen, metres_of([0.0, 0.0]))
+    assert factor is None and "no view shows enough" in source
+
+
+def test_every_file_says_which_scale_it_has(seen, tmp_path):
+    metric = in_metres(seen, Config(baseline=Baseline("a.jpg", "b.jpg", 2.0)))
+    for snapshot, word in ((metric, "metric"), (seen, "relative")):
+        out = tmp_path / word
+        report = finish(snapshot, out, seed=0, preset_name="fast")
+        assert report["scale"] == word and report["scene_bytes"] == (out / "scene.ply").stat().st_size
+        for name in ("report.json", "manifest.json", "cameras.json", "transforms.json"):
+            content = json.loads((out / name).read_text())
+            assert (content["scale"], content["scale_source"]) == (word, snapshot.scale.source), name
+        texts = [out / "trajectory.tum", *(out / "colmap").glob("*.txt")]
+        assert len(texts) == 4 and all(f"# scale: {word} (" in path.read_text() for path in texts)
+        assert f"scale {word}".encode() in (out / "scene.ply").read_bytes()
+        for form, file in (("nerfstudio", "t.json"), ("tum", "t.tum"), ("ply", "s.ply"), ("colmap", "model")):
+            path = export_scene(out, form, tmp_path / f"{word}_{file}")
+            written = (path / "images.txt" if form == "colmap" else path).read_bytes()
+            assert word.encode() in written, form
+        read = decode_ply((out / "scene.ply").read_bytes())
+        np.testing.assert_allclose(read.means, snapshot.gaussians.means)
+
+
+def test_a_refused_result_has_no_metres(seen):
+    refused = replace(seen, cameras=())
+    report = build_report(in_metres(refused, Config(network=True)), seed=0, preset="fast", peak_rss_mb=None)
+    assert (report["scale"], report["scale_source"]) == ("relative", None)
+
+
+def test_the_configuration_says_what_a_baseline_is():
+    config = overlaid(ReconConfig(), {"metric": {"baseline": ["a.jpg", "b.jpg", 0.5]}})
+    assert config.metric.baseline == ("a.jpg", "b.jpg", 0.5) and config.metric.baseline.metres == 0.5
+    for wrong in (["a.jpg", "a.jpg", 0.5], ["a.jpg", "b.jpg", -1]):
+        with pytest.raises(ConfigError, match="two different photographs and a positive distance"):
+            overlaid(ReconConfig(), {"metric": {"baseline": wrong}})

@@ -1,0 +1,139 @@
+"""A made-up bundle of exact observations, adjusted from other starts, without some points, with lenses set free."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode.recon.registration import bundle
+from splatnode.recon.verification import jackknife, lens, refit, reversal
+
+FOCAL = 900.0
+
+
+def made_up(noise_px: float = 0.2, depth: float = 1.0, radial: float = 0.0, focal: float = FOCAL) -> refit.Fit:
+    """Four cameras on an arc around 200 points, `depth` deep at distance 4; `focal` is what the fit is told."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1.0, 1.0, (200, 3)) * (1.2, 0.9, depth)
+    rotations, translations = [], []
+    for azimuth in np.radians([-18.0, -5.0, 7.0, 20.0]):
+        rotation = cv2.Rodrigues(np.array([0.1 * np.sin(9 * azimuth), azimuth, 0.0]))[0]
+        rotations.append(rotation)
+        translations.append(np.array([0.0, 0.0, 4.0]))
+    observed = [(camera, point) for point in range(len(points)) for camera in range(4)]
+    exact = bundle.Problem(
+        rotations=np.stack(rotations),
+        translations=np.stack(translations),
+        lens_of_camera=np.zeros(4, np.int64),
+        log_focals=np.log([FOCAL]),
+        radials=np.array([radial]),
+        shifts=np.zeros((1, 2)),
+        points=points,
+        camera_of=np.array([camera for camera, _ in observed]),
+        point_of=np.array([point for _, point in observed]),
+        pixels=np.zeros((len(observed), 2)),
+    )
+    pixels = bundle.project(exact)[0]
+    problem = replace(
+        exact, pixels=pixels + rng.normal(0, noise_px, pixels.shape), log_focals=np.log([focal]), radials=np.zeros(1)
+    )
+    prior = bundle.LensPrior(problem.log_focals, np.array([refit.FREE_SIGMA]), np.zeros(1), np.zeros(1))
+    return refit.Fit(problem, prior, bundle.Config(robust_px=1.0), np.ones(4), np.full(1, np.nan))
+
+
+def given(fit: refit.Fit) -> refit.Fit:
+    """The fit with a focal length that is held as it is."""
+    return replace(fit, prior=replace(fit.prior, sigmas=np.zeros(1)), told=np.exp(fit.problem.log_focals))
+
+
+def test_nothing_moves_between_a_fit_and_itself():
+    fit = refit.adjusted(made_up())
+    between = refit.shift(fit, fit)
+    assert between.rotation_deg < 1e-5 and between.centre_rel < 1e-9 and between.focal_rel == 0.0
+
+
+def test_a_moved_camera_is_measured_whatever_the_world_is():
+    fit = made_up()
+    turn = cv2.Rodrigues(np.radians([0.0, 2.0, 0.0]))[0]
+    rotations = fit.problem.rotations.copy()
+    rotations[2] = turn @ rotations[2]
+    translations = fit.problem.translations.copy()
+    translations[2] = turn @ translations[2]  # turned on the spot
+    world = cv2.Rodrigues(np.array([0.3, -1.0, 0.5]))[0]
+    moved = replace(
+        fit.problem,
+        rotations=rotations @ world.T,
+        translations=2.0 * translations,  # twice as large a world
+    )
+    between = refit.shift(fit, replace(fit, problem=moved))
+    assert between.rotation_deg == pytest.approx(2.0, abs=1e-4)
+    assert between.centre_rel < 0.02  # the common rotation is shared out, and turns the centres a little
+
+
+def test_a_fit_that_came_to_nothing_is_lost():
+    fit = made_up()
+    broken = replace(fit, problem=replace(fit.problem, translations=np.full((4, 3), np.nan)))
+    assert refit.shift(fit, broken) == refit.LOST
+
+
+def test_without_points_only_their_observations_go():
+    fit = made_up()
+    left_out = np.zeros(200, bool)
+    left_out[::3] = True
+    smaller = refit.without_points(fit, left_out).problem
+    assert len(smaller.points) == 133 and len(smaller.pixels) == 4 * 133
+    assert np.allclose(smaller.points, fit.problem.points[~left_out])
+    assert np.abs(bundle.reprojection_errors(smaller)).max() < 1.5
+
+
+def test_the_spread_grows_with_what_the_model_leaves_out():
+    """Four times the noise, or distortion that is not modelled: both must show."""
+    quiet, noisy, bent = (jackknife.by_regions(fit) for fit in (made_up(0.1), made_up(0.4), made_up(0.1, radial=0.1)))
+    assert quiet.rotation_deg < 0.1 and quiet.centre_rel < 0.01
+    assert noisy.centre_rel > 2 * quiet.centre_rel
+    assert bent.centre_rel > 3 * quiet.centre_rel and bent.focal_rel > 3 * quiet.focal_rel
+
+
+def test_perspective_tells_a_scene_from_its_mirror_image():
+    assert reversal.mirrored_cost(made_up(depth=1.0)) > 5.0
+
+
+def test_the_mirrored_scene_of_a_camera_far_away_cannot_be_told():
+    """From 400 times its size away, a scene and its mirror image look the same."""
+    near = made_up(noise_px=0.5)
+    far = replace(
+        near.problem,
+        translations=near.problem.translations * (1.0, 1.0, 100.0),
+        log_focals=near.problem.log_focals + np.log(100.0),
+    )
+    pixels = bundle.project(far)[0] + np.random.default_rng(1).normal(0, 0.5, near.problem.pixels.shape)
+    assert reversal.mirrored_cost(given(replace(near, problem=replace(far, pixels=pixels)))) < 1.2
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.0, 1.4])
+def test_a_given_focal_length_is_found_right_or_wrong(factor):
+    (freed,) = lens.freed(given(made_up(focal=factor * FOCAL)))
+    assert freed.trusted and freed.given == pytest.approx(factor * FOCAL)
+    assert freed.found == pytest.approx(FOCAL, rel=0.02)
+    assert (freed.cost_ratio < 0.5) == (factor != 1.0)
+
+
+def test_a_nominal_focal_length_is_doubted_too():
+    (freed,) = lens.freed(replace(made_up(focal=0.8 * FOCAL), told=np.array([0.8 * FOCAL])))
+    assert not freed.trusted and freed.found == pytest.approx(FOCAL, rel=0.02) and freed.cost_ratio < 0.5
+
+
+def test_no_lens_is_freed_that_did_not_come_with_the_frames():
+    assert lens.freed(made_up()) == ()
+
+
+def test_distortion_that_the_observations_ask_for():
+    bent = lens.distortion(made_up(radial=-0.2))
+    # A corner is 0.6 * 1024 pixels from the middle.
+    assert bent.corner_shift == pytest.approx(0.2 * (0.6 * 1024 / FOCAL) ** 2, rel=0.1)
+    assert bent.cost_ratio < 0.6
+    straight = lens.distortion(made_up())
+    assert straight.corner_shift < 0.01 and straight.cost_ratio > 0.97

@@ -1,0 +1,43 @@
+"""Mirror images among frames: descriptors turned round, and frames that fit better so."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.matching import features, nearest_neighbours
+from splatnode.recon.verification import reflection
+from tests.support.synthetic import photographs
+
+FEATURES = features.Config(num_features=1500)
+CONFIG = reflection.Config()
+
+
+def keyframes(mirrored: tuple[int, ...] = (), count: int = 5) -> list[Keyframe]:
+    frames = [
+        replace(frame, image=np.ascontiguousarray(frame.image[:, ::-1])) if number in mirrored else frame
+        for number, frame in enumerate(photographs()[:count])
+    ]
+    return [Keyframe(frame, frame.image, features.extract(frame.image, FEATURES)) for frame in frames]
+
+
+def test_mirrored_descriptors_are_those_of_the_mirrored_image():
+    (plain,), (seen,) = keyframes(count=1), keyframes((0,), count=1)
+    turned = reflection.mirrored_descriptors(plain.features.descriptors)
+    match = nearest_neighbours.match(turned, seen.features.descriptors, nearest_neighbours.Config())
+    places = plain.features.points[match[:, 0]]
+    places[:, 0] = plain.frame.width - places[:, 0]
+    assert len(match) > 0.7 * len(turned)
+    assert (np.linalg.norm(places - seen.features.points[match[:, 1]], axis=1) < 1.0).mean() > 0.95
+
+
+def test_frames_that_were_mirrored_are_found():
+    found = reflection.measure(keyframes((1, 4)), CONFIG)
+    assert found.frames == tuple(photographs()[number].name for number in (1, 4))
+    assert found.gain > 0.4
+
+
+def test_plain_frames_fit_better_as_they_are():
+    assert reflection.measure(keyframes(), CONFIG).gain < 0.0

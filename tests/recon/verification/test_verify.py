@@ -1,0 +1,139 @@
+"""Evidence for and against the registration of a known place: as it is, and with one camera or lens made wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.registration import register
+from splatnode.recon.registration.register import Registration
+from splatnode.recon.verification import epipolar_consistency, flatness, likelihood, verify, weakest_link
+from splatnode.recon.verification.evidence import Evidence
+from tests.support.synthetic import photographs, view_graph
+
+CONFIG = verify.Config()
+VIEWS = 4
+
+
+@lru_cache(maxsize=1)
+def placed() -> tuple[ViewGraph, Registration]:
+    """Four photographs, registered."""
+    graph = view_graph(photographs()[:VIEWS])
+    found = register.register(graph.keyframes, graph.pairs, register.Config())
+    assert found is not None and len(found.cameras) == VIEWS
+    return graph, found
+
+
+@lru_cache(maxsize=1)
+def good() -> Evidence:
+    found = verify.verify(*placed(), CONFIG)
+    assert found is not None
+    return found
+
+
+def turned(degrees: float, index: int = 1) -> Registration:
+    """The registration with one camera turned about the middle of what it sees, and its points moved along."""
+    _, found = placed()
+    camera = found.cameras[index]
+    turn = cv2.Rodrigues(np.radians(degrees) * np.array([0.3, 0.9, 0.3]))[0]
+    middle = camera.T_world_camera @ np.array([0.0, 0.0, 1.0, 1.0])
+    T_world_camera = camera.T_world_camera.copy()
+    T_world_camera[:3, :3] = T_world_camera[:3, :3] @ turn
+    T_world_camera[:3, 3] = middle[:3] - T_world_camera[:3, 2]
+    wrong = replace(camera, T_world_camera=T_world_camera)
+    return replace(found, cameras=(*found.cameras[:index], wrong, *found.cameras[index + 1 :]))
+
+
+def test_a_right_answer_has_evidence_from_every_source():
+    evidence = good()
+    odds = likelihood.weigh(evidence)
+    assert odds.total > 1.5 and not odds.doubtful
+    assert evidence.agreement > 0.9 and evidence.joint.points > 100
+    assert all(camera.patches.sigmas > 10 and camera.confirmed > 50 for camera in evidence.cameras)
+    assert evidence.rotation_deg < 1.0 and evidence.centre_rel < 0.02
+    assert evidence.mirrored_cost > 3.0
+    assert evidence.cycles.triangles >= 3 and evidence.cycles.rotation_deg < 2.0
+    assert all(abs(camera.gain - 1.0) < 0.1 for camera in evidence.cameras)
+    assert evidence.loose == () and evidence.flatness < 0.95
+    assert evidence.freed == () and evidence.distortion.corner_shift < 0.02
+
+
+@pytest.mark.filterwarnings("error")
+def test_where_no_camera_is_further_those_that_are_known_keep_their_evidence():
+    again = verify.verify_further(*placed(), good(), CONFIG)
+    assert [camera.patches for camera in again.cameras] == [camera.patches for camera in good().cameras]
+    assert [camera.gain for camera in again.cameras] == [camera.gain for camera in good().cameras]
+
+
+def test_fewer_than_three_cameras_confirm_nothing():
+    graph, found = placed()
+    assert verify.verify(graph, replace(found, cameras=found.cameras[:2]), CONFIG) is None
+    assert verify.verify(graph, None, CONFIG) is None
+
+
+@pytest.mark.parametrize("degrees", [10.0, 20.0])
+def test_pixels_tell_a_wrong_pose(degrees):
+    """Patches of a camera that stands elsewhere are found on the predicted lines no more often than beside them."""
+    graph, _ = placed()
+    wrong = turned(degrees)
+    pictures = verify.pictures(graph, wrong, CONFIG.epipolar_consistency, [camera.index for camera in wrong.cameras])
+    index = wrong.cameras[1].index
+    share = epipolar_consistency.in_partners(index, pictures, wrong, CONFIG.epipolar_consistency)
+    assert share.tried > 40
+    assert share.sigmas < 0.5 * good().cameras[1].patches.sigmas
+    assert share.share < 0.45 < good().cameras[1].patches.share
+
+
+def test_a_score_counts_in_standard_errors_beyond_chance():
+    assert epipolar_consistency.Score(100, 0.2, 0.2).sigmas == 0.0
+    assert epipolar_consistency.Score(100, 0.28, 0.2).sigmas == pytest.approx(2.0)
+    assert epipolar_consistency.Score(0, 0.0, 0.2).sigmas == 0.0
+
+
+def test_two_places_that_share_no_points_are_found_as_two_parts():
+    graph, found = placed()
+    first = found.observed_by < 2
+    seen_by_first = np.isin(found.observed_point, np.unique(found.observed_point[first]))
+    kept = first | ~seen_by_first
+    apart = replace(
+        found,
+        observed_by=found.observed_by[kept],
+        observed_point=found.observed_point[kept],
+        observed_pixels=found.observed_pixels[kept],
+    )
+    pictures = verify.pictures(graph, found, CONFIG.epipolar_consistency, [camera.index for camera in found.cameras])
+    joint = weakest_link.weakest(apart, graph.pairs, pictures, CONFIG.epipolar_consistency)
+    assert joint.points == 0 and joint.group in ((0, 1), (2, 3))
+
+
+def test_points_shared_by_two_frames_are_counted():
+    _, found = placed()
+    few = replace(
+        found,
+        points=np.zeros((3, 3)),
+        observed_by=np.array([0, 1, 2, 0, 1, 3]),
+        observed_point=np.array([0, 0, 0, 1, 1, 2]),
+    )
+    shared = weakest_link.shared_points(few)
+    assert shared[0, 1] == 2 and shared[0, 2] == 1 and shared[0, 3] == 0
+
+
+def test_frames_that_pairs_contradict_are_loose():
+    graph, found = placed()
+    assert weakest_link.loose(found, graph.pairs) == ()
+    doubted = {key: 0.4 if 3 in key else share for key, share in found.agreement.items()}
+    assert weakest_link.loose(replace(found, agreement=doubted), graph.pairs) == (3,)
+
+
+def test_the_share_of_points_on_a_plane():
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([rng.uniform(-1, 1, (300, 2)), np.ones(300)])
+    assert flatness.share_on_plane(wall) == 1.0
+    relief = wall + (0.0, 0.0, 1.0) * rng.choice([0.0, 0.2], (300, 1), p=[0.7, 0.3])
+    assert flatness.share_on_plane(relief) == pytest.approx(0.7, abs=0.06)
+    assert flatness.share_on_plane(wall[:2]) == 0.0

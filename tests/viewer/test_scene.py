@@ -1,0 +1,173 @@
+"""What the viewer knows of a scene: who sees what, colours, where to go next, what it says. No window."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatnode.capture.frame import DroppedFrame
+from splatnode.recon.result.export.prepare import base_rgb
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.viewer import words
+from splatnode.viewer.advice import GOOD_ANGLE_DEG, Points, next_view, surface_points
+from splatnode.viewer.colours import UNKNOWN, coloured, source_colour
+from splatnode.viewer.moment import Moment, remembered
+from splatnode.viewer.state import Colouring, State
+from splatnode.viewer.support import support
+from splatnode.viewer.viewpoint import look_at
+
+K = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]])
+UP = np.array([0.0, -1.0, 0.0])
+
+
+def camera(x: float, y: float = 0.0, z: float = 0.0, *, frame_id: int = 0, target=(0.0, 0.0, 1.0)) -> CameraEstimate:
+    """A camera of 100 x 80 pixels that looks at `target`."""
+    T_world_camera = look_at(np.array([x, y, z]), np.array(target), UP)
+    return CameraEstimate(f"{frame_id}.png", frame_id, T_world_camera, K, 100, 80, None, None)
+
+
+def wall(count: int = 41, depth: float = 1.0, half: float = 0.3, source: int = 0) -> GaussianArrays:
+    """count^2 small flat Gaussians on a wall that faces the world's origin."""
+    x, y = (axis.ravel() for axis in np.meshgrid(*2 * [np.linspace(-half, half, count)]))
+    number = count * count
+    return GaussianArrays(
+        means=np.stack([x, y, np.full(number, depth)], 1).astype(np.float32),
+        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (number, 1)),
+        scales=np.tile(np.array([half / count, half / count, 1e-4], np.float32), (number, 1)),
+        opacities=np.full(number, 0.95, np.float32),
+        sh=np.full((number, 1, 3), 0.5, np.float32),
+        source_frame=np.full(number, source, np.int32),
+    )
+
+
+def together(*parts: GaussianArrays) -> GaussianArrays:
+    names = ("means", "quats", "scales", "opacities", "sh", "source_frame")
+    return GaussianArrays(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+
+def moment(gaussians: GaussianArrays, *cameras: CameraEstimate, received_s: float = 0.0, **changes: object) -> Moment:
+    verdict = Verdict(Code.OK, "All is well.", "", publishable=True)
+    snapshot = Snapshot(1, verdict, cameras, gaussians, {}, (), 10)
+    return Moment(replace(snapshot, **changes), received_s)
+
+
+def test_what_hides_behind_a_wall_is_not_seen():
+    front, back = wall(half=0.15), wall(depth=1.5, half=0.1)
+    gaussians = together(front, back)
+    aside = camera(1.5, frame_id=1, target=(0.0, 0.0, 1.5))
+    found = support(gaussians, (camera(0.0), aside))
+    number = len(front)
+    assert (found.sizes[:number, 0] > 0).all() and (found.sizes[number:, 0] == 0).all()
+    assert (found.sizes[number:, 1] > 0).mean() > 0.9
+    assert found.sizes[0, 0] == pytest.approx(100.0, rel=1e-3)  # focal length over depth
+    assert set(found.views[:number]) <= {1, 2} and set(found.best[number:]) <= {-1, 1}
+
+
+def test_nothing_is_seen_of_nothing():
+    assert support(GaussianArrays.empty(), (camera(0.0),)).sizes.shape == (0, 1)
+    assert (support(wall(3), ()).best == -1).all()
+
+
+def test_colours_say_what_they_mean():
+    near, far = wall(5, depth=1.0, half=0.1, source=0), wall(5, depth=4.0, half=1.6, source=1)
+    cameras = camera(0.0), camera(0.05, frame_id=1)
+    there = moment(together(near, far), *cameras)
+    seen = support(there.snapshot.gaussians, cameras)
+    rgb = {colouring: base_rgb(coloured(there, colouring, seen)) / 255.0 for colouring in Colouring}
+    red, _, blue = rgb[Colouring.DEPTH][:25].mean(0)
+    assert red > 2 * blue  # near is red
+    assert np.allclose(rgb[Colouring.NORMAL][:25], [0.5, 0.5, 1.0], atol=0.01)  # it faces the cameras
+    assert np.allclose(rgb[Colouring.SOURCE][:25], source_colour(0), atol=0.01)
+    assert np.allclose(rgb[Colouring.SOURCE][25:], source_colour(1), atol=0.01)
+    assert (rgb[Colouring.SUPPORT][seen.views == 0] == np.round(np.array(UNKNOWN) * 255) / 255).all()
+    assert coloured(there, Colouring.PHOTOGRAPH, seen) is there.snapshot.gaussians
+
+
+def test_a_file_without_sources_is_coloured_by_the_camera_that_sees_it_largest():
+    cameras = camera(0.0), camera(0.0, z=0.5, frame_id=1)
+    there = moment(replace(wall(9, half=0.1), source_frame=np.full(81, -1, np.int32)), *cameras)
+    rgb = base_rgb(coloured(there, Colouring.SOURCE, support(there.snapshot.gaussians, cameras))) / 255.0
+    assert np.allclose(rgb, source_colour(1), atol=0.01)
+
+
+def plane_points(cameras: tuple[CameraEstimate, ...], half: float = 0.3) -> Points:
+    gaussians = wall(half=half)
+    return surface_points(gaussians, cameras, support(gaussians, cameras))
+
+
+def test_a_short_baseline_asks_for_a_step_aside():
+    cameras = camera(-0.01, frame_id=0), camera(0.01, frame_id=1)
+    advice = next_view(cameras, plane_points(cameras))
+    assert advice.arrow is not None and advice.target is not None
+    start, end = advice.arrow
+    assert abs((end - start)[2]) < 0.5 * np.linalg.norm(end - start)  # sideways, not forwards
+    ray = [(advice.target - centre) / np.linalg.norm(advice.target - centre) for centre in (start, end)]
+    assert np.degrees(np.arccos(ray[0] @ ray[1])) > GOOD_ANGLE_DEG
+    assert "100% of it is seen under less than 12°" in advice.sentence and advice.gain > 0.3
+
+
+def test_the_arrow_goes_where_views_are_missing():
+    """Both cameras stand to the left of a corner whose right wall only one of them sees, under a flat angle."""
+    left = np.array([[x, y, 1.0] for x in np.linspace(-0.4, 0, 15) for y in np.linspace(-0.2, 0.2, 9)])
+    right = np.array([[0.0, y, z] for z in np.linspace(1.0, 1.5, 15) for y in np.linspace(-0.2, 0.2, 9)])
+    cameras = camera(-0.3, frame_id=0, target=(0, 0, 1)), camera(-0.1, frame_id=1, target=(0, 0, 1))
+    away, aside = np.array([0.0, 0, -1.0]), np.array([1.0, 0, 0])
+    points = Points(
+        positions=np.concatenate([left, right]),
+        normals=np.concatenate([np.tile(away, (len(left), 1)), np.tile(aside, (len(right), 1))]),
+        seen_by=np.concatenate([np.ones((len(left), 2), bool), np.tile([False, True], (len(right), 1))]),
+    )
+    advice = next_view(cameras, points)
+    assert advice.arrow is not None and "to the right" in advice.sentence
+    assert advice.arrow[1][0] > advice.arrow[0][0] + 0.05
+
+
+def test_what_is_covered_well_needs_nothing():
+    cameras = tuple(
+        camera(np.sin(a) * 1.0, y, 1.0 - np.cos(a), frame_id=i)
+        for i, (a, y) in enumerate([(a, y) for a in np.radians([-24, -12, 0, 12, 24]) for y in (-0.25, 0.25)])
+    )
+    advice = next_view(cameras, plane_points(cameras, half=0.15))
+    assert advice.arrow is None and advice.gain == 0 and "covered well" in advice.sentence
+
+
+def test_without_cameras_there_is_advice_too():
+    advice = next_view((), Points(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 0), bool)))
+    assert advice.arrow is None and "overlap" in advice.sentence
+
+
+def test_the_time_axis_is_thinned_where_it_is_dense_and_never_grows():
+    size = moment(wall(5)).num_bytes
+    history = ()
+    for second in (0, 10, 20, 20.1, 30):
+        history = remembered(history, moment(wall(5), received_s=second), memory_bytes=4 * size)
+    assert [one.received_s for one in history] in ([0, 10, 20, 30], [0, 10, 20.1, 30])
+    for second in range(31, 60):
+        history = remembered(history, moment(wall(5), received_s=second), memory_bytes=4 * size)
+        assert len(history) == 4 and history[0].received_s == 0 and history[-1].received_s == second
+    assert len(remembered((), moment(wall(5)), memory_bytes=1)) == 1
+
+
+def test_words_are_plain():
+    dropped = tuple(DroppedFrame(f"{i}.png", "blurred") for i in range(8))
+    there = moment(wall(3), camera(0.0), dropped=dropped, seconds={"poses": 1.24, "total": 3.0})
+    refusal = Verdict(Code.NO_PARALLAX, "The camera only turned.", "Take a step to the side.", ("0.png",))
+    assert words.verdict_lines(replace(there, snapshot=replace(there.snapshot, verdict=refusal))) == [
+        "NO_PARALLAX: The camera only turned.",
+        "What to do: Take a step to the side.",
+        "About: 0.png",
+    ]
+    assert words.count_lines(there) == ["9 Gaussians, 1 camera", "3.0 s (poses 1.2)", "10 iterations"]
+    assert words.dropped_lines(there)[0] == "2 frames were left out before:"
+    assert words.dropped_lines(there)[-1] == "left out 7.png: blurred"
+    assert words.feed_line(None, True) == "a finished result"
+    assert "nothing has come" in words.waiting_line(float("inf")) and "is there" in words.waiting_line(1.0)
+    assert "STALE" in words.waiting_line(12.0)
+    assert "STALE" in words.feed_line(12.0, False) and words.feed_line(1.0, False) == "live"
+    assert words.advice_line(None, moment(wall(3), verdict=refusal)) == "Take a step to the side."
+    file = moment(wall(3))
+    assert "file" in words.advice_line(None, replace(file, snapshot=replace(file.snapshot, cameras=(), final=True)))
+    assert words.time_line(State(), (there,)) == "snapshot 1 of 1, the newest"
