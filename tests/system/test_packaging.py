@@ -56,8 +56,8 @@ def test_the_sdist_has_the_sources_and_nothing_compiled(project):
     with tarfile.open(build("build_sdist", project)) as archive:
         names = {name.split("/", 1)[-1] for name in archive.getnames()}
     core = ROOT / "recon" / "core"
-    sources = {f"splatnode/recon/core/{path.name}" for pattern in ("*.cpp", "*.h", "*.py") for path in core.glob(pattern)}
-    assert sources <= names
+    sources = {path.name for pattern in ("*.cpp", "*.h", "*.py") for path in core.glob(pattern)}
+    assert {f"splatnode/recon/core/{name}" for name in sources} <= names
     assert {"pyproject.toml", "constraints.txt", "run", "LICENSE", "tests/conftest.py"} <= names
     assert not [name for name in names if name.endswith((".so", ".stamp", ".pyc"))]
 
