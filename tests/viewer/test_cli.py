@@ -278,7 +278,7 @@ def test_a_node_is_watched_without_a_display(node, tmp_path, monkeypatch, capsys
 
 def test_the_viewer_starts_without_torch_and_without_open3d(result, tmp_path):
     code = (
-        "import sys; sys.modules['torch'] = sys.modules['open3d'] = None; import splatnode.command_line; "
+        "import sys; sys.modules['torch'] = sys.modules['open3d'] = None; from splatnode import command_line; "
         f"sys.exit(command_line.main(['view', {str(result)!r}, '--headless', '--size', '32x24', '--pictures', '1']))"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)

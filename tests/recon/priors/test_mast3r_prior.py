@@ -129,7 +129,7 @@ def test_what_a_lying_network_invents_is_refused(noise):
     if noise:
         rng = np.random.default_rng(0)
         frames = [replace(frame, image=rng.integers(0, 256, frame.image.shape, np.uint8)) for frame in frames]
-    prior = Mast3rPrior(Liar(), Config(longer_side=192, registration=few))
+    prior = Mast3rPrior(Liar(), Config(longer_side=192))
     graph = view_graph(frames, prior.matcher, few)
     registration = register.register(graph.keyframes, graph.pairs, register.Config())
     evidence = verify(graph, registration, VerificationConfig())
