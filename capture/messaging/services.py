@@ -26,8 +26,8 @@ class Service:
 
 
 CAPTURE_KEYFRAMES = Service("capture.keyframes", Pattern.QUEUE, 0)
-CAPTURE_PREVIEW = Service("splatnode.capture.preview", Pattern.BROADCAST, 1)
-CAPTURE_STATUS = Service("splatnode.capture.status", Pattern.BROADCAST, 2)
-RECON_SCENE = Service("splatnode.recon.scene.scene", Pattern.STATE, 3)  # and 4, for requests
+CAPTURE_PREVIEW = Service("capture.preview", Pattern.BROADCAST, 1)
+CAPTURE_STATUS = Service("capture.status", Pattern.BROADCAST, 2)
+RECON_SCENE = Service("recon.scene", Pattern.STATE, 3)  # and 4, for requests
 RECON_STATUS = Service("recon.status", Pattern.BROADCAST, 5)
-RECON_CONTROL = Service("splatnode.recon.optimize.control", Pattern.COMMANDS, 6)
+RECON_CONTROL = Service("recon.control", Pattern.COMMANDS, 6)

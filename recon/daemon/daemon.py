@@ -2,8 +2,8 @@
 
 intake    capture.keyframes -> checkpoint, acknowledged -> inbox
 worker    inbox -> scenes, saved and exported
-watcher   splatnode.capture.preview -> has the camera moved?
-main      splatnode.recon.scene.scene, recon.status, splatnode.recon.optimize.control; the service manager; signals
+watcher   capture.preview -> has the camera moved?
+main      recon.scene, recon.status, recon.control; the service manager; signals
 """
 
 from __future__ import annotations

@@ -132,7 +132,7 @@ def test_a_killed_capture_is_continued_by_the_next(tmp_path, start):
 
 def test_the_second_capture_is_told_who_the_first_is(tmp_path, start):
     first = start(", loops: 1000")
-    wait_for(lambda: (tmp_path / "run" / "splatnode.capture.preview").exists())
+    wait_for(lambda: (tmp_path / "run" / "capture.preview").exists())
     second = start()
     assert second.wait(60) == 75
     assert f"by process {first.pid}" in second.stderr.read()

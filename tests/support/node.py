@@ -59,7 +59,7 @@ class Node:
         environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_WAIT_POLICY": "passive"}
         with open(self.folder / f"{verb}.log", "ab") as log:
             process = subprocess.Popen(
-                [*before, sys.executable, str(ROOT / "splatnode.py"), verb, str(self.folder / f"{verb}.yaml")],
+                [*before, sys.executable, "-m", "splatnode", verb, str(self.folder / f"{verb}.yaml")],
                 cwd=self.folder,
                 env=environment,
                 stdout=log,

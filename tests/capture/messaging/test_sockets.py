@@ -222,7 +222,7 @@ def test_commands_are_answered(network):
 
 
 def test_a_command_to_nobody_says_so(tmp_path):
-    with pytest.raises(NoAnswer, match="splatnode.recon.optimize.control did not answer"):
+    with pytest.raises(NoAnswer, match="recon.control did not answer"):
         ask(RECON_CONTROL, ipc(tmp_path), Question(1), Question, timeout_s=0.1)
 
 

@@ -1,0 +1,19 @@
+"""The table of services: two machines understand each other only while names and ports stay."""
+
+from __future__ import annotations
+
+from splatnode.capture.messaging import services
+from splatnode.capture.messaging.services import Service
+
+
+def test_names_and_ports_stay():
+    table = [value for value in vars(services).values() if isinstance(value, Service)]
+    assert {service.name: service.tcp_port for service in table} == {
+        "capture.keyframes": 0,
+        "capture.preview": 1,
+        "capture.status": 2,
+        "recon.scene": 3,
+        "recon.status": 5,
+        "recon.control": 6,
+    }
+    assert services.RECON_SCENE.requests == Service("recon.scene.requests", services.Pattern.STATE, 4)
