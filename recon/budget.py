@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from splatnode.recon.config import Config
-from splatnode.recon.result.export.ply import ply_bytes
+from splatnode.recon.result.export.formats.ply import ply_bytes
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.scene.scene import Scene
 

@@ -18,7 +18,7 @@ from splatnode.recon.optimize.control import prune
 from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.priors import classical
 from splatnode.recon.registration import config as registration
-from splatnode.recon.result.export.ply import most_in_ply
+from splatnode.recon.result.export.formats.ply import most_in_ply
 from splatnode.recon.scene import background, completion, pixelwise, seeding
 from splatnode.recon.verification import decision, verify
 

@@ -7,11 +7,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from pkgutil import iter_modules
 
 from splatnode.capture.process.arguments import add_json, counts, megabytes, names, natural, positive, seconds
 from splatnode.capture.process.verb import Verb, lazily
 
-EXPORT_FORMATS = ("ply", "spz", "splat", "colmap", "nerfstudio", "tum")
+_FORMATS_FOLDER = Path(__file__).parent / "result" / "export" / "formats"
+EXPORT_FORMATS = tuple(
+    sorted(module.name for module in iter_modules([str(_FORMATS_FOLDER)]))
+)  # no import: it takes time
 
 
 def _demo_arguments(parser: argparse.ArgumentParser) -> None:

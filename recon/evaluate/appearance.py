@@ -13,7 +13,7 @@ from torch import Tensor
 
 from splatnode.recon.rasterize.render import Render
 from splatnode.recon.result.export import viewer_safe
-from splatnode.recon.result.export.ply import ply_bytes
+from splatnode.recon.result.export.formats.ply import ply_bytes
 from splatnode.recon.result.preview import render_rgb
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 

@@ -7,7 +7,7 @@ from importlib import metadata
 from pathlib import Path
 
 from splatnode.recon.result.export.cameras import camera_record
-from splatnode.recon.result.export.ply import ply_bytes
+from splatnode.recon.result.export.formats.ply import ply_bytes
 from splatnode.recon.result.export.prepare import viewer_safe
 from splatnode.recon.result.snapshot import Snapshot
 

@@ -22,8 +22,8 @@ from splatnode.recon.evaluate.protocol import Settings
 from splatnode.recon.evaluate.start import Start, continued
 from splatnode.recon.optimize.control import prune, relocate
 from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.result.export.formats.spz import encode_spz
 from splatnode.recon.result.export.prepare import viewer_safe
-from splatnode.recon.result.export.spz import encode_spz
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.scene import pixelwise
 from tests.bench.parts.held_out import Case, Folders, Scoring, load_case, parsed, parser_of

@@ -9,7 +9,7 @@ import torch
 from splatnode.recon.budget import STAYS, hits, loss_fall
 from splatnode.recon.config import Config
 from splatnode.recon.optimize import refinement
-from splatnode.recon.result.export.ply import ply_bytes
+from splatnode.recon.result.export.formats.ply import ply_bytes
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene
 

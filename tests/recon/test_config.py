@@ -7,7 +7,7 @@ import pytest
 
 from splatnode.capture.process.config import ConfigError
 from splatnode.recon.config import Config, overlaid, preset
-from splatnode.recon.result.export.ply import ply_bytes
+from splatnode.recon.result.export.formats.ply import ply_bytes
 
 
 def test_of_two_limits_the_tighter_one_holds():

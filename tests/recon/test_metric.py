@@ -14,7 +14,7 @@ from splatnode.recon.config import overlaid
 from splatnode.recon.metric import Baseline, Config, MetricDepth, by_network, in_metres
 from splatnode.recon.networks.crop import crop
 from splatnode.recon.result.export import export_scene
-from splatnode.recon.result.export.ply import decode_ply
+from splatnode.recon.result.export.formats.ply import decode as decode_ply
 from splatnode.recon.result.picture import take_picture
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot

@@ -18,8 +18,9 @@ import pytest
 
 from splatnode import command_line
 from splatnode.capture.process.verb import Verb
-from splatnode.recon.result.export import FORMATS, ResultWriteError
-from splatnode.recon.result.export.ply import encode_ply
+from splatnode.recon.result.export import ResultWriteError
+from splatnode.recon.result.export.format import format_names
+from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.recon.verbs import EXPORT_FORMATS
 from tests.conftest import ROOT
@@ -213,12 +214,12 @@ def test_bench_lists_are_parsed():
 
 
 def test_export_offers_the_formats_that_there_are():
-    assert tuple(FORMATS) == EXPORT_FORMATS
+    assert tuple(format_names()) == EXPORT_FORMATS
 
 
 def test_export_writes_beside_the_scene_but_never_over_a_file(tmp_path, capsys):
     from splatnode.recon.result.export import read_gaussians, write_file
-    from splatnode.recon.result.export.ply import encode_ply
+    from splatnode.recon.result.export.formats.ply import encode_ply
 
     one = GaussianArrays(
         means=np.zeros((1, 3), np.float32),

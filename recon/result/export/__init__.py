@@ -1,13 +1,13 @@
 """Scenes and cameras as files. NumPy only: a result can be read, converted and written where there is no torch."""
 
-from splatnode.recon.result.export.convert import FORMATS, export_scene, read_cameras, read_gaussians
+from splatnode.recon.result.export.convert import export_scene
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.prepare import viewer_safe
 from splatnode.recon.result.export.result import write_result
 from splatnode.recon.result.export.staged import ResultWriteError, write_file, write_files
+from splatnode.recon.result.export.stored import read_cameras, read_gaussians
 
 __all__ = [
-    "FORMATS",
     "ResultWriteError",
     "SceneFileError",
     "export_scene",

@@ -8,8 +8,11 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-from splatnode.recon.result.export.cameras import encode_cameras, encode_colmap, encode_nerfstudio, encode_tum
-from splatnode.recon.result.export.ply import encode_ply
+from splatnode.recon.result.export.cameras import encode_cameras
+from splatnode.recon.result.export.formats.colmap import encode_colmap
+from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
+from splatnode.recon.result.export.formats.ply import encode_ply
+from splatnode.recon.result.export.formats.tum import encode_tum
 from splatnode.recon.result.export.prepare import viewer_safe
 from splatnode.recon.result.export.staged import json_bytes, write_files
 from splatnode.recon.result.snapshot import Snapshot

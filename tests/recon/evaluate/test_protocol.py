@@ -18,8 +18,10 @@ from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.frames import border
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.export import write_result
-from splatnode.recon.result.export.cameras import encode_cameras, encode_colmap, encode_nerfstudio
-from splatnode.recon.result.export.ply import encode_ply
+from splatnode.recon.result.export.cameras import encode_cameras
+from splatnode.recon.result.export.formats.colmap import encode_colmap
+from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
+from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict

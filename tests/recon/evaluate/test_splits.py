@@ -12,7 +12,8 @@ import pytest
 
 from splatnode.recon.evaluate.splits import Split, load_split, paper_split
 from splatnode.recon.evaluate.truth import load_scene
-from splatnode.recon.result.export.cameras import encode_colmap, encode_nerfstudio
+from splatnode.recon.result.export.formats.colmap import encode_colmap
+from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 
 NAMES = tuple(f"{i:02d}.png" for i in range(8))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.recon.result.export import SceneFileError, export_scene, read_cameras, read_gaussians
+from splatnode.recon.result.export import SceneFileError, export_scene, read_gaussians
 from tests.support.exported import make_gaussians, make_snapshot, write
 
 
@@ -29,26 +29,10 @@ def test_result_is_exported_as_cameras(tmp_path):
     assert (tmp_path / "t.tum").read_bytes() == (tmp_path / "trajectory.tum").read_bytes()
 
 
-def test_cameras_read_back_exactly(tmp_path):
-    write(make_snapshot(), tmp_path)
-    for read, camera in zip(read_cameras(tmp_path / "cameras.json"), make_snapshot().cameras, strict=True):
-        assert np.array_equal(read.T_world_camera, camera.T_world_camera)
-        assert np.array_equal(read.K, camera.K)
-        assert (read.name, read.frame_id, read.width, read.height) == (camera.name, camera.frame_id, 512, 384)
-        assert (read.rotation_sigma_deg, read.centre_sigma_rel) == (0.1, None)
-
-
-@pytest.mark.parametrize("content", ["", "[]", "{}", '{"cameras": [{"name": "a"}]}', '{"cameras": [1]}'])
-def test_foreign_cameras_file_is_a_clear_error(tmp_path, content):
-    (tmp_path / "cameras.json").write_text(content)
-    with pytest.raises(SceneFileError, match="cameras.json"):
-        read_cameras(tmp_path / "cameras.json")
-
-
 def test_export_of_what_is_not_there(tmp_path):
     with pytest.raises(FileNotFoundError, match="splatnode replay"):
         export_scene(tmp_path, "ply", tmp_path / "x.ply")
-    with pytest.raises(ValueError, match="one of ply, spz"):
+    with pytest.raises(ValueError, match="one of colmap, nerfstudio"):
         export_scene(tmp_path, "obj", tmp_path / "x.obj")
     (tmp_path / "scene.txt").write_text("text")
     with pytest.raises(SceneFileError, match="must end with"):

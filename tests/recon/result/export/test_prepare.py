@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatnode.recon.result.export.ply import decode_ply, encode_ply
+from splatnode.recon.result.export.formats.ply import decode as decode_ply
+from splatnode.recon.result.export.formats.ply import encode_ply
+from splatnode.recon.result.export.formats.splat import decode as decode_splat
+from splatnode.recon.result.export.formats.splat import encode_splat
+from splatnode.recon.result.export.formats.spz import decode as decode_spz
+from splatnode.recon.result.export.formats.spz import encode_spz
 from splatnode.recon.result.export.prepare import viewer_safe
-from splatnode.recon.result.export.splat import decode_splat, encode_splat
-from splatnode.recon.result.export.spz import decode_spz, encode_spz
 from tests.support.exported import make_gaussians
 
 

@@ -14,7 +14,7 @@ import pytest
 
 from splatnode.recon.result.export import ResultWriteError, write_file, write_result
 from splatnode.recon.result.export import staged as staged_module
-from splatnode.recon.result.export.ply import encode_ply
+from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.verdict import Code
 from tests.support.exported import make_gaussians, make_snapshot, write

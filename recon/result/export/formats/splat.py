@@ -10,10 +10,17 @@ import numpy as np
 
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.prepare import SH_C0, base_rgb, take, unknown_source
+from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import GaussianArrays
+
+DEFAULT_NAME = "scene.splat"
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _OTHER_SIGNATURES = (b"ply", b"\x1f\x8b")  # a renamed .ply or .spz
+
+
+def export(result: StoredResult) -> bytes:
+    return encode_splat(result.gaussians())
 
 
 def encode_splat(gaussians: GaussianArrays) -> bytes:
@@ -28,7 +35,7 @@ def encode_splat(gaussians: GaussianArrays) -> bytes:
     return rows.tobytes()
 
 
-def decode_splat(data: bytes, name: str = "scene.splat") -> GaussianArrays:
+def decode(data: bytes, name: str = "scene.splat") -> GaussianArrays:
     """Reads a .splat file. Raises SceneFileError where the bytes cannot be one (the format has no signature)."""
     if not data or len(data) % _ROW.itemsize or data.startswith(_OTHER_SIGNATURES):
         raise SceneFileError(

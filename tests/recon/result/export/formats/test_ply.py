@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.export import SceneFileError
-from splatnode.recon.result.export.ply import decode_ply, encode_ply, most_in_ply, ply_bytes
+from splatnode.recon.result.export.formats.ply import decode as decode_ply
+from splatnode.recon.result.export.formats.ply import encode_ply, most_in_ply, ply_bytes
 from splatnode.recon.result.snapshot import GaussianArrays
 from tests.support.exported import make_gaussians
 

@@ -12,8 +12,11 @@ import numpy as np
 
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.prepare import unknown_source
+from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import GaussianArrays
+
+DEFAULT_NAME = "scene.ply"
 
 _LONGEST_HEADER = 65536
 _LONGER_HEADER = 8  # bytes by which a header with a large number exceeds one with a single digit
@@ -28,6 +31,10 @@ _TYPES = {
     **{name: "<f4" for name in ("float", "float32")},
     **{name: "<f8" for name in ("double", "float64")},
 }
+
+
+def export(result: StoredResult) -> bytes:
+    return encode_ply(result.gaussians(), result.scale())
 
 
 def encode_ply(gaussians: GaussianArrays, scale: Scale = RELATIVE) -> bytes:
@@ -58,7 +65,7 @@ def most_in_ply(num_bytes: int, num_bases: int = 1) -> int:
     return max(1, 1 + further)
 
 
-def decode_ply(data: bytes, name: str = "scene.ply") -> GaussianArrays:
+def decode(data: bytes, name: str = "scene.ply") -> GaussianArrays:
     """Reads any binary little-endian PLY with these properties, in any order and among others.
 
     Raises SceneFileError, which names the file as `name`, where it is truncated or is not such a file.

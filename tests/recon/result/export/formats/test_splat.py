@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.export import SceneFileError
+from splatnode.recon.result.export.formats.splat import decode as decode_splat
+from splatnode.recon.result.export.formats.splat import encode_splat
 from splatnode.recon.result.export.prepare import SH_C0
-from splatnode.recon.result.export.splat import decode_splat, encode_splat
 from tests.support.exported import make_gaussians, same_rotations
 
 

@@ -22,7 +22,10 @@ import numpy.typing as npt
 from splatnode.recon.result.export.axes import least_turned
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.prepare import take, unknown_source
+from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import GaussianArrays
+
+DEFAULT_NAME = "scene.spz"
 
 _MAGIC, _VERSION = 0x5053474E, 2
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
@@ -36,6 +39,10 @@ _NUM_BASES = {0: 1, 1: 4, 2: 9, 3: 16}
 # Signs under (x, y, z) -> (x, -y, -z) of the bases in order: each is odd or even in y and in z.
 _SH_SIGNS = np.array([1, -1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1], np.float32)
 _AXES = np.array([1, -1, -1], np.float32)
+
+
+def export(result: StoredResult) -> bytes:
+    return encode_spz(result.gaussians())
 
 
 def encode_spz(gaussians: GaussianArrays) -> bytes:
@@ -63,7 +70,7 @@ def encode_spz(gaussians: GaussianArrays) -> bytes:
     return compressor.compress(b"".join(parts)) + compressor.flush()
 
 
-def decode_spz(data: bytes, name: str = "scene.spz") -> GaussianArrays:
+def decode(data: bytes, name: str = "scene.spz") -> GaussianArrays:
     """Reads versions 2 and 3. Raises SceneFileError, which names the file as `name`, for anything else."""
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     version, num_gaussians, degree, bits, flags = _parse_header(_inflate(stream, data, _HEADER.size, name), name)

@@ -11,8 +11,9 @@ import pytest
 
 from splatnode.recon.result.export import SceneFileError
 from splatnode.recon.result.export.axes import least_turned
+from splatnode.recon.result.export.formats.spz import decode as decode_spz
+from splatnode.recon.result.export.formats.spz import encode_spz
 from splatnode.recon.result.export.prepare import take
-from splatnode.recon.result.export.spz import decode_spz, encode_spz
 from splatnode.recon.result.picture import take_picture
 from splatnode.recon.result.snapshot import GaussianArrays
 from tests.support.exported import make_gaussians, same_rotations
@@ -98,7 +99,7 @@ def test_spz_bytes_of_one_gaussian_worked_out_by_hand():
 
 def test_spz_sh_signs_follow_the_turned_axes():
     """Half a turn about x takes our axes to the file's; the bases must have the same parity."""
-    from splatnode.recon.result.export.spz import _SH_SIGNS
+    from splatnode.recon.result.export.formats.spz import _SH_SIGNS
 
     x, y, z = np.random.default_rng(0).normal(size=(3, 20))
     bases = lambda x, y, z: np.stack(  # noqa: E731

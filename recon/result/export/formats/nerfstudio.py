@@ -1,0 +1,41 @@
+"""transforms.json: the cameras for nerfstudio and instant-ngp, with OpenGL camera axes (right, up, back).
+
+The images are those at modelled size, expected in images/; the centre of the top-left pixel is at (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from splatnode.recon.result.export.staged import json_bytes
+from splatnode.recon.result.export.stored import StoredResult
+from splatnode.recon.result.scale import RELATIVE, Scale
+from splatnode.recon.result.snapshot import CameraEstimate
+
+DEFAULT_NAME = "transforms.json"
+
+_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes right, down, ahead from right, up, back
+
+
+def export(result: StoredResult) -> bytes:
+    return encode_nerfstudio(result.cameras(), result.scale())
+
+
+def encode_nerfstudio(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -> bytes:
+    """The bytes of transforms.json."""
+    frames = [
+        {
+            "file_path": f"images/{camera.name}",
+            "fl_x": camera.K[0, 0],
+            "fl_y": camera.K[1, 1],
+            "cx": camera.K[0, 2],
+            "cy": camera.K[1, 2],
+            "w": camera.width,
+            "h": camera.height,
+            "transform_matrix": (camera.T_world_camera @ _OPENCV_FROM_OPENGL).tolist(),
+        }
+        for camera in cameras
+    ]
+    return json_bytes({"camera_model": "OPENCV", **scale.record(), "frames": frames})

@@ -1,0 +1,82 @@
+"""A result on disk, read as far as somebody asks for it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+
+from splatnode.recon.result.export import formats
+from splatnode.recon.result.export.cameras import decode_cameras, decode_scale
+from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.export.prepare import viewer_safe
+from splatnode.recon.result.scale import RELATIVE, Scale
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+
+
+@dataclass(frozen=True)
+class StoredResult:
+    """A scene file, and the cameras.json beside it. Files are read when they are asked for.
+
+    What is asked for raises FileNotFoundError where its file is not there, SceneFileError where the file is something
+    else, OSError where it cannot be read.
+    """
+
+    scene: Path
+
+    @classmethod
+    def at(cls, path: Path) -> StoredResult:
+        """The result in a folder, or that of a scene file."""
+        return cls(path / "scene.ply" if path.is_dir() else path)
+
+    def gaussians(self) -> GaussianArrays:
+        """With finite values and bounded extents."""
+        return read_gaussians(_existing(self.scene))
+
+    def cameras(self) -> tuple[CameraEstimate, ...]:
+        return read_cameras(_existing(self._cameras))
+
+    def scale(self) -> Scale:
+        """The unit of the lengths, as cameras.json states it; relative where there is no such file."""
+        return decode_scale(self._cameras.read_bytes()) if self._cameras.is_file() else RELATIVE
+
+    @property
+    def _cameras(self) -> Path:
+        return self.scene.with_name("cameras.json")
+
+
+def read_gaussians(path: Path) -> GaussianArrays:
+    """The Gaussians of a scene file (.ply, .spz, .splat), with finite values and bounded extents.
+
+    Raises SceneFileError where the file is truncated or is something else, OSError where it cannot be read.
+    """
+    decode = _decoders().get(path.suffix.lower())
+    if decode is None:
+        raise SceneFileError(f"{path.name} must end with {', '.join(_decoders())}")
+    gaussians = decode(path.read_bytes(), path.name)
+    safe = viewer_safe(gaussians)
+    if len(gaussians) and not len(safe):
+        raise SceneFileError(f"{path.name} holds {len(gaussians)} Gaussians, none of them with finite values")
+    return safe
+
+
+def read_cameras(path: Path) -> tuple[CameraEstimate, ...]:
+    """The cameras of a cameras.json. Raises SceneFileError, OSError."""
+    return decode_cameras(path.read_bytes(), path.name)
+
+
+def _decoders() -> dict[str, Callable[[bytes, str], GaussianArrays]]:
+    """By suffix. Those formats can be read whose module has `decode`."""
+    modules = {name: import_module(f"{formats.__name__}.{name}") for _, name, _ in iter_modules(formats.__path__)}
+    return {f".{name}": module.decode for name, module in sorted(modules.items()) if hasattr(module, "decode")}
+
+
+def _existing(path: Path) -> Path:
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path} is not there. Give the folder of a result (splatnode replay FOLDER --out DIR), or a scene file; "
+            "the formats of cameras need the result's cameras.json beside it"
+        )
+    return path
