@@ -19,8 +19,6 @@ from splatnode.capture.video4linux import layout, locks
 from splatnode.capture.video4linux.device import Device
 
 DISCONNECT = 0x00F0F000 + 65  # vivid's control of that name
-VIVID = "/tmp/modules/vivid.ko"
-OPTIONS = ["n_devs=1", "node_types=0x1", "num_inputs=1", "input_types=0x0", "no_error_inj=0"]
 
 
 def main() -> None:

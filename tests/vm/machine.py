@@ -1,7 +1,8 @@
 """A virtual machine that boots a stock kernel, loads the `vivid` camera driver and runs a script of ours in it.
 
 Containers and test machines rarely may load kernel modules, so that the camera lives in a guest. It boots from memory
-into the host's own file system, read-only, and so runs the very Python environment that runs the tests.
+into the host's own file system, read-only, and so runs the very Python environment that runs the tests, wherever it
+lies. Only /run and /mnt can be written to.
 
 `python -m tests.vm.machine` fetches the kernel into ~/.cache/splatnode/kernel, or where $SPLATNODE_VM_KERNEL says.
 It needs Debian's packages qemu-system-x86 and busybox-static.
@@ -61,7 +62,6 @@ mount --bind /dev /root/dev
 mount --bind /proc /root/proc
 mount --bind /sys /root/sys
 mount -t tmpfs none /root/run
-mount -t tmpfs none /root/tmp
 mount -t 9p -o trans=virtio,version=9p2000.L,msize=512000 out /root/mnt
 ip link set lo up
 chroot /root /usr/bin/env -i HOME=/tmp PATH=/usr/bin:/bin:/usr/sbin:/sbin PYTHONPATH={root} PYTHONDONTWRITEBYTECODE=1 \\

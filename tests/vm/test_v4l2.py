@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from tests.conftest import ROOT
 from tests.vm.machine import Kernel, find_kernel, run
 
 
@@ -18,8 +16,6 @@ def test_a_real_camera_driver(tmp_path):
     kernel = find_kernel()
     if not isinstance(kernel, Kernel):
         pytest.skip(f"needs a virtual machine: {kernel}")
-    if any(Path(place).resolve().is_relative_to("/tmp") for place in (sys.prefix, ROOT)):
-        pytest.skip("the guest has a /tmp of its own: project and virtual environment must lie elsewhere")
     outcome = run(kernel, Path(__file__).with_name("guest_v4l2.py"), tmp_path)
     assert outcome.code == 0, outcome.output
     result = json.loads((tmp_path / "result.json").read_text())

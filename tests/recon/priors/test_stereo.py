@@ -20,7 +20,7 @@ from splatnode.recon.priors.stereo import (
     estimate,
     further_depth_map,
 )
-from tests.bench import stereo as bench
+from tests.bench.speed import stereo as bench
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1.0]])

@@ -1,4 +1,4 @@
-"""How good and how fast dense stereo is with the true cameras: `python -m tests.bench.stereo fountain_p11 sceaux`.
+"""How good and how fast dense stereo is with the true cameras: `python -m tests.bench stereo fountain_p11 sceaux`.
 
 The reference are SIFT points of the larger images, matched between all views, triangulated with the true cameras and
 kept where every ray agrees: sparse, biased to textured places, but independent of the method. Coverage is the share of

@@ -13,7 +13,7 @@ from splatnode.capture.messaging.state import StateClient
 from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon.checkpoint.store import MADE_ANEW, Store
 from splatnode.recon.result.message import SceneHeader
-from tests.bench.parts.trial import (
+from tests.bench.node.trial import (
     VIEWS,
     NotTried,
     Trial,

@@ -19,8 +19,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.bench.parts import befallen, intruders
-from tests.bench.parts.trial import NotTried, Trial
+from tests.bench.node import befallen, intruders
+from tests.bench.node.trial import NotTried, Trial
 
 FAULTS: tuple[Callable[[Trial], None], ...] = (
     befallen.kill_recon,

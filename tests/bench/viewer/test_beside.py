@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.bench.beside import paired
+from tests.bench.viewer.beside import paired
 
 
 def test_a_median_is_told_with_what_the_rounds_can_vouch_for():

@@ -1,4 +1,4 @@
-"""A million malformed messages: `python -m tests.bench.fuzz --messages 1000000 --out tests/bench/results/fuzz.json`.
+"""A million malformed messages: `python -m tests.bench fuzz --messages 1000000 --out tests/bench/results/fuzz.json`.
 
 Three quarters go to the decoders, the rest to open sockets of every kind: well-formed ZeroMQ messages with rubbish in
 them over ipc, and raw bytes on the tcp ports. Good messages are changed by flipped bytes, cuts, doubled and swapped
@@ -20,8 +20,8 @@ from typing import Any
 from splatnode.capture.messaging.wire import Limits, Message, WireError, decode, encode
 from splatnode.capture.preview import PreviewHeader, decode_preview
 from splatnode.capture.status import own_rss_mb
-from tests.bench.parts.attacked import TENTHS, fuzz_ports, fuzz_sockets
-from tests.bench.parts.malformed import Parts, good_messages, malformed
+from tests.bench.node.attacked import TENTHS, fuzz_ports, fuzz_sockets
+from tests.bench.node.malformed import Parts, good_messages, malformed
 
 
 def main() -> None:
@@ -32,7 +32,7 @@ def main() -> None:
     args = parser.parse_args()
     rng = random.Random(args.seed)
     start = time.monotonic()
-    result: dict[str, Any] = {"command": f"python -m tests.bench.fuzz --messages {args.messages} --seed {args.seed}"}
+    result: dict[str, Any] = {"command": f"python -m tests.bench fuzz --messages {args.messages} --seed {args.seed}"}
     result["decoders"] = fuzz_decoders(rng, args.messages * 3 // 4)
     result["ipc_sockets"] = fuzz_sockets(rng, args.messages - args.messages * 3 // 4)
     result["tcp_ports"] = fuzz_ports(rng, connections=max(10, args.messages // 2000))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from splatnode.recon.config import preset
-from tests.bench.budgets import LIMITS, Row, falls, within
+from tests.bench.quality.budgets import LIMITS, Row, falls, within
 
 
 def row(value: float, psnr: float, lpips: float = 0.1, limit: str = "max_mb") -> Row:

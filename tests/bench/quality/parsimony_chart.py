@@ -1,4 +1,5 @@
-"""What tests/bench/parsimony.py measured, told and drawn: `python -m tests.bench.parts.parsimony_chart JSON PNG`."""
+"""What the benchmark of parsimony measured, told and drawn:
+`python -m tests.bench.quality.parsimony_chart JSON PNG`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How right and how fast the cameras are: `python -m tests.bench.poses [SCENE ...] --out poses.json`.
+"""How right and how fast the cameras are: `python -m tests.bench poses [SCENE ...] --out poses.json`.
 
 Every set of splits.json goes through the same steps as in the pipeline: features, view graph, registration, verdict.
 An answer is right when every relative rotation is within 2 degrees and the centres are within 1.5 % of their spread;

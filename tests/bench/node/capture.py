@@ -1,4 +1,4 @@
-"""What the capture process costs besides decoding: `python -m tests.bench.capture --seconds 30 --out capture.json`.
+"""What the capture process costs besides decoding: `python -m tests.bench capture --seconds 30 --out capture.json`.
 
 A walk past a wall is written as JPEGs of 1280 x 720 and shown at 30 frames a second; somebody reads the previews and
 acknowledges the keyframes. The cost is processor time of the whole process, as the kernel counts it, less the time
@@ -42,7 +42,7 @@ def main() -> None:
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         photographs = write_walk(Path(folder, "walk"))
-        result = {"command": "python -m tests.bench.capture", "seconds": args.seconds, "frames_per_second": RATE}
+        result = {"command": "python -m tests.bench capture", "seconds": args.seconds, "frames_per_second": RATE}
         result |= measure(Path(folder), photographs, args.seconds)
     print(json.dumps(result, indent=1))
     if args.out:

@@ -12,7 +12,7 @@ from splatnode.capture.messaging.services import RECON_SCENE
 from splatnode.capture.messaging.state import StateClient
 from splatnode.capture.process.config import typed
 from splatnode.recon.result.message import SceneHeader
-from tests.bench.parts.trial import RECON, Trial, expect, expect_whole, wait_for
+from tests.bench.node.trial import RECON, Trial, expect, expect_whole, wait_for
 from tests.support.node import Node, running
 
 

@@ -2,8 +2,8 @@
 
 MASt3R at full size has weights generated from their names: its time and its memory are real, its answers are not. The
 alignment is that of synthetic pair predictions (tests/recon/priors/test_mast3r_global_alignment.py). PatchmatchNet has
-its own weights and the true cameras of a scene; the reference are triangulated SIFT points (tests/bench/stereo.py).
-Each part is a process of its own, so that its memory is its own.
+its own weights and the true cameras of a scene; the reference are triangulated SIFT points
+(tests/bench/speed/stereo.py). Each part is a process of its own, so that its memory is its own.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from splatnode.recon.priors.mast3r.global_alignment import align
 from splatnode.recon.priors.mast3r.network import Mast3r
 from splatnode.recon.priors.stereo import Config
 from splatnode.recon.result.report import peak_rss_mb
-from tests.bench.stereo import METHODS, make_case, run
+from tests.bench.speed.stereo import METHODS, make_case, run
 from tests.recon.priors.test_mast3r_global_alignment import cameras, intrinsics, predictions
 from tests.support.generated import generated_weights
 

@@ -28,9 +28,9 @@ from splatnode.viewer.session import Session
 from splatnode.viewer.sources import Finished, load_result
 from splatnode.viewer.state import Engine, State
 from splatnode.viewer.viewpoint import orbited
-from tests.bench.parts.viewer_agreement import agreement
-from tests.bench.parts.viewer_live import thinned, watch
-from tests.bench.rasterize import processor_name
+from tests.bench.speed.rasterize import processor_name
+from tests.bench.viewer.agreement import agreement
+from tests.bench.viewer.watching import thinned, watch
 
 GAUSSIANS = 30_000
 VIEWS = 24  # pictures that are timed

@@ -27,7 +27,7 @@ from splatnode.capture.messaging.state import StateClient, StateServer, Want
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.preview import PreviewHeader
 from splatnode.capture.status import own_rss_mb
-from tests.bench.parts.malformed import FRAME, IMAGE, Parts, good_messages, malformed
+from tests.bench.node.malformed import FRAME, IMAGE, Parts, good_messages, malformed
 
 TENTHS = 10
 GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x00"  # ZMTP 3.0 begins so

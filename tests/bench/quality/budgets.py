@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from splatnode.recon.config import Config, preset
 from splatnode.recon.evaluate.start import continued
 from splatnode.recon.result.snapshot import Snapshot
-from tests.bench.parts.held_out import Case, Scoring, load_case, parsed, parser_of
+from tests.bench.quality.held_out import Case, Scoring, load_case, parsed, parser_of
 
 CASES = ("fountain_p11:6", "llff_fern:6")
 LIMITS: dict[str, tuple[float, ...]] = {

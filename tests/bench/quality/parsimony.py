@@ -26,8 +26,8 @@ from splatnode.recon.result.export.formats.spz import encode_spz
 from splatnode.recon.result.export.prepare import viewer_safe
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.scene import pixelwise
-from tests.bench.parts.held_out import Case, Folders, Scoring, load_case, parsed, parser_of
-from tests.bench.parts.parsimony_chart import PIXEL, RIVAL, SELF, draw, summary
+from tests.bench.quality.held_out import Case, Folders, Scoring, load_case, parsed, parser_of
+from tests.bench.quality.parsimony_chart import PIXEL, RIVAL, SELF, draw, summary
 
 CASES = (  # of which cameras are found
     *(f"{scene}:{views}" for scene in ("fountain_p11", "llff_flower", "sceaux") for views in (3, 6)),

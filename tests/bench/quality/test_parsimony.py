@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from tests.bench.parsimony import configurations
-from tests.bench.parts.parsimony_chart import PIXEL, RIVAL, SELF, draw, no_worse_than_pixels, on_front, summary
+from tests.bench.quality.parsimony import configurations
+from tests.bench.quality.parsimony_chart import PIXEL, RIVAL, SELF, draw, no_worse_than_pixels, on_front, summary
 
 
 def row(method: str, count: int, psnr: float, ssim: float = 0.8, lpips: float = 0.1, views: int = 6) -> dict:

@@ -1,0 +1,34 @@
+"""`python -m tests.bench NAME`: every name is a benchmark, and every benchmark that the README names has one."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.bench.__main__ import MODULES
+from tests.conftest import ROOT
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_name_is_a_file_with_a_main(name):
+    tree = ast.parse(Path(ROOT, *MODULES[name].split(".")).with_suffix(".py").read_text())
+    assert "main" in [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
+
+
+def test_the_names_of_the_readme_are_all():
+    (listed,) = re.findall(r"^python -m tests\.bench ([a-z |]+)$", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert set(listed.split(" | ")) == set(MODULES)
+
+
+def test_a_name_runs_and_another_is_told_which_there_are():
+    told, run = (
+        subprocess.run([sys.executable, "-m", "tests.bench", *rest], cwd=ROOT, capture_output=True, text=True)
+        for rest in (["everything"], ["capture", "--help"])
+    )
+    assert told.returncode != 0 and "{beside,budgets,capture," in told.stderr
+    assert run.returncode == 0 and "--seconds" in run.stdout
