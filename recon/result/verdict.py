@@ -26,6 +26,7 @@ class Code(enum.Enum):
     SPLIT = "SPLIT"
     OVERFIT = "OVERFIT"
     DIVERGED = "DIVERGED"
+    UNDETERMINED = "UNDETERMINED"
     BUDGET_HIT = "BUDGET_HIT"
 
 

@@ -62,7 +62,7 @@ def measure(
     return Cycles(
         triangles=len(left),
         rotation_deg=float(np.median(left)) if left else 0.0,
-        worst_rotation_deg=max(left, default=0.0),
+        worst_rotation_deg=float(np.max(left)) if left else 0.0,
         direction_deg=float(np.median(directions)) if directions else 0.0,
     )
 

@@ -22,6 +22,7 @@ from splatnode.recon.verification.acceptances import accepted
 from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.lens import FreedLens
 from splatnode.recon.verification.likelihood import Odds, weigh
+from splatnode.recon.verification.undetermined import undetermined
 
 Pair = tuple[int, int]
 
@@ -59,8 +60,10 @@ def judge(graph: ViewGraph, registration: Registration | None, evidence: Evidenc
     """
     if registration is None or evidence is None or len(registration.cameras) < config.min_cameras:
         return _not_placed(graph, registration, config)
-    return _refused(graph, registration, evidence, weigh(evidence), config) or accepted(
-        graph, registration, evidence, config.exposure_ratio
+    return (
+        undetermined(registration, evidence)
+        or _refused(graph, registration, evidence, weigh(evidence), config)
+        or accepted(graph, registration, evidence, config.exposure_ratio)
     )
 
 
@@ -139,19 +142,19 @@ def _refused(
     if doubted:
         return refusals.wrong_focal(names, doubted)
     distortion = evidence.distortion
-    if distortion.cost_ratio < config.focal_gain and distortion.corner_shift > config.corner_shift:
+    if not (distortion.cost_ratio >= config.focal_gain or distortion.corner_shift <= config.corner_shift):
         return refusals.distorted(names, distortion.corner_shift)
-    if evidence.joint.points < config.min_joint_points:
+    if not evidence.joint.points >= config.min_joint_points:
         return refusals.apart([graph.keyframes[index].name for index in evidence.joint.group])
     if evidence.loose:
         return refusals.apart(evidence.loose)
-    if evidence.reflection.gain > config.max_reflection:
+    if not evidence.reflection.gain <= config.max_reflection:
         return refusals.reflected(evidence.reflection.frames)
-    if evidence.median_angle_deg < config.min_angle_deg:
+    if not evidence.median_angle_deg >= config.min_angle_deg:
         return _too_close(graph, evidence)
-    if odds.total < config.min_log_odds or odds.doubtful:
+    if not odds.total >= config.min_log_odds or odds.doubtful:
         return _reason(graph, registration, evidence, odds, config)
-    if evidence.focal_sigma > config.max_focal_sigma:
+    if not evidence.focal_sigma <= config.max_focal_sigma:
         return refusals.uncertain_focal(names, evidence.focal_sigma)
     return None
 
@@ -159,8 +162,9 @@ def _refused(
 def _contradicted(freed: FreedLens, config: Config) -> bool:
     off = abs(np.log(freed.found / freed.given))
     if freed.trusted:
-        return off > config.focal_change and freed.cost_ratio < config.focal_gain
-    return off > config.nominal_change and abs(np.log(freed.found / freed.registered)) > config.held_back
+        return not (off <= config.focal_change or freed.cost_ratio >= config.focal_gain)
+    pulled = abs(np.log(freed.found / freed.registered))
+    return not (off <= config.nominal_change or pulled <= config.held_back)
 
 
 def _reason(graph: ViewGraph, registration: Registration, evidence: Evidence, odds: Odds, config: Config) -> Verdict:

@@ -61,9 +61,11 @@ class Score:
 
     @property
     def sigmas(self) -> float:
-        """How far beyond chance the share is, in standard errors."""
-        error = (self.chance * (1.0 - self.chance) / max(1, self.tried)) ** 0.5
-        return (self.share - self.chance) / error if self.tried else 0.0
+        """How far beyond chance the share is, in standard errors of a binomial share; 0 where nothing was tried."""
+        if self.tried == 0:
+            return 0.0
+        error = np.sqrt(self.chance * (1.0 - self.chance) / self.tried)
+        return float((self.share - self.chance) / error)
 
 
 def in_partners(index: int, pictures: Mapping[int, Picture], registration: Registration, config: Config) -> Score:

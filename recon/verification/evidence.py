@@ -49,9 +49,11 @@ class Evidence:
     @property
     def rotation_deg(self) -> float:
         """How wrong rotations may be: by the covariance, or by half of what leaving out regions changes."""
-        return max(0.5 * self.spread.rotation_deg, *(camera.rotation_sigma_deg for camera in self.cameras))
+        return float(np.max([0.5 * self.spread.rotation_deg, *(camera.rotation_sigma_deg for camera in self.cameras)]))
 
     @property
     def centre_rel(self) -> float:
         """The same for the centres, relative to their spread; both together, for each misses what the other sees."""
-        return float(np.hypot(0.5 * self.spread.centre_rel, max(camera.centre_sigma_rel for camera in self.cameras)))
+        return float(
+            np.hypot(0.5 * self.spread.centre_rel, np.max([camera.centre_sigma_rel for camera in self.cameras]))
+        )

@@ -13,7 +13,11 @@ _SLIVER = 1e-4  # twice the area of a triangle that defines no plane
 
 
 def share_on_plane(points: Array, seed: int = 0) -> float:
-    """The largest share of `points` (P, 3), whose median depth is 1, that lies on one plane (RANSAC); 0 without any."""
+    """The largest share of `points` (P, 3), whose median depth is 1, that lies on one plane (RANSAC); 0 without any.
+
+    NaN where a point is not finite."""
+    if not np.isfinite(points).all():
+        return np.nan
     if len(points) < 3:
         return 0.0
     rng = np.random.default_rng(seed)

@@ -53,7 +53,7 @@ def freed(fit: refit.Fit) -> tuple[FreedLens, ...]:
     prior = replace(held.prior, sigmas=np.where(told, refit.FREE_SIGMA, held.prior.sigmas))
     starts = [held.problem.log_focals + np.where(told, step, 0.0) for step in STEPS]
     tried = [refit.adjusted(replace(held, prior=prior, problem=replace(held.problem, log_focals=s))) for s in starts]
-    free = min(tried, key=lambda candidate: candidate.cost)
+    free = tried[int(np.argmin([candidate.cost for candidate in tried]))]  # the first NaN, where there is one
     ratio = float(free.cost / max(held.cost, 1e-12))
     registered, found = np.exp(held.problem.log_focals), np.exp(free.problem.log_focals)
     return tuple(

@@ -8,8 +8,10 @@ and wrong when it is good counts little for an answer, and much against it when 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
@@ -46,19 +48,34 @@ class Odds:
 
     @property
     def doubtful(self) -> tuple[str, ...]:
-        """Cameras that are more likely wrong than right."""
-        return tuple(name for name, odds in self.cameras.items() if odds < 0.0)
+        """Cameras that are more likely wrong than right, or of which nobody can say."""
+        return tuple(name for name, odds in self.cameras.items() if not odds >= 0.0)
 
 
 def record(evidence: Evidence) -> dict[str, object]:
-    """The evidence and what it amounts to, for report.json."""
+    """The evidence and what it amounts to, for report.json: None stands for a number that could not be computed."""
     odds = weigh(evidence)
     log_odds = {"total": odds.total, "whole": dict(odds.whole), "cameras": dict(odds.cameras)}
-    return {**asdict(evidence), "log_odds": log_odds}
+    return {name: _with_none(value) for name, value in {**asdict(evidence), "log_odds": log_odds}.items()}
+
+
+def _with_none(value: Any) -> Any:
+    """The value of dictionaries, lists and tuples with None for every number that is not finite."""
+    if isinstance(value, dict):
+        return {key: _with_none(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(_with_none(each) for each in value)
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def weigh(evidence: Evidence) -> Odds:
-    whole = {
+    """NaN for every piece that rests on a number that is not finite, and for all that it is a part of."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # what comes of it is told as NaN
+        return Odds(_whole(evidence), {camera.name: CAMERA_PRIOR + _camera(camera) for camera in evidence.cameras})
+
+
+def _whole(evidence: Evidence) -> dict[str, float]:
+    return {
         "agreement": _bounded(15.0 * (evidence.agreement - MOSTLY_EXPLAINED), -5.0, 0.3),
         "rotations": _bounded(3.0 * np.log(UNCERTAIN_DEG / max(evidence.rotation_deg, 1e-3)), -6.0, 0.3),
         # Right answers are expected to be 1.16 % wrong and less, wrong ones (by 1.5 % and more) 1.35 % and more.
@@ -67,7 +84,6 @@ def weigh(evidence: Evidence) -> Odds:
         * _bounded((evidence.flatness - FLAT) / 0.01, 0.0, 1.0),
         "mirror": _bounded(12.0 * np.log(evidence.mirrored_cost / MIRRORED), -4.0, 0.2),
     }
-    return Odds(whole, {camera.name: CAMERA_PRIOR + _camera(camera) for camera in evidence.cameras})
 
 
 def _camera(camera: CameraEvidence) -> float:
@@ -82,4 +98,4 @@ def _camera(camera: CameraEvidence) -> float:
 
 
 def _bounded(value: float, least: float, most: float) -> float:
-    return float(np.clip(value, least, most))
+    return float(np.clip(value, least, most)) if math.isfinite(value) else math.nan

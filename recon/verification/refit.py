@@ -36,7 +36,13 @@ class Fit:
 
     @property
     def cost(self) -> float:
-        """Robust cost of an observation, pixels squared."""
+        """Robust cost of an observation, pixels squared; NaN where a camera or a lens is no longer a number.
+
+        The bundle counts an observation without a depth as one behind its camera, and would hide that.
+        """
+        lenses = (self.problem.log_focals, self.problem.radials, self.problem.shifts)
+        if not all(np.isfinite(known).all() for known in (self.Ts_world_camera, *lenses)):
+            return np.nan
         return bundle.robust_cost(self.problem, self.loss) / max(1, len(self.problem.pixels))
 
 

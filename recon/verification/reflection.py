@@ -47,7 +47,8 @@ def measure(keyframes: Sequence[Keyframe], config: Config) -> Reflection:
                 for other in (mirrored, plain)
             )
             gains[i, j] = gains[j, i] = np.log(found / expected)
-    group, gain = max((_grown(gains, first) for first in range(len(plain))), key=lambda found: found[1])
+    grown = [_grown(gains, first) for first in range(len(plain))]
+    group, gain = grown[int(np.argmax([gain for _, gain in grown]))]  # the first NaN, where there is one
     return Reflection(tuple(keyframes[index].name for index in np.flatnonzero(group).tolist()), gain)
 
 

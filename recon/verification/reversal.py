@@ -15,7 +15,7 @@ NO_RIVAL = 100.0
 
 def mirrored_cost(fit: refit.Fit) -> float:
     """How much worse the mirrored answer is than this one: the ratio of their costs, both adjusted; near 1 nothing
-    tells them apart, and 100 at most.
+    tells them apart, and 100 at most. NaN where one of the two could not be computed.
 
     Under an affine camera, points mirrored in a plane that faces the camera and cameras turned the other way give the
     same pictures (Necker's reversal; Shapiro et al. 1995). Perspective breaks the tie, if there is enough of it.
@@ -23,9 +23,9 @@ def mirrored_cost(fit: refit.Fit) -> float:
     whole = refit.adjusted(fit)
     other = refit.adjusted(replace(whole, problem=_mirrored(whole.problem)))
     between = refit.shift(whole, other)
-    if not np.isfinite(other.cost) or (between.rotation_deg < SAME_DEG and between.centre_rel < SAME_REL):
+    if between.rotation_deg < SAME_DEG and between.centre_rel < SAME_REL:
         return NO_RIVAL
-    return min(NO_RIVAL, other.cost / max(whole.cost, 1e-12))
+    return float(np.minimum(NO_RIVAL, other.cost / np.maximum(whole.cost, 1e-12)))
 
 
 def _mirrored(problem: bundle.Problem) -> bundle.Problem:

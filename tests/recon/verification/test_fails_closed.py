@@ -1,0 +1,165 @@
+"""Whatever could not be computed refuses: every number of the evidence and of the registration, one at a time."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, get_args, get_type_hints
+
+import numpy as np
+import pytest
+
+from splatnode.recon.registration.register import RegisteredCamera, Registration
+from splatnode.recon.result.verdict import Code
+from splatnode.recon.verification import flatness, likelihood, refit, reflection, reversal
+from splatnode.recon.verification.decision import Config, judge
+from splatnode.recon.verification.evidence import Evidence
+from splatnode.recon.verification.finiteness import not_finite
+from splatnode.recon.verification.lens import FreedLens
+from splatnode.recon.verification.undetermined import WORDS, undetermined
+from tests.recon.verification.test_decision import all_pairs, evidence, graph, registration
+from tests.recon.verification.test_refit import made_up
+
+ALL = (0, 1, 2)
+GOOD = evidence(ALL, freed=(FreedLens(1000.0, True, 1000.0, 1000.0, 1.0),))
+NOT_FINITE = (math.nan, math.inf, -math.inf)
+Path = tuple[str | int, ...]
+
+
+def numbers_of(record: type, at: Path = ()) -> Iterator[Path]:
+    """Where each number of a record type is, as its annotations say: field names, and 0 for the first of a tuple."""
+    for field in fields(record):
+        annotation = get_type_hints(record)[field.name]
+        path: Path = (*at, field.name)
+        if get_args(annotation)[1:] == (Ellipsis,):
+            annotation, path = get_args(annotation)[0], (*path, 0)
+        if is_dataclass(annotation):
+            yield from numbers_of(annotation, path)
+        elif annotation in (float, int):
+            yield path
+        else:
+            assert annotation in (str, bool), f"{field.name} is of a type that this walk does not know: {annotation}"
+
+
+def with_number(record: Any, path: Path, value: float) -> Any:
+    """The record with another number at `path`."""
+    if not path:
+        return value
+    first, *rest = path
+    if isinstance(first, int):
+        return (*record[:first], with_number(record[first], tuple(rest), value), *record[first + 1 :])
+    return replace(record, **{first: with_number(getattr(record, first), tuple(rest), value)})
+
+
+EVERY_NUMBER = tuple(numbers_of(Evidence))
+
+
+def test_the_walk_over_types_finds_the_numbers_wherever_they_are():
+    for path in (("cameras", 0, "patches", "share"), ("joint", "group", 0), ("freed", 0, "found"), ("rms_px",)):
+        assert path in EVERY_NUMBER
+    assert judge(graph(3, all_pairs(3)), registration(ALL), GOOD, Config()).code == Code.OK
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", NOT_FINITE)
+@pytest.mark.parametrize("path", EVERY_NUMBER, ids=lambda path: ".".join(map(str, path)))
+def test_every_number_of_the_evidence_that_could_not_be_computed_refuses(path, value):
+    seen = with_number(GOOD, path, value)
+    given = judge(graph(3, all_pairs(3)), registration(ALL), seen, Config())
+    assert given.code == Code.UNDETERMINED and not given.publishable
+    assert WORDS[path[0]] in given.message and given.message.endswith(".") and given.advice.endswith(".")
+    assert given.frames == (("0.png",) if path[0] == "cameras" else ("0.png", "1.png", "2.png"))
+
+
+@pytest.mark.parametrize("path", EVERY_NUMBER, ids=lambda path: ".".join(map(str, path)))
+def test_no_limit_lets_a_number_pass_that_could_not_be_computed(path, monkeypatch):
+    """Without the check of all numbers, the odds do not hide NaN, and refuse where they have it."""
+    monkeypatch.setattr("splatnode.recon.verification.decision.undetermined", lambda *asked: None)
+    good, odds = (likelihood.weigh(seen) for seen in (GOOD, with_number(GOOD, path, math.nan)))
+    before, after = ([*each.whole.values(), *each.cameras.values()] for each in (good, odds))
+    if before != after:
+        given = judge(graph(3, all_pairs(3)), registration(ALL), with_number(GOOD, path, math.nan), Config())
+        assert any(math.isnan(piece) for piece in after) and not given.publishable
+
+
+@pytest.mark.parametrize("limited", ["median_angle_deg", "focal_sigma", "mirrored_cost", "flatness", "agreement"])
+def test_every_limit_refuses_nan_by_itself(limited, monkeypatch):
+    monkeypatch.setattr("splatnode.recon.verification.decision.undetermined", lambda *asked: None)
+    given = judge(graph(3, all_pairs(3)), registration(ALL), replace(GOOD, **{limited: math.nan}), Config())
+    assert not given.publishable
+
+
+@pytest.mark.parametrize("value", NOT_FINITE)
+@pytest.mark.parametrize("field", ["T_world_camera", "focal", "principal", "radial"])
+def test_a_pose_that_is_not_a_number_refuses(field, value):
+    found = registration(ALL)
+    camera = found.cameras[1]
+    wrong = np.full_like(camera.T_world_camera, value) if field == "T_world_camera" else value
+    wrong = np.full(2, value) if field == "principal" else wrong
+    cameras = (found.cameras[0], replace(camera, **{field: wrong}), found.cameras[2])
+    given = judge(graph(3, all_pairs(3)), replace(found, cameras=cameras), GOOD, Config())
+    assert given.code == Code.UNDETERMINED and "the poses themselves" in given.message
+
+
+def test_the_root_of_a_negative_variance_refuses():
+    """Registration says infinity where the covariance of a focal length or of a pose came out negative."""
+    found = registration(ALL)
+    unsure = replace(found.cameras[2], rotation_sigma_deg=math.inf, centre_sigma_rel=math.inf)
+    found = replace(found, cameras=(*found.cameras[:2], unsure), focal_sigma=math.inf)
+    of_unsure = replace(GOOD.cameras[2], rotation_sigma_deg=math.inf, centre_sigma_rel=math.inf)
+    seen = replace(GOOD, cameras=(*GOOD.cameras[:2], of_unsure), focal_sigma=math.inf)
+    given = judge(graph(3, all_pairs(3)), found, seen, Config())
+    assert given.code == Code.UNDETERMINED and given.frames == ("2.png",)
+    assert "how certain the focal length is" in given.message and "how certain each pose is" in given.message
+
+
+def test_each_field_of_the_evidence_has_words_for_the_user():
+    assert set(WORDS) == {field.name for field in fields(Evidence)}
+
+
+def test_what_is_finite_is_let_pass():
+    assert undetermined(registration(ALL), GOOD) is None
+    assert list(not_finite(GOOD)) == []
+
+
+def test_arrays_and_mappings_are_walked_too():
+    found = replace(registration(ALL), points=np.array([[0.0, np.nan, 1.0]]), agreement={(0, 1): math.inf})
+    assert list(not_finite(found)) == [("points",), ("agreement", "(0, 1)")]
+    assert {field.name for field in fields(Registration)} >= {"points", "agreement"} and is_dataclass(RegisteredCamera)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("value", NOT_FINITE)
+@pytest.mark.parametrize("path", EVERY_NUMBER, ids=lambda path: ".".join(map(str, path)))
+def test_what_is_not_finite_is_none_in_the_report(path, value):
+    written = json.loads(json.dumps(likelihood.record(with_number(GOOD, path, value)), allow_nan=False))
+    found = written
+    for step in path:
+        found = found[step]
+    assert found is None
+    if path == ("mirrored_cost",):
+        assert written["log_odds"]["total"] is None and written["rms_px"] == GOOD.rms_px
+
+
+def test_a_mirrored_answer_that_could_not_be_computed_is_not_the_lack_of_a_rival(monkeypatch):
+    """The smaller of 100, which stands for no rival, and NaN is NaN."""
+    fit = made_up()
+    broken = replace(fit, problem=replace(fit.problem, points=np.full_like(fit.problem.points, np.nan)))
+    assert math.isnan(replace(fit, problem=replace(fit.problem, translations=np.full((4, 3), np.nan))).cost)
+    adjusted = iter([fit, replace(broken, problem=replace(fit.problem, translations=np.full((4, 3), np.nan)))])
+    monkeypatch.setattr(refit, "adjusted", lambda start: next(adjusted))
+    assert math.isnan(reversal.mirrored_cost(fit))
+
+
+def test_flatness_of_points_that_are_nowhere_is_not_known():
+    points = np.random.default_rng(0).uniform(size=(50, 3))
+    points[7, 2] = np.nan
+    assert math.isnan(flatness.share_on_plane(points))
+
+
+def test_a_gain_by_mirroring_that_is_not_a_number_is_not_passed_over(monkeypatch):
+    monkeypatch.setattr(reflection, "_across", lambda gains, group: math.nan if group[1] else 0.0)
+    monkeypatch.setattr(reflection, "_strongest", lambda features, count: np.zeros((4, 128), np.uint8))
+    assert math.isnan(reflection.measure(graph(3, {}).keyframes, reflection.Config()).gain)
