@@ -86,7 +86,7 @@ def landmarks(snapshot: Snapshot, keyframes: Sequence[Keyframe], config: Config)
         picture = take_picture(
             snapshot.gaussians, camera.T_world_camera, camera.K, camera.width, camera.height, channels=("depth",)
         )
-        plain = found.squeeze == 1.0
+        plain = found.tilt == 1.0
         pixels = found.points[found.point_of[plain]] * keyframe.scale
         column, row = np.clip(pixels.astype(int), 0, [camera.width - 1, camera.height - 1]).T
         depth = picture.depth[row, column].astype(np.float64)
@@ -169,7 +169,7 @@ class Watch:
 
 def _feature_config(config: Config) -> features.Config:
     side = config.longer_side
-    return features.Config(num_features=config.num_features, longer_side=side, shortest_longer_side=side)
+    return features.Config(num_features=config.num_features, max_longer_side=side, min_longer_side=side)
 
 
 def _resect(pixels: Array, points: Array, K: Array, max_error_px: float) -> tuple[Array, npt.NDArray[np.bool_]]:

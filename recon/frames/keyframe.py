@@ -10,15 +10,18 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Frame
 
+# Thresholds in pixels hold at this longer side of an image: an error counts as error * REFERENCE_SIDE / longer side.
+REFERENCE_SIDE = 1024
+
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """Local features of a frame at full size. A point may have several descriptors: how it looks from elsewhere."""
+    """Local features of a frame at full size. A point may have several descriptors, one for each simulated tilt."""
 
     points: npt.NDArray[np.float64]  # (M, 2) pixels of the full-size image, top-left pixel centre at (0.5, 0.5)
     descriptors: npt.NDArray[np.uint8]  # (D, 128) as matching/nearest_neighbours.py quantises them
     point_of: npt.NDArray[np.int64]  # (D,) the point that a descriptor describes
-    squeeze: npt.NDArray[np.float64]  # (D,) how much narrower than the frame the image was that it was found in
+    tilt: npt.NDArray[np.float64]  # (D,) simulated tilt: the image was this much narrower than the frame; 1 for none
 
 
 @dataclass(frozen=True, eq=False)

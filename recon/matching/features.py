@@ -1,4 +1,4 @@
-"""Local features: SIFT with many keypoints and root-normalised descriptors, also of squeezed images."""
+"""Local features: many SIFT keypoints with RootSIFT descriptors, also of images with a simulated tilt."""
 
 from __future__ import annotations
 
@@ -10,62 +10,65 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import KDTree
 
-from splatnode.recon.frames.keyframe import Features
+from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Features
 from splatnode.recon.matching.nearest_neighbours import quantise
 
+Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
+
+_TILT_BLUR = 0.8  # sigma over sqrt(tilt^2 - 1), pixels: against aliasing when the width is divided (Morel and Yu, 2009)
+_NO_BLUR = 0.01  # sigma, pixels, along the height: OpenCV takes 0 for "as along the width"
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     num_features: int = 8000
     contrast: float = 0.01  # SIFT's contrast threshold; low, because with few views every match counts
-    longer_side: int = 1600  # pixels; larger images are shrunk before features are found
-    shortest_longer_side: int = 1000  # pixels; smaller images are enlarged: a third more matches at 640 x 480
-    snap_px: float = 1.5  # a keypoint of a squeezed image this near to one of the plain image is the same point
+    max_longer_side: int = 1600  # pixels; larger images are shrunk before features are found
+    min_longer_side: int = 1000  # pixels; smaller images are enlarged: a third more matches at 640 x 480
+    snap_px: float = 1.5  # at REFERENCE_SIDE: a keypoint of a tilted image this near to a known point is that point
 
 
 def extract(image: Image, config: Config) -> Features:
-    """Features of `image` (H, W, 3) RGB, strongest first, one descriptor a point."""
+    """Features of `image` (H, W, 3) RGB, the strongest first, with one descriptor a point."""
     points, descriptors = _detect(image, 1.0, config)
     return Features(points, descriptors, np.arange(len(points)), np.ones(len(points)))
 
 
-def add_squeezed(features: Features, image: Image, squeezes: Sequence[float], config: Config) -> Features:
-    """`features` of `image` with those that are found after its width has been divided by each of `squeezes`.
+def add_tilted(features: Features, image: Image, tilts: Sequence[float], config: Config) -> Features:
+    """Adds to the `features` of `image` (H, W, 3) RGB those of the image with its width divided by each of `tilts`.
 
-    A surface seen from the side is the surface seen from the front but narrower: one tilt, along the axis along which
-    people walk, of the views that affine SIFT simulates (Morel and Yu, 2009).
+    Narrowing simulates that a frontal surface is seen from the side. These are the tilts of affine SIFT (Morel and Yu,
+    2009) along one axis only, the one along which people walk. Tilts that `features` has already are left out.
     """
-    for squeeze in squeezes:
-        if (features.squeeze == squeeze).any():
+    for tilt in tilts:
+        if (features.tilt == tilt).any():
             continue
-        points, descriptors = _detect(image, squeeze, config)
+        points, descriptors = _detect(image, tilt, config)
         if len(points) == 0:
             continue
-        known = np.full(len(points), -1)
+        point_of = np.full(len(points), -1)
         if len(features.points):
             distance, nearest = KDTree(features.points).query(points)
-            known = np.where(distance < config.snap_px * max(image.shape) / 1024.0, nearest, -1)
-        new = known < 0
-        known[new] = len(features.points) + np.arange(new.sum())
+            point_of = np.where(distance < config.snap_px * max(image.shape) / REFERENCE_SIDE, nearest, -1)
+        new = point_of < 0
+        point_of[new] = len(features.points) + np.arange(new.sum())
         features = Features(
             points=np.concatenate([features.points, points[new]]),
             descriptors=np.concatenate([features.descriptors, descriptors]),
-            point_of=np.concatenate([features.point_of, known]),
-            squeeze=np.concatenate([features.squeeze, np.full(len(points), squeeze)]),
+            point_of=np.concatenate([features.point_of, point_of]),
+            tilt=np.concatenate([features.tilt, np.full(len(points), tilt)]),
         )
     return features
 
 
-def _detect(image: Image, squeeze: float, config: Config) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.uint8]]:
-    """Points (M, 2) in pixels of `image`, strongest first, and their descriptors (M, 128)."""
+def _detect(image: Image, tilt: float, config: Config) -> tuple[Array, npt.NDArray[np.uint8]]:
+    """Points (M, 2) in pixels of `image`, the strongest first, and their descriptors (M, 128)."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
-    scale = float(np.clip(1.0, config.shortest_longer_side / max(grey.shape), config.longer_side / max(grey.shape)))
-    size = max(1, round(width * scale / squeeze)), max(1, round(height * scale))
-    if squeeze > 1.0:
-        # As if the narrower image had been taken: SIFT expects a blur of 0.5 pixels and more, along both axes.
-        grey = cv2.GaussianBlur(grey, (0, 0), sigmaX=0.8 * float(np.sqrt(squeeze**2 - 1)), sigmaY=0.01)
+    scale = float(np.clip(1.0, config.min_longer_side / max(grey.shape), config.max_longer_side / max(grey.shape)))
+    size = max(1, round(width * scale / tilt)), max(1, round(height * scale))
+    if tilt > 1.0:
+        grey = cv2.GaussianBlur(grey, (0, 0), sigmaX=_TILT_BLUR * float(np.sqrt(tilt**2 - 1)), sigmaY=_NO_BLUR)
     if size != (width, height):
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC)
     sift = cv2.SIFT.create(
@@ -75,20 +78,21 @@ def _detect(image: Image, squeeze: float, config: Config) -> tuple[npt.NDArray[n
     if len(keypoints) == 0:
         return np.zeros((0, 2)), np.zeros((0, 128), np.uint8)
     order = np.argsort([-keypoint.response for keypoint in keypoints], kind="stable")
+    # OpenCV's pixel centres are whole numbers; ours are at halves.
     points = (np.array([keypoint.pt for keypoint in keypoints])[order] + 0.5) * (width / size[0], height / size[1])
     return points, root_sift(np.asarray(raw, np.float32)[order])
 
 
-def describe(grey: Image, points: npt.NDArray[np.float64], size: float) -> npt.NDArray[np.uint8]:
-    """(M, 128) descriptors of upright patches of the image (H, W), around `points` (M, 2).
+def describe(grey: Image, points: Array, size: float) -> npt.NDArray[np.uint8]:
+    """(M, 128) RootSIFT descriptors of upright keypoints of the image `grey` (H, W), at its pixels `points` (M, 2).
 
-    `size` is that of a keypoint, in pixels: its descriptor looks at 6 times as much.
+    `size` is the diameter of a keypoint in pixels; its descriptor covers a square 6 times as wide.
     """
     if not len(points):
         return np.zeros((0, 128), np.uint8)
     keypoints = [cv2.KeyPoint(float(x), float(y), size, 0.0) for x, y in points - 0.5]
     kept, raw = cv2.SIFT.create().compute(grey, keypoints)
-    assert len(kept) == len(points)  # SIFT describes whatever it is given
+    assert len(kept) == len(points)  # SIFT describes every keypoint that it is given
     return root_sift(np.asarray(raw, np.float32))
 
 

@@ -131,7 +131,7 @@ def views_of(keyframes: Sequence[Keyframe], grouping: Grouping) -> list[View]:
 
 def in_pixels_of_lens(pairs: Mapping[tuple[int, int], TwoView], grouping: Grouping) -> dict[tuple[int, int], TwoView]:
     """The pairs in the pixels of their frames' lenses."""
-    return {(i, j): pair.enlarged(grouping.enlarged[i], grouping.enlarged[j]) for (i, j), pair in pairs.items()}
+    return {(i, j): pair.scaled(grouping.enlarged[i], grouping.enlarged[j]) for (i, j), pair in pairs.items()}
 
 
 def in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe], enlarged: Sequence[float]) -> Registration:

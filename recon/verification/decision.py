@@ -12,7 +12,9 @@ import msgspec
 import numpy as np
 
 from splatnode.capture import quality
+from splatnode.recon.frames.keyframe import longer_side
 from splatnode.recon.frames.screening import Rejected
+from splatnode.recon.matching.pair_matching import median_motion_px
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.register import Registration
@@ -218,7 +220,7 @@ def _through_other_lenses(graph: ViewGraph, registration: Registration) -> list[
 
 
 def _turned(graph: ViewGraph) -> list[Pair]:
-    return [pair for pair, view in graph.pairs.items() if view.turned_only]
+    return [pair for pair, view in graph.pairs.items() if view.is_pure_rotation]
 
 
 def _without_parallax(graph: ViewGraph, turned: list[Pair]) -> str:
@@ -230,7 +232,5 @@ def _names(graph: ViewGraph, pairs: Iterable[Pair]) -> list[str]:
 
 
 def _motion_px(graph: ViewGraph, pair: Pair, view: TwoView) -> float:
-    """Median motion of a pair's matches at 1024 pixels on the longer side."""
-    frame = graph.keyframes[pair[0]].frame
-    motion = np.linalg.norm(view.points2 - view.points1, axis=1)
-    return float(np.median(motion)) * 1024.0 / max(frame.width, frame.height)
+    side1, side2 = (longer_side(graph.keyframes[index].frame) for index in pair)
+    return median_motion_px(view, side1, side2)

@@ -53,7 +53,7 @@ def measure(keyframes: Sequence[Keyframe], config: Config) -> Reflection:
 
 
 def _strongest(features: Features, count: int) -> Bytes:
-    return features.descriptors[features.squeeze == 1.0][:count]
+    return features.descriptors[features.tilt == 1.0][:count]
 
 
 def mirrored_descriptors(descriptors: Bytes) -> Bytes:

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.matching.components import connected_components
 from splatnode.recon.matching.two_view import TwoView
-from splatnode.recon.matching.view_graph import connected
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.verification import epipolar_consistency
 
@@ -70,7 +70,7 @@ def loose(registration: Registration, pairs: Mapping[tuple[int, int], TwoView]) 
         for key, share in registration.agreement.items()
         if share >= FITTING and share * len(pairs[key].matches) >= FEW
     ]
-    _, *rest = connected([camera.index for camera in registration.cameras], fitting)
+    _, *rest = connected_components([camera.index for camera in registration.cameras], fitting)
     return tuple(sorted(index for part in rest for index in part))
 
 
@@ -90,9 +90,9 @@ def _two_parts(indices: list[int], shared: npt.NDArray[np.int64]) -> tuple[list[
     )
     taken: list[tuple[int, int]] = []
     for link in links:
-        parts = connected(indices, [*taken, link])
+        parts = connected_components(indices, [*taken, link])
         if len(parts) == 1:
             break
         taken.append(link)
-    first, *rest = connected(indices, taken)
+    first, *rest = connected_components(indices, taken)
     return first, [index for part in rest for index in part]

@@ -20,12 +20,8 @@ VIEWS = 6
 RECON = {
     "reconstruction": {
         "size": 160,
-        "prior": {
-            "registration": {
-                "features": {"num_features": 1500, "shortest_longer_side": 320},
-                "mapper": {"max_attempts": 2},
-            }
-        },
+        "matching": {"features": {"num_features": 1500, "min_longer_side": 320}},
+        "registration": {"mapper": {"max_attempts": 2}},
         "preview": {"iterations": 2, "half_resolution_share": 1.0},
         "optimize": {"iterations": 20, "checkpoints": [10]},
     },

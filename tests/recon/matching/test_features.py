@@ -1,4 +1,4 @@
-"""Features: where they are, what squeezing adds, and that squeezed views match what plain ones do not."""
+"""Features: where they are, what a simulated tilt adds, and that tilted views match what plain ones do not."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_points_are_in_full_size_pixels_at_whatever_size_they_are_found(picture,
     y, x = np.mgrid[:480, :640] + 0.5
     dot += 200 * np.exp(-((x - 201.3) ** 2 + (y - 150.8) ** 2) / (2 * 6.0**2))
     image = np.repeat(dot[..., None], 3, axis=2).astype(np.uint8)
-    config = features.Config(longer_side=longer_side, shortest_longer_side=min(longer_side, 1000))
+    config = features.Config(max_longer_side=longer_side, min_longer_side=min(longer_side, 1000))
     found = features.extract(image, config)
     np.testing.assert_allclose(found.points[0], [201.3, 150.8], atol=0.25)
 
@@ -45,39 +45,39 @@ def test_points_are_in_full_size_pixels_at_whatever_size_they_are_found(picture,
 def test_an_image_of_one_colour_has_none():
     found = features.extract(np.full((60, 80, 3), 128, np.uint8), features.Config())
     assert found.points.shape == (0, 2) and found.descriptors.shape == (0, 128)
-    assert len(features.add_squeezed(found, np.full((60, 80, 3), 128, np.uint8), (1.6,), features.Config()).points) == 0
+    assert len(features.add_tilted(found, np.full((60, 80, 3), 128, np.uint8), (1.6,), features.Config()).points) == 0
 
 
-def test_squeezing_adds_descriptors_to_known_points_and_points(picture):
+def test_a_tilt_adds_descriptors_to_known_points_and_points(picture):
     config = features.Config(num_features=500)
     plain = features.extract(picture, config)
-    widened = features.add_squeezed(plain, picture, (1.6,), config)
-    added = widened.squeeze == 1.6
+    widened = features.add_tilted(plain, picture, (1.6,), config)
+    added = widened.tilt == 1.6
     assert added.sum() > 200
     np.testing.assert_array_equal(widened.points[: len(plain.points)], plain.points)
-    np.testing.assert_array_equal(widened.squeeze[~added], 1.0)
+    np.testing.assert_array_equal(widened.tilt[~added], 1.0)
     snapped = widened.point_of[added] < len(plain.points)
     assert 0 < snapped.sum() < added.sum()
     assert widened.point_of.max() == len(widened.points) - 1
-    again = features.add_squeezed(widened, picture, (1.6,), config)
+    again = features.add_tilted(widened, picture, (1.6,), config)
     assert len(again.descriptors) == len(widened.descriptors)
 
 
-def test_a_view_from_the_side_is_matched_by_the_squeezed_features(picture):
+def test_a_view_from_the_side_is_matched_by_tilted_features(picture):
     """The picture half as wide, as a wall seen from 60 degrees aside is."""
     config = features.Config(num_features=2000)
     aside = cv2.resize(cv2.GaussianBlur(picture, (0, 0), sigmaX=1.4, sigmaY=0.01), (320, 480))
     front, side = features.extract(picture, config), features.extract(aside, config)
-    squeezed = features.add_squeezed(front, picture, (2.0,), config)
+    tilted = features.add_tilted(front, picture, (2.0,), config)
 
     def num_right(descriptors: np.ndarray, points: np.ndarray) -> int:
         found = nearest_neighbours.match(descriptors, side.descriptors, nearest_neighbours.Config())
         there = side.points[found[:, 1]] * [2.0, 1.0]
         return int((np.linalg.norm(points[found[:, 0]] - there, axis=1) < 3.0).sum())
 
-    chosen = squeezed.squeeze == 2.0
+    chosen = tilted.tilt == 2.0
     plain = num_right(front.descriptors, front.points)
-    assert num_right(squeezed.descriptors[chosen], squeezed.points[squeezed.point_of[chosen]]) > 3 * max(plain, 20)
+    assert num_right(tilted.descriptors[chosen], tilted.points[tilted.point_of[chosen]]) > 3 * max(plain, 20)
 
 
 def test_frames_without_features_are_compared_without_a_pair():
@@ -86,6 +86,6 @@ def test_frames_without_features_are_compared_without_a_pair():
     keyframes = [
         Keyframe(Frame(i, f"{i}.png", i, flat, None), flat, features.extract(flat, config.features)) for i in range(2)
     ]
-    plain = pair_matching.compare(keyframes[0], keyframes[1], config)
-    assert plain.pair is None and plain.log10_nfa == 0.0 and plain.matches.shape == (0, 2)
-    assert pair_matching.compare_squeezed(keyframes[0], keyframes[1], plain, config).pair is None
+    plain = pair_matching.match_plain(keyframes[0], keyframes[1], config.pair_matching)
+    assert plain.geometry is None and plain.log10_nfa == 0.0 and plain.matches.shape == (0, 2)
+    assert pair_matching.match_tilted(keyframes[0], keyframes[1], plain, config.pair_matching).geometry is None

@@ -12,9 +12,9 @@ import pytest
 
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import config as matching
-from splatnode.recon.matching import features, pair_matching
-from splatnode.recon.matching.pair_matching import Compared
-from splatnode.recon.matching.view_graph import AT_FIRST, ViewGraph
+from splatnode.recon.matching import features, pair_matching, tilting
+from splatnode.recon.matching.pair_matching import MatchedPair
+from splatnode.recon.matching.view_graph import FIRST_COMPARISONS, ViewGraph
 from splatnode.recon.registration import register
 from tests.support.synthetic import photographs, places, view_graph
 
@@ -40,24 +40,24 @@ def keyframe(name: str) -> SimpleNamespace:
 
 @pytest.fixture
 def compared(monkeypatch) -> list[tuple[str, ...]]:
-    """The names of the pairs that were compared, those by squeezed features after a third word."""
+    """The names of the pairs that were compared, those by tilted features after a third word."""
     calls: list[tuple[str, ...]] = []
 
     def compare(first, second, config):
         calls.append((first.name, second.name))
         hint = -2.0 if first.name[0].lower() == second.name[0].lower() else 0.0
         firm = Verified(range(200), (first.name, second.name)) if first.name[0] == second.name[0] else None
-        return Compared(NO_MATCHES, firm, hint)
+        return MatchedPair(NO_MATCHES, firm, hint)
 
-    def compare_squeezed(first, second, plain, config):
-        calls.append((first.name, second.name, "squeezed"))
+    def match_tilted(first, second, plain, config):
+        calls.append((first.name, second.name, "tilted"))
         weak = Verified(range(30), (first.name, second.name)) if plain.log10_nfa < 0.0 else None
-        return Compared(NO_MATCHES, weak, -20.0 if weak else 0.0)
+        return MatchedPair(NO_MATCHES, weak, -20.0 if weak else 0.0)
 
-    monkeypatch.setattr(pair_matching, "compare", compare)
-    monkeypatch.setattr(pair_matching, "compare_squeezed", compare_squeezed)
+    monkeypatch.setattr(pair_matching, "match_plain", compare)
+    monkeypatch.setattr(pair_matching, "match_tilted", match_tilted)
     monkeypatch.setattr("splatnode.recon.matching.view_graph.content_key", lambda keyframe: keyframe.name)
-    monkeypatch.setattr(features, "add_squeezed", lambda found, *others: found)
+    monkeypatch.setattr(features, "add_tilted", lambda found, *others: found)
     monkeypatch.setattr("splatnode.recon.matching.view_graph.replace", lambda keyframe, **changes: keyframe)
     return calls
 
@@ -75,7 +75,7 @@ def names_of(graph: Any) -> dict[tuple[str, str], tuple[str, str]]:
     return {(names[i], names[j]): pair.names for (i, j), pair in graph.pairs.items()}
 
 
-def squeezed(calls: list[tuple[str, ...]]) -> set[tuple[str, ...]]:
+def tilted(calls: list[tuple[str, ...]]) -> set[tuple[str, ...]]:
     return {call[:2] for call in calls if len(call) == 3}
 
 
@@ -86,27 +86,27 @@ def test_every_pair_is_compared_once_and_each_says_what_its_own_frames_are(compa
     assert graph.pairs[0, 2].names == ("a2", "a1")
 
 
-def test_squeezed_features_find_what_the_plain_ones_hint_at(compared):
+def test_tilted_features_find_what_the_plain_ones_hint_at(compared):
     graph = graph_of("a1", "A1", "b1")
-    assert ("A1", "a1") in squeezed(compared)
+    assert ("A1", "a1") in tilted(compared)
     assert names_of(graph) == {("a1", "A1"): ("a1", "A1")}
 
 
-def test_squeezed_features_are_not_tried_between_frames_that_firm_pairs_connect(compared, monkeypatch):
-    plain = pair_matching.compare
+def test_tilted_features_are_not_tried_between_frames_that_firm_pairs_connect(compared, monkeypatch):
+    plain = pair_matching.match_plain
 
     def chained(first, second, config):
         apart = abs(int(first.name[1]) - int(second.name[1])) > 1
         found = plain(first, second, config)
-        return Compared(NO_MATCHES, None, 0.0) if apart else found
+        return MatchedPair(NO_MATCHES, None, 0.0) if apart else found
 
-    monkeypatch.setattr(pair_matching, "compare", chained)
+    monkeypatch.setattr(pair_matching, "match_plain", chained)
     graph_of("a1", "a2", "a3", "a4")
     # Two steps away along the chain they may still overlap, three steps away no more.
-    assert squeezed(compared) == {("a1", "a3"), ("a2", "a4")}
+    assert tilted(compared) == {("a1", "a3"), ("a2", "a4")}
 
 
-def test_frames_with_enough_firm_partners_need_no_squeezed_features(compared):
+def test_frames_with_enough_firm_partners_need_no_tilted_features(compared):
     graph = graph_of(*(f"{letter}{number}" for number in range(5) for letter in "aA"))
     found = names_of(graph)
     assert {first[0] + second[0] for first, second in found} == {"aa", "AA"}
@@ -132,7 +132,7 @@ def test_without_a_keyframe_the_graph_is_that_of_the_others(compared):
     graph = graph_of("a1", "a2", "b1", "A1", "a3")
     rest = graph.without({"a1", "b1"})
     assert [keyframe.name for keyframe in rest.keyframes] == ["a2", "A1", "a3"]
-    # a2 and a3 had two firm partners before; now they have one, and squeezed features are worth their time.
+    # a2 and a3 had two firm partners before; now they have one, and tilted features are worth their time.
     assert names_of(rest) == names_of(graph_of("a2", "A1", "a3"))
     rest.add(keyframe("a4"))
     assert ("a2", "a4") in names_of(rest)
@@ -149,7 +149,7 @@ def test_pairs_from_elsewhere_stay_when_a_keyframe_comes(compared):
 
 @pytest.mark.parametrize("pairs", [[(0, 1), (1, 2), (2, 3)], [(2, 3), (0, 1), (1, 2)], [(0, 3), (2, 3), (1, 2)]])
 def test_a_chain_is_one_component_in_whatever_order_its_pairs_were_found(pairs):
-    graph = ViewGraph(matching.Config(squeezes=()))
+    graph = ViewGraph(matching.Config(tilting=tilting.Config(tilts=())))
     graph.keyframes.extend(["a", "b", "c", "d", "e"])
     graph.pairs.update(dict.fromkeys(pairs))
     assert graph.components() == [[0, 1, 2, 3], [4]]
@@ -159,7 +159,7 @@ def test_photographs_of_one_place_are_a_pair_and_those_of_two_are_not():
     here, there = photographs()[2:4], places()[5:]
     graph = view_graph([*here, *there])
     assert set(graph.pairs) == {(0, 1)}
-    assert len(graph.pairs[0, 1].matches) > 100 and not graph.pairs[0, 1].turned_only
+    assert len(graph.pairs[0, 1].matches) > 100 and not graph.pairs[0, 1].is_pure_rotation
 
 
 def test_cameras_do_not_depend_on_the_order_of_the_photographs():
@@ -187,7 +187,7 @@ def test_a_keyframe_added_soon_is_compared_with_a_few_first_and_in_the_end_with_
     graph = graph_of(*names[:7])
     compared.clear()
     graph.add(keyframe("a7"), soon=True)
-    assert len(compared) == AT_FIRST and not squeezed(compared)
+    assert len(compared) == FIRST_COMPARISONS and not tilted(compared)
     assert {i for i, j in graph.pending if j == 7} == {i for i in range(7) if (i, 7) not in graph.pairs}
     graph.complete()
     assert not graph.pending
@@ -199,7 +199,7 @@ def test_what_shares_most_with_the_partners_of_a_keyframe_is_looked_at_before_th
     compared.clear()
     graph.add(keyframe("a5"), soon=True)
     # The latest tell nothing, one after the other, until one of the a's is met.
-    assert compared[:AT_FIRST] == [("a5", "b3"), ("a5", "b2"), ("a5", "b1"), ("a4", "a5")]
+    assert compared[:FIRST_COMPARISONS] == [("a5", "b3"), ("a5", "b2"), ("a5", "b1"), ("a4", "a5")]
     # One partner is too little to be used: then all is compared.
     assert not graph.pending and len(names_of(graph)) == len(names_of(graph_of("a1", "a2", "a3", "a4", "a5"))) + 3
 

@@ -68,7 +68,7 @@ def compared(taken: Photographed, share_wrong: float = 0.2) -> dict[tuple[int, i
             wrong = generator.integers(0, len(taken.pixels[i]), (int(share_wrong * len(common)), 2))
             matches = np.concatenate([np.stack([common, common], 1), wrong])
             points1, points2 = taken.pixels[i][matches[:, 0]], taken.pixels[j][matches[:, 1]]
-            pair, _ = two_view.examine(points1, points2, matches, SIZE, two_view.Config())
+            pair, _ = two_view.estimate(points1, points2, matches, SIZE, two_view.Config())
             if pair is not None:
                 pairs[i, j] = pair
     return pairs
@@ -116,7 +116,7 @@ def test_a_pair_keeps_its_matches_and_drops_the_wrong_ones(taken, pairs):
         right = pair.matches[:, 0] == pair.matches[:, 1]
         assert right.sum() > 0.9 * common
         assert right.mean() > 0.97
-        assert not pair.turned_only
+        assert not pair.is_pure_rotation
         assert pair.num_homography < 0.7 * len(pair.matches)
 
 
@@ -124,7 +124,7 @@ def test_unrelated_points_are_no_pair():
     generator = np.random.default_rng(0)
     points1, points2 = ((generator.random((300, 2)) - 0.5) * SIZE for _ in range(2))
     matches = np.stack([np.arange(300)] * 2, 1)
-    assert two_view.examine(points1, points2, matches, SIZE, two_view.Config())[0] is None
+    assert two_view.estimate(points1, points2, matches, SIZE, two_view.Config())[0] is None
 
 
 def test_a_camera_that_only_turned_is_told():
@@ -133,9 +133,9 @@ def test_a_camera_that_only_turned_is_told():
     turned = rays @ cv2.Rodrigues(np.array([0.02, 0.15, 0.0]))[0].T
     points1, points2 = rays[:, :2] * FOCAL, turned[:, :2] / turned[:, 2:] * FOCAL
     points2 = points2 + generator.normal(size=points2.shape) * NOISE_PX
-    pair, _ = two_view.examine(points1, points2, np.stack([np.arange(300)] * 2, 1), SIZE, two_view.Config())
+    pair, _ = two_view.estimate(points1, points2, np.stack([np.arange(300)] * 2, 1), SIZE, two_view.Config())
     assert pair is not None
-    assert pair.turned_only
+    assert pair.is_pure_rotation
     assert pair.rotation_focal_ratio == pytest.approx(FOCAL / SIZE[0], rel=0.1)
 
 

@@ -34,7 +34,7 @@ def keyframe(index: int, num_features: int = RICH, size: tuple[int, int] = (64, 
         points=np.zeros((num_features, 2)),
         descriptors=np.zeros((num_features, 128), np.uint8),
         point_of=np.arange(num_features),
-        squeeze=np.ones(num_features),
+        tilt=np.ones(num_features),
     )
     return Keyframe(Frame(index, f"{index}.png", index, image, None), image, features)
 

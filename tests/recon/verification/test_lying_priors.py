@@ -16,8 +16,9 @@ from scipy.spatial import KDTree
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.frames.keyframe import Features, Keyframe
-from splatnode.recon.matching import appearance_check, features
 from splatnode.recon.matching import config as matching
+from splatnode.recon.matching import features
+from splatnode.recon.matching.appearance_check import matches_look_alike
 from splatnode.recon.registration import register
 from splatnode.recon.verification.decision import Config as JudgeConfig
 from splatnode.recon.verification.decision import hopeless, judge
@@ -26,7 +27,7 @@ from splatnode.recon.verification.verify import verify
 from tests.support.synthetic import SMALL, photographs, places, renumbered, view_graph
 
 WIDTH, HEIGHT = 192, 144
-SETTINGS = matching.Config(features=features.Config(num_features=500, shortest_longer_side=WIDTH))
+SETTINGS = matching.Config(features=features.Config(num_features=500, min_longer_side=WIDTH))
 FOCAL = 180.0
 GRID = np.stack(np.meshgrid(np.arange(6.0, WIDTH, 7.0), np.arange(6.0, HEIGHT, 7.0)), -1).reshape(-1, 2)
 
@@ -54,7 +55,7 @@ class SurfaceLiar:
         if len(known.points) >= len(GRID) and (known.points[-len(GRID) :] == self._seen(keyframe)).all():
             return keyframe
         points = np.concatenate([known.points, self._seen(keyframe)])
-        return replace(keyframe, features=Features(points, known.descriptors, known.point_of, known.squeeze))
+        return replace(keyframe, features=Features(points, known.descriptors, known.point_of, known.tilt))
 
     def match(self, keyframe1: Keyframe, keyframe2: Keyframe) -> np.ndarray:
         first, second = (len(keyframe.features.points) - len(GRID) for keyframe in (keyframe1, keyframe2))
@@ -113,7 +114,7 @@ def test_what_a_prior_invents_is_refused(lie, photographed):
 
 def test_the_best_lie_looks_right_to_all_but_the_photographs(monkeypatch):
     """The invented matches fit one set of cameras: the test above would be void if their geometry refused them."""
-    monkeypatch.setattr("splatnode.recon.matching.appearance_check.alike", lambda *asked: True)
+    monkeypatch.setattr("splatnode.recon.matching.appearance_check.matches_look_alike", lambda *asked: True)
     graph = view_graph(noise(), SurfaceLiar(), SETTINGS)
     assert sorted(graph.pairs) == [(0, 1), (0, 2), (1, 2)]
     registration = register.register(graph.keyframes, graph.pairs, register.Config())
@@ -124,6 +125,6 @@ def test_true_matches_look_alike_and_points_that_drifted_or_changed_places_do_no
     graph = view_graph(photographs()[:2])
     first, second = graph.keyframes
     matches = graph.pairs[0, 1].matches
-    assert appearance_check.alike(first, second, matches) and appearance_check.alike(first, second, matches[:40])
-    assert not appearance_check.alike(first, second, np.stack([matches[:, 0], np.roll(matches[:, 1], 17)], 1))
-    assert not appearance_check.alike(first, second, matches[:5])
+    assert matches_look_alike(first, second, matches) and matches_look_alike(first, second, matches[:40])
+    assert not matches_look_alike(first, second, np.stack([matches[:, 0], np.roll(matches[:, 1], 17)], 1))
+    assert not matches_look_alike(first, second, matches[:5])

@@ -58,7 +58,7 @@ def test_features_and_pairs_come_back_to_the_bit(graph):
     assert len(pairs) == len(graph.pairs) == 3
     for (i, j), pair in graph.pairs.items():
         assert isinstance(pairs[names[i], names[j]], TwoView) and same(pairs[names[i], names[j]], pair)
-        assert pairs[names[i], names[j]].turned_only == pair.turned_only
+        assert pairs[names[i], names[j]].is_pure_rotation == pair.is_pure_rotation
 
 
 def test_the_scene_comes_back_to_the_bit(graph, scene):
