@@ -105,15 +105,17 @@ class Judging:
         registration = continuation.extended(graph.keyframes, graph.pairs, start, self._config.registration)
         if registration is None or not {camera.index for camera in registration.cameras}.issuperset(further):
             return None
-        evidence = verify_further(graph, registration, evidence, self._config.verification)
-        names = {graph.keyframes[index].name for index in further}
-        if any(camera.confirmed < BEYOND_DOUBT for camera in evidence.cameras if camera.name in names):
+        continued = verify_further(graph, registration, evidence, self._config.verification)
+        if continued is None:
             return None
-        verdict = judge(graph, registration, evidence, self._config.decision)
+        names = {graph.keyframes[index].name for index in further}
+        if any(camera.confirmed < BEYOND_DOUBT for camera in continued.cameras if camera.name in names):
+            return None
+        verdict = judge(graph, registration, continued, self._config.decision)
         if not verdict.publishable:
             return None
         message = f"{verdict.message} {FOR_NOW}"
-        return Judgement(registration, evidence, replace(verdict, message=message, provisional=True))
+        return Judgement(registration, continued, replace(verdict, message=message, provisional=True))
 
     def _remember(self, known: Known, judgement: Judgement) -> Judgement:
         self._judged.pop(known, None)

@@ -70,17 +70,15 @@ class Score:
 
 def in_partners(index: int, pictures: Mapping[int, Picture], registration: Registration, config: Config) -> Score:
     """Patches of the picture `index` in the pictures that share most points with it."""
-    found_in = partners(index, pictures, registration, config)
+    found_in = partners(index, pictures, registration, config.partners)
     return pooled([score(pictures[index], pictures[other], config) for other in found_in], config)
 
 
-def partners(index: int, among: Collection[int], registration: Registration, config: Config) -> list[int]:
-    """The views of `among` that share most points with the view `index`."""
+def partners(index: int, among: Collection[int], registration: Registration, count: int) -> list[int]:
+    """The `count` views of `among` that share most points with the view `index`."""
     mine = registration.observed_point[registration.observed_by == index]
     shared = np.bincount(registration.observed_by[np.isin(registration.observed_point, mine)], minlength=max(among) + 1)
-    return sorted((other for other in among if other != index), key=lambda other: (-shared[other], other))[
-        : config.partners
-    ]
+    return sorted((other for other in among if other != index), key=lambda other: (-shared[other], other))[:count]
 
 
 def pooled(scores: Sequence[Score], config: Config) -> Score:

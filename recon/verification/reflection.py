@@ -24,6 +24,8 @@ Flags = npt.NDArray[np.bool_]
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     num_features: int = 1500  # of each frame, the strongest
     by_chance: float = 50.0  # matches of frames that have nothing in common, which say nothing
+    partners: int = 4  # known frames with which a further one is compared, those that share most points with it
+    max_further_gain: float = 0.1  # of a further frame beside them; right ones of ten scenes reach 0.08
     nearest_neighbours: nearest_neighbours.Config = nearest_neighbours.Config()
 
 
@@ -42,14 +44,33 @@ def measure(keyframes: Sequence[Keyframe], config: Config) -> Reflection:
     gains = np.zeros((len(plain), len(plain)))
     for j in range(len(plain)):
         for i in range(j):
-            found, expected = (
-                len(nearest_neighbours.match(plain[i], other[j], config.nearest_neighbours)) + config.by_chance
-                for other in (mirrored, plain)
-            )
-            gains[i, j] = gains[j, i] = np.log(found / expected)
+            gains[i, j] = gains[j, i] = _gain(plain[i], mirrored[j], plain[j], config)
     grown = [_grown(gains, first) for first in range(len(plain))]
     group, gain = grown[int(np.argmax([gain for _, gain in grown]))]  # the first NaN, where there is one
     return Reflection(tuple(keyframes[index].name for index in np.flatnonzero(group).tolist()), gain)
+
+
+def measure_further(further: Keyframe, known: Sequence[Keyframe], config: Config) -> Reflection:
+    """Of one frame more, beside frames of which it is known that they show the place the right way round."""
+    descriptors = _strongest(further.features, config.num_features)
+    mirrored = mirrored_descriptors(descriptors)
+    others = (_strongest(keyframe.features, config.num_features) for keyframe in known)
+    gains = [_gain(other, mirrored, descriptors, config) for other in others]
+    return Reflection((further.name,), float(np.mean(gains)))
+
+
+def strongest(found: Sequence[Reflection]) -> Reflection:
+    """The one with the largest gain; the first whose gain is NaN, where there is one."""
+    return found[int(np.argmax([each.gain for each in found]))]
+
+
+def _gain(other: Bytes, mirrored: Bytes, plain: Bytes, config: Config) -> float:
+    """The logarithm of the matches that a frame has with another one when it is mirrored, over those as it is."""
+    found, expected = (
+        len(nearest_neighbours.match(other, descriptors, config.nearest_neighbours)) + config.by_chance
+        for descriptors in (mirrored, plain)
+    )
+    return float(np.log(found / expected))
 
 
 def _strongest(features: Features, count: int) -> Bytes:

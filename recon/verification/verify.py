@@ -67,18 +67,26 @@ def verify(
     )
 
 
-def verify_further(graph: ViewGraph, registration: Registration, known: Evidence, config: Config) -> Evidence:
+def verify_further(graph: ViewGraph, registration: Registration, known: Evidence, config: Config) -> Evidence | None:
     """Evidence for `registration`, which continues the one that `known` is about: for now, and quick.
 
-    Measured are the cameras that `known` does not have, and what the matches say of all. Taken over is what hardly
-    changes while cameras are added: patches of the known cameras, and what left-out regions, mirroring and freed lenses
-    do. Without aligned patches sigmas are too large: they are reduced by as much as those of the known cameras.
+    None where a further photograph may be mirrored: a few partners cannot tell that for certain, all evidence must.
+
+    Measured anew: the cameras that `known` does not have, with their patches, exposure and whether their photographs
+    are mirrored; and of all cameras the matches, the weakest link, the plane, angles, errors and the focal length, of
+    which the larger uncertainty counts. Reused from `known`, because it says little about one camera more: the known
+    cameras' patches and exposures and that they are not mirrored, the jackknife, the scene mirrored in depth, cycles,
+    freed lenses and distortion. The pose sigmas of a continuation, which aligns no patches, are too large: they are
+    reduced by as much as those of the known cameras are.
     """
     before = {camera.name: camera for camera in known.cameras}
     names = {camera.index: graph.keyframes[camera.index].name for camera in registration.cameras}
     further = {index for index, name in names.items() if name not in before}
+    reflections = _reflections_of_further(graph, registration, names.keys() - further, further, config.reflection)
+    if not all(each.gain <= config.reflection.max_further_gain for each in reflections):
+        return None
     dense = config.epipolar_consistency
-    partners = (epipolar_consistency.partners(index, names, registration, dense) for index in further)
+    partners = (epipolar_consistency.partners(index, names, registration, dense.partners) for index in further)
     views = pictures(graph, registration, dense, further.union(*partners))
     measured = {camera.name: camera for camera in _of_cameras(graph, registration, views, config, further)}
     sharper = [
@@ -104,10 +112,11 @@ def verify_further(graph: ViewGraph, registration: Registration, known: Evidence
         agreement=_agreement(graph, registration, None),
         joint=weakest_link.weakest(registration, graph.pairs, views, config.epipolar_consistency),
         loose=tuple(graph.keyframes[index].name for index in weakest_link.loose(registration, graph.pairs)),
+        reflection=reflection.strongest([known.reflection, *reflections]),
         flatness=flatness.share_on_plane(registration.points),
         median_angle_deg=registration.median_angle_deg,
         rms_px=registration.rms_px,
-        focal_sigma=min(known.focal_sigma, registration.focal_sigma),
+        focal_sigma=float(np.maximum(known.focal_sigma, registration.focal_sigma)),
     )
 
 
@@ -142,6 +151,22 @@ def _of_cameras(
 def _reflection(graph: ViewGraph, registration: Registration, config: reflection.Config) -> Reflection:
     registered = [graph.keyframes[camera.index] for camera in registration.cameras]
     return reflection.measure(registered, config)
+
+
+def _reflections_of_further(
+    graph: ViewGraph,
+    registration: Registration,
+    known: Collection[int],
+    further: Collection[int],
+    config: reflection.Config,
+) -> list[Reflection]:
+    """Of each further camera beside the known ones that share most points with it."""
+    found = []
+    for index in sorted(further):
+        others = epipolar_consistency.partners(index, known, registration, config.partners)
+        beside = [graph.keyframes[other] for other in others]
+        found.append(reflection.measure_further(graph.keyframes[index], beside, config))
+    return found
 
 
 def _agreement(graph: ViewGraph, registration: Registration, index: int | None) -> float:

@@ -13,6 +13,7 @@ from splatnode.recon.estimation import FOR_NOW, Judging
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import continuation, register
+from splatnode.recon.verification import reflection
 from tests.support.synthetic import photographs, places, view_graph
 
 CONFIG = Config()
@@ -64,6 +65,19 @@ def test_a_further_keyframe_is_accepted_for_now_and_then_for_good(graph, judging
     assert thorough.verdict.publishable and not thorough.verdict.provisional
     assert judging.proven == {keyframe.name for keyframe in graph.keyframes}
     assert judging.soon(graph, []) is thorough
+
+
+def test_a_mirrored_photograph_is_not_accepted_for_now(graph, judging):
+    """Where a place is symmetric, the mirror image of a photograph fits to the pixel: only its details tell."""
+    photograph = graph.keyframes[3]
+    features = replace(
+        photograph.features, descriptors=reflection.mirrored_descriptors(photograph.features.descriptors)
+    )
+    fitting = first(graph, 4)
+    fitting.keyframes = [*graph.keyframes[:3], replace(photograph, features=features)]
+    assert judging.soon(first(graph, 3), []).verdict.publishable
+    assert judging.quickly(fitting, []) is None
+    assert judging.quickly(graph, []).verdict.publishable  # the same photograph as it is
 
 
 def test_another_place_is_not_accepted_for_now(judging):

@@ -39,5 +39,17 @@ def test_frames_that_were_mirrored_are_found():
     assert found.gain > 0.4
 
 
+def test_a_further_frame_is_compared_with_known_ones():
+    plain, mirrored = keyframes(), keyframes((4,))
+    assert reflection.measure_further(plain[4], plain[:3], CONFIG).gain < 0.0
+    found = reflection.measure_further(mirrored[4], plain[:3], CONFIG)
+    assert found.frames == (photographs()[4].name,) and found.gain > CONFIG.max_further_gain
+
+
+def test_the_strongest_is_one_that_is_not_a_number_where_there_is_one():
+    found = [reflection.Reflection((name,), gain) for name, gain in (("a", 0.3), ("b", np.nan), ("c", 0.5))]
+    assert reflection.strongest(found).frames == ("b",) and reflection.strongest([found[0], found[2]]).frames == ("c",)
+
+
 def test_plain_frames_fit_better_as_they_are():
     assert reflection.measure(keyframes(), CONFIG).gain < 0.0

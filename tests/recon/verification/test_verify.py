@@ -66,8 +66,19 @@ def test_a_right_answer_has_evidence_from_every_source():
 @pytest.mark.filterwarnings("error")
 def test_where_no_camera_is_further_those_that_are_known_keep_their_evidence():
     again = verify.verify_further(*placed(), good(), CONFIG)
+    assert again is not None
     assert [camera.patches for camera in again.cameras] == [camera.patches for camera in good().cameras]
     assert [camera.gain for camera in again.cameras] == [camera.gain for camera in good().cameras]
+
+
+def test_the_larger_uncertainty_of_the_focal_length_counts():
+    graph, found = placed()
+    for known, continued in ((0.01, 0.05), (0.05, 0.01), (np.nan, 0.01), (0.01, np.nan)):
+        seen = verify.verify_further(
+            graph, replace(found, focal_sigma=continued), replace(good(), focal_sigma=known), CONFIG
+        )
+        assert seen is not None
+        assert np.array_equal(seen.focal_sigma, np.maximum(known, continued), equal_nan=True)
 
 
 def test_fewer_than_three_cameras_confirm_nothing():
