@@ -44,6 +44,8 @@ def capture(config: CaptureConfig) -> None:
         reader = resources.enter_context(Reader(lambda: open_stream(camera), is_live(camera), config.reader))
         resources.callback(manager.stopping)
         event(log, logging.INFO, "started", camera=camera.kind, waiting=server.queued)
+        if why := server.spool.shortage():
+            event(log, logging.WARNING, "disk_space", problem=why)
         if not is_live(camera):
             manager.ready()  # its first frame may be long in coming; a live camera's proves that it is there
         while not (reader.state is State.FINISHED and server.queued == 0):
@@ -103,7 +105,7 @@ class _Node:
         status = CaptureStatus(
             **self._heartbeat_numbers.next(),
             state=reader.state.value,
-            why=reader.why or self._spool_full,
+            why=reader.why or self._spool_full or self._server.spool.shortage(),
             camera=self.config.camera.kind,
             pid=os.getpid(),
             uptime_s=time.monotonic() - self._started,

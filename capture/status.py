@@ -19,7 +19,7 @@ class CaptureStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     """Capture's heartbeat."""
 
     state: str  # starting, streaming, degraded, finished
-    why: str  # of a degraded state; or that the spool is full
+    why: str  # of a degraded state; or that the spool, or its disk, is full or nearly so
     camera: str  # its kind
     pid: int
     uptime_s: float

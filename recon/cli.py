@@ -19,7 +19,7 @@ from splatnode.capture.process.config import read_yaml
 from splatnode.recon.config import Config, overlaid, preset
 from splatnode.recon.evaluate import methods
 from splatnode.recon.evaluate.bench import Entrants, Plan, Scoring, run_bench, told
-from splatnode.recon.evaluate.demo import write_capture
+from splatnode.recon.evaluate.demo import largest_capture_bytes, write_capture
 from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
 from splatnode.recon.evaluate.records import merged, read_bench
 from splatnode.recon.evaluate.report import redraw
@@ -28,8 +28,10 @@ from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.metric import in_metres
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.result.folder import result_folder
+from splatnode.recon.result.size import largest_result_bytes
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.write import check_writable, finish
+from splatnode.recon.result.write import finish
 from splatnode.recon.viewer_process import viewer
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
@@ -42,8 +44,11 @@ def replay(args: argparse.Namespace) -> int:
     frames = list(folder.stream(folder.Config(folder=args.folder, names=_chosen(args))))
     _check_baseline(config, [frame.name for frame in frames])
     _check_apart(args.out, args.folder)
-    check_writable(args.out)
-    with viewer(args.out / "view") if args.view else contextlib.nullcontext(_shown_to_nobody) as show:
+    sizes = [(frame.width, frame.height) for frame in frames if isinstance(frame, Frame)]
+    with (
+        result_folder(args.out, largest_result_bytes(sizes, config.size, config.most_gaussians)),
+        viewer(args.out / "view") if args.view else contextlib.nullcontext(_shown_to_nobody) as show,
+    ):
         snapshot = run(frames, with_looks(config, LOOK_EVERY) if args.view else config, show)
         snapshot = in_metres(snapshot, config.metric)
         where = str(args.folder.resolve())
@@ -92,14 +97,15 @@ def run(
 def demo(args: argparse.Namespace) -> int:
     """Writes the built-in capture, reconstructs it, and measures the result on views that it has not seen."""
     seed = args.seed or 0
-    config = overlaid(preset("balanced"), {"seed": seed})
-    check_writable(args.out)
-    capture = args.out / "capture"
-    split = write_capture(capture, synthetic.Config(seed=seed))
-    snapshot = run(folder.stream(folder.Config(folder=capture / "images", names=split.train)), config)
-    measured = held_out_quality(snapshot, capture, split) if snapshot.verdict.publishable else None
-    report = finish(snapshot, args.out, seed=seed, preset_name="balanced", held_out=measured)
-    _tell(snapshot, args.out, report, as_json=args.json)
+    config, place = overlaid(preset("balanced"), {"seed": seed}), synthetic.Config(seed=seed)
+    needed_bytes = largest_result_bytes([(place.width, place.height)] * place.views, config.size, None)
+    with result_folder(args.out, needed_bytes + largest_capture_bytes(place)):
+        capture = args.out / "capture"
+        split = write_capture(capture, place)
+        snapshot = run(folder.stream(folder.Config(folder=capture / "images", names=split.train)), config)
+        measured = held_out_quality(snapshot, capture, split) if snapshot.verdict.publishable else None
+        report = finish(snapshot, args.out, seed=seed, preset_name="balanced", held_out=measured)
+        _tell(snapshot, args.out, report, as_json=args.json)
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
 
 

@@ -17,6 +17,7 @@ import msgspec
 
 from splatnode.capture.messaging.message_file import read_message, size_in_file, write_message
 from splatnode.capture.messaging.wire import Part
+from splatnode.capture.process.disk_space import shortage
 from splatnode.capture.process.lock import exclusive
 from splatnode.capture.process.state_directory import state_directory
 
@@ -75,6 +76,11 @@ class Spool:
     @property
     def size_bytes(self) -> int:
         return sum(self._bytes.values())
+
+    def shortage(self) -> str:
+        """Why the disk may be full before the bound is reached; empty where it has room."""
+        further_bytes = (self.config.max_mb << 20) - self.size_bytes
+        return shortage(self.directory, further_bytes, "further keyframes (spool.max_mb)")
 
     def put(self, key: Key, parts: Sequence[Part]) -> None:
         """Returns when the message is on the disk. Raises SpoolFull; OSError where the disk fails otherwise."""

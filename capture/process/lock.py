@@ -7,6 +7,7 @@ import fcntl
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TextIO
 
 
 class Held(RuntimeError):
@@ -21,7 +22,22 @@ class Held(RuntimeError):
 
 @contextlib.contextmanager
 def exclusive(path: Path) -> Iterator[None]:
-    """Holds the lock file at `path`, which stays and tells the holder's process id. Raises Held."""
+    """Holds the lock file at `path`, which tells the holder's process id. Raises Held, OSError.
+
+    The file stays, unless its holder removes it.
+    """
+    with contextlib.ExitStack() as resources:
+        file = resources.enter_context(_locked(path))
+        while not _is_at(path, file):  # the holder before removed the file after it was opened here
+            file = resources.enter_context(_locked(path))
+        file.truncate(0)
+        file.write(f"{os.getpid()}\n")
+        file.flush()
+        yield
+
+
+@contextlib.contextmanager
+def _locked(path: Path) -> Iterator[TextIO]:
     with open(path, "a+") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -30,7 +46,11 @@ def exclusive(path: Path) -> Iterator[None]:
             text = file.read(32).strip()
             pid = int(text) if text.isdecimal() else None
             raise Held(f"{path} is held by {f'process {pid}' if pid else 'another process'}", pid) from error
-        file.truncate(0)
-        file.write(f"{os.getpid()}\n")
-        file.flush()
-        yield
+        yield file
+
+
+def _is_at(path: Path, file: TextIO) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False

@@ -33,12 +33,14 @@ from splatnode.capture.status import own_rss_mb
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
 from splatnode.recon.daemon.control import Answer, Retract
+from splatnode.recon.daemon.disk_space import DiskSpace
 from splatnode.recon.daemon.inbox import Inbox, LeftOut
 from splatnode.recon.daemon.intake import Intake
 from splatnode.recon.daemon.output import Shown
 from splatnode.recon.daemon.status import ReconStatus, State
 from splatnode.recon.daemon.watcher import Watcher
 from splatnode.recon.daemon.worker import Worker
+from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.message import camera_record, to_message
 
 log = logging.getLogger(__name__)
@@ -65,7 +67,7 @@ def recon(args: argparse.Namespace) -> int:
 
 class Daemon:
     def __init__(self, config: Config, stopping: threading.Event) -> None:
-        """Raises AlreadyRunning, CheckpointError, NetworkError, OSError."""
+        """Raises AlreadyRunning, CheckpointError, FolderInUse, NetworkError, OSError."""
         self._config, self._stopping = config, stopping
         self._resources = contextlib.ExitStack()
         with self._closing_on_error():
@@ -75,7 +77,9 @@ class Daemon:
             self._commands = self._resources.enter_context(CommandServer(RECON_CONTROL, network, Retract))
             self._store = Store(config.checkpoint or state_directory() / "recon")
             self._resources.callback(self._store.close)
+            self._resources.enter_context(result_folder(config.out))
             remove_leftovers(config.out)
+        self._disk_space = DiskSpace(config, self._store)
         self._inbox = Inbox()
         self._newest = _Newest()
         self._intake = Intake(network, config.reconstruction, self._store, self._inbox, stopping)
@@ -178,7 +182,7 @@ class Daemon:
             camera_moved=motion.moved if motion else None,
             moved=str(motion) if motion and motion.moved else "",
             tracked=camera_record(tracked) if tracked else None,
-            problem=intake.problem or worker.problem,
+            problem=intake.problem or worker.problem or self._disk_space.problem(),
         )
 
     @contextlib.contextmanager

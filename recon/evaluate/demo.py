@@ -27,3 +27,8 @@ def write_capture(folder: Path, place: synthetic.Config) -> Split:
     write_files(folder / "images", files)
     write_file(folder / "cameras.json", encode_cameras(cameras))
     return Split(tuple(training), tuple(testing))
+
+
+def largest_capture_bytes(place: synthetic.Config) -> int:
+    """Bytes that `write_capture` stays below: those of its photographs without compression."""
+    return (2 * place.views - 1) * place.width * place.height * 3

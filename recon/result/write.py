@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
-from splatnode.recon.result.export import write_file, write_result
+from splatnode.recon.result.export import write_result
 from splatnode.recon.result.preview import contact_sheet
 from splatnode.recon.result.report import build_report, peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
-
-
-def check_writable(out: Path) -> None:
-    """Raises ResultWriteError where nothing could be written into the folder `out`: before the work, not after it."""
-    probe = out / f".writable-{os.getpid()}"
-    write_file(probe, b"")
-    probe.unlink()
 
 
 def finish(snapshot: Snapshot, out: Path, *, seed: int, preset_name: str, **extra: object) -> dict[str, object]:

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -31,7 +35,7 @@ def photographs(tmp_path):
         (["--out", "new", "--baseline", "a.png", "b.png", "far"], 2, "a distance in metres, got 'far'"),
         (["--out", "new/../photographs"], 2, "must not be the folder of the photographs"),
         (["--out", "new", "--seed", str(2**63)], 2, "seed: expected int <="),
-        (["--out", "photographs/a.png"], 73, "Choose another folder"),
+        (["--out", "photographs/a.png"], 73, "choose another folder"),
         (["--out", "photographs/a.png/below"], 73, "choose another folder"),
     ],
 )
@@ -66,3 +70,61 @@ def test_a_refusal_leaves_a_report_that_says_why(photographs, capsys):
     verdict = json.loads((out / "report.json").read_text())["verdict"]
     assert verdict["code"] == "STATIC_CAMERA"
     assert capsys.readouterr().out.startswith(f"STATIC_CAMERA: {verdict['message']}")
+
+
+@pytest.fixture
+def replayed(photographs, monkeypatch):
+    """Replays the photographs into new/out, where `instead` is done in place of the reconstruction."""
+
+    def replay(instead) -> int:
+        monkeypatch.chdir(photographs.parent)
+        monkeypatch.setattr(cli, "reconstruct", lambda frames, config: instead())
+        return command_line.main(["replay", "photographs", "--out", "new/out"])
+
+    return replay
+
+
+@pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (SystemExit(0), None), (OSError(5, "x"), 74)])
+def test_a_replay_that_is_interrupted_leaves_no_empty_folder(replayed, photographs, error, code):
+    def interrupted():
+        assert Path("new/out").is_dir()
+        raise error
+
+    if code is None:
+        with pytest.raises(SystemExit):
+            replayed(interrupted)
+    else:
+        assert replayed(interrupted) == code
+    assert {path.name for path in photographs.parent.iterdir()} == {"photographs"}
+
+
+def test_a_replay_that_is_interrupted_leaves_what_was_there_before_and_what_was_written(replayed, photographs):
+    def interrupted():
+        Path("new/out/kept.txt").write_text("mine")
+        raise KeyboardInterrupt
+
+    assert replayed(interrupted) == 130
+    assert [path.name for path in (photographs.parent / "new" / "out").iterdir()] == ["kept.txt"]
+    (photographs.parent / "new" / "out" / "kept.txt").unlink()
+    assert replayed(lambda: (_ for _ in ()).throw(KeyboardInterrupt)) == 130
+    assert (photographs.parent / "new" / "out").is_dir()
+
+
+def test_two_replays_into_one_folder_refuse_each_other(replayed, capsys):
+    def again():
+        code = command_line.main(["replay", "photographs", "--out", "new/out"])
+        assert code == 75 and f"process {os.getpid()} writes its results into new/out" in capsys.readouterr().err
+        raise KeyboardInterrupt
+
+    assert replayed(again) == 130
+    assert not Path("new").exists()
+
+
+def test_a_nearly_full_disk_is_told_before_the_work(replayed, monkeypatch, capsys):
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=10**9, free=1_500_000))
+    assert replayed(lambda: pytest.fail("was begun")) == 74
+    said = capsys.readouterr().err
+    assert "1.5 MB are free in new/out, and the result may take 7.9 MB. Free some space" in said
+    assert command_line.main(["demo", "--out", "new/out"]) == 74
+    assert "the result may take" in capsys.readouterr().err
+    assert not Path("new").exists()

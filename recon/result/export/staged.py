@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from splatnode.capture.process.durable import sync_folder
+from splatnode.capture.process.folders import made
 
 
 class ResultWriteError(OSError):
@@ -23,6 +24,11 @@ def write_files(folder: Path, contents: Mapping[str, bytes]) -> None:
     Raises ResultWriteError when one cannot be written (no space, no permission); the temporary files are gone then and
     every file that was there before is as it was.
     """
+    with contextlib.ExitStack() as folders:  # those that it makes and that stay empty are removed at the end
+        _write_files(folder, contents, folders)
+
+
+def _write_files(folder: Path, contents: Mapping[str, bytes], folders: contextlib.ExitStack) -> None:
     mark = f".{uuid.uuid4().hex[:12]}.tmp"
     temporary: dict[Path, Path] = {}
     try:
@@ -33,14 +39,14 @@ def write_files(folder: Path, contents: Mapping[str, bytes]) -> None:
             if target.exists() and not target.is_file():  # root could replace /dev/null
                 raise FileExistsError(errno.EEXIST, f"{name} is a device or a pipe, not a file")
             temporary[target] = target.with_name(f".{target.name}{mark}")
-            target.parent.mkdir(parents=True, exist_ok=True)
+            folders.enter_context(made(target.parent))
             _write_through(temporary[target], content)
         for target, source in temporary.items():
             os.replace(source, target)
         for parent in {target.parent for target in temporary}:
             sync_folder(parent)
     except OSError as error:
-        raise ResultWriteError(error.errno, _explain(error, folder, contents)) from error
+        raise ResultWriteError(error.errno, explanation(error, folder, contents)) from error
     finally:
         for source in temporary.values():
             with contextlib.suppress(OSError):
@@ -64,7 +70,9 @@ def _write_through(path: Path, content: bytes) -> None:
         os.fsync(file.fileno())
 
 
-def _explain(error: OSError, folder: Path, contents: Mapping[str, bytes]) -> str:
+def explanation(error: OSError, folder: Path, contents: Mapping[str, bytes] | None = None) -> str:
+    """Why `contents` could not be written into `folder`, and what to do."""
+    contents = contents or {}
     megabytes = sum(map(len, contents.values())) / 1e6
     advice = {
         errno.ENOSPC: "Free some space or choose another folder",

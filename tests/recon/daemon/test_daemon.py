@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from msgspec.structs import replace
@@ -18,6 +21,7 @@ from splatnode.capture.messaging.services import RECON_CONTROL, RECON_SCENE
 from splatnode.capture.messaging.spool import Config as SpoolConfig
 from splatnode.capture.messaging.spool import Spool
 from splatnode.capture.messaging.state import StateClient
+from splatnode.capture.process.folders import LOCK
 from splatnode.capture.status import heartbeats
 from splatnode.recon.config import Config as Reconstruction
 from splatnode.recon.daemon import membership
@@ -27,6 +31,7 @@ from splatnode.recon.daemon.daemon import Daemon
 from splatnode.recon.daemon.tracking import Config as Tracking
 from splatnode.recon.optimize import refinement
 from splatnode.recon.result.export import read_cameras
+from splatnode.recon.result.folder import FolderInUse
 from splatnode.recon.result.message import LiveScene, SceneHeader, from_message
 from splatnode.recon.result.verdict import Code
 from tests.capture.messaging.test_sockets import wait_for
@@ -189,6 +194,39 @@ def test_a_scene_that_its_refinement_ruined_is_neither_shown_nor_kept(config, pe
             assert not ruined.snapshot.verdict.publishable and not len(ruined.snapshot.gaussians)
             peer.wait_for_acknowledgements()
     assert not config.out.exists()
+
+
+def test_two_daemons_do_not_export_into_one_folder(config, tmp_path):
+    (tmp_path / "other").mkdir(mode=0o700)
+    other = replace(config, network=Network(directory=tmp_path / "other"), checkpoint=tmp_path / "another checkpoint")
+    with running(config):
+        wait_for((config.out / LOCK).exists, PATIENCE_S)
+        with pytest.raises(FolderInUse, match=f"process {os.getpid()} writes its results into .*out already; stop it"):
+            Daemon(other, threading.Event())
+    assert FolderInUse.exit_code == 75 and not config.out.exists()
+    with running(other):
+        wait_for((config.out / LOCK).exists, PATIENCE_S)
+
+
+def test_a_nearly_full_disk_is_a_problem_that_the_status_tells_until_there_is_room(config, monkeypatch, caplog):
+    free = {"checkpoint": 10**12, "out": 10**12}
+    monkeypatch.setattr(
+        shutil, "disk_usage", lambda path: SimpleNamespace(total=10**12, free=free[path.relative_to(tmp).parts[0]])
+    )
+    tmp = config.out.parent
+
+    def problem() -> str:
+        return heartbeats(config.network)["recon"]["problem"]
+
+    with running(replace(config, max_views=10, max_gaussians=10_000)), caplog.at_level("INFO"):
+        assert problem() == ""
+        for folder, what, needed in (("checkpoint", "the checkpoint", "60.6 MB"), ("out", "the result", "3.2 MB")):
+            free[folder] = 2_000_000
+            said = f"2.0 MB are free in {tmp / folder}, and {what} may take {needed}: make room on the disk"
+            wait_for(lambda said=said: problem() == said, PATIENCE_S)
+            free[folder] = 10**12
+            wait_for(lambda: problem() == "", PATIENCE_S)
+    assert caplog.text.count("event=disk_space") == 4
 
 
 def offer_when_three_are_shown(peer, frames) -> None:

@@ -1,0 +1,38 @@
+"""Says that a disk is nearly full while the daemon can still write: before a keyframe or a result is refused."""
+
+from __future__ import annotations
+
+import logging
+
+from splatnode.capture.process.disk_space import shortage
+from splatnode.capture.process.logs import event
+from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.config import Config
+from splatnode.recon.result.size import result_bytes
+
+log = logging.getLogger(__name__)
+
+# In the checkpoint. Keyframe of 1280 x 720: photograph 2.8 MB, point map 1.2 MB, features and pairs 1 to 2 MB.
+BYTES_A_KEYFRAME = 6_000_000
+BYTES_A_GAUSSIAN = 56  # 14 numbers of 4 bytes
+
+
+class DiskSpace:
+    """The free space where the daemon writes, against what it may still write."""
+
+    def __init__(self, config: Config, store: Store) -> None:
+        self._config, self._store = config, store
+        self._told = ""
+
+    def problem(self) -> str:
+        """What may not fit, and where; empty where there is room for all. A change is logged."""
+        further_keyframes = max(0, self._config.max_views - len(self._store.names))
+        most_gaussians = self._config.max_gaussians
+        checkpoint_bytes = further_keyframes * BYTES_A_KEYFRAME + most_gaussians * BYTES_A_GAUSSIAN
+        problem = shortage(self._store.directory, checkpoint_bytes, "the checkpoint") or shortage(
+            self._config.out, result_bytes(most_gaussians), "the result"
+        )
+        if bool(problem) != bool(self._told):
+            event(log, logging.WARNING if problem else logging.INFO, "disk_space", problem=problem or "none")
+        self._told = problem
+        return problem and f"{problem}: make room on the disk"

@@ -1,0 +1,41 @@
+"""The folder that results are written into: one process at a time, checked before the work, not left behind empty."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+from collections.abc import Iterator
+from pathlib import Path
+
+from splatnode.capture.process.disk_space import shortage
+from splatnode.capture.process.folders import claimed
+from splatnode.capture.process.lock import Held
+from splatnode.recon.result.export.staged import ResultWriteError, explanation
+
+
+class FolderInUse(Held):
+    """Another process writes results into this folder."""
+
+    def __init__(self, folder: Path, pid: int | None) -> None:
+        who = f"process {pid}" if pid else "another process"
+        super().__init__(f"{who} writes its results into {folder} already; stop it, or give another --out", pid)
+
+
+@contextlib.contextmanager
+def result_folder(out: Path, needed_bytes: int = 0) -> Iterator[None]:
+    """Holds the folder `out` for this process. Folders that it made and that are empty are removed at the end.
+
+    Raises ResultWriteError where nothing can be written into it or fewer than `needed_bytes` are free, and FolderInUse
+    where another process holds it: all before the work and not after it.
+    """
+    with contextlib.ExitStack() as resources:
+        try:
+            resources.enter_context(claimed(out))
+            why = shortage(out, needed_bytes, "the result")
+        except Held as error:
+            raise FolderInUse(out, error.pid) from error
+        except OSError as error:
+            raise ResultWriteError(error.errno, explanation(error, out)) from error
+        if why:
+            raise ResultWriteError(errno.ENOSPC, f"{why}. Free some space or choose another folder")
+        yield

@@ -1,0 +1,25 @@
+"""How much a result takes on the disk, before it is made."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+BYTES_A_GAUSSIAN = 120  # 68 in scene.ply, 46 to 50 in colmap/points3D.txt
+OTHER_BYTES = 2_000_000  # preview.png (1.2 MB measured at most), report and cameras
+# Photographs of real scenes led to a Gaussian for 28 to 60 pixels; four times as many are allowed for.
+PIXELS_A_GAUSSIAN = 8
+
+
+def largest_result_bytes(sizes: Iterable[tuple[int, int]], longer_side: int, most_gaussians: int | None) -> int:
+    """Bytes that the result of photographs of these `sizes` (width, height) stays below.
+
+    `longer_side` of the modelled images is in pixels; `most_gaussians` is the limit that was set, if any.
+    """
+    pixels = sum(longer_side**2 * min(size) / max(size) for size in sizes)
+    expected = round(pixels / PIXELS_A_GAUSSIAN)
+    return result_bytes(expected if most_gaussians is None else min(expected, most_gaussians))
+
+
+def result_bytes(num_gaussians: int) -> int:
+    """Bytes of a result folder with so many Gaussians, rounded up."""
+    return BYTES_A_GAUSSIAN * num_gaussians + OTHER_BYTES
