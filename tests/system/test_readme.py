@@ -1,0 +1,329 @@
+"""Every figure that the README prints of a measurement is that of its raw file in tests/bench/results.
+
+Each test makes the README's rows and phrases from the raw numbers, rounded as they are printed, and looks for them.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+from collections.abc import Callable, Iterable, Sequence
+from statistics import mean, median
+
+import pytest
+
+from tests.conftest import ROOT
+
+RESULTS = ROOT / "tests" / "bench" / "results"
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+TEXT = re.sub(r"\s+", " ", README)  # a phrase may be broken into lines anywhere
+
+METHODS = ("preview", "fast", "balanced", "quality", "instantsplat-s", "instantsplat-xl", "paper")
+
+
+def raw(name: str) -> dict:
+    return json.loads((RESULTS / f"{name}.json").read_text())
+
+
+def says(*phrases: str) -> None:
+    missing = [phrase for phrase in phrases if phrase not in TEXT]
+    assert not missing, f"README.md must say {missing}"
+
+
+def part(value: float, digits: int) -> str:
+    """0.8274 as .827, as the README prints what is below 1."""
+    return f"{value:.{digits}f}".replace("0.", ".", 1) if abs(value) < 1 else f"{value:.{digits}f}"
+
+
+def change(value: float, digits: int = 1) -> str:
+    return f"{'−' if value < 0 else '+'}{part(abs(value), digits)}"
+
+
+def thousands(count: float) -> str:
+    return f"{round(count, -3):,.0f}".replace(",", " ")
+
+
+def ends(name: str, **wanted: object) -> list[dict]:
+    """The final rows of a benchmark that have the wanted values."""
+    rows = [row for row in raw(name)["rows"] if row["final"]]
+    return [row for row in rows if all(row[key] == value for key, value in wanted.items())]
+
+
+def over_sets(rows: Iterable[dict], value: Callable[[dict], float]) -> float:
+    """The mean over sets of photographs of the mean over seeds."""
+    sets: dict[tuple, list[float]] = {}
+    for row in rows:
+        sets.setdefault((row["scene"], row["views"]), []).append(value(row))
+    return mean(mean(values) for values in sets.values())
+
+
+def of_set(method: str, scene: str) -> float:
+    """Mean PSNR over seeds in bench_7sets."""
+    return mean(row["psnr"] for row in ends("bench_7sets", method=method, scene=scene))
+
+
+@pytest.mark.parametrize("name, digits", [("bench_6views", 1), ("bench_7sets", 0)])
+@pytest.mark.parametrize("method", METHODS)
+def test_speed_and_accuracy(name, digits, method):
+    rows = ends(name, method=method)
+    score = {key: over_sets(rows, lambda row, key=key: row[key]) for key in ("psnr", "ssim", "lpips_alex")}
+    gaussians = thousands(over_sets(rows, lambda row: row["num_gaussians"]))
+    seconds = f"{over_sets(rows, lambda row: row['seconds']['total']):.{digits}f}"
+    quality = f"{score['psnr']:.1f} dB | {part(score['ssim'], 3)} | {part(score['lpips_alex'], 3)}"
+    says(f"| `{method}` | {quality} | {gaussians} | {seconds} |")
+
+
+def test_the_sets_are_those_that_are_named():
+    for name in ("bench_6views", "bench_7sets"):
+        for row in ends(name):
+            assert row["views"] == (12 if row["scene"] in ("castle_p30", "fox") else 6)
+    assert {row["scene"] for row in ends("bench_6views")} == {"fountain_p11", "llff_fern", "sceaux"}
+    assert len({row["scene"] for row in ends("bench_7sets")}) == 7
+    assert not [row for row in ends("bench_7sets") if row["views"] == 3]  # the README says that there are none
+
+
+def test_seeds():
+    spreads = []
+    for method in METHODS:
+        for scene in {row["scene"] for row in ends("bench_7sets")}:
+            values = [row["psnr"] for row in ends("bench_7sets", method=method, scene=scene)]
+            assert len(values) in (1, 3)
+            spreads += [max(values) - min(values)] if len(values) == 3 else []
+    says(f"lie {part(min(spreads), 2)} to {part(max(spreads), 2)} dB apart")
+
+
+def test_one_run_at_a_time():
+    for row in raw("replay")["rows"]:
+        scored = ends("bench_7sets", scene=row["scene"], views=row["views"], method=row["preset"], seed=0)
+        quality = "not measured"
+        if scored:
+            quality = f"{scored[0]['psnr']:.1f} dB / {part(scored[0]['ssim'], 3)} / {part(scored[0]['lpips_alex'], 3)}"
+        costs = f"{thousands(row['num_gaussians'])} | {row['peak_rss_mb'] / 1e3:.2f} GB | {row['seconds']['total']:.1f}"
+        if row["scene"] != "fox":
+            says(f"| {row['scene']}, {row['views']} views, `{row['preset']}` | {quality} | {costs} |")
+    demo = raw("demo")
+    held_out = f"{demo['held_out']['psnr']:.1f} dB / {part(demo['held_out']['ssim'], 3)} / not measured"
+    says(
+        f"| built-in capture, {demo['num_cameras']} views (`./run demo`) | {held_out} | "
+        f"{thousands(demo['num_gaussians'])} | {demo['peak_rss_mb'] / 1e3:.2f} GB | not measured alone |"
+    )
+
+
+def test_the_rim():
+    (row,) = ends("bench_7sets", scene="llff_fern", method="balanced", seed=0)
+    says(f"`balanced` scores {row['psnr']:.1f} dB without the rim and {row['psnr_with_rim']:.1f} with it")
+
+
+def test_what_is_said_of_instantsplat_and_paper():
+    better = of_set("instantsplat-xl", "llff_flower") - of_set("balanced", "llff_flower")
+    says(f"On llff_flower `instantsplat-xl` is {part(better, 1)} dB better than `balanced`")
+    for scene in ("llff_flower", "llff_fern", "fox"):
+        sharp, ours = (
+            mean(row["lpips_alex"] for row in ends("bench_7sets", method=method, scene=scene))
+            for method in ("instantsplat-xl", "balanced")
+        )
+        assert sharp < ours
+    changes = {
+        scene: change(of_set("paper", scene) - of_set("instantsplat-xl", scene))
+        for scene in ("fountain_p11", "sceaux", "castle_p30", "llff_fern", "llff_flower", "tum_fr3_office", "fox")
+    }
+    first, *middle, last = (f"{value}{' dB' * (i == 0)} on {scene}" for i, (scene, value) in enumerate(changes.items()))
+    says(f"`paper` changes PSNR by {', '.join([first, *middle])} and {last}.")
+    alone = {row["method"]: row["psnr"] for row in ends("ablation_6views")}
+    point, depth, normal = (
+        change(alone[f"instantsplat-xl+{term}"] - alone["instantsplat-xl"], 2)
+        for term in ("point-render", "depth", "normal")
+    )
+    says(f"loss alone changes it by {point} dB, the depth loss by {depth} and the normal loss by {normal}")
+
+
+@pytest.mark.parametrize("method", ["fast", "colmap-3dgs", "colmap-fsgs", "cf-3dgs", "nope-nerf", "nerfmm"])
+def test_rivals(method):
+    rows = [ends("bench_rivals", method=method, scene=scene)[0] for scene in ("fountain_p11", "llff_fern")]
+    scores = " | ".join(f"{row['psnr']:.1f} dB" for row in rows)
+    errors = " | ".join(f"{row['rotation_error_deg']:.1f}°" for row in rows)
+    name = "`nerfmm` (NeRF--)" if method == "nerfmm" else f"`{method}`"
+    says(f"| {name} | {scores} | {errors} |")
+
+
+def test_how_the_rivals_are_cut_down():
+    from splatnode.recon.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs, nerfmm
+    from splatnode.recon.optimize.control import adaptive
+
+    assert colmap_3dgs.OPTIMIZE.iterations == colmap_fsgs.OPTIMIZE.iterations == nerfmm.OPTIMIZE.iterations == 1500
+    assert (adaptive.Config().max_gaussians, nerfmm.OPTIMIZE.rays, nerfmm.SIZE) == (100_000, 384, 256)
+    film = cf_3dgs.Config()
+    says(f"CF-3DGS to {film.alone} iterations a frame, {film.motion} a motion and {film.final} at the end")
+
+
+SIZES = {
+    "a quarter": "x0.25",
+    "half": "x0.5",
+    "chosen": "chosen",
+    "twice": "x2",
+    "four times": "x4",
+    "as many by MCMC": "mcmc",
+    "a Gaussian a pixel": "pixel",
+}
+
+
+@pytest.mark.parametrize("name, method", SIZES.items())
+def test_size(name, method):
+    rows = [row for row in raw("parsimony")["rows"] if row["method"] == method]
+    psnr, ssim, lpips, count = (mean(row[key] for row in rows) for key in ("psnr", "ssim", "lpips", "num_gaussians"))
+    says(f"| {name} | {psnr:.1f} dB | {part(ssim, 3)} | {part(lpips, 3)} | {thousands(count)} |")
+
+
+def test_where_another_size_is_better():
+    found = raw("parsimony")
+    by_case: dict[tuple[str, int], dict[str, dict]] = {}
+    for row in found["rows"]:
+        by_case.setdefault((row["scene"], row["views"]), {})[row["method"]] = row
+    gains = {case: rows["pixel"]["psnr"] - rows["chosen"]["psnr"] for case, rows in by_case.items()}
+    worse = {("llff_fern", 6), ("llff_flower", 3), ("llff_flower", 6), ("sceaux", 3), ("castle_p30", 6)}
+    assert {case for case, gain in gains.items() if gain > 0} == worse
+    flower = " and ".join(part(gains["llff_flower", views], 1) for views in (3, 6))
+    says(
+        f"llff_fern at 6 views ({part(gains['llff_fern', 6], 1)} dB), llff_flower at 3 and 6 ({flower}), "
+        f"sceaux at 3 ({part(gains['sceaux', 3], 1)}) and castle_p30 at 6 ({part(gains['castle_p30', 6], 1)})"
+    )
+    castle = by_case["castle_p30", 6]
+    mcmc = castle["mcmc"]["psnr"] - castle["chosen"]["psnr"]
+    says(
+        f"With 6 a Gaussian a pixel is {gains['castle_p30', 6]:.1f} dB better there than splatnode, "
+        f"and MCMC of splatnode's size {mcmc:.1f} dB."
+    )
+    summary = found["summary"]
+    says(f"In {summary['on_front']['together']} of the {summary['cases']} cases no other row")
+    chosen = [rows["chosen"] for rows in by_case.values()]
+    a_gaussian = mean(row["spz_bytes"] / row["num_gaussians"] for row in chosen)
+    says(f"6 views takes {summary['spz_mb_6_views']:.2f} MB as `.spz`, {a_gaussian:.0f} bytes a Gaussian")
+    kept = [row["psnr_to_ply"] for row in raw("spz")["rows"]]
+    assert len(kept) == 4
+    says(f"renders of four scenes keep {min(kept):.0f} to {max(kept):.0f} dB")
+
+
+def test_budgets():
+    found = raw("budgets")
+    psnr = {(row["scene"], row["limit"], row["value"]): row["psnr"] for row in found["rows"]}
+    after = [psnr["fountain_p11", "iterations", count] for count in (25, 100, 500)]
+    says(f"worth {after[0]:.1f} dB after 25 iterations, {after[1]:.1f} after 100 and {after[2]:.1f} after 500")
+    falls = [re.fullmatch(r"fountain_p11 6, .* psnr ([\d.]+) to ([\d.]+)", fall) for fall in found["falls"]]
+    assert all(fall and 0.05 <= float(fall[1]) - float(fall[2]) < 0.15 for fall in falls)
+
+
+def test_trust():
+    poses = raw("poses")
+    total, rows = poses["summary"], poses["rows"]
+    assert total["published"] == total["right"] and not total["false_accepts"]
+    scenes = len({row["scene"] for row in rows})
+    says(f"Of {total['sets']} sets of 3, 6 and 12 views from {scenes} real scenes with known cameras")
+    says(f"{total['published']} were published, all of them right within 2° and 1.5 %")
+    stages = ("features", "matching", "mapping", "verification")
+    seconds = [
+        median(sum(row[f"seconds_{stage}"] for stage in stages) for row in rows if row["views"] == views)
+        for views in (3, 6, 12)
+    ]
+    says(f"take {seconds[0]:.1f}, {seconds[1]:.1f} and {seconds[2]:.1f} seconds in the median at 3, 6 and 12 views")
+    depth = [row["seconds"]["points"] / row["views"] for row in raw("replay")["rows"]]
+    says(f"depth maps take {part(min(depth), 1)} to {part(max(depth), 1)} seconds a view")
+
+
+def test_stability():
+    found = raw("stability")
+    trials, (summary,) = found["trials"], found["methods"]
+    assert summary["false_accept"]["count"] == 0
+    kinds, seeds = len({trial["name"] for trial in trials}), len({trial["seed"] for trial in trials})
+    says(
+        f"Of {len(trials)} trials of the stability matrix (`stability.json`, "
+        f"{kinds} kinds of trials with {seeds} seeds) none published"
+    )
+    low, high = found["false_accept_interval"]
+    says(f"({low:.0%} to {high:.1%} with 95 % confidence)".replace("%", " %", 2).replace("0 % to", "0 to"))
+    refused = [trial for trial in trials if trial["outcome"] == "false_refuse"]
+    says(f"In {len(refused)} of the {summary['false_refuse']['of']} trials that deserved a scene there was none")
+    says(f"in {sum(trial['verdict'] == 'BASELINE_TOO_SMALL' for trial in refused)} of them because the centres")
+
+
+def test_live():
+    rows = raw("live")["rows"]
+    assert [row["scene"] for row in rows] == ["fox", "llff_flower", "tum_fr3_office"]
+    assert all(row["live_psnr"] == row["offline_psnr"] for row in rows)
+    first, further = (", ".join(f"{row[key]:.1f}" for row in rows) for key in ("first_scene_s", "further_s_p95"))
+    says(f"| {first} s | `live.json` |", f"same sets | {further} s | `live.json` |")
+    says(f"besides decoding | {part(raw('capture')['besides_decoding'], 2)} of a core |")
+    soak = raw("soak")
+    assert soak["previews_lost"] == 0 and max(soak["memory_change"].values()) < 0.01
+    says(f"previews within {soak['preview_latency_ms']['p99']:.0f} ms (99th percentile) | `soak.json` |")
+    faults = raw("faults")["faults"].values()
+    tried, good = sum(fault["tried"] for fault in faults), sum(fault["good"] for fault in faults)
+    assert tried == good
+    says(f"| {len(faults)} faults, from kill -9 to a wrong key, 20 times each | all {tried} trials ended")
+    fuzz = raw("fuzz")
+    assert (
+        fuzz["decoders"]["errors_other_than_refusal"] == fuzz["tcp_ports"]["messages_that_reached_the_application"] == 0
+    )
+    says(f"| {fuzz['messages'] / 1e6:.1f} million malformed messages | no harm |")
+
+
+def test_viewer():
+    for name in ("viewer_hour", "viewer_live"):
+        live = raw(name)["live"]
+        assert live["not_seen_within_10_s"] == 0
+        late, memory = live["latency_ms"]["percentile_95"] / 1e3, live["memory_mb"]["at_the_end"]
+        assert memory >= max(live["memory_mb"]["median_of_each_twentieth"])
+        says(
+            f"all of {live['updates']} updates shown, 95 % within {late:.2f} s, "
+            f"memory at most {memory} MB | `{name}.json` |"
+        )
+    beside = raw("beside")
+    intake, steps = (beside["ratios"][kind]["viewer"] for kind in ("intake_per_s", "iterations_per_s"))
+    says(
+        f"{beside['taken']:.0%}".replace("%", " %") + " of both cores; "
+        f"keyframes taken in {part(intake['median'], 2)} times as fast in the median of {intake['rounds']} rounds "
+        f"({span(intake['range'])}), iterations {steps['median']:.2f} ({span(steps['range'])})"
+    )
+    viewer = raw("viewer")
+    points, splats = (viewer["pictures"][f"core {kind}"]["per_second_median"] for kind in ("points", "Gaussians"))
+    says(f"| {thousands(viewer['gaussians'])} points, Gaussians in the window, software Vulkan | ")
+    says(f"| {points:.0f}, {splats:.0f} pictures a second |")
+    agreement = viewer["agreement"]
+    says(f"differ by {agreement['mean']:.1f} of 255 levels in the mean ({len(agreement['cameras'])} cameras")
+
+
+def span(ends: Sequence[float]) -> str:
+    return " to ".join(part(end, 2) for end in ends)
+
+
+def test_speed_of_parts():
+    clock = raw("rasterize")["cases"]["50k_512x384_all"]["clock_ms"]
+    says(f"| {clock['median']:.1f} ms in the median, {clock['min']:.1f} ms at best | `rasterize.json` |")
+    pair = raw("priors")["figures"]["mast3r"]
+    says(f"| {pair['seconds_pair']:.0f} s, {pair['peak_rss_mb'] / 1e3:.1f} GB | `priors.json` |")
+
+
+def listed() -> dict[str, str]:
+    """The commit that the README gives, by raw file."""
+    rows = re.findall(r"^\| ([0-9a-f]{7,}) \| ((?:`\w+\.json`(?:, )?)+) \|$", README, re.MULTILINE)
+    return {name: commit for commit, names in rows for name in re.findall(r"`(\w+\.json)`", names)}
+
+
+def test_every_raw_file_is_listed():
+    assert set(listed()) == {path.name for path in RESULTS.glob("*.json")}
+
+
+@pytest.mark.parametrize("name", sorted(listed()))
+def test_a_raw_file_is_that_of_the_commit_that_the_readme_gives(name):
+    def git(*arguments: str) -> int:
+        return subprocess.run(["git", *arguments], cwd=ROOT, capture_output=True, check=False).returncode
+
+    if git("cat-file", "-e", f"{listed()[name]}^{{commit}}"):
+        pytest.skip("needs the project's whole history in git")
+    assert git("diff", "--quiet", listed()[name], "--", f"tests/bench/results/{name}") == 0
+
+
+def test_paths_in_the_readme_are_there():
+    paths = re.findall(r"`((?:capture|recon|viewer|tests|configs|docs)/[\w./*]*)`|\]\(([\w./]+)\)", README)
+    for path in (first or second for first, second in paths):
+        assert list(ROOT.glob(path.rstrip("/"))), f"README.md names {path}, which is not there"
