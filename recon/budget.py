@@ -53,12 +53,12 @@ def hits(config: Config, begun: Scene | None, scene: Scene | None, seconds: Mapp
 
 def _gaussians(config: Config, begun: Scene, scene: Scene) -> Hit | None:
     most, count = config.most_gaussians, len(scene.gaussians)
-    if most is None or count < most or begun.called_for <= most:
+    if most is None or count < most or begun.num_unlimited <= most:
         return None
     share = 1.0 if config.optimize.control is None else STAYS
-    would_take = max(round(share * begun.called_for), count)
+    would_take = max(round(share * begun.num_unlimited), count)
     gain = _gain(float(np.log2(would_take / count)), FEWER)
-    basis = f"{begun.called_for} pieces of equal colour and depth, of which {share:.0%} stay as a rule"
+    basis = f"{begun.num_unlimited} pieces of equal colour and depth, of which {share:.0%} stay as a rule"
     if most == config.max_gaussians:
         return Hit("max_gaussians", most, would_take, gain, basis)
     assert config.max_mb is not None  # it is the only other limit

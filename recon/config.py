@@ -19,7 +19,7 @@ from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.priors import classical
 from splatnode.recon.registration import config as registration
 from splatnode.recon.result.export.formats.ply import most_in_ply
-from splatnode.recon.scene import background, completion, pixelwise, seeding
+from splatnode.recon.scene import background, completion, initialisation, pixelwise, seeding
 from splatnode.recon.verification import decision, verify
 
 
@@ -47,7 +47,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     completion: completion.Config = completion.Config()
     seeding: seeding.Config = seeding.Config()
     background: background.Config = background.Config()
-    pixelwise: pixelwise.Config | None = None  # in place of completion, density and background, for comparison
+    pixelwise: pixelwise.Config | None = None  # in place of completion, seeding and background, for comparison
     preview: refinement.Config = refinement.Config(iterations=20, half_resolution_share=1.0)  # after each keyframe
     optimize: refinement.Config = FITTING  # after the last one
     metric: metric.Config = metric.Config()  # of what is published
@@ -68,6 +68,12 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """How many it may begin with."""
         most = self.most_gaussians
         return most if most is None or self.optimize.control is None else round(self.surplus * most)
+
+    @property
+    def initialisation(self) -> initialisation.Config:
+        """What decides the Gaussians that a scene begins with."""
+        most = self.first_gaussians
+        return initialisation.Config(self.completion, self.seeding, self.background, self.pixelwise, most)
 
 
 PRESETS: dict[str, Config] = {

@@ -1,9 +1,10 @@
-"""Rigid motions, quaternions and similarities. T_world_camera: p_world = T_world_camera @ p_camera."""
+"""Projection, rigid motions, quaternions and similarities. T_world_camera: p_world = T_world_camera @ p_camera."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -11,6 +12,23 @@ import torch
 from torch import Tensor
 
 Array = npt.NDArray[np.float64]
+ArrayOrTensor = TypeVar("ArrayOrTensor", Array, Tensor)
+
+MIN_DEPTH = 1e-9  # of a point that is projected; the scene's median depth is 1. Nearer points count as that near
+
+
+def to_camera(points: ArrayOrTensor, T_world_camera: ArrayOrTensor) -> ArrayOrTensor:
+    """World points (..., 3) in the frame of the camera `T_world_camera` (4, 4)."""
+    return (points - T_world_camera[:3, 3]) @ T_world_camera[:3, :3]
+
+
+def project(in_camera: Array, K: Array) -> Array:
+    """(N, 2) pixels of points (N, 3) in the camera frame, under intrinsics K (3, 3) without skew.
+
+    Points behind the camera get pixels too, which mean nothing: look at their depth.
+    """
+    depth = np.maximum(in_camera[:, 2:], MIN_DEPTH)
+    return in_camera[:, :2] / depth * np.diag(K)[:2] + K[:2, 2]
 
 
 def exp_se3(twist: Tensor) -> Tensor:
@@ -80,26 +98,27 @@ def multiply_quats(a: Tensor, b: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class Similarity:
-    """x -> scale * rotation @ x + translation."""
+    """The map x -> scale * rotation @ x + translation of points in 3D."""
 
     scale: float
     rotation: Array  # (3, 3)
     translation: Array  # (3,)
 
     def __call__(self, points: Array) -> Array:
-        """Points (..., 3) where they are after it."""
+        """The points (..., 3) after the similarity."""
         return self.scale * points @ self.rotation.T + self.translation
 
     def after(self, inner: Similarity) -> Similarity:
-        """This one applied to the result of `inner`."""
+        """The similarity that applies `inner` first and then this one."""
         return Similarity(self.scale * inner.scale, self.rotation @ inner.rotation, self(inner.translation))
 
     def inverse(self) -> Similarity:
+        """The similarity that undoes this one."""
         rotation = self.rotation.T
         return Similarity(1.0 / self.scale, rotation, -rotation @ self.translation / self.scale)
 
     def camera(self, T_world_camera: Array) -> Array:
-        """The camera after the world was moved: its rotation turned, its centre moved, no scale in the matrix."""
+        """(4, 4) the camera after the similarity moved the world; still a rigid motion: the scale moves its centre."""
         moved = np.eye(4)
         moved[:3, :3] = self.rotation @ T_world_camera[:3, :3]
         moved[:3, 3] = self.scale * self.rotation @ T_world_camera[:3, 3] + self.translation

@@ -18,7 +18,7 @@ from splatnode.recon.clock import Clock
 from splatnode.recon.config import Config
 from splatnode.recon.estimation import Judgement, Judging
 from splatnode.recon.frames.keyframe import Features, Keyframe, modelled_image
-from splatnode.recon.frames.screening import Look, Rejected, look, screen
+from splatnode.recon.frames.screening import FrameSummary, Rejected, screen, summarise
 from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -27,8 +27,9 @@ from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Verdict
-from splatnode.recon.scene import growth
-from splatnode.recon.scene.scene import Scene, begin
+from splatnode.recon.scene import growth, warping
+from splatnode.recon.scene.initialisation import initial_scene
+from splatnode.recon.scene.scene import Scene
 from splatnode.recon.verification.likelihood import record
 
 log = logging.getLogger(__name__)
@@ -98,7 +99,7 @@ class Reconstruction:
         self.scene: Scene | None = None  # what is shown
         self._ruined: Verdict | None = None  # of the last refinement, if it was given up
         self.sequence = 0
-        self._looks: dict[str, Look] = {}  # of the frames that were taken
+        self._looks: dict[str, FrameSummary] = {}  # of the frames that were taken
         self._judging = Judging(config)
         self.pointmaps: dict[str, Pointmap] = {}  # by keyframe, as they were last computed
 
@@ -135,7 +136,7 @@ class Reconstruction:
 
     def screen(self, frame: Frame) -> list[Rejected]:
         """The frames that say nothing beside the others, now that there is this one too: it, or earlier ones."""
-        self._looks[frame.name] = look(frame)
+        self._looks[frame.name] = summarise(frame)
         _, rejected = screen(list(self._looks.values()), self.config.screening)
         self.rejected = [*self.rejected, *rejected][-REMEMBERED_REJECTED:]
         for each in rejected:
@@ -144,7 +145,7 @@ class Reconstruction:
 
     def add(self, keyframe: Keyframe) -> None:
         """Adds a frame that was prepared elsewhere to the view graph, compared with a few others for now."""
-        self._looks.setdefault(keyframe.name, look(keyframe.frame))
+        self._looks.setdefault(keyframe.name, summarise(keyframe.frame))
         self.graph.add(keyframe, soon=True)
         newest = len(self.graph.keyframes) - 1
         overlapping = sum(newest in pair for pair in self.graph.pairs)
@@ -165,7 +166,7 @@ class Reconstruction:
         self.begun = None
         self.pointmaps = {name: pointmap for name, pointmap in self.pointmaps.items() if name not in names}
         if self.scene is not None and not {view.name for view in self.scene.views}.isdisjoint(names):
-            rest = growth.without(self.scene, names)
+            rest = growth.without_views(self.scene, names)
             self.scene = rest if rest.views else None
 
     def judge(self) -> Judgement:
@@ -195,14 +196,14 @@ class Reconstruction:
         judged = self.judge()
         if self.scene is None or judged.registration is None or not judged.verdict.publishable:
             return False
-        placed = growth.in_world_of(self.scene, judged.registration, self.graph)
-        known = growth.carried(self.pointmaps, placed, self.graph) if placed else {}
-        moved = growth.moved(self.scene, self.pointmaps, known, FITS)
+        placed = warping.registration_in_scene_world(self.scene, judged.registration, self.graph)
+        known = warping.updated_pointmaps(self.pointmaps, placed, self.graph) if placed else {}
+        moved = warping.warped_scene(self.scene, self.pointmaps, known, FITS)
         if placed is None or moved is None:
             return False
         further = self._prior.further_pointmaps(self.graph, placed, known)
         self.pointmaps = known | {pointmap.name: pointmap for pointmap in further}
-        self.show(growth.grow(moved, self.pointmaps, self.graph, placed, self.config))
+        self.show(growth.grow(moved, self.pointmaps, self.graph, placed, self.config.initialisation))
         self.clock.lap("points")
         return True
 
@@ -231,16 +232,11 @@ class Reconstruction:
         if registration is None or not judged.verdict.publishable:
             self.begun = None
             return
-        config = self.config
-        self.begun = begin(
+        self.begun = initial_scene(
             tuple(self.pointmaps.values()),
             {keyframe.name: keyframe.image for keyframe in self.graph.keyframes},
             registration.cameras,
-            config.completion,
-            config.seeding,
-            config.background,
-            config.first_gaussians,
-            config.pixelwise,
+            self.config.initialisation,
         )
         self.clock.lap("points")
 
@@ -265,7 +261,7 @@ class Reconstruction:
         if scene is None or self._ruined is not None:
             self.scene = None
         else:
-            self.scene = growth.within(scene, self.config.most_gaussians)
+            self.scene = growth.limited(scene, self.config.most_gaussians)
 
     def snapshot(self, final: bool = False) -> Snapshot:
         self.sequence += 1

@@ -7,7 +7,7 @@ from collections.abc import Collection, Mapping, Sequence
 from splatnode.recon.config import Config
 from splatnode.recon.estimation import Judgement
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.frames.screening import look
+from splatnode.recon.frames.screening import summarise
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.pipeline import Reconstruction
 
@@ -68,7 +68,7 @@ class LiveReconstruction(Reconstruction):
         place = {keyframe.name: index for index, keyframe in enumerate(keyframes)}
         self.graph.pairs = {(place[i], place[j]): pair for (i, j), pair in pairs.items() if i in place and j in place}
         self.graph.pending = {(place[i], place[j]) for i, j in pending if i in place and j in place}
-        self._looks |= {keyframe.name: look(keyframe.frame) for keyframe in keyframes}
+        self._looks |= {keyframe.name: summarise(keyframe.frame) for keyframe in keyframes}
 
     def restore_judgement(self, judgement: Judgement, proven: Collection[str]) -> None:
         """Takes over what an earlier process had judged of just the keyframes that there are."""

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.geometry import MIN_DEPTH, project, to_camera
 from splatnode.recon.matching import features, nearest_neighbours
 from splatnode.recon.result.picture import take_picture
 from splatnode.recon.result.snapshot import Snapshot
@@ -189,10 +190,8 @@ def _resect(pixels: Array, points: Array, K: Array, max_error_px: float) -> tupl
 
 def _project(T_world_camera: Array, K: Array, points: Array) -> Array:
     """(N, 3) columns, rows and depths of world points (N, 3)."""
-    T_camera_world = np.linalg.inv(T_world_camera)
-    inside = points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
-    depth = np.maximum(inside[:, 2], 1e-9)
-    return np.c_[inside[:, 0] / depth * K[0, 0] + K[0, 2], inside[:, 1] / depth * K[1, 1] + K[1, 2], depth]
+    in_camera = to_camera(points, T_world_camera)
+    return np.c_[project(in_camera, K), np.maximum(in_camera[:, 2], MIN_DEPTH)]
 
 
 def _covariance(T_world_camera: Array, pixels: Array, points: Array, K: Array, independent: int) -> Array:

@@ -191,10 +191,10 @@ def _score_test_views(
     names = [name for name in split.test if name in scene.cameras]
     photographs = [modelled_image(scene.image(name), settings.longer_side) for name in names]
     scores = []
-    for name, photograph, shown in zip(names, photographs, border.shown(photographs), strict=True):
+    for name, photograph, shown in zip(names, photographs, border.valid_masks(photographs), strict=True):
         whole = torch.from_numpy(photograph).float() / 255.0
         whole_K = mean_intrinsics(cameras, photograph.shape[1], photograph.shape[0])
-        rows, columns = border.rectangle(shown)
+        rows, columns = border.valid_rectangle(shown)
         truth = whole[rows, columns]
         K = whole_K - np.array([[0.0, 0.0, columns.start], [0.0, 0.0, rows.start], [0.0, 0.0, 0.0]])
         if name in found:

@@ -12,16 +12,16 @@ import numpy.typing as npt
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
-WIDEST = 0.03  # of the longer side: what is dark for longer, inwards from the border, is a dark scene
-SHORTEST = 0.2  # of a side: dark along less of it is no rim
-BRIGHTEST = 80  # grey level of a pixel of the rim, into which shrinking the photograph mixes its neighbours
+MAX_RIM_WIDTH = 0.03  # of the longer side: what is dark farther inwards from the border is a dark scene
+MIN_RIM_LENGTH = 0.2  # of a side: what is dark along less of it is no rim
+MAX_RIM_LEVEL = 80  # of 255: shrinking a photograph mixes the black of its rim with the scene beside it
 
 
-def shown(images: Sequence[Image]) -> list[Mask]:
-    """For each photograph (h, w, 3) the pixels (h, w) that show the scene.
+def valid_masks(images: Sequence[Image]) -> list[Mask]:
+    """For each photograph (h, w, 3) the mask (h, w) of the pixels that show the scene.
 
-    A lens leaves the same rim in all its photographs, so it is where all those of a size are dark; of a size that
-    there is only once, all pixels are taken to show the scene.
+    A lens leaves the same rim in all its photographs, so the rim is where all photographs of one size are dark. Of a
+    size that occurs only once, all pixels count as valid.
     """
     by_size: dict[tuple[int, ...], list[Image]] = {}
     for image in images:
@@ -30,14 +30,14 @@ def shown(images: Sequence[Image]) -> list[Mask]:
     return [~rims[image.shape] for image in images]
 
 
-def rectangle(shown: Mask) -> tuple[slice, slice]:
-    """Rows and columns of an upright rectangle, as large as can be, all of which a photograph shows.
+def valid_rectangle(valid: Mask) -> tuple[slice, slice]:
+    """Rows and columns of an upright rectangle of valid pixels only, as large as can be found greedily.
 
-    The side that shows least is taken away until all sides show everything.
+    The side with the smallest share of valid pixels is taken away until all sides are valid. `valid` is (h, w).
     """
     top, left = 0, 0
-    bottom, right = shown.shape
-    while not (inside := shown[top:bottom, left:right]).all():
+    bottom, right = valid.shape
+    while not (inside := valid[top:bottom, left:right]).all():
         sides = inside[0], inside[-1], inside[:, 0], inside[:, -1]
         worst = int(np.argmin([side.mean() for side in sides]))
         top, bottom, left, right = top + (worst == 0), bottom - (worst == 1), left + (worst == 2), right - (worst == 3)
@@ -45,14 +45,14 @@ def rectangle(shown: Mask) -> tuple[slice, slice]:
 
 
 def _rim(images: Sequence[Image]) -> Mask:
-    """(h, w) what is dark in all of several images, from the border inwards, and a pixel more."""
-    dark = reduce(np.maximum, images).max(2) <= BRIGHTEST
+    """(h, w) runs of pixels from the border inwards that are dark in all `images`, dilated by a pixel."""
+    dark = reduce(np.maximum, images).max(2) <= MAX_RIM_LEVEL
     if len(images) < 2:
         return np.zeros_like(dark)
-    band = max(2, round(WIDEST * max(dark.shape)))
-    upright = _from_top(dark, band) | _from_top(dark[::-1], band)[::-1]
-    across = _from_top(dark.T, band).T | _from_top(dark.T[::-1], band)[::-1].T
-    # Along one side's rim a corner is dark for longer than another side's rim is wide.
+    band = max(2, round(MAX_RIM_WIDTH * max(dark.shape)))
+    upright = _top_runs(dark, band) | _top_runs(dark[::-1], band)[::-1]
+    across = _top_runs(dark.T, band).T | _top_runs(dark.T[::-1], band)[::-1].T
+    # In a corner, a run along one side lies in the other side's rim and is longer than `band`.
     corner = np.zeros_like(dark)
     for rows in (slice(0, band), slice(-band, None)):
         for columns in (slice(0, band), slice(-band, None)):
@@ -61,9 +61,9 @@ def _rim(images: Sequence[Image]) -> Mask:
     return cv2.dilate(rim.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
-def _from_top(dark: Mask, band: int) -> Mask:
-    """What is dark from the first row downwards, in the columns in which that ends within `band` rows, if many."""
+def _top_runs(dark: Mask, band: int) -> Mask:
+    """(h, w) leading dark runs per column, if at most `band` long; none if in under MIN_RIM_LENGTH of the columns."""
     run = np.zeros_like(dark)
     run[: band + 1] = np.logical_and.accumulate(dark[: band + 1], axis=0)
     run &= ~run[min(band, len(run) - 1)]
-    return run & (run[0].mean() >= SHORTEST)
+    return run & (run[0].mean() >= MIN_RIM_LENGTH)

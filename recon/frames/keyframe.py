@@ -1,4 +1,4 @@
-"""Keyframe: an accepted frame with its features and its image at modelled size."""
+"""Keyframe: an accepted frame with its features, and its image at modelled size, to which the scene is fitted."""
 
 from __future__ import annotations
 
@@ -24,9 +24,12 @@ class Features:
     tilt: npt.NDArray[np.float64]  # (D,) simulated tilt: the image was this much narrower than the frame; 1 for none
 
 
+_KEY_POINTS = 64  # features whose places tell any two photographs apart
+
+
 @dataclass(frozen=True, eq=False)
 class Keyframe:
-    frame: Frame
+    frame: Frame  # undistorted, at full size
     image: npt.NDArray[np.uint8]  # (h, w, 3) RGB at modelled size
     features: Features
 
@@ -36,22 +39,22 @@ class Keyframe:
 
     @property
     def scale(self) -> tuple[float, float]:
-        """Modelled size over full size, horizontally and vertically."""
+        """Modelled width over full width, and modelled height over full height."""
         return self.image.shape[1] / self.frame.width, self.image.shape[0] / self.frame.height
 
 
 def content_key(keyframe: Keyframe) -> bytes:
-    """Sorts keyframes by what they show: with it, an answer does not depend on the order in which they came."""
-    return keyframe.features.points[:64].tobytes()
+    """A key to sort keyframes by what they show, so that an answer does not depend on the order in which they came."""
+    return keyframe.features.points[:_KEY_POINTS].tobytes()
 
 
 def longer_side(frame: Frame) -> int:
-    """Pixels."""
+    """Of the frame at full size, pixels."""
     return max(frame.width, frame.height)
 
 
 def principal_point(frame: Frame) -> npt.NDArray[np.float64]:
-    """(2,) pixels: as given, else the middle of the image."""
+    """(2,) pixels of the frame at full size: as its intrinsics give it, else the middle of the image."""
     if frame.intrinsics is not None:
         return np.array([frame.intrinsics.cx, frame.intrinsics.cy])
     return np.array([frame.width / 2.0, frame.height / 2.0])
@@ -64,7 +67,7 @@ def modelled_size(width: int, height: int, longer_side: int) -> tuple[int, int]:
 
 
 def modelled_image(image: npt.NDArray[np.uint8], longer_side: int) -> npt.NDArray[np.uint8]:
-    """`image` (H, W, 3) area-resampled to its modelled size."""
+    """`image` (H, W, 3) area-resampled to its modelled size (h, w, 3); itself where it has that size."""
     width, height = modelled_size(image.shape[1], image.shape[0], longer_side)
     if (width, height) == (image.shape[1], image.shape[0]):
         return image

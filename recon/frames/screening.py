@@ -1,4 +1,4 @@
-"""Frames that say nothing new are left out before anything is computed from them: copies, blank and blurred ones."""
+"""Screening: copies, blank and blurred frames are left out before anything is computed from them."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from splatnode.recon.result.verdict import Code
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    limits: quality.Limits = quality.Limits()
+    limits: quality.Limits = quality.Limits()  # those of capture, which has screened live frames already
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """What the screening keeps in mind of a frame."""
+class FrameSummary:
+    """What the screening remembers of a frame."""
 
     name: str
     quality: quality.Quality
-    thumbnail: npt.NDArray[np.uint8]  # (h, w, 3) RGB
-    size: tuple[int, int]  # width and height of the frame
+    thumbnail: npt.NDArray[np.uint8]  # (h, w, 3) RGB, the longer side at most quality.THUMBNAIL_SIDE
+    size: tuple[int, int]  # width and height of the frame, pixels
 
 
 @dataclass(frozen=True)
@@ -38,41 +38,43 @@ class Rejected:
     reason: str
 
 
-def look(frame: Frame) -> Look:
+def summarise(frame: Frame) -> FrameSummary:
+    """The frame's quality, measured, and its thumbnail."""
     scale = min(1.0, quality.THUMBNAIL_SIDE / max(frame.width, frame.height))
     size = max(1, round(frame.width * scale)), max(1, round(frame.height * scale))
     thumbnail = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
-    return Look(frame.name, quality.assess(frame.image), thumbnail, (frame.width, frame.height))
+    return FrameSummary(frame.name, quality.assess(frame.image), thumbnail, (frame.width, frame.height))
 
 
-def screen(looks: Sequence[Look], config: Config) -> tuple[list[int], list[Rejected]]:
-    """Which of the frames are worth working on, by position, and why the others are not.
+def screen(summaries: Sequence[FrameSummary], config: Config) -> tuple[list[int], list[Rejected]]:
+    """The positions of the frames that are worth working on, and the others with the reason.
 
     Of copies the first is kept. Blur is compared with the sharpest frame of all, so that the order does not matter.
     """
-    sharpest = min((look.quality.blur_px for look in looks if look.quality.blur_px is not None), default=None)
+    sharpest = min((each.quality.blur_px for each in summaries if each.quality.blur_px is not None), default=None)
     kept: list[int] = []
     rejected: list[Rejected] = []
-    for index, look in enumerate(looks):
-        why = quality.why_unusable(look.quality, config.limits, sharpest)
+    for index, summary in enumerate(summaries):
+        why = quality.why_unusable(summary.quality, config.limits, sharpest)
         if why is not None:
-            rejected.append(Rejected(look.name, _code(look.quality, config.limits), why))
+            rejected.append(Rejected(summary.name, _code(summary.quality, config.limits), why))
             continue
-        copied = next((looks[other] for other in kept if _same(look, looks[other], config.limits)), None)
-        if copied is None:
+        original = next((summaries[i] for i in kept if _is_copy(summary, summaries[i], config.limits)), None)
+        if original is None:
             kept.append(index)
         else:
-            rejected.append(Rejected(look.name, Code.STATIC_CAMERA, f"duplicate of {copied.name}"))
+            rejected.append(Rejected(summary.name, Code.STATIC_CAMERA, f"duplicate of {original.name}"))
     return kept, rejected
 
 
 def _code(measured: quality.Quality, limits: quality.Limits) -> Code:
+    """The verdict on an unusable frame: nothing to see on it, else too blurred."""
     blank = measured.blur_px is None or measured.contrast < limits.contrast
     exposed = 1.0 - measured.dark - measured.bright >= limits.exposed
     return Code.LOW_TEXTURE if blank or not exposed else Code.BLUR
 
 
-def _same(one: Look, other: Look, limits: quality.Limits) -> bool:
+def _is_copy(one: FrameSummary, other: FrameSummary, limits: quality.Limits) -> bool:
     if one.size != other.size:
         return False
     return quality.why_redundant(quality.novelty(one.thumbnail, other.thumbnail), limits) is not None

@@ -1,4 +1,4 @@
-"""Frames of a calibrated lens as a pinhole with square pixels would have taken them: what the rest of recon models."""
+"""Undistortion: frames of a calibrated lens, resampled to the pinhole with square pixels that recon models."""
 
 from __future__ import annotations
 
@@ -12,23 +12,25 @@ from splatnode.capture.frame import Frame, Intrinsics
 
 Array = npt.NDArray[np.float64]
 
-SQUARE = 0.002  # relative difference of fx and fy below which pixels are square
+SQUARE_TOLERANCE = 0.002  # relative difference of fx and fy below which pixels are square: a pixel in 500
 _NUM_COEFFICIENTS = (4, 5, 8, 12, 14)  # that OpenCV's lens model takes
-_SHORTEST_SIDE = 0.3  # of the rectangle that is kept, over the focal length's: less is no picture
+_MIN_SIDE = 0.3  # shorter side of the rectangle that is kept, over the undistorted one's: less is no picture
+_POINTS_A_SIDE = 33  # of the picture's border that are undistorted: between two of them a real lens bends by no pixel
+_MAX_ROUND_TRIP_PX = 0.5  # from a border point to its ray and back: a model that folds over misses by many pixels
 
 
 def undistorted(frame: Frame) -> Frame:
-    """The frame without its lens' distortion and with fx = fy; the frame itself where there is nothing to take out.
+    """The frame without its lens' distortion and with fx = fy; the frame itself where there is nothing to undo.
 
-    The largest picture of the same size without unseen corners: pixels outside the distorted one would be invented.
-    Raises ValueError for coefficients that OpenCV's model does not have, or that fold the picture over.
+    It has the same size in pixels and shows the largest rectangle without unseen corners, whose pixels would be
+    invented. Raises ValueError for coefficients that OpenCV's model does not have, or that fold the picture over.
     """
     given = frame.intrinsics
     if given is None:
         return frame
     given = given.resized(frame.width, frame.height)
     straight = not any(given.distortion)
-    if straight and abs(given.fx / given.fy - 1.0) < SQUARE:
+    if straight and abs(given.fx / given.fy - 1.0) < SQUARE_TOLERANCE:
         return frame if given == frame.intrinsics else replace(frame, intrinsics=given)
     coefficients = _coefficients(frame.name, given)
     left, top, right, bottom = _seen_rectangle(frame.name, given, coefficients)
@@ -54,6 +56,7 @@ def undistorted(frame: Frame) -> Frame:
 
 
 def _coefficients(name: str, given: Intrinsics) -> Array:
+    """The lens' coefficients, filled up with zeros to a number that OpenCV takes. Raises ValueError for too many."""
     values = given.distortion or (0.0,)
     if len(values) > max(_NUM_COEFFICIENTS):
         raise ValueError(
@@ -70,8 +73,11 @@ def _opencv_matrix(intrinsics: Intrinsics) -> Array:
 
 
 def _seen_rectangle(name: str, given: Intrinsics, coefficients: Array) -> tuple[float, float, float, float]:
-    """Left, top, right and bottom, at depth 1, of the largest upright rectangle whose every ray the picture has."""
-    across, down = np.linspace(0.0, given.width, 33) - 0.5, np.linspace(0.0, given.height, 33) - 0.5
+    """Left, top, right and bottom, at depth 1, of the largest upright rectangle of rays that the picture has.
+
+    Raises ValueError where the distortion folds the picture over.
+    """
+    across, down = (np.linspace(0.0, side, _POINTS_A_SIDE) - 0.5 for side in (given.width, given.height))
     ends = [
         np.stack([np.full_like(down, across[0]), down], 1),
         np.stack([across, np.full_like(across, down[0])], 1),
@@ -92,7 +98,7 @@ def _seen_rectangle(name: str, given: Intrinsics, coefficients: Array) -> tuple[
     left, top = float(straight[0][:, 0].max()), float(straight[1][:, 1].max())
     right, bottom = float(straight[2][:, 0].min()), float(straight[3][:, 1].min())
     plain = min(given.width / given.fx, given.height / given.fy)
-    if not error < 0.5 or min(right - left, bottom - top) < _SHORTEST_SIDE * plain:
+    if not error < _MAX_ROUND_TRIP_PX or min(right - left, bottom - top) < _MIN_SIDE * plain:
         raise ValueError(
             f"{name}: distortion {given.distortion} folds the picture over at its border. "
             "Calibrate again, with the pattern in the corners of the picture too."

@@ -10,7 +10,7 @@ from splatnode.recon.optimize.refinement import PARAMETERS
 from splatnode.recon.optimize.target import target
 from splatnode.recon.rasterize.gaussian_render import seen
 from splatnode.recon.result.verdict import Verdict
-from splatnode.recon.scene.scene import Scene, View
+from splatnode.recon.scene.scene import Scene, TrainingView
 from splatnode.recon.verification import refusals
 
 WORSE = 1.1  # times the misfit that the scene began with; refinements that work end between .2 and .8 of it
@@ -33,7 +33,7 @@ def misfit(scene: Scene) -> float:
     return sum(_misfit(scene, view) for view in views) / len(views)
 
 
-def _misfit(scene: Scene, view: View) -> float:
+def _misfit(scene: Scene, view: TrainingView) -> float:
     photograph = target(view, np.ones((view.height, view.width), np.bool_), _SCALE, _DSSIM)
     size = photograph.width, photograph.height
     rgb = seen(scene.gaussians, scene.gaussians.opacities, view.T_world_camera, photograph.K, *size).rgb

@@ -13,8 +13,9 @@ import msgspec
 import torch
 from torch import Tensor
 
+from splatnode.recon.geometry import to_camera
 from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.scene import View
+from splatnode.recon.scene.scene import TrainingView
 
 MOST_OPACITY = 0.9999
 
@@ -28,7 +29,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Dropout:
     """Draws what each render leaves out."""
 
-    def __init__(self, config: Config, gaussians: Gaussians, views: Sequence[View], seed: int) -> None:
+    def __init__(self, config: Config, gaussians: Gaussians, views: Sequence[TrainingView], seed: int) -> None:
         if not 0 <= config.share < 1:
             raise ValueError(f"dropout.share must be from 0 to below 1, got {config.share}")
         self._config, self._views = config, views
@@ -49,7 +50,7 @@ class Dropout:
 
 
 @torch.no_grad()
-def doubt(gaussians: Gaussians, views: Sequence[View], sure: float) -> Tensor:
+def doubt(gaussians: Gaussians, views: Sequence[TrainingView], sure: float) -> Tensor:
     """(N,) from 0 for Gaussians on pixels that stereo is `sure` of to 1 for those of which it knows nothing.
 
     Each is looked up in the view that started it; what none did is doubted. Views without a point map doubt nothing.
@@ -61,7 +62,7 @@ def doubt(gaussians: Gaussians, views: Sequence[View], sure: float) -> Tensor:
             result[own] = 0.0
             continue
         T, K = view.T_world_camera, view.K
-        x, y, z = ((gaussians.means[own] - T[:3, 3]) @ T[:3, :3] @ K.T).unbind(1)
+        x, y, z = (to_camera(gaussians.means[own], T) @ K.T).unbind(1)
         z = z.clamp(min=1e-6)
         column = (x / z).clamp(0, view.width - 1).long()
         row = (y / z).clamp(0, view.height - 1).long()

@@ -116,7 +116,7 @@ class _Fit:
         self._Ts_world_camera = [view.T_world_camera.clone() for view in scene.views]
         self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
         self._pose_moments = [(torch.zeros(6), torch.zeros(6), 0) for _ in scene.views]
-        shown = border.shown([view.image for view in scene.views])
+        shown = border.valid_masks([view.image for view in scene.views])
         self._targets = [
             [target(*each, scale, config.dssim) for each in zip(scene.views, shown, strict=True)]
             for scale in (1.0, 0.5)

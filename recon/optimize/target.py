@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.optimize.photometric_loss import PhotometricLoss
-from splatnode.recon.scene.scene import View
+from splatnode.recon.scene.scene import TrainingView
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class Target:
     loss: PhotometricLoss  # with the photograph as its target, where it shows the scene
 
 
-def target(view: View, shown: npt.NDArray[np.bool_], scale: float, dssim: float) -> Target:
+def target(view: TrainingView, shown: npt.NDArray[np.bool_], scale: float, dssim: float) -> Target:
     """The photograph of `view` at `scale` of its size; `dssim` weighs the two parts of the loss.
 
     Only pixels that are `shown` (h, w) entirely are compared.

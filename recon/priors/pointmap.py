@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -25,13 +25,22 @@ class Pointmap:
         """(h, w, 3) world points; the camera's centre where the depth is unknown."""
         return world_points(self.depth, self.T_world_camera, self.K)
 
+    def masked(self, keep: npt.NDArray[np.bool_]) -> Pointmap:
+        """The point map with depth, normal and confidence 0, which is unknown, outside the mask `keep` (h, w)."""
+        return replace(
+            self,
+            depth=self.depth * keep,
+            confidence=self.confidence * keep,
+            normal=self.normal * keep[..., None],
+        )
+
 
 def world_points(
     depth: npt.NDArray[np.float32],  # (h, w) z in the camera frame
     T_world_camera: npt.NDArray[np.float64],  # (4, 4)
     K: npt.NDArray[np.float64],  # (3, 3)
 ) -> npt.NDArray[np.float32]:
-    """(h, w, 3) what a camera's pixels show, in the world."""
+    """(h, w, 3) world points that a camera's pixels show; the camera's centre where the depth is 0."""
     height, width = depth.shape
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1)

@@ -1,4 +1,4 @@
-"""A far shell behind the scene, so that what no view has seen is not black but of the colour around it."""
+"""The far shell: Gaussians on a sphere behind the scene, so that what no view has seen has the colours around it."""
 
 from __future__ import annotations
 
@@ -10,46 +10,59 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from splatnode.recon.geometry import quat_from_matrix
+from splatnode.recon.geometry import project, quat_from_matrix, to_camera
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.scene.gaussians import SH_C0, Gaussians
+from splatnode.recon.scene.gaussians import SH_C0, Gaussians, logit
 
 Array = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
+Image = npt.NDArray[np.uint8]
+
+SHELL = -1  # the source_frame of the shell's Gaussians, which no frame's pixels seeded
+
+EXTENT = 0.7  # standard deviation of a Gaussian along the shell, over the spacing: neighbours overlap without seams
+THICKNESS = 0.1  # standard deviation of a Gaussian across the shell, over that along it
+MIN_COSINE = 0.05  # of a point's angle to the optical axis: beyond, 87 degrees, a pinhole's pixels run to infinity
+BLUR = 0.04  # standard deviation of the colours' blur, over an image's longer side: the shell shows no detail
+BLURRED_PX = 4  # pixels of a blurred image in a standard deviation of its blur: finer ones show nothing more
+FAR_POWER = 4  # of a pixel's depth over the farthest, by which its colour counts: half as far is a sixteenth
+MIN_FAR_WEIGHT = 1e-3  # of the nearest pixel, where no far one is in reach of the blur
+OUTSIDE_PENALTY = 10.0  # by which the logarithm of a view's weight falls for each image size that a point lies outside
+ELEVATION_STRETCH = 4.0  # by which differences of elevation count: what lies beside the images is more like them
+MIN_SQUARED_DISTANCE = 1e-4  # between directions of length 1, in the weights of the continuation
+MIN_WIDENING = 1.1  # of the spacing in each attempt to have fewer Gaussians
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    spacing_deg: float = 5.0  # between neighbouring Gaussians of the shell; 0 leaves it out
-    margin: float = 2.0  # how far beyond the images' borders it reaches, in units of their size
-    distance: float = 1.3  # from the cameras, in units of the farthest known depth
+    spacing_deg: float = 5.0  # between neighbouring Gaussians of the shell; 0 leaves the shell out
+    margin: float = 2.0  # how far beyond the images' borders the shell reaches, in units of the images' size
+    distance: float = 1.3  # radius, in units of the farthest known depth
     opacity: float = 0.95
 
 
-SHELL = -1  # the source_frame of its Gaussians, which no frame's pixels started
-
-
-def background(
-    pointmaps: Sequence[Pointmap],
-    images: Sequence[npt.NDArray[np.uint8]],
-    config: Config,
-    max_gaussians: int | None = None,
+def far_shell(
+    pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Config, max_gaussians: int | None = None
 ) -> Gaussians:
-    """Gaussians on a sphere around the cameras, in the directions that they look; wider apart to be `max_gaussians`."""
+    """Gaussians on a sphere around the cameras, in the directions in which these look; at most `max_gaussians`.
+
+    `images` (h, w, 3) are those of the point maps. Where there would be more Gaussians, they are farther apart.
+    """
     shell = _shell(pointmaps, images, config)
     while max_gaussians is not None and len(shell) > max_gaussians:
-        wider = max(1.1, (len(shell) / max(max_gaussians, 1)) ** 0.5)
+        wider = max(MIN_WIDENING, (len(shell) / max(max_gaussians, 1)) ** 0.5)
         config = msgspec.structs.replace(config, spacing_deg=wider * config.spacing_deg)
         shell = _shell(pointmaps, images, config)
     return shell
 
 
-def _shell(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config) -> Gaussians:
-    """The Gaussians `config.spacing_deg` apart, with the colours that the images have there or suggest."""
+def _shell(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Config) -> Gaussians:
+    """Gaussians `config.spacing_deg` apart, with the colours that the images have there, or suggest."""
     centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps])
     centre = centres.mean(0)
     farthest = max(float(pointmap.depth.max()) for pointmap in pointmaps)
     spread = float(np.linalg.norm(centres - centre, axis=1).max())
     radius = config.distance * max(farthest, spread)
-    directions = _sphere(config.spacing_deg)
+    directions = _fibonacci_sphere(config.spacing_deg)
     outside, colours = _seen(centre + radius * directions, farthest, pointmaps, images)
     kept = outside < config.margin
     directions, outside, colours = directions[kept], outside[kept], colours[kept]
@@ -58,41 +71,41 @@ def _shell(pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]
         upward = -np.sum([pointmap.T_world_camera[:3, 1] for pointmap in pointmaps], axis=0)
         colours[~inside] = _continued(directions[~inside], directions[inside], colours[inside], upward)
     count = len(directions)
-    extent = 0.7 * radius * np.radians(config.spacing_deg)
-    scales = np.tile(extent * np.array([1.0, 1.0, 0.1]), (count, 1))
+    extent = EXTENT * radius * np.radians(config.spacing_deg)
+    scales = np.tile(extent * np.array([1.0, 1.0, THICKNESS]), (count, 1))
     return Gaussians(
         means=torch.from_numpy(centre + radius * directions).float(),
         quats=quat_from_matrix(torch.from_numpy(_frames(directions)).float()),
         log_scales=torch.from_numpy(np.log(scales)).float(),
-        logit_opacities=torch.full((count,), float(np.log(config.opacity / (1 - config.opacity)))),
+        logit_opacities=torch.full((count,), logit(config.opacity)),
         sh=torch.from_numpy((colours - 0.5) / SH_C0).float()[:, None],
         source_frame=torch.full((count,), SHELL, dtype=torch.int32),
     )
 
 
 def _seen(
-    points: Array, farthest: float, pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]]
+    points: Array, farthest: float, pointmaps: Sequence[Pointmap], images: Sequence[Image]
 ) -> tuple[Array, Array]:
-    """How far outside all images the points (M, 3) lie, in units of the images' size, and their colours (M, 3) there.
+    """(M,) how far world points (M, 3) lie outside all images, in units of the images' size; (M, 3) their colours.
 
-    A colour is strongly blurred over what is far or unknown: a wall that is near says nothing about what lies behind
-    it. Views that see far in that direction count, and of these the one that the point lies deepest in.
+    A point inside an image has a negative distance, one that no view has before it an infinite one. A colour is
+    strongly blurred over what is far or unknown: a near wall says nothing about what lies behind it. It comes from the
+    view that sees farthest in that direction, less so the farther outside its image the point lies.
     """
     outside = np.full(len(points), np.inf)
     best = np.full(len(points), -np.inf)
     colours = np.zeros((len(points), 3))
     for pointmap, image in zip(pointmaps, images, strict=True):
         height, width = image.shape[:2]
-        in_camera = (points - pointmap.T_world_camera[:3, 3]) @ pointmap.T_world_camera[:3, :3]
-        ahead = in_camera[:, 2] > 0.05 * np.linalg.norm(in_camera, axis=1)
-        pixels = in_camera[:, :2] / np.where(ahead, in_camera[:, 2], 1.0)[:, None] * np.diag(pointmap.K)[:2]
-        pixels += pointmap.K[:2, 2]
+        in_camera = to_camera(points, pointmap.T_world_camera)
+        ahead = in_camera[:, 2] > MIN_COSINE * np.linalg.norm(in_camera, axis=1)
+        pixels = project(in_camera, pointmap.K)
         relative = pixels / (width, height) - 0.5
         distance = np.where(ahead, np.abs(relative).max(1) - 0.5, np.inf)
-        blurred, sees_far = _far_colours(image, pointmap.depth / farthest, 0.04 * max(height, width))
+        blurred, sees_far = _far_colours(image, pointmap.depth / farthest, BLUR * max(height, width))
         size = np.array([blurred.shape[1], blurred.shape[0]])
         column, row = np.clip(pixels * (size / (width, height)), 0, size - 1).astype(int).T
-        score = np.log(sees_far[row, column]) - 10.0 * distance
+        score = np.log(sees_far[row, column]) - OUTSIDE_PENALTY * distance
         better = score > best
         colours[better], best[better] = blurred[row, column][better], score[better]
         outside = np.minimum(outside, distance)
@@ -100,28 +113,26 @@ def _seen(
 
 
 def _continued(directions: Array, seen: Array, colours: Array, upward: Array) -> Array:
-    """(M, 3) for unseen directions (M, 3) the mean of the colours (N, 3) of directions that are `seen` (N, 3).
+    """(M, 3) colours for unseen unit `directions` (M, 3), from the colours (N, 3) of directions `seen` (N, 3).
 
-    Each counts by the fourth power of its nearness (Shepard, 1968). A difference of elevation counts fourfold: what
-    lies beside the images is more likely like them than what lies above or below.
+    Inverse distance weighting with the fourth power (Shepard 1968), elevation stretched by ELEVATION_STRETCH.
+    `upward` (3,) is of any length.
     """
     upward = upward / max(float(np.linalg.norm(upward)), 1e-9)
-    stretched = np.eye(3) + 3.0 * np.outer(upward, upward)
+    stretched = np.eye(3) + (ELEVATION_STRETCH - 1.0) * np.outer(upward, upward)
     squared = (((directions @ stretched)[:, None] - (seen @ stretched)[None]) ** 2).sum(2)
-    nearness = 1.0 / (squared + 1e-4) ** 2
+    nearness = 1.0 / (squared + MIN_SQUARED_DISTANCE) ** 2
     return nearness @ colours / nearness.sum(1, keepdims=True)
 
 
-def _far_colours(
-    image: npt.NDArray[np.uint8], relative_depth: npt.NDArray[np.float32], sigma_px: float
-) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Colours (h', w', 3) in [0, 1] blurred over far and unknown pixels, and the weight (h', w') of these around.
+def _far_colours(image: Image, relative_depth: Float32, sigma_px: float) -> tuple[Float32, Float32]:
+    """Colours (h', w', 3) in [0, 1] blurred over far and unknown pixels, and the weight (h', w') of these.
 
-    `relative_depth` is 1 at the farthest known depth and 0 where the depth is unknown. The blur leaves nothing finer
-    than a quarter of `sigma_px`, so that is the size of the result's pixels.
+    `relative_depth` (h, w) is 1 at the farthest known depth and 0 where the depth is unknown. The result has
+    BLURRED_PX pixels to a standard deviation `sigma_px` of the blur.
     """
-    far = np.where(relative_depth > 0, relative_depth**4, np.float32(1)) + np.float32(1e-3)
-    shrink = max(1.0, sigma_px / 4)
+    far = np.where(relative_depth > 0, relative_depth**FAR_POWER, np.float32(1)) + np.float32(MIN_FAR_WEIGHT)
+    shrink = max(1.0, sigma_px / BLURRED_PX)
     size = (max(1, round(image.shape[1] / shrink)), max(1, round(image.shape[0] / shrink)))
     weighted = cv2.resize(image * (far / 255)[..., None], size, interpolation=cv2.INTER_AREA)
     sigma = sigma_px / shrink
@@ -130,8 +141,8 @@ def _far_colours(
     return np.asarray(blurred / weight[..., None], np.float32), np.asarray(weight, np.float32)
 
 
-def _sphere(spacing_deg: float) -> Array:
-    """(M, 3) directions that cover the sphere evenly (Fibonacci lattice); none for a spacing of 0."""
+def _fibonacci_sphere(spacing_deg: float) -> Array:
+    """(M, 3) unit directions that cover the sphere evenly, on a Fibonacci lattice; none for a spacing of 0."""
     count = int(4 * np.pi / np.radians(spacing_deg) ** 2) if spacing_deg > 0 else 0
     step = np.arange(count) + 0.5
     z = 1.0 - 2.0 * step / count
@@ -141,8 +152,8 @@ def _sphere(spacing_deg: float) -> Array:
 
 
 def _frames(directions: Array) -> Array:
-    """(M, 3, 3) rotations whose third axis points along each direction."""
-    helper = np.where(np.abs(directions[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    """(M, 3, 3) rotations whose third axis is each of the unit directions (M, 3)."""
+    helper = np.where(np.abs(directions[:, :1]) < 0.9, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])  # far from parallel
     first: Array = np.cross(helper, directions)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(directions, first), directions], 2)

@@ -1,9 +1,10 @@
-"""What no two views confirm: filled from its surroundings where nothing speaks against it, else left empty.
+"""Depth completion: pixels that no two views confirm are filled where no view contradicts it, else left empty.
 
-A plain wall or the sky gives stereo nothing to match. Left empty it would be black in every new view. So a pixel on
-which no other view's point of like colour falls gets the first of these depths that does not hide a known surface from
-any other view: stereo's own doubtful one; the smoothest that agrees with the image's edges (the stated prior); a far
-background. Where points of other colour fall, something nearer stands before them: it is put close to the camera.
+A plain wall or the sky gives stereo nothing to match. Left empty it would be black in every new view. So a pixel that
+no other view's point of like colour explains gets the first of these depths that hides no known surface from another
+view: stereo's own doubtful depth; the smoothest depth that may jump at the image's edges (the stated prior); a far
+background. Where points of another colour fall on it, something nearer stands before them: it gets a depth close to
+the camera.
 """
 
 from __future__ import annotations
@@ -25,39 +26,46 @@ Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
+BLUR_PX = 5  # side of the blur before colours are compared: a pixel's noise and half a pixel's offset should not count
+GAP_PX = 5  # gaps of this size between the points of another view count as covered
+NEAREST_PERCENTILE = 2.0  # of a view's known depths: its nearest depth, of which this part may be wrong
+DATA_WEIGHT = 10.0  # of a known inverse depth of confidence 1, against smoothness of weight 1 between neighbours
+MIN_LINK = 1e-3  # weight of smoothness across the strongest edge: nothing is cut off from all known depths
+MAX_EXTRAPOLATION = 2.0  # factor by which a filled depth may lie nearer or farther than all known ones of its view
+
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    min_confidence: float = 0.12  # depths below are doubtful
-    least_confidence: float = 0.1  # and those below this tell less than their surroundings do
-    like: float = 0.12  # difference of colour, in [0, 1], up to which a point explains a pixel
-    object_px: int = 15  # least width of a region of other colour that is taken for a foreground object
-    foreground: float = 0.4  # depth of an unknown foreground in units of the nearest known depth of its view
-    background: float = 1.5  # depth of the background in units of the farthest known depth of a view
-    confidence: float = 0.1  # of what is filled in
-    reduction: int = 4  # the smooth depth is found at this part of the resolution
-    edge: float = 0.06  # difference of colour, in [0, 1], that counts as an edge between surfaces
-    in_front: float = 0.03  # relative depth by which a filled point may lie before a known one
+    min_confidence: float = 0.12  # of stereo: depths from here on are known, those below doubtful
+    min_usable_confidence: float = 0.1  # doubtful depths below tell less than their surroundings do: they are dropped
+    colour_tolerance: float = 0.12  # difference of colour, in [0, 1], up to which a point explains a pixel
+    min_object_px: int = 15  # width of a region of other colour from which on it is taken for a foreground object
+    foreground_depth: float = 0.4  # of an unknown foreground, over the nearest known depth of its view
+    background_depth: float = 1.5  # of an unknown background, over the farthest known depth of its view
+    confidence: float = 0.1  # of filled depths
+    reduction: int = 4  # the smooth depth is found at 1 / `reduction` of the resolution
+    edge_contrast: float = 0.06  # difference of colour, in [0, 1], by which smoothness weakens to 1 / e
+    occlusion_tolerance: float = 0.03  # relative depth by which a filled point may lie before a known surface
 
 
 def complete(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Config) -> list[Pointmap]:
-    """The point maps with their unknown pixels filled or, where that would contradict another view, empty."""
-    known = [only(pointmap, pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
-    # Blurred, so that a pixel's noise and a point's being half a pixel beside it make no difference.
-    calm = [np.asarray(cv2.GaussianBlur(image, (5, 5), 0), np.uint8) for image in images]
+    """The point maps with unknown pixels filled or, where that would contradict another view, empty."""
+    known = [pointmap.masked(pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
+    blurred = [np.asarray(cv2.GaussianBlur(image, (BLUR_PX, BLUR_PX), 0), np.uint8) for image in images]
     completed = list(known)
     for j in sorted(range(len(known)), key=lambda i: -float(known[i].confidence.mean())):
         rest = [i for i in range(len(known)) if i != j]
-        falls, explained = _seen_by_others(known[j], calm[j], [(completed[i], calm[i]) for i in rest], config.like)
+        others = [(completed[i], blurred[i]) for i in rest]
+        covered, explained = _seen_by_others(known[j], blurred[j], others, config.colour_tolerance)
         unknown = known[j].depth <= 0
         # Single pixels of another colour are noise and edges; an object that only this view sees is larger.
-        object_size = np.ones((config.object_px, config.object_px), np.uint8)
-        occluded = cv2.morphologyEx((unknown & falls & ~explained).astype(np.uint8), cv2.MORPH_OPEN, object_size) > 0
-        hole = unknown & (~falls | occluded)
+        object_size = np.ones((config.min_object_px, config.min_object_px), np.uint8)
+        occluder = cv2.morphologyEx((unknown & covered & ~explained).astype(np.uint8), cv2.MORPH_OPEN, object_size) > 0
+        hole = unknown & (~covered | occluder)
         if not hole.any() or not (known[j].depth > 0).any():
             continue
-        for guess in _guesses(pointmaps[j], known[j], images[j], falls, occluded, config):
-            guess = only(guess, hole)
-            guess = only(guess, ~_hides_known(guess, [known[i] for i in rest], config.in_front))
+        for guess in _guesses(pointmaps[j], known[j], images[j], covered, occluder, config):
+            guess = guess.masked(hole)
+            guess = guess.masked(~_hides_known(guess, [known[i] for i in rest], config.occlusion_tolerance))
             completed[j] = replace(
                 completed[j],
                 depth=completed[j].depth + guess.depth,
@@ -69,18 +77,22 @@ def complete(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Con
 
 
 def _guesses(
-    doubtful: Pointmap, known: Pointmap, image: Image, falls: Mask, occluded: Mask, config: Config
+    doubtful: Pointmap, known: Pointmap, image: Image, covered: Mask, occluder: Mask, config: Config
 ) -> Iterator[Pointmap]:
-    """What a hole may be filled with, the best first."""
-    near, far = np.percentile(known.depth[known.depth > 0], [2.0, 100.0])
+    """The point maps that a hole may be filled from, the best first."""
+    near, far = np.percentile(known.depth[known.depth > 0], [NEAREST_PERCENTILE, 100.0])
     yield doubtful
-    yield only(_facing(known, smooth_depth(known, image, config)), ~falls)
-    yield only(_facing(known, config.background * far), ~falls)
-    yield only(_facing(known, config.foreground * near), occluded)
+    yield _facing_camera(known, smooth_depth(known, image, config)).masked(~covered)
+    yield _facing_camera(known, config.background_depth * far).masked(~covered)
+    yield _facing_camera(known, config.foreground_depth * near).masked(occluder)
 
 
 def smooth_depth(pointmap: Pointmap, image: Image, config: Config) -> Float32:
-    """(h, w) the smoothest inverse depth through the known ones that may jump at the image's edges, as a depth."""
+    """(h, w) the depth whose inverse is the smoothest through the known ones that may jump at the image's edges.
+
+    Minimises sum_i confidence_i (x_i - inverse_i)^2 + sum_ij link_ij (x_i - x_j)^2 over neighbouring pixels, a sparse
+    linear system. At least one depth must be known. `image` is (h, w, 3).
+    """
     height, width = pointmap.depth.shape
     size = (max(2, width // config.reduction), max(2, height // config.reduction))
     weight = cv2.resize(pointmap.confidence, size, interpolation=cv2.INTER_AREA)
@@ -91,57 +103,49 @@ def smooth_depth(pointmap: Pointmap, image: Image, config: Config) -> Float32:
     first = np.concatenate([index[:, :-1].ravel(), index[:-1].ravel()])
     second = np.concatenate([index[:, 1:].ravel(), index[1:].ravel()])
     flat = colour.reshape(-1, 3)
-    link = np.exp(-np.abs(flat[first] - flat[second]).max(1) / config.edge) + 1e-3
+    link = np.exp(-np.abs(flat[first] - flat[second]).max(1) / config.edge_contrast) + MIN_LINK
     count = index.size
     laplacian = coo_matrix((link, (first, second)), (count, count))
     laplacian = laplacian + laplacian.T
     laplacian = diags(np.asarray(laplacian.sum(1)).ravel()) - laplacian
-    data = 10.0 * weight.ravel().astype(np.float64)
+    data = DATA_WEIGHT * weight.ravel().astype(np.float64)
     solution = np.asarray(spsolve((laplacian + diags(data + 1e-9)).tocsc(), data * inverse.ravel()), np.float64)
     smooth = cv2.resize(solution.reshape(size[1], size[0]), (width, height), interpolation=cv2.INTER_LINEAR)
     known = pointmap.depth[pointmap.depth > 0]
-    return (1.0 / np.clip(smooth, 0.5 / known.max(), 2.0 / known.min())).astype(np.float32)
-
-
-def only(pointmap: Pointmap, keep: Mask) -> Pointmap:
-    """The point map with nothing known where `keep` (h, w) does not say so."""
-    return replace(
-        pointmap,
-        depth=pointmap.depth * keep,
-        confidence=pointmap.confidence * keep,
-        normal=pointmap.normal * keep[..., None],
-    )
+    least, most = 1 / MAX_EXTRAPOLATION / known.max(), MAX_EXTRAPOLATION / known.min()
+    return (1.0 / np.clip(smooth, least, most)).astype(np.float32)
 
 
 def _seen_by_others(
-    target: Pointmap, image: Image, others: Sequence[tuple[Pointmap, Image]], like: float
+    target: Pointmap, image: Image, others: Sequence[tuple[Pointmap, Image]], colour_tolerance: float
 ) -> tuple[Mask, Mask]:
-    """Pixels of the target on which other views' points fall, and those of which one has the pixel's colour.
+    """(h, w) pixels of the target on which other views' points fall; (h, w) those of which one has the pixel's colour.
 
     Small gaps between the points are closed.
     """
-    falls, explained = (np.zeros(target.depth.shape, bool) for _ in range(2))
+    covered, explained = (np.zeros(target.depth.shape, bool) for _ in range(2))
     for other, other_image in others:
-        falls_here, explained_here = reprojection.explained(other, other_image, target, image, like)
-        falls |= falls_here
+        covered_here, explained_here = reprojection.explained(other, other_image, target, image, colour_tolerance)
+        covered |= covered_here
         explained |= explained_here
-    return _closed(falls), _closed(explained)
+    return _closed(covered), _closed(explained)
 
 
 def _closed(mask: Mask) -> Mask:
-    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+    """The mask (h, w) without gaps of up to GAP_PX."""
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((GAP_PX, GAP_PX), np.uint8)) > 0
 
 
-def _hides_known(filled: Pointmap, others: Sequence[Pointmap], in_front: float) -> Mask:
-    """Filled pixels whose point lies clearly before a known surface of another view."""
+def _hides_known(filled: Pointmap, others: Sequence[Pointmap], occlusion_tolerance: float) -> Mask:
+    """(h, w) filled pixels whose point lies clearly before a known surface of another view."""
     wrong = np.zeros(filled.depth.shape, bool)
     for other in others:
-        wrong |= reprojection.hiding(filled, other, in_front)
+        wrong |= reprojection.hiding(filled, other, occlusion_tolerance)
     return wrong
 
 
-def _facing(pointmap: Pointmap, depth: Float32 | float) -> Pointmap:
-    """The point map at another depth, with normals that look straight at the camera."""
+def _facing_camera(pointmap: Pointmap, depth: Float32 | float) -> Pointmap:
+    """The point map at another depth, a number or (h, w), with normals along the rays towards the camera."""
     height, width = pointmap.depth.shape
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     K = pointmap.K

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,14 +17,14 @@ SH_C0 = 0.28209479177387814  # the constant basis function of the real spherical
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N anisotropic Gaussians (equation 1). Raw parameters carry their space; activated values are properties."""
+    """N anisotropic 3D Gaussians (equation 1). Raw parameters carry their space; activated values are properties."""
 
     means: Tensor  # (N, 3) world
     quats: Tensor  # (N, 4) wxyz, not necessarily of unit length
     log_scales: Tensor  # (N, 3)
     logit_opacities: Tensor  # (N,)
     sh: Tensor  # (N, B, 3) spherical harmonics, B = 1, 4, 9 or 16; colour = 0.5 + sum of basis * sh
-    source_frame: Tensor  # (N,) int32: frame_id of the keyframe whose pixels started it
+    source_frame: Tensor  # (N,) int32: frame_id of the keyframe whose pixels seeded it; -1 for the far shell
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -50,7 +51,10 @@ class Gaussians:
         return self.map(lambda tensor: tensor[index])
 
     def transformed(self, scale: float, rotation: Tensor, translation: Tensor) -> Gaussians:
-        """After the similarity x -> scale * rotation @ x + translation. View-dependent colour is not rotated."""
+        """The Gaussians after the similarity x -> scale * rotation @ x + translation; SH are not rotated.
+
+        `rotation` is (3, 3) and `translation` (3,). View-dependent colour therefore keeps its old directions.
+        """
         rotation = rotation.to(self.means)
         return replace(
             self,
@@ -60,8 +64,13 @@ class Gaussians:
         )
 
 
+def logit(opacity: float) -> float:
+    """The raw parameter of an opacity, which lies between 0 and 1."""
+    return float(np.log(opacity / (1 - opacity)))
+
+
 def concatenate(parts: list[Gaussians]) -> Gaussians:
-    """All Gaussians of `parts` in order. Lower SH degrees are padded with zeros."""
+    """All Gaussians of `parts`, in order; lower SH degrees are padded with zeros."""
     bases = max(part.sh.shape[1] for part in parts)
     padded = [replace(part, sh=torch.nn.functional.pad(part.sh, (0, 0, 0, bases - part.sh.shape[1]))) for part in parts]
     return Gaussians(*(torch.cat([getattr(part, field.name) for part in padded]) for field in fields(Gaussians)))

@@ -1,4 +1,4 @@
-"""One Gaussian a pixel: how InstantSplat and the paper start, and what the size of our scenes is compared with."""
+"""Pixelwise seeding, a Gaussian a pixel: how InstantSplat and the paper start; our scenes are compared with it."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy.typing as npt
 
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.points import NEIGHBOURS, gaussians_at
+from splatnode.recon.scene.points import NUM_NEIGHBOURS, gaussians_at
 from splatnode.recon.scene.seeding import Config as DownSampling
-from splatnode.recon.scene.seeding import redundant
+from splatnode.recon.scene.seeding import redundant_pixels
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    down_sampling: DownSampling = DownSampling(coarser=1e9)  # equations 14 to 17 as they are written
-    min_confidence: float = 0.05
-    opacity: float = 0.1
-    neighbours: int = NEIGHBOURS  # whose mean squared distance is a new Gaussian's variance
+    down_sampling: DownSampling = DownSampling(max_footprint_ratio=1e9)  # equations 14 to 17 as they are written
+    min_confidence: float = 0.05  # of stereo, in [0, 1]: pixels below get no Gaussian
+    opacity: float = 0.1  # of a new Gaussian, as in 3DGS
+    neighbours: int = NUM_NEIGHBOURS  # whose mean squared distance is a new Gaussian's variance
 
 
 def pixelwise_gaussians(
@@ -28,12 +28,13 @@ def pixelwise_gaussians(
     config: Config,
     max_gaussians: int | None = None,
 ) -> Gaussians:
-    """An isotropic Gaussian for every pixel that is confident and that no more confident view covers.
+    """An isotropic Gaussian for each pixel whose depth is confident and that no more confident view covers.
 
-    Beyond `max_gaussians` an even choice of them is kept; their sizes then follow from the distances that are left.
+    Of more than `max_gaussians` an even choice is kept; sizes then follow from the distances between those.
     """
     points, colours, frames = [], [], []
-    for pointmap, image, covered in zip(pointmaps, images, redundant(pointmaps, config.down_sampling), strict=True):
+    redundant = redundant_pixels(pointmaps, config.down_sampling)
+    for pointmap, image, covered in zip(pointmaps, images, redundant, strict=True):
         kept = ~covered & (pointmap.depth > 0) & (pointmap.confidence >= config.min_confidence)
         points.append(pointmap.points[kept])
         colours.append(image[kept].astype(np.float32) / 255.0)

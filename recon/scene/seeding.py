@@ -1,8 +1,8 @@
-"""Where Gaussians start: the paper's confidence-ranked down-sampling, then one Gaussian per piece of equal colour.
+"""Seeding: the paper's confidence-ranked down-sampling, then one Gaussian for each piece of equal colour and depth.
 
-A piece is as large as what it leaves unexplained allows (`partition`): the same visible error everywhere is the
-best use of a number of Gaussians (`contrast_masking`). What a Gaussian has to explain to be worth having is told in
-photographs of a fixed size, so that the number follows from what there is to see and not from how many pixels show it.
+A piece is as large as its error allows (`partition`), with the same visible error everywhere (`contrast_masking`): that
+is the best use of a number of Gaussians. Errors are measured in photographs of a fixed size, so that the number of
+Gaussians follows from what there is to see and not from how many pixels show it.
 """
 
 from __future__ import annotations
@@ -19,32 +19,39 @@ from splatnode.recon.geometry import quat_from_matrix
 from splatnode.recon.priors import reprojection
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.scene.contrast_masking import visibility
-from splatnode.recon.scene.gaussians import SH_C0, Gaussians, concatenate
+from splatnode.recon.scene.gaussians import SH_C0, Gaussians, concatenate, logit
 from splatnode.recon.scene.partition import partition
 
 Mask = npt.NDArray[np.bool_]
 Array = npt.NDArray[np.float64]
-REFERENCE_PX = 512  # longer side of the photographs that the configuration's pixels are of
+
+REFERENCE_PX = 512  # longer side of the photographs in whose pixels the configuration counts: the default size
+PIXEL_VARIANCE = 1 / 12  # pixels squared, along each axis: a pixel is a square, not a point
+MIN_COSINE = 0.25  # between normal and line of sight, 76 degrees: beyond, a surface is known badly
+MIN_NORMAL_LENGTH = 0.3  # of a piece's mean normal: shorter ones are means of normals that contradict each other
+ATTEMPTS = 12  # to have at most a given number of Gaussians; then an even choice of them is kept
+MIN_COARSENING = 1.1  # factor by which each attempt is to have fewer pieces
+ERROR_EXPONENT = 1.3  # a piece's error grows a little faster than its area
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth_tolerance: float = 0.02  # theta of equation 16, relative to the depth
-    coarser: float = 1.5  # a point replaces a pixel only if its own pixel covers at most this many times the surface
-    min_confidence: float = 0.05  # pixels below get no Gaussian
-    largest_px: int = 64  # side of a square beyond which no piece reaches
-    smallest_px: float = 3.0  # area of a piece that is not divided
-    most_error: float = 0.0021  # squared visible deviation of colours in [0, 1], over a piece's pixels and channels
-    depth_weight: float = 1.0  # a relative difference of depth counts as this many times the difference of colour
+    max_footprint_ratio: float = 1.5  # a pixel is redundant only beside a point whose footprint is at most this larger
+    min_confidence: float = 0.05  # of stereo, in [0, 1]: pixels below get no Gaussian
+    max_side_px: int = 64  # side of the squares of a grid that no piece reaches across
+    min_area_px: float = 3.0  # pieces of at most this area are not cut
+    max_error: float = 0.0021  # of a piece: squared visible deviation of colours in [0, 1], over pixels and channels
+    depth_weight: float = 1.0  # a relative difference of depth counts as this many times a difference of colour
     noise: float = 0.01  # standard deviation of colours in [0, 1] that is not worth a Gaussian
-    footprint: float = 1.2  # standard deviations of a new Gaussian in units of its piece's
-    thickness: float = 0.15  # standard deviation along the normal, in units of the smaller across
-    opacity: float = 0.5
+    footprint: float = 1.2  # standard deviations of a new Gaussian, over its piece's
+    thickness: float = 0.15  # standard deviation along the normal, over the smaller one across
+    opacity: float = 0.5  # of a new Gaussian
 
 
-def redundant(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
-    """For each point map the pixels (h, w) that a more confident one already covers (equations 14 to 17).
+def redundant_pixels(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
+    """For each point map the pixels (h, w) that a more confident map already covers (equations 14 to 17).
 
-    Beyond the paper, a pixel is not given up for a point that was seen from so much further away that detail is lost.
+    Beyond the paper, a pixel is kept where the other map's point was seen from so far away that detail would be lost.
     """
     score = [float(pointmap.confidence.mean()) for pointmap in pointmaps]  # equation 14
     masks = []
@@ -55,7 +62,7 @@ def redundant(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
                 projected, footprint = reprojection.nearest(source, target)
                 near = np.abs(projected - target.depth) < config.depth_tolerance * target.depth
                 own = target.depth / target.K[0, 0]
-                covered |= near & (footprint < config.coarser * own)
+                covered |= near & (footprint < config.max_footprint_ratio * own)
         masks.append(covered & (target.depth > 0))
     return masks
 
@@ -63,9 +70,9 @@ def redundant(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask]:
 def gaussians_from_pointmap(
     pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, config: Config
 ) -> Gaussians:
-    """One Gaussian for each piece of the pixels `wanted` (h, w) of a keyframe's `image` (h, w, 3).
+    """One Gaussian for each piece of the `wanted` (h, w) pixels of a keyframe's `image` (h, w, 3).
 
-    Each has its piece's mean colour, and lies on its surface with its position and extent there (moment matching).
+    Each lies on its piece's surface and has the piece's mean colour, centre and extent there (moment matching).
     """
     labels, count = _pieces(pointmap, image, wanted & (pointmap.depth > 0), config)
     wanted = labels >= 0
@@ -81,8 +88,7 @@ def gaussians_from_pointmap(
     inverse_depth = mean(1.0 / pointmap.depth[wanted])
     colour = np.column_stack([mean(image[..., channel][wanted] / 255.0) for channel in range(3)])
     normal = np.column_stack([mean(pointmap.normal[..., axis][wanted]) for axis in range(3)])
-    # A pixel is a square of variance 1/12, not a point.
-    uu, vv = (mean(x * x) - centre[:, i] ** 2 + 1 / 12 for i, x in enumerate((u, v)))
+    uu, vv = (mean(x * x) - centre[:, i] ** 2 + PIXEL_VARIANCE for i, x in enumerate((u, v)))
     uv = mean(u * v) - centre[:, 0] * centre[:, 1]
     spread = np.stack([np.stack([uu, uv], 1), np.stack([uv, vv], 1)], 1)
     return _on_surface(pointmap, centre, spread, inverse_depth, normal, colour, config)
@@ -91,10 +97,10 @@ def gaussians_from_pointmap(
 def _pieces(
     pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, config: Config
 ) -> tuple[npt.NDArray[np.int32], int]:
-    """(h, w) the number of the piece that each pixel belongs to, -1 for unwanted ones, and how many there are.
+    """(h, w) the label of the piece that each pixel belongs to, -1 where it is not wanted; and the number of pieces.
 
-    Larger images are cut where they are at the reference's size: what only more pixels show is no reason for more
-    Gaussians.
+    Images above the reference's size are shrunk to it before they are cut: detail that only more pixels show is no
+    reason for more Gaussians.
     """
     scale = max(wanted.shape) / REFERENCE_PX
     if scale > 1:
@@ -115,7 +121,7 @@ def _pieces(
 def _cut(
     depth: npt.NDArray[np.float32], image: npt.NDArray[np.uint8], wanted: Mask, scale: float, config: Config
 ) -> tuple[npt.NDArray[np.int32], int]:
-    """The pieces of an image at `scale` of the reference's size."""
+    """Labels (h, w) and number of the pieces of an image (h, w, 3) at `scale` of the reference's size."""
     log_depth = np.log(np.maximum(depth, 1e-9))
     middle = np.float32(np.median(log_depth[wanted])) if wanted.any() else np.float32(0)
     colour = np.asarray(image / np.float32(255), np.float32)
@@ -126,10 +132,10 @@ def _cut(
         features,
         visibility(colour, scale) ** 2,
         wanted,
-        tile_px=max(1, round(config.largest_px * scale)),
-        smallest_px=max(1, round(config.smallest_px * scale**2)),
-        most_error=config.most_error * scale**2,
-        noise=3 * config.noise**2,
+        tile_px=max(1, round(config.max_side_px * scale)),
+        min_area_px=max(1, round(config.min_area_px * scale**2)),
+        max_error=config.max_error * scale**2,
+        noise_variance=3 * config.noise**2,  # of three channels of colour
     )
 
 
@@ -142,14 +148,14 @@ def _on_surface(
     colour: Array,  # (N, 3) in [0, 1]
     config: Config,
 ) -> Gaussians:
-    """Gaussians in the tangent planes at these pixels, with the images' covariances carried there."""
+    """Gaussians in the tangent planes of the surface at these pixels, with their covariances carried there."""
     K, T_world_camera = pointmap.K, pointmap.T_world_camera
     count = len(centre)
     focal = np.array([K[0, 0], K[1, 1]])
     ray = np.column_stack([(centre - K[:2, 2]) / focal, np.ones(count)])
     mean = ray / np.maximum(inverse_depth, 1e-9)[:, None]
-    normal = _facing(normal, ray)
-    # On the plane n . X = d a pixel's point is ray * d / (n . ray); these are its derivatives by u and by v.
+    normal = _facing_normals(normal, ray)
+    # On the plane n . X = d a pixel's point is ray * d / (n . ray); `steps` are its derivatives by u and by v.
     along_ray = (normal * ray).sum(1)
     depth = (normal * mean).sum(1) / along_ray
     steps = np.stack([np.eye(3)[axis] - ray * (normal[:, axis] / along_ray)[:, None] for axis in (0, 1)], 2)
@@ -171,24 +177,25 @@ def _on_surface(
         means=tensor(mean @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]),
         quats=quat_from_matrix(tensor(rotation)),
         log_scales=tensor(np.log(scales)),
-        logit_opacities=torch.full((count,), float(np.log(config.opacity / (1 - config.opacity)))),
+        logit_opacities=torch.full((count,), logit(config.opacity)),
         sh=tensor((colour - 0.5) / SH_C0)[:, None],
         source_frame=torch.full((count,), pointmap.frame_id, dtype=torch.int32),
     )
 
 
-def _facing(normal: Array, ray: Array, least_cosine: float = 0.25) -> Array:
-    """(N, 3) unit normals that face the camera; the line of sight's where there is none, and not far from edge-on.
+def _facing_normals(normal: Array, ray: Array) -> Array:
+    """(N, 3) unit normals that face the camera, from `normal` (N, 3) of any length; `ray` (N, 3) goes to the surface.
 
-    A surface seen at a grazing angle is known badly: its Gaussians would be stretched out along the line of sight.
+    The direction to the camera stands in for a missing normal. A normal at more than MIN_COSINE's angle to the line of
+    sight is turned back to it: Gaussians of a surface seen edge-on would be stretched along the line of sight.
     """
     direction = ray / np.linalg.norm(ray, axis=1, keepdims=True)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
-    unit = np.where(length > 0.3, normal / np.maximum(length, 1e-9), -direction)
+    unit = np.where(length > MIN_NORMAL_LENGTH, normal / np.maximum(length, 1e-9), -direction)
     cosine = -(unit * direction).sum(1, keepdims=True)
     sideways = unit + cosine * direction
-    sideways *= np.sqrt(1 - least_cosine**2) / np.maximum(np.linalg.norm(sideways, axis=1, keepdims=True), 1e-9)
-    return np.where(cosine < least_cosine, sideways - least_cosine * direction, unit)
+    sideways *= np.sqrt(1 - MIN_COSINE**2) / np.maximum(np.linalg.norm(sideways, axis=1, keepdims=True), 1e-9)
+    return np.where(cosine < MIN_COSINE, sideways - MIN_COSINE * direction, unit)
 
 
 def initial_gaussians(
@@ -197,31 +204,32 @@ def initial_gaussians(
     config: Config,
     max_gaussians: int | None = None,
 ) -> Gaussians:
-    """The Gaussians of a scene that has not been optimised: every surface once, from its best view.
+    """The Gaussians of a scene that has not been optimised: every surface once, from its most confident view.
 
-    With `max_gaussians` pieces are coarsened, everywhere alike, until there are at most that many.
+    `images` (h, w, 3) are those of the point maps. With `max_gaussians` the pieces become coarser, everywhere alike,
+    until there are at most that many.
     """
     wanted = [
         ~covered & (pointmap.confidence >= config.min_confidence)
-        for pointmap, covered in zip(pointmaps, redundant(pointmaps, config), strict=True)
+        for pointmap, covered in zip(pointmaps, redundant_pixels(pointmaps, config), strict=True)
     ]
-    for _ in range(12):
+    for _ in range(ATTEMPTS):
         gaussians = concatenate(
             [gaussians_from_pointmap(*view, config) for view in zip(pointmaps, images, wanted, strict=True)]
         )
         if max_gaussians is None or len(gaussians) <= max_gaussians:
             return gaussians
-        config = _coarser(config, len(gaussians) / max(max_gaussians, 1))
+        config = _coarsened(config, len(gaussians) / max(max_gaussians, 1))
     assert max_gaussians is not None  # else the first was returned
     return gaussians.subset(torch.linspace(0, len(gaussians) - 1, max_gaussians).round().long())
 
 
-def _coarser(config: Config, times: float) -> Config:
-    """For about `times` fewer pieces."""
-    times = max(times, 1.1)
+def _coarsened(config: Config, times: float) -> Config:
+    """The configuration that gives about `times` fewer pieces."""
+    times = max(times, MIN_COARSENING)
     return msgspec.structs.replace(
         config,
-        most_error=times**1.3 * config.most_error,
-        smallest_px=times * config.smallest_px,
-        largest_px=min(round(times**0.5 * config.largest_px), REFERENCE_PX),  # a whole photograph
+        max_error=times**ERROR_EXPONENT * config.max_error,
+        min_area_px=times * config.min_area_px,
+        max_side_px=min(round(times**0.5 * config.max_side_px), REFERENCE_PX),  # a whole photograph
     )

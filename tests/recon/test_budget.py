@@ -23,8 +23,8 @@ def gaussians(count: int) -> Gaussians:
     )
 
 
-def begun(called_for: int = 10_000) -> Scene:
-    return Scene((), gaussians(0), called_for=called_for)
+def begun(num_unlimited: int = 10_000) -> Scene:
+    return Scene((), gaussians(0), num_unlimited=num_unlimited)
 
 
 def refined(count: int, iterations: int = 500, losses: tuple[float, ...] = ()) -> Scene:

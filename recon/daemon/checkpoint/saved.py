@@ -16,7 +16,7 @@ from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.scene import Scene, View
+from splatnode.recon.scene.scene import Scene, TrainingView
 
 T = TypeVar("T")
 Numbers = dict[str, bool | int | float | None]
@@ -91,7 +91,7 @@ def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe])
         raise ValueError(f"a scene of {len(message.arrays)} arrays is of another version")
     Ts_world_camera, Ks, *gaussians = (torch.from_numpy(np.array(array)) for array in message.arrays)
     views = tuple(
-        View(
+        TrainingView(
             name=record.name,
             frame_id=keyframes[record.name].frame.frame_id,
             image=keyframes[record.name].image,

@@ -36,7 +36,7 @@ from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.points import gaussians_at
-from splatnode.recon.scene.scene import Scene, View
+from splatnode.recon.scene.scene import Scene, TrainingView
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -79,7 +79,7 @@ def _frame_by_frame(
     yield from (outcome.of_scene(frames, each) for each in refined)
 
 
-def _next_pose(sight: Sight, view: View, following: Sight, seed: int, config: Config) -> np.ndarray:
+def _next_pose(sight: Sight, view: TrainingView, following: Sight, seed: int, config: Config) -> np.ndarray:
     """(4, 4) T_world_camera from which the Gaussians of `sight` alone look like the following frame."""
     T_world_camera = view.T_world_camera.double().numpy()
     alone = Scene((view,), _from_depth(sight, T_world_camera, config))
@@ -119,9 +119,9 @@ def _refined(scene: Scene, config: refinement.Config, iterations: int, seed: int
     return last
 
 
-def _view(sight: Sight, T_world_camera: np.ndarray) -> View:
+def _view(sight: Sight, T_world_camera: np.ndarray) -> TrainingView:
     T, K = torch.from_numpy(T_world_camera).float(), torch.from_numpy(sight.K).float()
-    return View(sight.name, sight.frame_id, sight.image, T, K, None, None)
+    return TrainingView(sight.name, sight.frame_id, sight.image, T, K, None, None)
 
 
 def _from_depth(sight: Sight, T_world_camera: np.ndarray, config: Config) -> Gaussians:

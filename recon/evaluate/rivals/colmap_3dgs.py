@@ -25,7 +25,7 @@ from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.points import gaussians_at
-from splatnode.recon.scene.scene import Scene, View
+from splatnode.recon.scene.scene import Scene, TrainingView
 
 SIZE = 512  # longer side of the photographs, pixels
 _OPACITY = 0.1  # of a Gaussian that starts from a point
@@ -80,14 +80,14 @@ def begin(model: Model, _seed: int) -> Scene:
     return Scene(tuple(map(view, model.placed)), gaussians)
 
 
-def view(placed: Placed) -> View:
+def view(placed: Placed) -> TrainingView:
     """A placed frame without its lens' distortion, at modelled size."""
     frame = undistorted(replace(placed.frame, intrinsics=placed.intrinsics))
     assert frame.intrinsics is not None  # COLMAP's
     image = modelled_image(frame.image, SIZE)
     K = frame.intrinsics.resized(image.shape[1], image.shape[0]).K
     T_world_camera = torch.from_numpy(placed.T_world_camera).float()
-    return View(frame.name, frame.frame_id, image, T_world_camera, torch.from_numpy(K).float(), None, None)
+    return TrainingView(frame.name, frame.frame_id, image, T_world_camera, torch.from_numpy(K).float(), None, None)
 
 
 def in_extent(config: refinement.Config, scene: Scene) -> refinement.Config:

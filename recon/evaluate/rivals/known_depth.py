@@ -69,5 +69,5 @@ def sights(frames: Sequence[Frame], seed: int) -> tuple[Sight, ...]:
 
 def _everywhere(pointmap: Pointmap, image: npt.NDArray[np.uint8]) -> npt.NDArray[np.float32]:
     settings = completion.Config()
-    known = completion.only(pointmap, pointmap.confidence >= settings.min_confidence)
+    known = pointmap.masked(pointmap.confidence >= settings.min_confidence)
     return np.where(known.depth > 0, known.depth, completion.smooth_depth(known, image, settings)).astype(np.float32)

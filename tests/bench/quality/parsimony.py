@@ -56,7 +56,7 @@ def configurations(chosen: int) -> dict[str, Config]:
     """By method, with `chosen` the size that splatnode chose."""
     ours = preset("balanced")
     ours = replace(ours, optimize=replace(ours.optimize, iterations=ITERATIONS, checkpoints=()))
-    fine = replace(ours.seeding, most_error=1e-4, smallest_px=1.0)
+    fine = replace(ours.seeding, max_error=1e-4, min_area_px=1.0)
     by_size = replace(ours.optimize, control=ControlChoice("prune", prune.Config(least_change=0.0)))
     by_pixel = replace(ours, pixelwise=pixelwise.Config(), optimize=replace(ours.optimize, control=None))
     relocating = replace(ours.optimize, control=ControlChoice("relocate", relocate.Config()))

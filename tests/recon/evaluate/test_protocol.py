@@ -163,7 +163,7 @@ def test_what_photographs_do_not_show_is_not_scored(scene_folder, tmp_path, monk
     def below(images):
         return [np.arange(len(image))[:, None] >= np.array([3] * image.shape[1]) for image in images]
 
-    monkeypatch.setattr(border, "shown", below)
+    monkeypatch.setattr(border, "valid_masks", below)
     row = score(perfect_snapshot(), spoilt / scene_folder.name)
     assert row.psnr is not None and row.psnr > 50
     assert row.psnr_with_rim is not None and row.psnr_with_rim < 20

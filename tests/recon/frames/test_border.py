@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from splatnode.recon.frames.border import rectangle, shown
+from splatnode.recon.frames.border import valid_masks, valid_rectangle
 
 HEIGHT, WIDTH = 80, 120
 
@@ -17,7 +17,7 @@ def photographs(count: int = 3, seed: int = 0) -> list[np.ndarray]:
 
 
 def test_photographs_without_a_rim_show_the_scene_everywhere():
-    assert all(mask.all() for mask in shown(photographs()))
+    assert all(mask.all() for mask in valid_masks(photographs()))
 
 
 def test_a_rim_and_a_pixel_beside_it_are_left_out_in_all_photographs_of_a_size():
@@ -27,7 +27,7 @@ def test_a_rim_and_a_pixel_beside_it_are_left_out_in_all_photographs_of_a_size()
         image[-1, :50] = 60  # the last row's rim is narrower than a pixel, and ends
     expected = np.ones((HEIGHT, WIDTH), bool)
     expected[:3], expected[:, -2:], expected[-2:, :51] = False, False, False
-    for mask in shown([*images, np.full((50, 50, 3), 200, np.uint8)])[:3]:
+    for mask in valid_masks([*images, np.full((50, 50, 3), 200, np.uint8)])[:3]:
         np.testing.assert_array_equal(mask, expected)
 
 
@@ -35,24 +35,24 @@ def test_what_is_dark_here_and_there_is_no_rim():
     images = photographs()
     for image in images:
         image[:2, 10:20] = 0
-    assert all(mask.all() for mask in shown(images))
+    assert all(mask.all() for mask in valid_masks(images))
 
 
 def test_a_dark_scene_has_no_rim():
     images = photographs()
     for image in images:
         image[:, :20] = 0
-    assert all(mask.all() for mask in shown(images))
+    assert all(mask.all() for mask in valid_masks(images))
 
 
 def test_one_photograph_does_not_tell_a_rim_from_the_scene():
     (image,) = photographs(1)
     image[:2] = 0
-    assert shown([image])[0].all()
+    assert valid_masks([image])[0].all()
 
 
 def test_a_photograph_is_cut_down_to_what_shows_the_scene():
     mask = np.ones((HEIGHT, WIDTH), bool)
-    assert rectangle(mask) == (slice(0, HEIGHT), slice(0, WIDTH))
+    assert valid_rectangle(mask) == (slice(0, HEIGHT), slice(0, WIDTH))
     mask[:2], mask[:, -1], mask[-1, :5] = False, False, False
-    assert rectangle(mask) == (slice(2, HEIGHT - 1), slice(0, WIDTH - 1))
+    assert valid_rectangle(mask) == (slice(2, HEIGHT - 1), slice(0, WIDTH - 1))

@@ -9,15 +9,15 @@ import torch
 from splatnode.recon.optimize.dropout import Config, Dropout, doubt
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.scene import View
+from splatnode.recon.scene.scene import TrainingView
 from tests.support.synthetic import plane_pointmap
 
 SEEN = plane_pointmap(np.eye(4), confidence=0.3, frame_id=4)
 
 
-def view(pointmap=SEEN) -> View:
+def view(pointmap=SEEN) -> TrainingView:
     image = np.zeros((*SEEN.depth.shape, 3), np.uint8)
-    return View(SEEN.name, 4, image, torch.eye(4), torch.from_numpy(SEEN.K).float(), None, None, pointmap)
+    return TrainingView(SEEN.name, 4, image, torch.eye(4), torch.from_numpy(SEEN.K).float(), None, None, pointmap)
 
 
 def gaussians(count: int, source_frame: int = SHELL) -> Gaussians:

@@ -18,14 +18,14 @@ from splatnode.recon.optimize.refinement import Config, Rates, refine
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.gaussian_render import seen
 from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.scene import Scene, View
+from splatnode.recon.scene.scene import Scene, TrainingView
 from tests.support.synthetic import tiny_scene
 
 FROZEN = Rates(means=0.0, quats=0.0, log_scales=0.0, logit_opacities=0.0, sh=0.0)
 QUICK = Config(iterations=12, checkpoints=(), half_resolution_share=0.0)
 
 
-def render(gaussians: Gaussians, view: View) -> torch.Tensor:
+def render(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
     return seen(gaussians, gaussians.opacities, view.T_world_camera, view.K, view.width, view.height).rgb.clamp(0, 1)
 
 
@@ -35,7 +35,7 @@ def photographed() -> Scene:
     views = []
     for index, (T, K) in enumerate(zip(tiny.Ts_world_camera, tiny.Ks, strict=True)):
         empty = np.zeros((tiny.height, tiny.width, 3), np.uint8)
-        view = View(f"{index}.png", index, empty, T, K, 0.1, 0.01)
+        view = TrainingView(f"{index}.png", index, empty, T, K, 0.1, 0.01)
         image = (255 * render(tiny.gaussians, view)).round().byte().numpy()
         views.append(replace(view, image=image))
     return Scene(tuple(views), tiny.gaussians, iterations=7)
@@ -217,7 +217,7 @@ def test_torch_gets_its_threads_back(truth, wholly):
         torch.set_num_threads(before)
 
 
-def with_pointmap(view: View) -> View:
+def with_pointmap(view: TrainingView) -> TrainingView:
     shape = (view.height, view.width)
     nothing = [np.zeros(size, np.float32) for size in (shape, shape, (*shape, 3))]
     camera = view.T_world_camera.double().numpy(), view.K.double().numpy()

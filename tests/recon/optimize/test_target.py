@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from splatnode.recon.optimize.target import target
-from splatnode.recon.scene.scene import View
+from splatnode.recon.scene.scene import TrainingView
 
 HEIGHT, WIDTH = 24, 40
 
@@ -16,7 +16,7 @@ def test_only_what_shows_the_scene_is_compared(scale):
     shown = np.ones((HEIGHT, WIDTH), bool)
     image[:3], shown[:3] = 0, False
     K = torch.tensor([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
-    seen = target(View("a", 0, image, torch.eye(4), K, None, None), shown, scale, 0.2)
+    seen = target(TrainingView("a", 0, image, torch.eye(4), K, None, None), shown, scale, 0.2)
     assert (seen.width, seen.height) == (WIDTH * scale, HEIGHT * scale)
     torch.testing.assert_close(seen.K[:2], scale * K[:2])
     grey = torch.full((seen.height, seen.width, 3), 128 / 255, requires_grad=True)

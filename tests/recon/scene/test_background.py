@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.rasterize.gaussian_render import seen
-from splatnode.recon.scene.background import SHELL, Config, background
+from splatnode.recon.scene.background import SHELL, Config, far_shell
 from splatnode.recon.scene.gaussians import Gaussians
 from tests.support.synthetic import plane_pointmap
 
@@ -41,7 +41,7 @@ def directions(gaussians: Gaussians) -> np.ndarray:
 
 
 def test_the_shell_stands_at_its_distance_and_faces_the_cameras():
-    shell = background([pointmap(np.eye(4))], [two_colours()], Config(distance=4.0, spacing_deg=5.0))
+    shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config(distance=4.0, spacing_deg=5.0))
     assert len(shell) > 50
     np.testing.assert_allclose(np.linalg.norm(shell.means.numpy(), axis=1), 4.0 * 2.0, rtol=1e-5)
     axes = Rotation.from_quat(shell.quats.double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
@@ -51,7 +51,7 @@ def test_the_shell_stands_at_its_distance_and_faces_the_cameras():
 
 
 def test_neighbours_are_about_the_spacing_apart():
-    shell = background([pointmap(np.eye(4))], [two_colours()], Config(spacing_deg=6.0))
+    shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config(spacing_deg=6.0))
     cosines = directions(shell) @ directions(shell).T - 2 * np.eye(len(shell))
     nearest = np.degrees(np.arccos(cosines.max(1)))
     assert nearest.min() > 0.7 * 6 and nearest.max() < 1.3 * 6
@@ -60,7 +60,7 @@ def test_neighbours_are_about_the_spacing_apart():
 def test_it_reaches_beyond_the_image_by_its_margin_and_no_further():
     view = pointmap(np.eye(4))
     for margin in (0.0, 0.5):
-        ray = directions(background([view], [two_colours()], Config(margin=margin, spacing_deg=2.0)))
+        ray = directions(far_shell([view], [two_colours()], Config(margin=margin, spacing_deg=2.0)))
         u = ray[:, 0] / ray[:, 2] * view.K[0, 0] / WIDTH + 0.5
         v = ray[:, 1] / ray[:, 2] * view.K[1, 1] / HEIGHT + 0.5
         for share in (u, v):
@@ -69,7 +69,7 @@ def test_it_reaches_beyond_the_image_by_its_margin_and_no_further():
 
 
 def test_it_has_the_colour_of_the_image_there():
-    shell = background([pointmap(np.eye(4))], [two_colours()], Config(margin=0.0))
+    shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config(margin=0.0))
     ray = directions(shell)
     left, right = ray[:, 0] < -0.1, ray[:, 0] > 0.1
     torch.testing.assert_close(shell.rgb[left], torch.tensor([[1.0, 0, 0]]).expand(left.sum(), 3), rtol=0, atol=0.03)
@@ -79,7 +79,7 @@ def test_it_has_the_colour_of_the_image_there():
 def test_beside_the_images_it_has_their_colour_at_that_elevation():
     sky_over_grass = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     sky_over_grass[: HEIGHT // 2, :, 2], sky_over_grass[HEIGHT // 2 :, :, 1] = 255, 255
-    ray = directions(shell := background([pointmap(np.eye(4))], [sky_over_grass], Config()))
+    ray = directions(shell := far_shell([pointmap(np.eye(4))], [sky_over_grass], Config()))
     beside = ray[:, 0] / ray[:, 2] > 0.8  # the image ends at 0.5
     sky, grass = beside & (ray[:, 1] < -0.2), beside & (ray[:, 1] > 0.2)
     assert sky.sum() > 20 and grass.sum() > 20
@@ -90,7 +90,7 @@ def test_beside_the_images_it_has_their_colour_at_that_elevation():
 def test_each_direction_has_the_colour_of_the_view_that_looks_there():
     green, white = np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     green[..., 1] = 255
-    shell = background([pointmap(turned(0)), pointmap(turned(180))], [green, white], Config(margin=0.0))
+    shell = far_shell([pointmap(turned(0)), pointmap(turned(180))], [green, white], Config(margin=0.0))
     ahead = directions(shell)[:, 2] > 0
     assert ahead.any() and (~ahead).any()
     torch.testing.assert_close(shell.rgb[ahead], torch.tensor([[0, 1.0, 0]]).expand(ahead.sum(), 3))
@@ -100,7 +100,7 @@ def test_each_direction_has_the_colour_of_the_view_that_looks_there():
 @pytest.mark.parametrize("yaw_deg", [0.0, 90.0])
 def test_no_gap_shows_through(yaw_deg):
     view, white = pointmap(turned(yaw_deg)), np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
-    shell = background([view], [white], Config())
+    shell = far_shell([view], [white], Config())
     camera = torch.from_numpy(view.T_world_camera).float(), torch.from_numpy(view.K).float()
     image = seen(shell, shell.opacities, *camera, WIDTH, HEIGHT).rgb
     assert image.min() > 0.8
@@ -109,15 +109,15 @@ def test_no_gap_shows_through(yaw_deg):
 def test_a_shell_of_spacing_zero_is_left_out():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        shell = background([pointmap(np.eye(4))], [two_colours()], Config(spacing_deg=0.0))
+        shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config(spacing_deg=0.0))
     assert len(shell) == 0
 
 
 @pytest.mark.parametrize("most", [40, 8, 0])
 def test_a_bounded_shell_is_coarser_not_torn(most):
     views = [pointmap(turned(yaw)) for yaw in (0, 60)]
-    assert len(background(views, [two_colours()] * 2, Config())) > 40
-    shell = background(views, [two_colours()] * 2, Config(), max_gaussians=most)
+    assert len(far_shell(views, [two_colours()] * 2, Config())) > 40
+    shell = far_shell(views, [two_colours()] * 2, Config(), max_gaussians=most)
     assert len(shell) <= most
     if most:
         assert len(shell) >= most // 2

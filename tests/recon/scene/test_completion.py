@@ -108,16 +108,16 @@ def contradicted() -> tuple[Pointmap, Pointmap]:
 def test_nothing_is_filled_before_a_known_surface_of_another_view():
     holed, beyond = contradicted()
     hole = holed.depth == 0
-    filled, _ = complete([holed, beyond], [GREY, GREY], Config(background=1.5))
+    filled, _ = complete([holed, beyond], [GREY, GREY], Config(background_depth=1.5))
     assert not filled.depth[hole].any()  # neither on the wall, at 2, nor at 3: both would hide what is at 4
-    (alone,) = complete([holed], [GREY], Config(background=1.5))
+    (alone,) = complete([holed], [GREY], Config(background_depth=1.5))
     np.testing.assert_allclose(alone.depth[hole], 2.0, rtol=1e-3)
 
 
 def test_the_background_is_taken_where_nothing_nearer_is_possible():
     holed, beyond = contradicted()
     hole = holed.depth == 0
-    filled, _ = complete([holed, beyond], [GREY, GREY], Config(background=3.0))
+    filled, _ = complete([holed, beyond], [GREY, GREY], Config(background_depth=3.0))
     np.testing.assert_allclose(filled.depth[hole], 6.0, rtol=1e-5)
 
 
@@ -139,7 +139,7 @@ def test_what_stands_before_another_views_surface_is_put_close_to_the_camera(ste
     image = GREY.copy()
     image[hole] = 255, 0, 0
     pointmaps = [without(wall(confidence=0.9), hole), wall(x=step)]
-    filled, _ = complete(pointmaps, [image, GREY], Config(foreground=0.4))
+    filled, _ = complete(pointmaps, [image, GREY], Config(foreground_depth=0.4))
     inside = box(slice(19, 29), slice(43, 53))
     np.testing.assert_allclose(filled.depth[inside], depth, rtol=1e-5)
     assert np.array_equal(filled.depth[~hole], pointmaps[0].depth[~hole])
@@ -149,5 +149,5 @@ def test_a_few_pixels_of_another_colour_are_noise_and_not_an_object():
     hole = box(slice(20, 23), slice(45, 48))
     image = GREY.copy()
     image[hole] = 255, 0, 0
-    filled, _ = complete([without(wall(confidence=0.9), hole), wall(x=0.9)], [image, GREY], Config(object_px=7))
+    filled, _ = complete([without(wall(confidence=0.9), hole), wall(x=0.9)], [image, GREY], Config(min_object_px=7))
     assert not filled.depth[hole].any()

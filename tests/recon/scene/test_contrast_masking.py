@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from splatnode.recon.scene.contrast_masking import PLAIN, visibility
+from splatnode.recon.scene.contrast_masking import MASKING_STD, visibility
 
 
 def stripes(contrast: float) -> np.ndarray:
@@ -19,8 +19,8 @@ def test_on_a_plain_surface_a_difference_counts_in_full():
 
 
 def test_contrast_masks_a_difference_as_in_ssim():
-    assert visibility(stripes(PLAIN), 1.0) == pytest.approx(2**-0.5, rel=0.01)
-    assert visibility(stripes(10 * PLAIN), 1.0) == pytest.approx(101**-0.5, rel=0.01)
+    assert visibility(stripes(MASKING_STD), 1.0) == pytest.approx(2**-0.5, rel=0.01)
+    assert visibility(stripes(10 * MASKING_STD), 1.0) == pytest.approx(101**-0.5, rel=0.01)
 
 
 def test_what_masks_reaches_as_far_in_every_size_of_an_image():

@@ -14,7 +14,7 @@ from splatnode.recon.config import PRUNING, Config
 from splatnode.recon.evaluate.start import continued, find_start
 from splatnode.recon.optimize import refinement
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene.scene import Scene, View
+from splatnode.recon.scene.scene import Scene, TrainingView
 from splatnode.recon.scene.seeding import initial_gaussians
 from tests.support.synthetic import photographs, plane_pointmap, repeated
 
@@ -75,7 +75,9 @@ def refined_wall(image: np.ndarray) -> int:
     size = image.shape[0]
     pointmap = plane_pointmap(np.eye(4), width=size, height=size)
     T, K = torch.eye(4), torch.from_numpy(pointmap.K).float()
-    scene = Scene((View("0.png", 0, image, T, K, 0.1, 0.01),), initial_gaussians([pointmap], [image], CONFIG.seeding))
+    scene = Scene(
+        (TrainingView("0.png", 0, image, T, K, 0.1, 0.01),), initial_gaussians([pointmap], [image], CONFIG.seeding)
+    )
     return len(list(refinement.refine(scene, SHORT, seed=0))[-1].gaussians)
 
 

@@ -12,7 +12,7 @@ from splatnode.recon.scene.partition import partition
 def cut(
     features: np.ndarray, wanted: np.ndarray | None = None, weights: np.ndarray | None = None, **changed
 ) -> tuple[np.ndarray, int]:
-    settings = {"tile_px": 64, "smallest_px": 1, "most_error": 0.1, "noise": 0.0} | changed
+    settings = {"tile_px": 64, "min_area_px": 1, "max_error": 0.1, "noise_variance": 0.0} | changed
     everywhere = np.ones(features.shape[:2], np.float32)
     return partition(
         features,
@@ -59,7 +59,7 @@ def test_one_cut_at_a_diagonal_edge(sign):
 def test_detail_takes_small_pieces_and_plain_ground_large_ones():
     values = np.full((64, 64), 0.5)
     values[:16, :16] = np.random.default_rng(0).random((16, 16))
-    labels, count = cut(grey(values), most_error=1e-5)
+    labels, count = cut(grey(values), max_error=1e-5)
     detail = np.unique(labels[:16, :16])
     assert len(detail) > 200 and np.median(np.bincount(labels.ravel())[detail]) == 1
     assert count - len(detail) < 30
@@ -68,7 +68,7 @@ def test_detail_takes_small_pieces_and_plain_ground_large_ones():
 def test_no_piece_keeps_more_than_the_error_unless_it_is_of_the_smallest():
     random = np.random.default_rng(0)
     features = random.normal(0, 0.1, (50, 70, 4)).astype(np.float32)
-    labels, count = cut(features, most_error=0.3, smallest_px=6)
+    labels, count = cut(features, max_error=0.3, min_area_px=6)
     sizes = np.bincount(labels.ravel(), minlength=count)
     assert sizes.sum() == labels.size and sizes.min() >= 1
     for piece in range(count):
@@ -79,8 +79,8 @@ def test_no_piece_keeps_more_than_the_error_unless_it_is_of_the_smallest():
 
 def test_noise_that_is_allowed_for_is_not_cut():
     features = np.random.default_rng(0).normal(0, 0.02, (64, 64, 4)).astype(np.float32)
-    assert cut(features, most_error=0.1)[1] > 20
-    assert cut(features, most_error=0.1, noise=4 * 0.02**2 * 1.1)[1] == 1
+    assert cut(features, max_error=0.1)[1] > 20
+    assert cut(features, max_error=0.1, noise_variance=4 * 0.02**2 * 1.1)[1] == 1
 
 
 def test_what_weighs_little_is_cut_as_if_it_differed_less():

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.gaussian_render import seen
 from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.seeding import Config, gaussians_from_pointmap, initial_gaussians, redundant
+from splatnode.recon.scene.seeding import Config, gaussians_from_pointmap, initial_gaussians, redundant_pixels
 from tests.support.synthetic import plane_pointmap, without
 
 NORMAL = (0.36, 0.48, -0.8)  # of a slanted plane
@@ -54,28 +54,33 @@ def everything(pointmap: Pointmap) -> np.ndarray:
 def test_a_pixel_is_redundant_where_a_more_confident_point_falls_on_it():
     # A camera 0.5 to the right sees depth 2 shifted by f b / z = 4 * 0.5 / 2 = 1 pixel to the left.
     sure, doubtful = wall(at(), 0.9), wall(at(x=0.5), 0.5, frame_id=1)
-    masks = redundant([sure, doubtful], Config())
+    masks = redundant_pixels([sure, doubtful], Config())
     assert not masks[0].any()
     assert masks[1].tolist() == [[True, True, True, False]] * 3
-    swapped = redundant([doubtful, sure], Config())
+    swapped = redundant_pixels([doubtful, sure], Config())
     assert swapped[0].tolist() == masks[1].tolist() and not swapped[1].any()
 
 
 def test_depths_must_agree_within_the_relative_tolerance():
     sure, doubtful = wall(at(), 0.9), wall(at(x=0.5), 0.5)
     doubtful.depth[0, :3] = 2.03, 2.05, 1.97  # from 2 by 1.5 %, 2.4 % and 1.5 % of itself
-    assert redundant([sure, doubtful], Config(depth_tolerance=0.02))[1][0].tolist() == [True, False, True, False]
-    assert redundant([sure, doubtful], Config(depth_tolerance=0.01))[1][0].tolist() == [False, False, False, False]
+    assert redundant_pixels([sure, doubtful], Config(depth_tolerance=0.02))[1][0].tolist() == [True, False, True, False]
+    assert redundant_pixels([sure, doubtful], Config(depth_tolerance=0.01))[1][0].tolist() == [
+        False,
+        False,
+        False,
+        False,
+    ]
 
 
-def test_unknown_pixels_cover_nothing_and_are_not_redundant():
+def test_unknown_pixels_cover_nothing_and_are_not_redundant_pixels():
     sure = without(wall(at(), 0.9), np.array([[False, True, False, False]] * 3))
     doubtful = without(wall(at(x=0.5), 0.3), np.array([[False, False, True, False]] * 3))
-    assert redundant([sure, doubtful], Config())[1].tolist() == [[False, True, False, False]] * 3
+    assert redundant_pixels([sure, doubtful], Config())[1].tolist() == [[False, True, False, False]] * 3
 
 
 def test_of_equally_confident_views_the_first_keeps_its_pixels():
-    masks = redundant([wall(at(), 0.5), wall(at(x=0.5), 0.5)], Config())
+    masks = redundant_pixels([wall(at(), 0.5), wall(at(x=0.5), 0.5)], Config())
     assert not masks[0].any() and masks[1].sum() == 9
 
 
@@ -88,20 +93,20 @@ def test_what_lies_before_the_surface_covers_what_it_hides():
     target.depth[:] = 4.0
     expected = np.ones((3, 4), bool)
     expected[1, 2] = False
-    assert redundant([two_layers, target], Config())[1].tolist() == expected.tolist()
+    assert redundant_pixels([two_layers, target], Config())[1].tolist() == expected.tolist()
 
 
 @pytest.mark.parametrize(("behind", "covers"), [(0.8, True), (1.2, False)])
 def test_detail_is_not_given_up_for_a_point_seen_from_far_away(behind, covers):
     # A pixel's footprint is depth / f: at distance 2.8 it is 1.4 times that at 2, at 3.2 it is 1.6 times.
-    masks = redundant([wall(at(z=-behind), 0.9), wall(at(), 0.5)], Config(coarser=1.5))
+    masks = redundant_pixels([wall(at(z=-behind), 0.9), wall(at(), 0.5)], Config(max_footprint_ratio=1.5))
     assert masks[1].any() == covers
 
 
 def test_a_plain_wall_takes_one_gaussian_a_square_and_stripes_one_each():
     # A photograph of 64 pixels stands for one of 512, so that 128 pixels there are 16 here.
     pointmap = plane_pointmap(np.eye(4), width=64, height=64)
-    config = Config(largest_px=128)
+    config = Config(max_side_px=128)
     stripes = np.tile(np.repeat([0, 255], 4), 8)[None, :, None].repeat(64, 0).repeat(3, 2).astype(np.uint8)
     assert len(gaussians_from_pointmap(pointmap, plain(64), everything(pointmap), config)) == 4 * 4
     assert len(gaussians_from_pointmap(pointmap, stripes, everything(pointmap), config)) == 4 * 16
@@ -112,7 +117,7 @@ def test_a_plain_wall_takes_one_gaussian_a_square_and_stripes_one_each():
 def test_a_step_in_depth_divides_pieces_as_one_in_colour_does():
     pointmap = plane_pointmap(np.eye(4), width=64, height=64)
     pointmap.depth[:, 40:] = 3.0
-    gaussians = gaussians_from_pointmap(pointmap, plain(64), everything(pointmap), Config(largest_px=512))
+    gaussians = gaussians_from_pointmap(pointmap, plain(64), everything(pointmap), Config(max_side_px=512))
     assert len(gaussians) == 2
     assert sorted(gaussians.means[:, 2].tolist()) == pytest.approx([2.0, 3.0], rel=1e-5)
 
@@ -149,7 +154,7 @@ def test_a_large_photographs_gaussians_have_its_pixels_moments():
     pointmap = plane_pointmap(np.eye(4), width=1024, height=768)
     image = np.zeros((768, 1024, 3), np.uint8)
     image[:, 513:] = 255  # within a pixel of the size at which pieces are cut
-    gaussians = gaussians_from_pointmap(pointmap, image, everything(pointmap), Config(largest_px=512))
+    gaussians = gaussians_from_pointmap(pointmap, image, everything(pointmap), Config(max_side_px=512))
     left = gaussians.subset(gaussians.rgb[:, 0] < 0.1)
     u = left.means[:, 0] / left.means[:, 2] * pointmap.K[0, 0] + pointmap.K[0, 2]
     assert float(u.min()) == pytest.approx(256.5, abs=1)
@@ -176,7 +181,7 @@ def test_gaussians_lie_on_a_slanted_plane_and_face_along_its_normal():
 
 def test_size_colour_and_opacity_of_one_piece():
     pointmap = plane_pointmap(np.eye(4), width=16, height=16)
-    config = Config(largest_px=512, footprint=1.5, thickness=0.1, opacity=0.8)
+    config = Config(max_side_px=512, footprint=1.5, thickness=0.1, opacity=0.8)
     gaussians = gaussians_from_pointmap(pointmap, plain(16), everything(pointmap), config)
     extent = 1.5 * 16 / 12**0.5 * 2.0 / pointmap.K[0, 0]  # a square's standard deviation is its side over root 12
     torch.testing.assert_close(gaussians.scales, torch.tensor([[extent, extent, 0.1 * extent]], dtype=torch.float32))
@@ -190,7 +195,7 @@ def test_a_gaussian_is_as_long_and_wide_as_its_piece_and_lies_along_it():
     rows, columns = np.indices((32, 32))
     stripe = np.abs(rows - columns) < 3
     image = np.where(stripe[..., None], 255, 0).repeat(3, 2).astype(np.uint8)
-    gaussians = gaussians_from_pointmap(pointmap, image, stripe, Config(largest_px=512))
+    gaussians = gaussians_from_pointmap(pointmap, image, stripe, Config(max_side_px=512))
     assert len(gaussians) == 1
     long, wide, _ = gaussians.scales[0].tolist()
     v, u = np.nonzero(stripe)
@@ -202,7 +207,7 @@ def test_a_gaussian_is_as_long_and_wide_as_its_piece_and_lies_along_it():
 
 def test_foreshortened_gaussians_are_longer_along_the_line_of_sight():
     pointmap = plane_pointmap(np.eye(4), (0.6, 0.0, -0.8), (0, 0, 2), width=16, height=16)
-    config = Config(largest_px=512, most_error=1e6)
+    config = Config(max_side_px=512, max_error=1e6)
     gaussians = gaussians_from_pointmap(pointmap, plain(16), everything(pointmap), config)
     along, across, _ = gaussians.scales[0].tolist()
     assert along / across == pytest.approx(1 / 0.8, rel=0.02)
@@ -213,7 +218,7 @@ def test_foreshortened_gaussians_are_longer_along_the_line_of_sight():
 def test_a_surface_seen_edge_on_is_not_stretched_out_without_end():
     pointmap = plane_pointmap(np.eye(4), width=16, height=16)
     pointmap = replace(pointmap, normal=np.tile(np.array([1.0, 0, 0], np.float32), (16, 16, 1)))
-    gaussians = gaussians_from_pointmap(pointmap, plain(16), everything(pointmap), Config(largest_px=512))
+    gaussians = gaussians_from_pointmap(pointmap, plain(16), everything(pointmap), Config(max_side_px=512))
     assert normals(gaussians)[0, 2] == pytest.approx(-0.25, abs=0.01)
     assert 2 < float(gaussians.scales[0, 0] / gaussians.scales[0, 1]) < 5
 
@@ -263,7 +268,7 @@ def test_what_two_views_see_starts_from_one_of_them():
 def test_doubtful_pixels_start_no_gaussian():
     pointmap = plane_pointmap(np.eye(4), width=32, height=32)
     pointmap.confidence[:, :16] = 0.04
-    gaussians = initial_gaussians([pointmap], [plain(32)], Config(min_confidence=0.05, largest_px=256))
+    gaussians = initial_gaussians([pointmap], [plain(32)], Config(min_confidence=0.05, max_side_px=256))
     assert len(gaussians) == 2 and gaussians.means[:, 0].min() > 0
 
 
@@ -281,7 +286,7 @@ def test_at_most_as_many_gaussians_as_are_allowed(most):
 def test_large_pieces_are_not_coarsened_beyond_what_a_partition_takes():
     noise = np.random.default_rng(0).integers(0, 255, (64, 64, 3)).astype(np.uint8)
     pointmap = plane_pointmap(np.eye(4), width=64, height=64)
-    assert len(initial_gaussians([pointmap], [noise], Config(largest_px=4096), max_gaussians=1)) == 1
+    assert len(initial_gaussians([pointmap], [noise], Config(max_side_px=4096), max_gaussians=1)) == 1
 
 
 def render(gaussians: Gaussians, pointmap: Pointmap) -> torch.Tensor:

@@ -19,7 +19,7 @@ from splatnode.recon.daemon.checkpoint.saved import (
 )
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.scene import Scene, View
+from splatnode.recon.scene.scene import Scene, TrainingView
 from tests.support.synthetic import photographs, tiny_scene, view_graph
 
 
@@ -36,7 +36,7 @@ def graph():
 def scene(graph) -> Scene:
     tiny = tiny_scene()
     views = tuple(
-        View(keyframe.name, keyframe.frame.frame_id, keyframe.image, T, K, 0.1, 0.02)
+        TrainingView(keyframe.name, keyframe.frame.frame_id, keyframe.image, T, K, 0.1, 0.02)
         for keyframe, T, K in zip(graph.keyframes, tiny.Ts_world_camera, tiny.Ks, strict=True)
     )
     return Scene(views, replace(tiny.gaussians, source_frame=torch.arange(64, dtype=torch.int32) % 3), 40)

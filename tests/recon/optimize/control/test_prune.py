@@ -17,7 +17,7 @@ from splatnode.recon.optimize.target import Target, target
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.contrast_masking import visibility
 from splatnode.recon.scene.gaussians import Gaussians, concatenate
-from splatnode.recon.scene.scene import Scene, View
+from splatnode.recon.scene.scene import Scene, TrainingView
 from tests.recon.optimize.test_refinement import render, truth  # noqa: F401  a fixture
 
 
@@ -34,7 +34,7 @@ def worth(scene: Scene, probes: int, scale: float = 1.0) -> torch.Tensor:
     return changes_without(scene.gaussians, cameras_of(scene, scale), probes, torch.Generator().manual_seed(0))
 
 
-def left_out(gaussians: Gaussians, view: View, index: int) -> float:
+def left_out(gaussians: Gaussians, view: TrainingView, index: int) -> float:
     """The squared visible difference to the picture without Gaussian `index`, as worth is counted."""
     others = gaussians.subset(torch.arange(len(gaussians)) != index)
     whole = render(gaussians, view)

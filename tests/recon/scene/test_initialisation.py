@@ -1,4 +1,4 @@
-"""The scene: what it starts from and what it tells."""
+"""What a scene begins with, and what it tells."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from splatnode.recon.config import Config
 from splatnode.recon.frames import border
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.registration.register import RegisteredCamera
-from splatnode.recon.scene import background, completion, pixelwise, seeding
-from splatnode.recon.scene.scene import Scene, begin
+from splatnode.recon.scene import background, initialisation, pixelwise
+from splatnode.recon.scene.initialisation import initial_scene
+from splatnode.recon.scene.scene import Scene
 from tests.support.synthetic import plane_pointmap
 
 WIDTH, HEIGHT = 32, 24
@@ -40,8 +41,8 @@ def scene_of(
         for i, pointmap in enumerate(pointmaps)
     )
     images = {pointmap.name: noise for pointmap in pointmaps}
-    settings = completion.Config(), seeding.Config(), background.Config(), max_gaussians, by_pixel
-    return begin(pointmaps, images, cameras, *settings)
+    config = initialisation.Config(pixelwise=by_pixel, max_gaussians=max_gaussians)
+    return initial_scene(pointmaps, images, cameras, config)
 
 
 def test_a_scene_begins_with_the_registered_cameras_and_a_gaussian_for_what_they_saw():
@@ -70,7 +71,7 @@ def test_depths_that_stereo_does_not_believe_in_move_neither_surfaces_nor_the_sh
 @pytest.mark.parametrize("by_pixel", [None, pixelwise.Config()])
 def test_nothing_begins_where_photographs_do_not_show_the_scene(by_pixel, monkeypatch):
     right = np.broadcast_to(np.arange(WIDTH) >= 8, (HEIGHT, WIDTH))
-    monkeypatch.setattr(border, "shown", lambda images: [right] * len(images))
+    monkeypatch.setattr(border, "valid_masks", lambda images: [right] * len(images))
     scene = begun(by_pixel=by_pixel)
     for view in scene.views:
         assert view.pointmap is not None and not view.pointmap.depth[~right].any()

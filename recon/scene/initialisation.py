@@ -1,0 +1,72 @@
+"""Initialisation: the scene that has not been optimised, seeded from point maps of registered cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from splatnode.recon.frames import border
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.registration.register import RegisteredCamera
+from splatnode.recon.scene import background, completion, pixelwise, seeding
+from splatnode.recon.scene.gaussians import concatenate
+from splatnode.recon.scene.scene import Scene, TrainingView
+
+Image = npt.NDArray[np.uint8]
+
+SHELL_PARTS = 10  # with a limit on the Gaussians, one part in this many may be the far shell
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Which Gaussians a scene begins with."""
+
+    completion: completion.Config = completion.Config()
+    seeding: seeding.Config = seeding.Config()
+    background: background.Config = background.Config()
+    pixelwise: pixelwise.Config | None = None  # in place of the three: a Gaussian a pixel that stereo knows
+    max_gaussians: int | None = None  # None: as many as the photographs call for
+
+
+def initial_scene(
+    pointmaps: Sequence[Pointmap],
+    images: Mapping[str, Image],
+    cameras: Sequence[RegisteredCamera],
+    config: Config,
+) -> Scene:
+    """The scene with a training view for each point map, and Gaussians seeded from all of them.
+
+    `images` (h, w, 3) are found by the point maps' names; `cameras` are in the order of the point maps. Pixels of a
+    dark rim, which do not show the scene, seed nothing.
+    """
+    pictures = [images[pointmap.name] for pointmap in pointmaps]
+    valid = border.valid_masks(pictures)
+    pointmaps = tuple(map(Pointmap.masked, pointmaps, valid))
+    views = tuple(
+        TrainingView(
+            name=pointmap.name,
+            frame_id=pointmap.frame_id,
+            image=images[pointmap.name],
+            T_world_camera=torch.tensor(pointmap.T_world_camera, dtype=torch.float32),
+            K=torch.tensor(pointmap.K, dtype=torch.float32),
+            rotation_sigma_deg=camera.rotation_sigma_deg,
+            centre_sigma_rel=camera.centre_sigma_rel,
+            pointmap=pointmap,
+        )
+        for pointmap, camera in zip(pointmaps, cameras, strict=True)
+    )
+    if config.pixelwise is not None:
+        return Scene(views, pixelwise.pixelwise_gaussians(pointmaps, pictures, config.pixelwise, config.max_gaussians))
+    usable = [each.masked(each.confidence >= config.completion.min_usable_confidence) for each in pointmaps]
+    completed = list(map(Pointmap.masked, completion.complete(usable, pictures, config.completion), valid))
+    shell_limit = None if config.max_gaussians is None else config.max_gaussians // SHELL_PARTS
+    shell = background.far_shell(usable, pictures, config.background, shell_limit)
+    surfaces = seeding.initial_gaussians(completed, pictures, config.seeding)
+    num_unlimited = len(surfaces) + len(shell)
+    if config.max_gaussians is not None and num_unlimited > config.max_gaussians:
+        limit = config.max_gaussians - len(shell)
+        surfaces = seeding.initial_gaussians(completed, pictures, config.seeding, limit)
+    return Scene(views, concatenate([surfaces, shell]), num_unlimited=num_unlimited)
