@@ -15,7 +15,9 @@ from splatnode.recon.geometry import (
     align_cameras,
     exp_se3,
     multiply_quats,
+    project,
     quat_from_matrix,
+    to_camera,
     twist_gradient,
 )
 
@@ -187,3 +189,17 @@ def test_noise_moves_the_alignment_only_a_little():
     found = align_cameras(source, target)
     assert found.scale == pytest.approx(1, abs=2e-3)
     assert np.linalg.norm(found.translation) < 2e-3
+
+
+def test_a_world_point_is_projected_where_its_camera_sees_it():
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()  # looks along the world's x
+    T_world_camera[:3, 3] = 1.0, 2.0, 3.0
+    K = np.array([[100.0, 0, 50], [0, 200.0, 40], [0, 0, 1]])
+    in_camera = to_camera(np.array([[3.0, 2.5, 2.0], [-1.0, 2.0, 3.0]]), T_world_camera)
+    np.testing.assert_allclose(in_camera, [[1, 0.5, 2], [0, 0, -2]], atol=1e-12)
+    pixels = project(in_camera, K)
+    np.testing.assert_allclose(pixels[0], [100 * 1 / 2 + 50, 200 * 0.5 / 2 + 40])
+    assert np.isfinite(pixels).all()  # behind the camera they mean nothing, and are numbers all the same
+    in_float32 = to_camera(torch.tensor([[3.0, 2.5, 2.0]]), torch.from_numpy(T_world_camera).float())
+    torch.testing.assert_close(in_float32, torch.tensor([[1.0, 0.5, 2.0]]))

@@ -75,9 +75,8 @@ def refined_wall(image: np.ndarray) -> int:
     size = image.shape[0]
     pointmap = plane_pointmap(np.eye(4), width=size, height=size)
     T, K = torch.eye(4), torch.from_numpy(pointmap.K).float()
-    scene = Scene(
-        (TrainingView("0.png", 0, image, T, K, 0.1, 0.01),), initial_gaussians([pointmap], [image], CONFIG.seeding)
-    )
+    view = TrainingView("0.png", 0, image, T, K, 0.1, 0.01)
+    scene = Scene((view,), initial_gaussians([pointmap], [image], CONFIG.seeding))
     return len(list(refinement.refine(scene, SHORT, seed=0))[-1].gaussians)
 
 

@@ -64,13 +64,8 @@ def test_a_pixel_is_redundant_where_a_more_confident_point_falls_on_it():
 def test_depths_must_agree_within_the_relative_tolerance():
     sure, doubtful = wall(at(), 0.9), wall(at(x=0.5), 0.5)
     doubtful.depth[0, :3] = 2.03, 2.05, 1.97  # from 2 by 1.5 %, 2.4 % and 1.5 % of itself
-    assert redundant_pixels([sure, doubtful], Config(depth_tolerance=0.02))[1][0].tolist() == [True, False, True, False]
-    assert redundant_pixels([sure, doubtful], Config(depth_tolerance=0.01))[1][0].tolist() == [
-        False,
-        False,
-        False,
-        False,
-    ]
+    for tolerance, expected in ((0.02, [True, False, True, False]), (0.01, [False] * 4)):
+        assert redundant_pixels([sure, doubtful], Config(depth_tolerance=tolerance))[1][0].tolist() == expected
 
 
 def test_unknown_pixels_cover_nothing_and_are_not_redundant_pixels():

@@ -27,10 +27,8 @@ def test_a_registration_in_another_world_is_carried_into_that_of_the_scene():
 
 def test_a_view_that_is_no_longer_placed_means_a_fresh_start():
     graph, registration = graph_of(4), registration_of(4)
-    assert (
-        registration_in_scene_world(scene_of(3, graph), replace(registration, cameras=registration.cameras[1:]), graph)
-        is None
-    )
+    lacking = replace(registration, cameras=registration.cameras[1:])
+    assert registration_in_scene_world(scene_of(3, graph), lacking, graph) is None
 
 
 def observed(registration: Registration, depth: float) -> Registration:
