@@ -5,7 +5,7 @@ into the host's own file system, read-only, and so runs the very Python environm
 lies. Only /run and /mnt can be written to.
 
 `python -m tests.vm.machine` fetches the kernel into ~/.cache/splatnode/kernel, or where $SPLATNODE_VM_KERNEL says.
-It needs Debian's packages qemu-system-x86 and busybox-static.
+Both need Debian's packages qemu-system-x86 and busybox-static.
 """
 
 from __future__ import annotations
@@ -164,5 +164,8 @@ def fetch_kernel() -> None:
 
 
 if __name__ == "__main__":
-    fetch_kernel()
-    print(find_kernel())
+    if isinstance(find_kernel(), str):
+        fetch_kernel()
+    found = find_kernel()
+    print(found)
+    sys.exit(isinstance(found, str))

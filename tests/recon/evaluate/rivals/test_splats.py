@@ -112,10 +112,10 @@ def test_colmap_3dgs_and_fsgs_look_like_the_photographs(frames):
 def test_cf_3dgs_finds_the_poses_of_a_film_frame_by_frame():
     film = synthetic.Config(views=8, width=200, height=150)
     frames = list(synthetic.stream(film))[:3]
-    config = cf_3dgs.Config(alone=30, motion=80, growing=5, final=10, stride=2)
+    config = cf_3dgs.Config(alone=30, motion=160, growing=5, final=10, stride=2)
     end = last(cf_3dgs.reconstruct(frames, 0, config))
     found = errors(end, film)  # of turns of 14 and 20 degrees
-    assert found.rotation_pair_deg < 8.0 and found.centre_pct < 20.0
+    assert found.rotation_pair_deg < 2.0 and found.centre_pct < 8.0  # .3 to .6 degrees, 1.5 to 2.2 %
     assert training_psnr(end, frames) > 15.0
 
 
