@@ -11,7 +11,7 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import continuation
 from splatnode.recon.registration.register import RegisteredCamera, Registration, register
 from splatnode.recon.result.verdict import Verdict
-from splatnode.recon.verification.decision import hopeless, judge
+from splatnode.recon.verification.decision import decide, refuse_before_registration
 from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.verify import verify, verify_further
 
@@ -81,13 +81,13 @@ class Judging:
     def _made_anew(self, graph: ViewGraph, rejected: Sequence[Rejected], pause: Callable[[], None]) -> Judgement:
         """A registration of the keyframes, judged by its evidence; none where it would be of no use."""
         graph.complete(pause)
-        refusal = hopeless(graph, rejected, self._config.decision)
+        refusal = refuse_before_registration(graph, rejected, self._config.decision)
         if refusal is not None:
             return Judgement(None, None, refusal)
         registration = register(graph.keyframes, graph.pairs, self._config.registration, pause)
         pause()
         evidence = verify(graph, registration, self._config.verification, pause)
-        return Judgement(registration, evidence, judge(graph, registration, evidence, self._config.decision))
+        return Judgement(registration, evidence, decide(graph, registration, evidence, self._config.decision))
 
     def _continued(self, graph: ViewGraph) -> Judgement | None:
         """The newest judgement that can be continued, with cameras for all keyframes that it did not have, or None."""
@@ -111,7 +111,7 @@ class Judging:
         names = {graph.keyframes[index].name for index in further}
         if any(camera.confirmed < BEYOND_DOUBT for camera in continued.cameras if camera.name in names):
             return None
-        verdict = judge(graph, registration, continued, self._config.decision)
+        verdict = decide(graph, registration, continued, self._config.decision)
         if not verdict.publishable:
             return None
         message = f"{verdict.message} {FOR_NOW}"

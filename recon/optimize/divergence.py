@@ -22,7 +22,10 @@ _DSSIM = 0.2
 def refusal(before: float, scene: Scene) -> Verdict | None:
     """The verdict on `scene` where its misfit is worse than the one `before` the refinement; else None."""
     after = misfit(scene)
-    return None if after <= WORSE * before else refusals.diverged([view.name for view in scene.views], before, after)
+    if after <= WORSE * before:
+        return None
+    names = [view.name for view in scene.views]
+    return refusals.refuse(refusals.DIVERGED, names, before=before, after=after)
 
 
 def misfit(scene: Scene) -> float:

@@ -28,7 +28,7 @@ FAR_PX = 5.0  # parallax below which the sign of a depth means nothing
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_error_px: float = 2.5  # of a match that agrees, at 1024 px on the longer side
     min_points: int = 15  # 2D-3D inliers that a proposal needs
-    min_inlier_share: float = 0.2
+    min_inlier_ratio: float = 0.2
     ample_points: int = 40  # 2D-3D inliers from which on no pair needs to be asked for its relative pose
     min_scale_points: int = 5  # that must agree on the distance along the direction that a pair gives
 
@@ -179,7 +179,7 @@ def _proposals(
             {"max_reproj_error": 3.0 * limit, "seed": 0, "min_iterations": 200, "max_iterations": 5000},
         )
         num_inliers = int(sum(info["inliers"]))
-        if num_inliers >= max(config.min_points, config.min_inlier_share * chosen.sum()):
+        if num_inliers >= max(config.min_points, config.min_inlier_ratio * chosen.sum()):
             most = max(most, num_inliers)
             yield np.asarray(pose.R), np.asarray(pose.t)
     if most >= config.ample_points:

@@ -50,7 +50,7 @@ def accepted(graph: ViewGraph, registration: Registration, evidence: Evidence, e
 
 def _all_placed(evidence: Evidence, exposure_ratio: float) -> Verdict:
     count = len(evidence.cameras)
-    gains = {camera.name: camera.gain for camera in evidence.cameras}
+    gains = {camera.name: camera.gain for camera in evidence.cameras}  # finite, for `undetermined` let them pass
     ratio = max(gains.values()) / min(gains.values())
     if ratio <= exposure_ratio:
         return Verdict(Code.OK, f"All {count} frames were placed.", "", (), publishable=True)

@@ -11,7 +11,7 @@ from splatnode.recon.verification.epipolar_consistency import Score
 from splatnode.recon.verification.jackknife import Spread
 from splatnode.recon.verification.lens import Distortion, FreedLens
 from splatnode.recon.verification.reflection import Reflection
-from splatnode.recon.verification.weakest_link import Joint
+from splatnode.recon.verification.weakest_link import WeakestLink
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class CameraEvidence:
     """What speaks for the pose of one camera."""
 
     name: str
-    agreement: float  # share of its matches, in all verified pairs, that the poses explain
+    inlier_ratio: float  # of its matches, in all verified pairs: those that the poses explain
     confirmed: int  # points of it that at least two other cameras see
     gain: float  # of its exposure, over that of most cameras
     patches: Score  # of it in the pictures that share most points with it
@@ -32,9 +32,9 @@ class Evidence:
     """Of a registration with at least three cameras."""
 
     cameras: tuple[CameraEvidence, ...]
-    agreement: float  # share of all matches that the cameras explain
-    joint: Joint  # the weakest
-    loose: tuple[str, ...]  # frames that only contradicted matches join to most of the others
+    inlier_ratio: float  # of all matches of verified pairs: those that the poses explain
+    weakest_link: WeakestLink
+    disconnected: tuple[str, ...]  # frames outside the largest component of geometrically consistent pairs
     reflection: Reflection  # the frames that stand out most as mirror images
     flatness: float  # share of the points on one plane
     spread: Spread  # how much the answer changes without parts of the pictures

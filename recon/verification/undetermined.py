@@ -6,16 +6,22 @@ asked about such a number: poses of which something could not be computed are no
 
 from __future__ import annotations
 
-from splatnode.recon.registration.register import Registration
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification.evidence import Evidence
+from splatnode.recon.verification.checks import Case
 from splatnode.recon.verification.finiteness import not_finite
+from splatnode.recon.verification.refusals import Refusal, refuse
+
+UNDETERMINED = Refusal(
+    Code.UNDETERMINED,
+    "The poses cannot be verified: these could not be computed: {missing}.",
+    "Leave out the frames named, or add photographs from further to the side between them and the others.",
+)
 
 WORDS = {  # what each field of the evidence says, for the user
     "cameras": "how certain each pose is",
-    "agreement": "how many matches the poses explain",
-    "joint": "what connects the frames",
-    "loose": "which frames belong together",
+    "inlier_ratio": "how many matches the poses explain",
+    "weakest_link": "what connects the frames",
+    "disconnected": "which frames belong together",
     "reflection": "whether photographs are mirrored",
     "flatness": "whether everything lies in one plane",
     "spread": "how much the poses depend on parts of the pictures",
@@ -29,18 +35,14 @@ WORDS = {  # what each field of the evidence says, for the user
 }
 
 
-def undetermined(registration: Registration, evidence: Evidence) -> Verdict | None:
-    """A refusal where a number of the registration or of its evidence is NaN or infinite, which names what it is."""
-    missing = list(not_finite(evidence))
-    of_cameras = [evidence.cameras[int(path[1])].name for path in missing if path[0] == "cameras"]
-    found = [WORDS[path[0]] for path in missing]
-    if any(not_finite(registration)):
+def undetermined(case: Case) -> Verdict | None:
+    """A number of the registration or of its evidence is NaN or infinite."""
+    paths = list(not_finite(case.evidence))
+    of_cameras = [case.names[int(path[1])] for path in paths if path[0] == "cameras"]
+    found = [WORDS[path[0]] for path in paths]
+    if any(not_finite(case.registration)):
         found.append("the poses themselves")
     if not found:
         return None
-    return Verdict(
-        Code.UNDETERMINED,
-        f"The poses cannot be verified: these could not be computed: {'; '.join(dict.fromkeys(found))}.",
-        "Leave out the frames named, or add photographs from further to the side between them and the others.",
-        tuple(dict.fromkeys(of_cameras)) or tuple(camera.name for camera in evidence.cameras),
-    )
+    frames = tuple(dict.fromkeys(of_cameras)) or case.names
+    return refuse(UNDETERMINED, frames, missing="; ".join(dict.fromkeys(found)))

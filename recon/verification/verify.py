@@ -51,9 +51,9 @@ def verify(
     pause()
     return Evidence(
         cameras=cameras,
-        agreement=_agreement(graph, registration, None),
-        joint=weakest_link.weakest(registration, graph.pairs, views, config.epipolar_consistency),
-        loose=tuple(graph.keyframes[index].name for index in weakest_link.loose(registration, graph.pairs)),
+        inlier_ratio=inlier_ratio(graph, registration, None),
+        weakest_link=weakest_link.measure(registration, graph.pairs, views, config.epipolar_consistency),
+        disconnected=_disconnected(graph, registration),
         reflection=_reflection(graph, registration, config.reflection),
         flatness=flatness.share_on_plane(registration.points),
         spread=jackknife.by_regions(fit),
@@ -103,15 +103,15 @@ def verify_further(graph: ViewGraph, registration: Registration, known: Evidence
         cameras=tuple(
             replace(
                 measured.get(names[camera.index]) or before[names[camera.index]],
-                agreement=_agreement(graph, registration, camera.index),
+                inlier_ratio=inlier_ratio(graph, registration, camera.index),
                 rotation_sigma_deg=float(sharper_rotation * camera.rotation_sigma_deg),
                 centre_sigma_rel=float(sharper_centre * camera.centre_sigma_rel),
             )
             for camera in registration.cameras
         ),
-        agreement=_agreement(graph, registration, None),
-        joint=weakest_link.weakest(registration, graph.pairs, views, config.epipolar_consistency),
-        loose=tuple(graph.keyframes[index].name for index in weakest_link.loose(registration, graph.pairs)),
+        inlier_ratio=inlier_ratio(graph, registration, None),
+        weakest_link=weakest_link.measure(registration, graph.pairs, views, config.epipolar_consistency),
+        disconnected=_disconnected(graph, registration),
         reflection=reflection.strongest([known.reflection, *reflections]),
         flatness=flatness.share_on_plane(registration.points),
         median_angle_deg=registration.median_angle_deg,
@@ -136,7 +136,7 @@ def _of_cameras(
     return tuple(
         CameraEvidence(
             name=graph.keyframes[camera.index].name,
-            agreement=_agreement(graph, registration, camera.index),
+            inlier_ratio=inlier_ratio(graph, registration, camera.index),
             confirmed=int(confirmed[camera.index]),
             gain=gains[camera.index],
             patches=epipolar_consistency.in_partners(camera.index, views, registration, config.epipolar_consistency),
@@ -169,8 +169,12 @@ def _reflections_of_further(
     return found
 
 
-def _agreement(graph: ViewGraph, registration: Registration, index: int | None) -> float:
-    """The share of matches that the cameras explain, of all verified pairs or of those of one frame."""
+def _disconnected(graph: ViewGraph, registration: Registration) -> tuple[str, ...]:
+    return tuple(graph.keyframes[index].name for index in weakest_link.disconnected(registration, graph.pairs))
+
+
+def inlier_ratio(graph: ViewGraph, registration: Registration, index: int | None) -> float:
+    """The share of matches that the cameras explain, of all verified pairs or of those of the keyframe `index`."""
     pairs = {key: share for key, share in registration.agreement.items() if index is None or index in key}
     matched = sum(len(graph.pairs[key].matches) for key in pairs)
     return sum(share * len(graph.pairs[key].matches) for key, share in pairs.items()) / max(1, matched)

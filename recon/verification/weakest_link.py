@@ -1,4 +1,4 @@
-"""The weakest joint: what holds the two parts together into which the cameras fall most easily."""
+"""The weakest link: the last edge of the maximum spanning tree of the cameras, over the points that pairs share."""
 
 from __future__ import annotations
 
@@ -13,29 +13,29 @@ from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.verification import epipolar_consistency
 
-FITTING = 0.6  # share of a pair's matches that the poses explain, from which on the pair holds its frames together
-FEW = 20  # matches that hold nothing together
-TRIED = 3  # pairs across the joint in which patches are looked for, those with most points in common
+MIN_CONSISTENT_SHARE = 0.6  # of a pair's matches that the poses explain, for it to connect its frames
+MIN_CONSISTENT_MATCHES = 20  # that the poses explain, for a pair to connect its frames
+MAX_PAIRS_SCORED = 3  # pairs across the link in which patches are looked for, those that share most points
 
 
 @dataclass(frozen=True)
-class Joint:
-    """Two places that a few chance matches join are each right by themselves: only the joint tells."""
+class WeakestLink:
+    """Two places that a few chance matches connect are each right by themselves: only what connects them tells."""
 
-    group: tuple[int, ...]  # frames of the smaller part
-    points: int  # that pairs of frames across the joint share, summed
+    smaller_part: tuple[int, ...]  # its keyframes, by position
+    shared_points: int  # of the pairs of frames across the link, summed
     matches: int  # of the verified pairs across it
-    explained: float  # of these, how many the poses explain
+    inliers: float  # of these, how many the poses explain
     patches: epipolar_consistency.Score  # across it
 
 
-def weakest(
+def measure(
     registration: Registration,
     pairs: Mapping[tuple[int, int], TwoView],
     pictures: Mapping[int, epipolar_consistency.Picture],
     config: epipolar_consistency.Config,
-) -> Joint:
-    """The joint that is left last when cameras are put together in the order of the points that they share.
+) -> WeakestLink:
+    """What connects the two parts into which the cameras fall without the last edge of the maximum spanning tree.
 
     Patches across it are looked for in what there is of `pictures`.
     """
@@ -45,32 +45,32 @@ def weakest(
     across = sorted(((i, j) for i in one for j in other), key=lambda pair: (-shared[pair], pair))
     scores = [
         epipolar_consistency.score(pictures[a], pictures[b], config)
-        for i, j in across[:TRIED]
+        for i, j in across[:MAX_PAIRS_SCORED]
         for a, b in ((i, j), (j, i))
         if i in pictures and j in pictures
     ]
     verified = [key for i, j in across if (key := (min(i, j), max(i, j))) in registration.agreement]
-    return Joint(
-        group=tuple(sorted(min(one, other, key=len))),
-        points=int(sum(shared[pair] for pair in across)),
+    return WeakestLink(
+        smaller_part=tuple(sorted(min(one, other, key=len))),
+        shared_points=int(sum(shared[pair] for pair in across)),
         matches=sum(len(pairs[key].matches) for key in verified),
-        explained=sum(registration.agreement[key] * len(pairs[key].matches) for key in verified),
+        inliers=sum(registration.agreement[key] * len(pairs[key].matches) for key in verified),
         patches=epipolar_consistency.pooled(scores, config),
     )
 
 
-def loose(registration: Registration, pairs: Mapping[tuple[int, int], TwoView]) -> tuple[int, ...]:
-    """Frames outside the largest group that fitting pairs hold together.
+def disconnected(registration: Registration, pairs: Mapping[tuple[int, int], TwoView]) -> tuple[int, ...]:
+    """Keyframes, by position, outside the largest component of geometrically consistent pairs.
 
     Frames that pose as others, as mirror images of a symmetric place do, fit well with each other, and with the rest
     only where the place repeats.
     """
-    fitting = [
+    consistent = [
         key
         for key, share in registration.agreement.items()
-        if share >= FITTING and share * len(pairs[key].matches) >= FEW
+        if share >= MIN_CONSISTENT_SHARE and share * len(pairs[key].matches) >= MIN_CONSISTENT_MATCHES
     ]
-    _, *rest = connected_components([camera.index for camera in registration.cameras], fitting)
+    _, *rest = connected_components([camera.index for camera in registration.cameras], consistent)
     return tuple(sorted(index for part in rest for index in part))
 
 
@@ -83,7 +83,7 @@ def shared_points(registration: Registration) -> npt.NDArray[np.int64]:
 
 
 def _two_parts(indices: list[int], shared: npt.NDArray[np.int64]) -> tuple[list[int], list[int]]:
-    """The frames without the last of the links that join all, strongest first: the larger part and the rest."""
+    """The parts without the edge that Kruskal's algorithm adds last, most shared points first: the larger, the rest."""
     links = sorted(
         ((i, j) for place, i in enumerate(indices) for j in indices[:place]),
         key=lambda pair: (-shared[pair], pair),

@@ -33,7 +33,7 @@ from splatnode.recon.registration import register
 from splatnode.recon.result.preview import render_rgb
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification.decision import hopeless, judge
+from splatnode.recon.verification.decision import decide, refuse_before_registration
 from splatnode.recon.verification.verify import verify
 from tests.support.synthetic import SMALL, errors, photographs, places, pure_rotation, view_graph
 
@@ -273,7 +273,11 @@ def real(shared: Path, name: str, views: int | None = None, step: int = 1) -> tu
         np.array([truth.K for _, truth in pairs]).reshape(-1, 3, 3),
     )
     evidence = verify(graph, found, CONFIG.verification)
-    return graph, measured, hopeless(graph, (), CONFIG.decision) or judge(graph, found, evidence, CONFIG.decision)
+    return (
+        graph,
+        measured,
+        refuse_before_registration(graph, (), CONFIG.decision) or decide(graph, found, evidence, CONFIG.decision),
+    )
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import register
 from splatnode.recon.registration.register import Registration
-from splatnode.recon.verification.decision import hopeless, judge
+from splatnode.recon.verification.decision import decide, refuse_before_registration
 from splatnode.recon.verification.verify import verify
 
 RIGHT_ROTATION_DEG = 2.0
@@ -69,7 +69,9 @@ def measure(scene: EvaluationScene, names: tuple[str, ...], config: Config) -> R
     laps.append(time.perf_counter())
     evidence = verify(graph, registration, config.verification)
     laps.append(time.perf_counter())
-    verdict = hopeless(graph, (), config.decision) or judge(graph, registration, evidence, config.decision)
+    verdict = refuse_before_registration(graph, (), config.decision) or decide(
+        graph, registration, evidence, config.decision
+    )
     seconds = np.diff(laps).tolist()
     errors = against_truth(scene, names, registration)
     return Row(

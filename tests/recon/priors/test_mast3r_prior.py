@@ -21,8 +21,8 @@ from splatnode.recon.priors.mast3r.inference import PATCH, Asked, prepared
 from splatnode.recon.priors.mast3r.network import Encoded, Prediction
 from splatnode.recon.priors.mast3r.prior import Config, Mast3rPrior, load
 from splatnode.recon.registration import register
-from splatnode.recon.verification.decision import Config as JudgeConfig
-from splatnode.recon.verification.decision import hopeless, judge
+from splatnode.recon.verification.decision import Config as DecisionConfig
+from splatnode.recon.verification.decision import decide, refuse_before_registration
 from splatnode.recon.verification.verify import Config as VerificationConfig
 from splatnode.recon.verification.verify import verify
 from tests.support.synthetic import SMALL, photographs, places, renumbered, view_graph
@@ -133,7 +133,9 @@ def test_what_a_lying_network_invents_is_refused(noise):
     graph = view_graph(frames, prior.matcher, few)
     registration = register.register(graph.keyframes, graph.pairs, register.Config())
     evidence = verify(graph, registration, VerificationConfig())
-    verdict = hopeless(graph, (), JudgeConfig()) or judge(graph, registration, evidence, JudgeConfig())
+    verdict = refuse_before_registration(graph, (), DecisionConfig()) or decide(
+        graph, registration, evidence, DecisionConfig()
+    )
     assert not verdict.publishable
 
 

@@ -16,13 +16,13 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.verification.cycles import Cycles
-from splatnode.recon.verification.decision import Config, hopeless, judge
+from splatnode.recon.verification.decision import Config, decide, refuse_before_registration
 from splatnode.recon.verification.epipolar_consistency import Score
 from splatnode.recon.verification.evidence import CameraEvidence, Evidence
 from splatnode.recon.verification.jackknife import Spread
 from splatnode.recon.verification.lens import Distortion, FreedLens
 from splatnode.recon.verification.reflection import Reflection
-from splatnode.recon.verification.weakest_link import Joint
+from splatnode.recon.verification.weakest_link import WeakestLink
 
 PLAIN, RICH = 20, 2000  # features
 FOUND, BY_CHANCE = Score(300, 0.8, 0.2), Score(300, 0.2, 0.2)
@@ -65,7 +65,7 @@ def all_pairs(num_frames: int, turned: tuple[tuple[int, int], ...] = ()) -> dict
 
 
 def registration(indices: tuple[int, ...]) -> Registration:
-    """Cameras a step apart on a line. What the judge needs to know of them is in the evidence."""
+    """Cameras a step apart on a line. What the verdict needs to know of them is in the evidence."""
     cameras = []
     for index in indices:
         T_world_camera = np.eye(4)
@@ -95,9 +95,9 @@ def evidence(
     """Evidence for cameras about which there is no doubt, but for `doubtful` ones and `what` concerns all."""
     good = Evidence(
         cameras=tuple(camera(index, **(doubtful or {}).get(index, {})) for index in indices),
-        agreement=1.0,
-        joint=Joint(group=(indices[-1],), points=500, matches=200, explained=200.0, patches=FOUND),
-        loose=(),
+        inlier_ratio=1.0,
+        weakest_link=WeakestLink((indices[-1],), shared_points=500, matches=200, inliers=200.0, patches=FOUND),
+        disconnected=(),
         reflection=Reflection(("0.png",), 0.0),
         flatness=0.5,
         spread=Spread(0.1, 0.005, 0.01),
@@ -115,7 +115,7 @@ def evidence(
 def verdict(count: int, doubtful: dict[int, dict[str, object]] | None = None, **what: object) -> Verdict:
     """Of `count` frames that were all placed."""
     indices = tuple(range(count))
-    return judge(graph(count, all_pairs(count)), registration(indices), evidence(indices, doubtful, **what), Config())
+    return decide(graph(count, all_pairs(count)), registration(indices), evidence(indices, doubtful, **what), Config())
 
 
 def refused(given: Verdict | None, code: Code) -> Verdict:
@@ -136,23 +136,23 @@ def test_all_frames_placed_is_ok():
 def test_frames_left_out_are_named():
     pairs = {key: value for key, value in all_pairs(5).items() if 3 not in key}
     left = (0, 1, 2, 4)
-    given = judge(graph(5, pairs), registration(left), evidence(left), Config())
+    given = decide(graph(5, pairs), registration(left), evidence(left), Config())
     assert given.code == Code.OUTLIER_VIEW and given.publishable
     assert given.frames == names(3) and "3.png" in given.message
-    given = judge(graph(5, all_pairs(5)), registration(left), evidence(left), Config())
+    given = decide(graph(5, all_pairs(5)), registration(left), evidence(left), Config())
     assert given.code == Code.OK_PARTIAL and given.publishable
     assert given.frames == names(3) and "3.png" in given.advice
 
 
 def test_two_frames_of_somewhere_else_are_a_place():
     pairs = {**all_pairs(3), (3, 4): pair()}
-    given = judge(graph(5, pairs), registration((0, 1, 2)), evidence((0, 1, 2)), Config())
+    given = decide(graph(5, pairs), registration((0, 1, 2)), evidence((0, 1, 2)), Config())
     assert given.code == Code.SPLIT and given.publishable and given.frames == names(3, 4)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_too_few_frames(count):
-    given = refused(hopeless(graph(count, all_pairs(count)), (), Config()), Code.TOO_FEW_VIEWS)
+    given = refused(refuse_before_registration(graph(count, all_pairs(count)), (), Config()), Code.TOO_FEW_VIEWS)
     assert given.frames == names(*range(count)) and str(count) in given.message
 
 
@@ -169,40 +169,40 @@ def test_too_few_frames(count):
 )
 def test_what_the_screening_left_out_is_the_reason(kept, codes, expected):
     rejected = [Rejected(f"r{i}.png", code, "that is why") for i, code in enumerate(codes)]
-    given = refused(hopeless(graph(kept, all_pairs(kept)), rejected, Config()), expected)
+    given = refused(refuse_before_registration(graph(kept, all_pairs(kept)), rejected, Config()), expected)
     assert "that is why" in given.message or expected in (Code.STATIC_CAMERA, Code.LOW_TEXTURE)
 
 
 def test_frames_without_texture():
-    given = refused(hopeless(graph(4, {}, plain=(0, 2, 3)), (), Config()), Code.LOW_TEXTURE)
+    given = refused(refuse_before_registration(graph(4, {}, plain=(0, 2, 3)), (), Config()), Code.LOW_TEXTURE)
     assert given.frames == names(0, 2, 3)
 
 
 def test_rich_frames_that_do_not_overlap():
-    refused(hopeless(graph(4, {}, plain=(1,)), (), Config()), Code.NO_OVERLAP)
+    refused(refuse_before_registration(graph(4, {}, plain=(1,)), (), Config()), Code.NO_OVERLAP)
 
 
 def test_frames_that_stand_still_and_those_that_see_one_plane():
     still = {key: replace(value, points2=value.points1 + 0.01) for key, value in all_pairs(3).items()}
-    refused(hopeless(graph(3, still), (), Config()), Code.STATIC_CAMERA)
+    refused(refuse_before_registration(graph(3, still), (), Config()), Code.STATIC_CAMERA)
     flat = {key: replace(value, num_homography=195) for key, value in all_pairs(3).items()}
-    refused(hopeless(graph(3, flat), (), Config()), Code.PLANAR_ONLY)
+    refused(refuse_before_registration(graph(3, flat), (), Config()), Code.PLANAR_ONLY)
 
 
 def test_a_camera_that_only_turned():
     pairs = all_pairs(4, turned=((0, 1), (0, 2), (0, 3), (1, 2), (1, 3)))  # 5 of 6
-    given = refused(hopeless(graph(4, pairs), (), Config()), Code.NO_PARALLAX)
+    given = refused(refuse_before_registration(graph(4, pairs), (), Config()), Code.NO_PARALLAX)
     assert given.frames == names(0, 1, 2, 3) and "5 of 6" in given.message
-    assert hopeless(graph(4, all_pairs(4, turned=((0, 1), (2, 3)))), (), Config()) is None
+    assert refuse_before_registration(graph(4, all_pairs(4, turned=((0, 1), (2, 3)))), (), Config()) is None
 
 
 def test_only_two_frames_that_overlap():
-    given = refused(judge(graph(4, {(0, 1): pair()}), registration((0, 1)), None, Config()), Code.NO_OVERLAP)
+    given = refused(decide(graph(4, {(0, 1): pair()}), registration((0, 1)), None, Config()), Code.NO_OVERLAP)
     assert "2 of 4" in given.message
 
 
 def test_frames_that_overlap_and_still_cannot_be_placed():
-    refused(judge(graph(4, all_pairs(4)), None, None, Config()), Code.NO_OVERLAP)
+    refused(decide(graph(4, all_pairs(4)), None, None, Config()), Code.NO_OVERLAP)
 
 
 def test_frames_that_find_no_place_because_of_the_focal_length_that_was_given():
@@ -210,7 +210,7 @@ def test_frames_that_find_no_place_because_of_the_focal_length_that_was_given():
     told = graph(4, pairs)
     lens = Intrinsics(64, 48, 64.0, 64.0, 32.0, 24.0, "given")
     told.keyframes = [replace(k, frame=replace(k.frame, intrinsics=lens)) for k in told.keyframes]
-    given = refused(judge(told, None, None, Config()), Code.FOCAL_SUSPECT)
+    given = refused(decide(told, None, None, Config()), Code.FOCAL_SUSPECT)
     assert "64 pixels" in given.message and "+40 %" in given.message
 
 
@@ -242,7 +242,7 @@ def test_views_too_close_together():
 def test_uncertain_views_of_a_camera_that_hardly_moved_have_turned():
     turning = graph(3, {key: replace(value, num_rotation=150) for key, value in all_pairs(3).items()})
     seen = evidence((0, 1, 2), median_angle_deg=0.8)
-    refused(judge(turning, registration((0, 1, 2)), seen, Config()), Code.NO_PARALLAX)
+    refused(decide(turning, registration((0, 1, 2)), seen, Config()), Code.NO_PARALLAX)
 
 
 @pytest.mark.parametrize("what", [{"rotation_sigma_deg": 4.0}, {"centre_sigma_rel": 0.1}])
@@ -266,15 +266,15 @@ def test_a_focal_length_that_is_not_known_well_enough():
 
 
 def test_matches_that_contradict_each_other():
-    given = refused(verdict(3, {2: {"agreement": 0.45}}, agreement=0.5), Code.AMBIGUOUS)
+    given = refused(verdict(3, {2: {"inlier_ratio": 0.45}}, inlier_ratio=0.5), Code.AMBIGUOUS)
     assert given.frames == names(2) and "50 %" in given.message
 
 
 def test_a_frame_that_poses_as_another_is_told_by_its_pixels():
     """Half of its matches agree; only of a frame that is where it seems to be, the pixels do too."""
-    given = refused(verdict(6, {4: {"agreement": 0.55, "patches": BY_CHANCE}}, agreement=0.84), Code.AMBIGUOUS)
+    given = refused(verdict(6, {4: {"inlier_ratio": 0.55, "patches": BY_CHANCE}}, inlier_ratio=0.84), Code.AMBIGUOUS)
     assert given.frames == names(4)
-    assert verdict(6, {4: {"agreement": 0.55}}, agreement=0.84).code == Code.OK
+    assert verdict(6, {4: {"inlier_ratio": 0.55}}, inlier_ratio=0.84).code == Code.OK
     assert verdict(6, {4: {"patches": BY_CHANCE}}).code == Code.OK  # seen from too far aside to be compared
 
 
@@ -289,13 +289,13 @@ def test_an_answer_that_is_as_good_as_its_mirror_image():
 
 
 def test_two_places_that_almost_no_point_joins():
-    joint = Joint(group=(3, 4), points=3, matches=180, explained=150.0, patches=BY_CHANCE)
-    given = refused(verdict(5, joint=joint), Code.SPLIT)
+    link = WeakestLink((3, 4), shared_points=3, matches=180, inliers=150.0, patches=BY_CHANCE)
+    given = refused(verdict(5, weakest_link=link), Code.SPLIT)
     assert given.frames == names(3, 4)
 
 
 def test_frames_that_only_contradicted_matches_join_to_the_others():
-    assert refused(verdict(5, loose=("4.png",)), Code.SPLIT).frames == names(4)
+    assert refused(verdict(5, disconnected=("4.png",)), Code.SPLIT).frames == names(4)
 
 
 def test_frames_that_fit_better_mirrored_are_named():
@@ -304,17 +304,17 @@ def test_frames_that_fit_better_mirrored_are_named():
 
 
 def test_a_flat_thing_that_moves_is_not_taken_for_the_scene():
-    given = refused(verdict(4, flatness=1.0, agreement=0.8), Code.MOVING_SCENE)
+    given = refused(verdict(4, flatness=1.0, inlier_ratio=0.8), Code.MOVING_SCENE)
     assert "80 %" in given.message
-    assert verdict(4, flatness=1.0, agreement=0.99).code == Code.OK  # a wall, and nothing against it
-    assert verdict(4, flatness=0.97, agreement=0.85).code == Code.OK  # a facade in relief
+    assert verdict(4, flatness=1.0, inlier_ratio=0.99).code == Code.OK  # a wall, and nothing against it
+    assert verdict(4, flatness=0.97, inlier_ratio=0.85).code == Code.OK  # a facade in relief
 
 
 def test_frames_through_another_lens_that_do_not_fit_are_named():
     mixed = registration((0, 1, 2, 3))
     mixed = replace(mixed, cameras=tuple(replace(camera, lens=int(camera.index == 1)) for camera in mixed.cameras))
     uncertain = evidence((0, 1, 2, 3), spread=Spread(0.1, 0.2, 0.01))
-    given = refused(judge(graph(4, all_pairs(4)), mixed, uncertain, Config()), Code.MIXED_CAMERAS)
+    given = refused(decide(graph(4, all_pairs(4)), mixed, uncertain, Config()), Code.MIXED_CAMERAS)
     assert given.frames == names(1)
 
 
@@ -326,5 +326,5 @@ def test_different_exposures_are_noted():
 
 def test_limits_come_from_the_configuration():
     seen = evidence((0, 1, 2), median_angle_deg=0.8)
-    assert judge(graph(3, all_pairs(3)), registration((0, 1, 2)), seen, Config(min_angle_deg=0.5)).code == Code.OK
-    refused(hopeless(graph(3, all_pairs(3)), (), Config(min_cameras=4)), Code.TOO_FEW_VIEWS)
+    assert decide(graph(3, all_pairs(3)), registration((0, 1, 2)), seen, Config(min_angle_deg=0.5)).code == Code.OK
+    refused(refuse_before_registration(graph(3, all_pairs(3)), (), Config(min_cameras=4)), Code.TOO_FEW_VIEWS)

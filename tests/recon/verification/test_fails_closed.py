@@ -14,7 +14,8 @@ import pytest
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.verification import flatness, likelihood, refit, reflection, reversal
-from splatnode.recon.verification.decision import Config, judge
+from splatnode.recon.verification.checks import Case
+from splatnode.recon.verification.decision import CHECKS, Config, decide
 from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.finiteness import not_finite
 from splatnode.recon.verification.lens import FreedLens
@@ -57,9 +58,14 @@ EVERY_NUMBER = tuple(numbers_of(Evidence))
 
 
 def test_the_walk_over_types_finds_the_numbers_wherever_they_are():
-    for path in (("cameras", 0, "patches", "share"), ("joint", "group", 0), ("freed", 0, "found"), ("rms_px",)):
+    for path in (
+        ("cameras", 0, "patches", "share"),
+        ("weakest_link", "smaller_part", 0),
+        ("freed", 0, "found"),
+        ("rms_px",),
+    ):
         assert path in EVERY_NUMBER
-    assert judge(graph(3, all_pairs(3)), registration(ALL), GOOD, Config()).code == Code.OK
+    assert decide(graph(3, all_pairs(3)), registration(ALL), GOOD, Config()).code == Code.OK
 
 
 @pytest.mark.filterwarnings("error")
@@ -67,7 +73,7 @@ def test_the_walk_over_types_finds_the_numbers_wherever_they_are():
 @pytest.mark.parametrize("path", EVERY_NUMBER, ids=lambda path: ".".join(map(str, path)))
 def test_every_number_of_the_evidence_that_could_not_be_computed_refuses(path, value):
     seen = with_number(GOOD, path, value)
-    given = judge(graph(3, all_pairs(3)), registration(ALL), seen, Config())
+    given = decide(graph(3, all_pairs(3)), registration(ALL), seen, Config())
     assert given.code == Code.UNDETERMINED and not given.publishable
     assert WORDS[path[0]] in given.message and given.message.endswith(".") and given.advice.endswith(".")
     assert given.frames == (("0.png",) if path[0] == "cameras" else ("0.png", "1.png", "2.png"))
@@ -76,18 +82,18 @@ def test_every_number_of_the_evidence_that_could_not_be_computed_refuses(path, v
 @pytest.mark.parametrize("path", EVERY_NUMBER, ids=lambda path: ".".join(map(str, path)))
 def test_no_limit_lets_a_number_pass_that_could_not_be_computed(path, monkeypatch):
     """Without the check of all numbers, the odds do not hide NaN, and refuse where they have it."""
-    monkeypatch.setattr("splatnode.recon.verification.decision.undetermined", lambda *asked: None)
+    monkeypatch.setattr("splatnode.recon.verification.decision.CHECKS", CHECKS[1:])
     good, odds = (likelihood.weigh(seen) for seen in (GOOD, with_number(GOOD, path, math.nan)))
     before, after = ([*each.whole.values(), *each.cameras.values()] for each in (good, odds))
     if before != after:
-        given = judge(graph(3, all_pairs(3)), registration(ALL), with_number(GOOD, path, math.nan), Config())
+        given = decide(graph(3, all_pairs(3)), registration(ALL), with_number(GOOD, path, math.nan), Config())
         assert any(math.isnan(piece) for piece in after) and not given.publishable
 
 
-@pytest.mark.parametrize("limited", ["median_angle_deg", "focal_sigma", "mirrored_cost", "flatness", "agreement"])
+@pytest.mark.parametrize("limited", ["median_angle_deg", "focal_sigma", "mirrored_cost", "flatness", "inlier_ratio"])
 def test_every_limit_refuses_nan_by_itself(limited, monkeypatch):
-    monkeypatch.setattr("splatnode.recon.verification.decision.undetermined", lambda *asked: None)
-    given = judge(graph(3, all_pairs(3)), registration(ALL), replace(GOOD, **{limited: math.nan}), Config())
+    monkeypatch.setattr("splatnode.recon.verification.decision.CHECKS", CHECKS[1:])
+    given = decide(graph(3, all_pairs(3)), registration(ALL), replace(GOOD, **{limited: math.nan}), Config())
     assert not given.publishable
 
 
@@ -99,7 +105,7 @@ def test_a_pose_that_is_not_a_number_refuses(field, value):
     wrong = np.full_like(camera.T_world_camera, value) if field == "T_world_camera" else value
     wrong = np.full(2, value) if field == "principal" else wrong
     cameras = (found.cameras[0], replace(camera, **{field: wrong}), found.cameras[2])
-    given = judge(graph(3, all_pairs(3)), replace(found, cameras=cameras), GOOD, Config())
+    given = decide(graph(3, all_pairs(3)), replace(found, cameras=cameras), GOOD, Config())
     assert given.code == Code.UNDETERMINED and "the poses themselves" in given.message
 
 
@@ -110,7 +116,7 @@ def test_the_root_of_a_negative_variance_refuses():
     found = replace(found, cameras=(*found.cameras[:2], unsure), focal_sigma=math.inf)
     of_unsure = replace(GOOD.cameras[2], rotation_sigma_deg=math.inf, centre_sigma_rel=math.inf)
     seen = replace(GOOD, cameras=(*GOOD.cameras[:2], of_unsure), focal_sigma=math.inf)
-    given = judge(graph(3, all_pairs(3)), found, seen, Config())
+    given = decide(graph(3, all_pairs(3)), found, seen, Config())
     assert given.code == Code.UNDETERMINED and given.frames == ("2.png",)
     assert "how certain the focal length is" in given.message and "how certain each pose is" in given.message
 
@@ -120,7 +126,7 @@ def test_each_field_of_the_evidence_has_words_for_the_user():
 
 
 def test_what_is_finite_is_let_pass():
-    assert undetermined(registration(ALL), GOOD) is None
+    assert undetermined(Case(graph(3, {}), registration(ALL), GOOD, Config())) is None
     assert list(not_finite(GOOD)) == []
 
 

@@ -20,8 +20,8 @@ from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features
 from splatnode.recon.matching.appearance_check import matches_look_alike
 from splatnode.recon.registration import register
-from splatnode.recon.verification.decision import Config as JudgeConfig
-from splatnode.recon.verification.decision import hopeless, judge
+from splatnode.recon.verification.decision import Config as DecisionConfig
+from splatnode.recon.verification.decision import decide, refuse_before_registration
 from splatnode.recon.verification.verify import Config as VerificationConfig
 from splatnode.recon.verification.verify import verify
 from tests.support.synthetic import SMALL, photographs, places, renumbered, view_graph
@@ -108,7 +108,9 @@ def test_what_a_prior_invents_is_refused(lie, photographed):
     graph = view_graph(photographed(), LIARS[lie], SETTINGS)
     registration = register.register(graph.keyframes, graph.pairs, register.Config())
     evidence = verify(graph, registration, VerificationConfig())
-    verdict = hopeless(graph, (), JudgeConfig()) or judge(graph, registration, evidence, JudgeConfig())
+    verdict = refuse_before_registration(graph, (), DecisionConfig()) or decide(
+        graph, registration, evidence, DecisionConfig()
+    )
     assert not verdict.publishable, verdict
 
 

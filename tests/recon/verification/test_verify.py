@@ -53,13 +53,13 @@ def test_a_right_answer_has_evidence_from_every_source():
     evidence = good()
     odds = likelihood.weigh(evidence)
     assert odds.total > 1.5 and not odds.doubtful
-    assert evidence.agreement > 0.9 and evidence.joint.points > 100
+    assert evidence.inlier_ratio > 0.9 and evidence.weakest_link.shared_points > 100
     assert all(camera.patches.sigmas > 10 and camera.confirmed > 50 for camera in evidence.cameras)
     assert evidence.rotation_deg < 1.0 and evidence.centre_rel < 0.02
     assert evidence.mirrored_cost > 3.0
     assert evidence.cycles.triangles >= 3 and evidence.cycles.rotation_deg < 2.0
     assert all(abs(camera.gain - 1.0) < 0.1 for camera in evidence.cameras)
-    assert evidence.loose == () and evidence.flatness < 0.95
+    assert evidence.disconnected == () and evidence.flatness < 0.95
     assert evidence.freed == () and evidence.distortion.corner_shift < 0.02
 
 
@@ -118,8 +118,8 @@ def test_two_places_that_share_no_points_are_found_as_two_parts():
         observed_pixels=found.observed_pixels[kept],
     )
     pictures = verify.pictures(graph, found, CONFIG.epipolar_consistency, [camera.index for camera in found.cameras])
-    joint = weakest_link.weakest(apart, graph.pairs, pictures, CONFIG.epipolar_consistency)
-    assert joint.points == 0 and joint.group in ((0, 1), (2, 3))
+    link = weakest_link.measure(apart, graph.pairs, pictures, CONFIG.epipolar_consistency)
+    assert link.shared_points == 0 and link.smaller_part in ((0, 1), (2, 3))
 
 
 def test_points_shared_by_two_frames_are_counted():
@@ -134,11 +134,11 @@ def test_points_shared_by_two_frames_are_counted():
     assert shared[0, 1] == 2 and shared[0, 2] == 1 and shared[0, 3] == 0
 
 
-def test_frames_that_pairs_contradict_are_loose():
+def test_frames_that_pairs_contradict_are_disconnected():
     graph, found = placed()
-    assert weakest_link.loose(found, graph.pairs) == ()
+    assert weakest_link.disconnected(found, graph.pairs) == ()
     doubted = {key: 0.4 if 3 in key else share for key, share in found.agreement.items()}
-    assert weakest_link.loose(replace(found, agreement=doubted), graph.pairs) == (3,)
+    assert weakest_link.disconnected(replace(found, agreement=doubted), graph.pairs) == (3,)
 
 
 def test_the_share_of_points_on_a_plane():

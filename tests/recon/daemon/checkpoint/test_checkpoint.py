@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import cast
 
+import msgspec
 import numpy as np
 import pytest
 
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.recon.config import Config
-from splatnode.recon.daemon.checkpoint import checkpoint
+from splatnode.recon.daemon.checkpoint import checkpoint, saved_judgement
 from splatnode.recon.daemon.checkpoint.saved import GraphRecord
 from splatnode.recon.daemon.checkpoint.store import MADE_ANEW, Store
 from splatnode.recon.daemon.reconstruction import LiveReconstruction
@@ -76,6 +78,22 @@ def test_what_another_version_wrote_is_made_anew(store, caplog):
     store.save("graph", GraphRecord(names=["a.png"], features=[{"unknown": 1}], pairs=[], pending=[]), [])
     found = checkpoint.restore(store, LiveReconstruction(CONFIG))
     assert (found.keyframes, len(found.new), found.final) == (3, 3, False) and "made anew" in caplog.text
+
+
+def test_evidence_of_an_older_version_is_weighed_anew_and_no_frame_is_lost(store, work, caplog):
+    """Before, the weakest link was the weakest joint, inlier ratios were agreements."""
+    record, arrays = saved_judgement.judgement_message(work.judge(), work.names, work.proven)
+    older = msgspec.to_builtins(record)
+    evidence = older["evidence"]
+    evidence["joint"], evidence["loose"] = evidence.pop("weakest_link"), evidence.pop("disconnected")
+    evidence["agreement"] = evidence.pop("inlier_ratio")
+    store.save("judgement", cast(msgspec.Struct, older), arrays)
+    again = LiveReconstruction(CONFIG)
+    found = checkpoint.restore(store, again)
+    assert "judgement of the checkpoint is made anew" in caplog.text
+    assert found.keyframes == 3 and len(again.scene.views) == 3
+    assert again.names + [keyframe.name for keyframe in found.new] == work.names
+    assert again.judge().verdict == work.judge().verdict
 
 
 @pytest.mark.parametrize("lost", MADE_ANEW)

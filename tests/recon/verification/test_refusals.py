@@ -1,0 +1,68 @@
+"""The table of refusals: every entry is used, and whoever fills one in names just the fields of its sentence."""
+
+from __future__ import annotations
+
+import ast
+from collections import defaultdict
+from pathlib import Path
+from string import Formatter
+
+import pytest
+
+import splatnode.recon
+from splatnode.recon.result.verdict import Code
+from splatnode.recon.verification import refusals, undetermined
+from splatnode.recon.verification.decision import CHECKS
+from splatnode.recon.verification.refusals import Refusal, refuse
+
+ROOT = Path(splatnode.recon.__file__).parent
+ENTRIES = {
+    name: entry
+    for module in (refusals, undetermined)
+    for name, entry in vars(module).items()
+    if isinstance(entry, Refusal)
+}
+
+
+def calls_of_refuse() -> dict[str, list[set[str | None]]]:
+    """The keywords of every call of `refuse` in the product, by the entry that it fills in."""
+    found = defaultdict(list)
+    for path in sorted(ROOT.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] == "refuse":
+                entry = ast.unparse(node.args[0]).split(".")[-1]
+                found[entry].append({keyword.arg for keyword in node.keywords})
+    return found
+
+
+CALLS = calls_of_refuse()
+
+
+def test_the_table_has_all_entries_that_are_filled_in_anywhere():
+    assert set(CALLS) == set(ENTRIES)
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_every_caller_names_the_fields_of_the_sentence_and_no_others(name):
+    wanted = {field for _, field, _, _ in Formatter().parse(ENTRIES[name].message) if field is not None}
+    assert CALLS[name]
+    assert all(named == wanted for named in CALLS[name])
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_every_entry_is_a_code_a_sentence_and_an_advice(name):
+    entry = ENTRIES[name]
+    assert entry.code in Code and entry.advice.endswith(".")
+    assert entry.message.endswith((".", "{found}"))
+
+
+def test_an_entry_that_is_filled_in_is_a_verdict_without_a_scene():
+    given = refuse(refusals.UNCERTAIN_FOCAL, ["a.png"], sigma=12.4)
+    assert given.code == Code.FOCAL_SUSPECT and given.frames == ("a.png",) and not given.publishable
+    assert given.message == "The focal length is uncertain by 12 %." and given.advice
+    with pytest.raises(KeyError, match="sigma"):
+        refuse(refusals.UNCERTAIN_FOCAL, ["a.png"])
+
+
+def test_whether_all_was_computed_is_asked_first():
+    assert CHECKS[0] is undetermined.undetermined
