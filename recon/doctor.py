@@ -18,7 +18,6 @@ from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.network import Network, runtime_directory
 from splatnode.recon import core
 from splatnode.recon.core.compile import find_compiler
-from splatnode.recon.networks.capabilities import PARTS, Part, obstacle
 
 _UDEV_RULES = Path("/etc/udev/rules.d")
 
@@ -70,7 +69,7 @@ def findings() -> list[Finding]:
         *(_required(module, distribution) for module, distribution in REQUIRED.items()),
         *(_optional(module, *about) for module, about in OPTIONAL.items()),
         *(_lpips(network) for network in ("alex", "vgg")),
-        *map(_learned, PARTS),
+        *_learned_parts(),
         _cameras(),
         *_oak_rights(),
         _network(),
@@ -165,14 +164,23 @@ def _version(distribution: str) -> str:
         return f"installed, though not from {distribution}"
 
 
-def _learned(part: Part) -> Finding:
-    """Whether a learned part is ready; one that is not costs nothing but itself."""
+def _learned_parts() -> list[Finding]:
+    """Whether each learned part is ready; one that is not costs nothing but itself."""
     try:
-        hindered = obstacle(part)
-    except ValueError as error:
-        hindered = str(error)
-    detail = f"{part.purpose}; weights: {part.licence}"
-    return Finding(part.name, "optional" if hindered else "ok", f"{hindered or 'ready'}; {detail}")
+        from splatnode.recon.learned_parts import learned_parts, obstacle
+
+        parts = learned_parts()
+    except (ImportError, OSError) as error:
+        return [Finding("learned parts", "optional", f"not examined: {error}")]
+    found = []
+    for part in parts:
+        try:
+            hindered = obstacle(part)
+        except ValueError as error:
+            hindered = str(error)
+        detail = f"{part.purpose}; weights: {part.licence}"
+        found.append(Finding(part.name, "optional" if hindered else "ok", f"{hindered or 'ready'}; {detail}"))
+    return found
 
 
 def _lpips(network: str) -> Finding:

@@ -139,7 +139,7 @@ VERBS = (
         "weights",
         "get and check the weights of optional networks",
         _weights_arguments,
-        lazily("splatnode.recon.networks.weights", "command"),
+        lazily("splatnode.recon.networks.weights_command", "command"),
     ),
     Verb("doctor", "tell what is installed and what is missing", add_json, lazily("splatnode.recon.doctor", "doctor")),
 )

@@ -1,1 +1,1 @@
-"""Learned networks: their parts, and images through those that several rooms of the reconstruction use."""
+"""Learned networks: their building blocks, their weights, and the networks that several rooms use."""

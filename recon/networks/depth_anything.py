@@ -16,17 +16,17 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from splatnode.recon.networks import dinov2, weight_files
+from splatnode.recon.networks import dinov2, weight_loading
 from splatnode.recon.networks.crop import Crop, crop, cropped
 from splatnode.recon.networks.dinov2 import PATCH, Dinov2, normalised
-from splatnode.recon.networks.fusion import Scratch, enlarged, resizers
-from splatnode.recon.networks.weights import located
+from splatnode.recon.networks.feature_fusion import Scratch, enlarged, resizers
+from splatnode.recon.networks.weight_folder import located
 
 RELATIVE = "depth_anything_v2/depth_anything_v2_vits.pth"
 METRIC = "depth_anything_v2/depth_anything_v2_metric_hypersim_vits.pth"
 INDOORS_M = 20.0  # metres at most, of the network for metres indoors
-_LONGER_SIDE = 518
-_DETAIL = 32
+_LONGER_SIDE = 518  # of the network's images, pixels: what it was trained with
+_DETAIL = 32  # channels at full resolution
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,8 @@ SMALL = Size()
 
 
 class DepthAnythingV2(nn.Module):
+    """DINOv2 with the decoder of a dense prediction transformer."""
+
     def __init__(self, size: Size = SMALL, *, most_m: float | None = None) -> None:
         """`most_m`: the network answers in metres up to this; None: it answers inverse depths."""
         super().__init__()
@@ -52,7 +54,10 @@ class DepthAnythingV2(nn.Module):
 
     @torch.inference_mode()
     def forward(self, image: Tensor) -> Tensor:
-        """(H, W) of a `recon.networks.dinov2.normalised` image (3, H, W), sides multiples of 14."""
+        """(H, W) inverse depth up to scale and offset, or metres, of a `dinov2.normalised` image (3, H, W).
+
+        Sides must be multiples of `dinov2.PATCH`.
+        """
         raw = self.depth_head(self.pretrained(image[None], self._layers), *image.shape[1:])[0, 0]
         return torch.relu(raw) if self._most_m is None else self._most_m * torch.sigmoid(raw)
 
@@ -86,7 +91,7 @@ class _HeadScratch(Scratch):
 def load_network(path: Path, size: Size = SMALL, *, most_m: float | None = None) -> DepthAnythingV2:
     """Raises ValueError where the file is damaged, holds another model or anything but data, and FileNotFoundError."""
     build = partial(DepthAnythingV2, size, most_m=most_m)
-    return weight_files.load_network(build, weight_files.read_weights(path), path, "Depth Anything V2 Small")
+    return weight_loading.load_network(build, weight_loading.read_weights(path), path, "Depth Anything V2 Small")
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,9 @@
 """LPIPS, the learned perceptual distance of Zhang et al. 2018 (version 0.1), without torchvision.
 
 It is a metric of the benchmark and, with gradients, the perceptual loss of equation 7. The weights are data that the
-user supplies (`recon/networks/weights.py`); without them nothing is measured. Images are mapped to [-1, 1], as the
+user supplies (`recon/networks/weight_folder.py`); without them nothing is measured.
+
+Images are mapped to [-1, 1], as the
 metric is defined. The 3DGS and InstantSplat code feeds it [0, 1], so published figures of that family are not exactly
 comparable.
 """
@@ -16,7 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from splatnode.recon.networks.weights import located
+from splatnode.recon.networks.weight_folder import located
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,8 @@ _VGG = (
     *(Layer(pool=2), Layer(), Layer(tap=True)) * 3,
 )
 _NETWORKS = {"alex": (_ALEX, "lpips_alex.pth"), "vgg": (_VGG, "lpips_vgg_fp16.pth")}
-_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of the networks' training images, in [-1, 1]
+_MIN_SIDE = 32  # pixels: smaller images are pooled away
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,8 +64,8 @@ class Lpips:
 
     def features(self, image: Tensor) -> tuple[Tensor, ...]:
         """What the network sees in an image (H, W, 3) in [0, 1]: unit vectors (1, C, h, w) of each tapped layer."""
-        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < 32:
-            raise ValueError(f"image must be (H, W, 3) of at least 32x32, got {tuple(image.shape)}")
+        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < _MIN_SIDE:
+            raise ValueError(f"image must be (H, W, 3) of at least {_MIN_SIDE}x{_MIN_SIDE}, got {tuple(image.shape)}")
         x = image.to(torch.float32).permute(2, 0, 1)[None] * 2 - 1
         x = (x - x.new_tensor(_SHIFT).view(3, 1, 1)) / x.new_tensor(_SCALE).view(3, 1, 1)
         tapped = []

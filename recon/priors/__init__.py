@@ -1,1 +1,1 @@
-"""One file a prior; each turns keyframes into cameras and point maps."""
+"""Priors: each proposes matches where plain features find few, and gives depth to registered cameras."""

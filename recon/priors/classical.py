@@ -1,4 +1,4 @@
-"""The default prior, without any learned weights: structure from motion, then multi-view stereo."""
+"""The default prior, without learned weights: PatchMatch stereo between registered cameras, and no matches."""
 
 from __future__ import annotations
 
@@ -6,44 +6,41 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import msgspec
-import numpy as np
-import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import Matcher, ViewGraph
 from splatnode.recon.priors import stereo
-from splatnode.recon.priors.fusion import DepthMap
+from splatnode.recon.priors.consistency import DepthMap
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior
-from splatnode.recon.registration.register import RegisteredCamera, Registration
-
-Array = npt.NDArray[np.float64]
+from splatnode.recon.priors.registered_camera import modelled_K, sparse_points
+from splatnode.recon.registration.register import Registration
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stereo: stereo.Config = stereo.Config()
-    seed: int = 0
-    # Few sparse points lie on what is far, so stereo searches this many times further than they reach; in inverse
+    seed: int = 0  # of the random planes
+    # Few sparse points lie on what is far, so stereo searches this many times farther than they reach; in inverse
     # depth, in which it samples, that is a small part of the range.
     far_margin: float = 8.0
 
 
 class DepthMaps(Protocol):
-    """`stereo.depth_maps`, or another way to the same."""
+    """`stereo.depth_maps`, or another function with the same arguments and result."""
 
     def __call__(
         self,
-        views: Sequence[stereo.View],
+        views: Sequence[stereo.StereoView],
         config: stereo.Config,
         *,
         seed: int = ...,
-        sparse: Sequence[stereo.Sparse | None] | None = ...,
+        sparse: Sequence[stereo.SparsePoints | None] | None = ...,
         pause: Callable[[], None] = ...,
     ) -> list[DepthMap]: ...
 
 
 class ClassicalPrior(Prior):
-    """Depth by `recon.priors.stereo`, or by another function in its place."""
+    """Depth by `recon.priors.stereo`, or by `depth_maps` in its place; matches by `matcher`, if there is one."""
 
     def __init__(
         self, config: Config, depth_maps: DepthMaps = stereo.depth_maps, matcher: Matcher | None = None
@@ -72,15 +69,17 @@ class ClassicalPrior(Prior):
             found.append(_pointmap(keyframes[i], views[i], depth_map))
         return tuple(found)
 
-    def _views(self, graph: ViewGraph, registration: Registration) -> tuple[list[stereo.View], list[stereo.Sparse]]:
-        """The registered cameras as stereo wants them, with the points that they see."""
+    def _views(
+        self, graph: ViewGraph, registration: Registration
+    ) -> tuple[list[stereo.StereoView], list[stereo.SparsePoints]]:
+        """The registered cameras as stereo takes them, and the registered points that each observes."""
         views, sparse = [], []
         for camera in registration.cameras:
             keyframe = graph.keyframes[camera.index]
             points = sparse_points(registration, camera, keyframe.scale)
             near, far = stereo.depth_range(points.depths)
             near_far = (near, self._config.far_margin * far)
-            views.append(stereo.View(keyframe.image, modelled_K(graph, camera), camera.T_world_camera, near_far))
+            views.append(stereo.StereoView(keyframe.image, modelled_K(graph, camera), camera.T_world_camera, near_far))
             sparse.append(points)
         return views, sparse
 
@@ -89,7 +88,7 @@ def _keyframes(graph: ViewGraph, registration: Registration) -> list[Keyframe]:
     return [graph.keyframes[camera.index] for camera in registration.cameras]
 
 
-def _pointmap(keyframe: Keyframe, view: stereo.View, depth_map: DepthMap) -> Pointmap:
+def _pointmap(keyframe: Keyframe, view: stereo.StereoView, depth_map: DepthMap) -> Pointmap:
     return Pointmap(
         name=keyframe.name,
         frame_id=keyframe.frame.frame_id,
@@ -102,20 +101,5 @@ def _pointmap(keyframe: Keyframe, view: stereo.View, depth_map: DepthMap) -> Poi
 
 
 def load(config: Config) -> ClassicalPrior:
+    """Needs no weights."""
     return ClassicalPrior(config)
-
-
-def modelled_K(graph: ViewGraph, camera: RegisteredCamera) -> Array:
-    """(3, 3) intrinsics of a registered camera for its image at modelled size."""
-    keyframe = graph.keyframes[camera.index]
-    (sx, sy), (cx, cy) = keyframe.scale, camera.principal
-    return np.array([[camera.focal * sx, 0.0, cx * sx], [0.0, camera.focal * sy, cy * sy], [0.0, 0.0, 1.0]])
-
-
-def sparse_points(registration: Registration, camera: RegisteredCamera, scale: tuple[float, float]) -> stereo.Sparse:
-    """The registered points that a camera sees, at the modelled size that `scale` leads to."""
-    mine = registration.observed_by == camera.index
-    world = registration.points[registration.observed_point[mine]]
-    to_camera = np.linalg.inv(camera.T_world_camera)
-    depths = world @ to_camera[2, :3] + to_camera[2, 3]
-    return stereo.Sparse(registration.observed_pixels[mine] * scale, depths)

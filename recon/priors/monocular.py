@@ -1,4 +1,4 @@
-"""A single photograph's depth, learned, brought to what several views say: known where they say nothing, too."""
+"""Monocular depth, learned from single photographs, fitted to multi-view depth: known where that is unknown too."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ from splatnode.recon.priors.pointmap import Pointmap
 Map = npt.NDArray[np.float32]
 Network = Callable[[npt.NDArray[np.uint8]], tuple[Map, Crop]]  # image (h, w, 3) -> values (H, W), and their crop
 
-_ENOUGH = 50  # known pixels
-_FARTHEST = 20.0  # times the median depth: beyond, inverse depths say nothing
+_MIN_KNOWN = 50  # pixels with multi-view depth, to fit two numbers to
+_MAX_DEPTH = 20.0  # times the median depth: beyond, inverse depths say nothing
+_ITERATIONS = 15  # of reweighted least squares: the line then moves no more
+_MIN_RESIDUAL = 1e-4  # of the median inverse depth: smaller residuals weigh no more
 
 
 def with_monocular(pointmap: Pointmap, image: npt.NDArray[np.uint8], network: Network) -> Pointmap:
@@ -28,13 +30,13 @@ def with_monocular(pointmap: Pointmap, image: npt.NDArray[np.uint8], network: Ne
     """
     inverse = _at_image(*network(image), image.shape[:2])
     known = (pointmap.depth > 0) & (inverse > 0)
-    if known.sum() < _ENOUGH:
+    if known.sum() < _MIN_KNOWN:
         return pointmap
     slope, offset = _fitted(inverse[known], 1.0 / pointmap.depth[known], pointmap.confidence[known])
     if slope <= 0:
         return pointmap
     fitted = slope * inverse + offset
-    usable = (inverse > 0) & (fitted > 1.0 / (_FARTHEST * np.median(pointmap.depth[known])))
+    usable = (inverse > 0) & (fitted > 1.0 / (_MAX_DEPTH * np.median(pointmap.depth[known])))
     depth = np.where(usable, 1.0 / np.where(usable, fitted, 1.0), 0.0).astype(np.float32)
     return replace(
         pointmap, depth=depth, confidence=usable.astype(np.float32), normal=normals_of_depth(depth, pointmap.K)
@@ -42,7 +44,7 @@ def with_monocular(pointmap: Pointmap, image: npt.NDArray[np.uint8], network: Ne
 
 
 def _at_image(values: Map, crop: Crop, size: tuple[int, ...]) -> Map:
-    """(h, w) of the image that was cropped; 0 outside of the crop."""
+    """(h, w) at the size of the image that was cropped, from `values` (H, W) of the crop; 0 outside of it."""
     to_network = np.array([[crop.scale, 0, -crop.left], [0, crop.scale, -crop.top]])
     to_network[:, 2] += 0.5 * crop.scale - 0.5  # from centres at whole numbers to such
 
@@ -55,13 +57,13 @@ def _at_image(values: Map, crop: Crop, size: tuple[int, ...]) -> Map:
 
 
 def _fitted(x: Map, y: Map, weights: Map) -> tuple[float, float]:
-    """Slope and offset of the line through (M,) points, by least absolute deviations."""
+    """Slope and offset of the line through points x, y (M,), by weighted least absolute deviations."""
     x64, y64, robust = x.astype(np.float64), y.astype(np.float64), weights.astype(np.float64) + 1e-6
     slope, offset = 0.0, float(np.median(y64))
-    for _ in range(15):
+    for _ in range(_ITERATIONS):
         share = robust / robust.sum()
         mean_x, mean_y = share @ x64, share @ y64
         slope = float(share @ ((x64 - mean_x) * (y64 - mean_y)) / max(share @ (x64 - mean_x) ** 2, 1e-18))
         offset = float(mean_y - slope * mean_x)
-        robust = (weights + 1e-6) / np.maximum(np.abs(slope * x64 + offset - y64), 1e-4 * np.median(y64))
+        robust = (weights + 1e-6) / np.maximum(np.abs(slope * x64 + offset - y64), _MIN_RESIDUAL * np.median(y64))
     return slope, offset

@@ -14,7 +14,7 @@ from splatnode.recon.core import library, pointer
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
-MAX_SOURCES = 16  # kMaxSources
+MAX_SOURCES = 16  # kMaxSources of recon/core/patchmatch.h
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Matching:
 
 @dataclass(frozen=True)
 class Search:
-    """How many planes are tried."""
+    """Which planes are tried."""
 
     iterations: int  # each visits every pixel once
     perturbation: float  # size of random changes in the first iteration, pixels of parallax; halved in each
@@ -168,7 +168,7 @@ def improve(
 
 
 def transfer(reference: Level, other: Level) -> Transfer:
-    """From pixels and inverse depths of `reference` to pixels of `other`."""
+    """The map from pixels and inverse depths of `reference` to pixels of `other`."""
     T_other_reference = np.linalg.inv(other.T_world_camera) @ reference.T_world_camera
     A = other.K @ T_other_reference[:3, :3] @ np.linalg.inv(reference.K)
     t = other.K @ T_other_reference[:3, 3]

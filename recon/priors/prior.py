@@ -1,4 +1,8 @@
-"""The interface of priors: a prior proposes matches that plain features miss, and gives depth to registered cameras."""
+"""The interface of priors. A new prior is one file or folder of recon/priors, and no line elsewhere.
+
+Its module has `Config`, a Struct with at least `seed`, and `load(config)`; `splatnode.recon.learned_parts` says what a
+module with learned weights has beside them. The weights need an entry in recon/networks/weight_catalogue.py.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +15,10 @@ from splatnode.recon.registration.register import Registration
 
 
 class Prior(Protocol):
-    """A loaded prior. Its module has `Config`, with at least `seed`, and `load(config)`.
+    """A loaded prior. It proposes matches that plain features miss, and gives depth to registered cameras.
 
-    Cameras come from `recon.registration` whatever the prior is; the verdict stands between them and the depth:
-    cameras that were refused cost no depth.
+    Cameras come from `recon.registration` whatever the prior is. The verdict on them comes before depth is asked for,
+    so that cameras which are refused cost none.
     """
 
     matcher: Matcher | None  # what the view graph asks where plain features find few matches
@@ -22,7 +26,7 @@ class Prior(Protocol):
     def pointmaps(
         self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None
     ) -> tuple[Pointmap, ...]:
-        """A point map for each registered camera, in the same order and the same world.
+        """A point map for each registered camera, in the order and the world of `registration`.
 
         `pause` is called several times a second; it may raise to abandon the work.
         """
@@ -31,5 +35,8 @@ class Prior(Protocol):
     def further_pointmaps(
         self, graph: ViewGraph, registration: Registration, known: Mapping[str, Pointmap]
     ) -> tuple[Pointmap, ...]:
-        """Point maps of the registered cameras that `known` (by name, in the same world) does not have, in order."""
+        """Point maps of the registered cameras that `known` (by name, in the same world) does not have, in their order.
+
+        A prior that can add one view to others does better than this default, which computes all anew.
+        """
         return tuple(found for found in self.pointmaps(graph, registration) if found.name not in known)

@@ -1,4 +1,4 @@
-"""What the points of one view are in another: where they fall, which is nearest, and what they would hide."""
+"""Reprojection of one view's point map into another: which point is nearest at a pixel, and what it would hide."""
 
 from __future__ import annotations
 
@@ -16,8 +16,10 @@ Mask = npt.NDArray[np.bool_]
 
 
 def nearest(source: Pointmap, target: Pointmap) -> tuple[Float32, Float32]:
-    """Of the source's points that fall into each pixel of the target, the nearest: its depth there (h, w), and its
-    footprint, which is its depth in the source over the focal length. Both are infinite where none falls.
+    """(h, w) depth in the target of the nearest source point that falls into each target pixel; (h, w) its footprint.
+
+    The footprint is the point's depth in the source over the focal length: how much of the surface a pixel covers.
+    Both are infinite where no point falls.
     """
     depth, footprint = (np.full(target.depth.shape, np.inf, np.float32) for _ in range(2))
     call = _reprojection(source, target)
@@ -27,34 +29,34 @@ def nearest(source: Pointmap, target: Pointmap) -> tuple[Float32, Float32]:
 
 
 def explained(
-    source: Pointmap, source_image: Image, target: Pointmap, target_image: Image, like: float
+    source: Pointmap, source_image: Image, target: Pointmap, target_image: Image, colour_tolerance: float
 ) -> tuple[Mask, Mask]:
-    """(h, w) pixels of the target on which points of the source fall; (h, w) those of which one has the pixel's colour.
+    """(h, w) target pixels on which source points fall; (h, w) those of which one has the pixel's colour.
 
-    Colours are alike when no channel differs by more than `like`, in [0, 1]. Images are (h, w, 3).
+    Colours are alike when no channel differs by more than `colour_tolerance`, in [0, 1]. Images are (h, w, 3).
     """
     falls, alike = np.zeros(target.depth.shape, np.uint8), np.zeros(target.depth.shape, np.uint8)
     call = _reprojection(source, target)
     images = [np.ascontiguousarray(image) for image in (source_image, target_image)]
     library().core_reproject_explained(
-        ctypes.byref(call.native), *map(pointer, images), int(255 * like), pointer(falls), pointer(alike)
+        ctypes.byref(call.native), *map(pointer, images), int(255 * colour_tolerance), pointer(falls), pointer(alike)
     )
     return falls > 0, alike > 0
 
 
-def hiding(source: Pointmap, target: Pointmap, in_front: float) -> Mask:
-    """(h, w) pixels of the source whose point lies before the target's surface by more than `in_front` of its depth."""
+def hiding(source: Pointmap, target: Pointmap, tolerance: float) -> Mask:
+    """(h, w) source pixels whose point lies before the target's surface by more than `tolerance` of its depth."""
     marks = np.zeros(source.depth.shape, np.uint8)
     call = _reprojection(source, target)
     surface = np.ascontiguousarray(target.depth, np.float32)
     library().core_reproject_hiding(
-        ctypes.byref(call.native), pointer(surface), ctypes.c_float(in_front), pointer(marks)
+        ctypes.byref(call.native), pointer(surface), ctypes.c_float(tolerance), pointer(marks)
     )
     return marks > 0
 
 
 class _Native(ctypes.Structure):
-    """Reprojection of recon/core/reproject.cpp."""
+    """The struct Reprojection of recon/core/reproject.cpp."""
 
     _fields_ = [
         ("depth", ctypes.c_void_p),
@@ -65,7 +67,7 @@ class _Native(ctypes.Structure):
 
 
 class _Call:
-    """The structure for one call, and the array that it points to."""
+    """The struct for one call, and the array that it points to, which must live as long."""
 
     def __init__(self, depth: Float32, target: Pointmap, A: npt.NDArray[np.float64], t: npt.NDArray[np.float64]):
         self.depth = depth

@@ -1,4 +1,4 @@
-"""Dense multi-view stereo: a depth, a normal and a confidence for every pixel of views with known cameras.
+"""PatchMatch multi-view stereo: a depth, a normal and a confidence for every pixel of views with known cameras.
 
 `depth_maps` does it for a set of views, `further_depth_map` for one more beside those that have a map: there
 `choose_sources` names the views to compare it with, and `estimate` matches it alone.
@@ -13,19 +13,24 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.priors import fusion
-from splatnode.recon.priors.fusion import DepthMap
+from splatnode.recon.priors import consistency
+from splatnode.recon.priors.consistency import DepthMap
 from splatnode.recon.priors.patchmatch import Level, Matching, Planes, Search, improve, make_level, resized
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
+
+MIN_SOURCE_SCORE = 0.01  # of a view to compare with, in [0, 1]: below, the two overlap in next to nothing
+DEPTH_PERCENTILES = 1.0, 99.0  # of sparse depths, that count as the nearest and the farthest: few points are wrong
+MIN_SPARSE_POINTS = 3  # to know a depth range
+PROBES = 8, 6, 5  # columns, rows and depths of the grid that stands in for sparse points
 
 
 @dataclass(frozen=True)
 class Stage:
     """One call of PatchMatch for every view."""
 
-    level: int  # at 1 / 2**level of the resolution
+    level: int  # works at 1 / 2**level of the resolution
     search: Search
     geometric: bool = True  # whether the depth of the other views, from the stage before, is part of the cost
 
@@ -44,12 +49,12 @@ class Config:
     best_angle_deg: float = 12.0  # triangulation angle that matches best
     stages: tuple[Stage, ...] = DEFAULT_STAGES
     matching: Matching = field(default_factory=Matching)
-    fusion: fusion.Config = field(default_factory=fusion.Config)
+    consistency: consistency.Config = field(default_factory=consistency.Config)
 
 
 @dataclass(frozen=True, eq=False)
-class View:
-    """An image with its camera. The centre of the top-left pixel is (0.5, 0.5)."""
+class StereoView:
+    """An image with its camera, as stereo takes it. The centre of the top-left pixel is (0.5, 0.5)."""
 
     image: npt.NDArray[np.uint8]  # (h, w, 3) RGB
     K: Float64  # (3, 3)
@@ -69,19 +74,19 @@ class View:
 
 
 @dataclass(frozen=True, eq=False)
-class Sparse:
+class SparsePoints:
     """Known points of a view, as structure from motion gives them, to start the search from."""
 
-    points: Float64  # (M, 2) pixels
+    points: Float64  # (M, 2) pixels of the view's image
     depths: Float64  # (M,) z in the camera frame
 
 
 def depth_maps(
-    views: Sequence[View],
+    views: Sequence[StereoView],
     config: Config,
     *,
     seed: int = 0,
-    sparse: Sequence[Sparse | None] | None = None,
+    sparse: Sequence[SparsePoints | None] | None = None,
     pause: Callable[[], None] = lambda: None,
 ) -> list[DepthMap]:
     """A depth map for every view, in order. A view that overlaps with no other comes back without any depth.
@@ -111,17 +116,17 @@ def depth_maps(
                 seed=seed, stream=stream,
             )  # fmt: skip
         planes = improved
-    return fusion.cross_check(levels[config.stages[-1].level], planes, config.matching, config.fusion)
+    return consistency.cross_check(levels[config.stages[-1].level], planes, config.matching, config.consistency)
 
 
 def further_depth_map(
-    views: Sequence[View],
+    views: Sequence[StereoView],
     index: int,
     depths: Mapping[int, Float32],
     config: Config,
     *,
     seed: int = 0,
-    sparse: Sparse | None = None,
+    sparse: SparsePoints | None = None,
 ) -> DepthMap:
     """The depth map of view `index` alone, beside those that have one already.
 
@@ -135,17 +140,17 @@ def further_depth_map(
     checked = [j for j in depths if j != index]
     levels = {j: _level(views[j], finest) for j in (index, *checked)}
     others = [resized(_flat(depths[j]), levels[j]) for j in checked]
-    agreeing = fusion.agreement(levels[index], planes, [levels[j] for j in checked], others, config.fusion)
-    return fusion.depth_map(levels[index], planes, agreeing, config.matching, config.fusion)
+    agreeing = consistency.agreement(levels[index], planes, [levels[j] for j in checked], others, config.consistency)
+    return consistency.depth_map(levels[index], planes, agreeing, config.matching, config.consistency)
 
 
 def estimate(
-    view: View,
-    sources: Sequence[View],
+    view: StereoView,
+    sources: Sequence[StereoView],
     config: Config,
     *,
     seed: int = 0,
-    sparse: Sparse | None = None,
+    sparse: SparsePoints | None = None,
     known: Mapping[int, Float32] | None = None,
 ) -> Planes:
     """The planes of `view` alone, matched against `sources`, not yet checked against other maps.
@@ -167,7 +172,9 @@ def estimate(
     return planes
 
 
-def choose_sources(views: Sequence[View], index: int, config: Config, sparse: Sparse | None = None) -> list[int]:
+def choose_sources(
+    views: Sequence[StereoView], index: int, config: Config, sparse: SparsePoints | None = None
+) -> list[int]:
     """The views that view `index` should be compared with, best first: at most `config.num_sources`, maybe none.
 
     A candidate scores for every probe point of the view that falls into its image, by the triangulation angle: too
@@ -182,27 +189,29 @@ def choose_sources(views: Sequence[View], index: int, config: Config, sparse: Sp
         for other, candidate in enumerate(views)
         if other != index
     }
-    useful = [other for other, score in scores.items() if score > 0.01]
+    useful = [other for other, score in scores.items() if score > MIN_SOURCE_SCORE]
     return sorted(useful, key=lambda other: -scores[other])[: config.num_sources]
 
 
 def depth_range(depths: Float64, margin: float = 1.5) -> tuple[float, float]:
-    """(near, far) to search, from the depths of sparse points of a view: robust extremes, widened by `margin`.
+    """(near, far) to search, from the depths (M,) of sparse points of a view: robust extremes, widened by `margin`.
 
-    Raises ValueError below three positive depths.
+    Raises ValueError below MIN_SPARSE_POINTS positive depths.
     """
     depths = depths[np.isfinite(depths) & (depths > 0)]
-    if len(depths) < 3:
-        raise ValueError(f"at least 3 sparse points are needed to know a depth range, got {len(depths)}")
-    near, far = np.percentile(depths, [1.0, 99.0])
+    if len(depths) < MIN_SPARSE_POINTS:
+        raise ValueError(
+            f"at least {MIN_SPARSE_POINTS} sparse points are needed to know a depth range, got {len(depths)}"
+        )
+    near, far = np.percentile(depths, DEPTH_PERCENTILES)
     return float(near / margin), float(far * margin)
 
 
-def _level(view: View, level: int) -> Level:
+def _level(view: StereoView, level: int) -> Level:
     return make_level(view.image, view.K, view.T_world_camera, view.depth_range, level)
 
 
-def _start(view: View, level: Level, sparse: Sparse | None) -> Planes:
+def _start(view: StereoView, level: Level, sparse: SparsePoints | None) -> Planes:
     """The depth of the nearest sparse point, facing the camera; all unknown where there are no sparse points."""
     values = np.zeros((*level.shape, 3), np.float32)
     if sparse is not None and len(sparse.points):
@@ -220,16 +229,17 @@ def _start(view: View, level: Level, sparse: Sparse | None) -> Planes:
     return Planes(values, np.zeros(level.shape, np.float32))
 
 
-def _probes(view: View) -> tuple[Float64, Float64]:
+def _probes(view: StereoView) -> tuple[Float64, Float64]:
     """(M, 2) pixels and (M,) depths of a grid in the view's frustum, even in the logarithm of depth."""
     height, width = view.image.shape[:2]
     near, far = view.depth_range
-    depths = np.geomspace(near, far, 7)[1:-1]
-    u, v, z = np.meshgrid((np.arange(8) + 0.5) * width / 8, (np.arange(6) + 0.5) * height / 6, depths)
+    columns, rows, count = PROBES
+    depths = np.geomspace(near, far, count + 2)[1:-1]
+    u, v, z = np.meshgrid((np.arange(columns) + 0.5) * width / columns, (np.arange(rows) + 0.5) * height / rows, depths)
     return np.stack([u.ravel(), v.ravel()], 1), z.ravel()
 
 
-def _inside(view: View, world: Float64) -> npt.NDArray[np.bool_]:
+def _inside(view: StereoView, world: Float64) -> npt.NDArray[np.bool_]:
     """Which of the points (M, 3) fall into the view's image."""
     T_camera_world = np.linalg.inv(view.T_world_camera)
     x, y, z = view.K @ (T_camera_world[:3, :3] @ world.T + T_camera_world[:3, 3:])
@@ -237,8 +247,11 @@ def _inside(view: View, world: Float64) -> npt.NDArray[np.bool_]:
     return (z > 0) & (x >= 0) & (y >= 0) & (x < width * z) & (y < height * z)
 
 
-def _angle_score(view: View, other: View, world: Float64, best_angle_deg: float) -> Float64:
-    """(M,) in [0, 1]: how well the angle at each point between the rays of two views suits matching."""
+def _angle_score(view: StereoView, other: StereoView, world: Float64, best_angle_deg: float) -> Float64:
+    """(M,) in [0, 1]: how well the angle at each point between the rays of two views suits matching.
+
+    A Gaussian around the best angle, narrow below it, where depth is uncertain, and wide above it, where views differ.
+    """
     here, there = (camera.T_world_camera[:3, 3] - world for camera in (view, other))
     lengths = np.linalg.norm(here, axis=1) * np.linalg.norm(there, axis=1)
     angle = np.degrees(np.arccos(np.clip((here * there).sum(1) / np.maximum(lengths, 1e-12), -1, 1)))

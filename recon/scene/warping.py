@@ -12,8 +12,8 @@ import torch
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import Similarity, align_cameras, multiply_quats, quat_from_matrix, to_camera
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.priors.classical import modelled_K, sparse_points
 from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors.registered_camera import modelled_K, sparse_points
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView

@@ -50,8 +50,8 @@ def with_depth(model: Model, seed: int) -> Scene:
         points = points[points[:, 2] > 0]
         pixels = points @ K.T
         near, far = stereo.depth_range(points[:, 2])
-        views.append(stereo.View(view.image, K, T, (near, classical.Config().far_margin * far)))
-        sparse.append(stereo.Sparse(pixels[:, :2] / pixels[:, 2:], points[:, 2]))
+        views.append(stereo.StereoView(view.image, K, T, (near, classical.Config().far_margin * far)))
+        sparse.append(stereo.SparsePoints(pixels[:, :2] / pixels[:, 2:], points[:, 2]))
     maps = stereo.depth_maps(views, stereo.Config(), seed=seed, sparse=sparse)
     known = [
         replace(view, pointmap=Pointmap(view.name, view.frame_id, found.depth, found.confidence, found.normal, T, K))

@@ -1,25 +1,25 @@
-"""ALIKED as a prior: the classical one, with learned matches where its own features find few."""
+"""ALIKED (Zhao et al. 2023) as a prior: the classical depth, with learned matches where plain features find few."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from splatnode.recon.networks.weights import find
+from splatnode.recon.networks.weight_folder import find
 from splatnode.recon.priors import classical
 from splatnode.recon.priors.aliked.matcher import AlikedMatcher
 from splatnode.recon.priors.aliked.network import load_aliked
 from splatnode.recon.priors.classical import ClassicalPrior
 
-WEIGHTS = "aliked/aliked-n16.pth"
+WEIGHTS = ("aliked/aliked-n16.pth",)
 
 
 class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
     weights: Path | None = None  # of N16 or T16; None: N16's, where `splatnode weights` puts them
     longer_side: int = 800  # of the network's images, pixels; none is enlarged
-    num_keypoints: int = 2000
+    num_keypoints: int = 2000  # of an image, at most
 
 
 def load(config: Config) -> ClassicalPrior:
-    """Raises FileNotFoundError or ValueError where there are no weights, or not those of ALIKED N16 or T16."""
-    network = load_aliked(config.weights or find(WEIGHTS))
+    """Raises WeightsError or FileNotFoundError without weights, ValueError where they are not ALIKED N16's or T16's."""
+    network = load_aliked(config.weights or find(*WEIGHTS))
     return ClassicalPrior(config, matcher=AlikedMatcher(network, config.longer_side, config.num_keypoints))

@@ -1,4 +1,4 @@
-"""What looks where it is told to: a convolution and a descriptor whose samples are shifted by what they see."""
+"""Deformable sampling: a convolution and a descriptor whose samples are shifted by what they see."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from splatnode.recon.priors.aliked.deformable import window
 
 _REACH = 2  # pixels: no two keypoints are as close, and the place of one is measured within it
-_LEAST = 0.2  # score
+_MIN_SCORE = 0.2  # of a keypoint, in [0, 1], as published
 _TEMPERATURE = 0.1  # of scores, as in training
 
 
@@ -21,7 +21,7 @@ def detected(scores: Tensor, count: int) -> Tensor:
     size = 2 * _REACH + 1
     highest = F.max_pool2d(scores[None, None], size, stride=1, padding=_REACH)[0, 0]
     inner = (slice(_REACH, -_REACH),) * 2  # where all of the window is in the image
-    row, column = ((scores == highest) & (scores > _LEAST))[inner].nonzero(as_tuple=True)
+    row, column = ((scores == highest) & (scores > _MIN_SCORE))[inner].nonzero(as_tuple=True)
     best = scores[inner][row, column].argsort(descending=True, stable=True)[:count]
     peaks = torch.stack([column[best], row[best]], -1) + _REACH
     around = window(size)

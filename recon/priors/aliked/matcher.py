@@ -1,4 +1,4 @@
-"""ALIKED's matches in terms of keyframes' points: its keypoints are added to those that a keyframe has."""
+"""ALIKED's matches: its keypoints are added to a keyframe's points, which its matches then name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""ALIKED's network: a map of features and one of how well each pixel serves as a keypoint, then descriptors of some.
+"""ALIKED's network: maps of features and of keypoint scores, then descriptors of the best keypoints.
 
 "ALIKED: A Lighter Keypoint and Descriptor Extraction Network via Deformable Transformation" (Zhao et al. 2023),
 section III. Parameters are called as in the authors' checkpoints.
@@ -13,13 +13,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from splatnode.recon.networks.weight_files import load_network, read_weights
+from splatnode.recon.networks.weight_loading import load_network, read_weights
 from splatnode.recon.priors.aliked.deformable import DeformableConv, DeformableDescriptor
 from splatnode.recon.priors.aliked.detection import detected
 
 STRIDE = 32  # of the coarsest features: an image has sides that this divides
 _STRIDES = (1, 2, 8, STRIDE)
-_N16 = 16  # width of the network that a checkpoint is compared with that tells none
+_N16 = 16  # width of the N16 network
 
 
 @dataclass(frozen=True, eq=False)

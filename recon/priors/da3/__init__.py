@@ -1,5 +1,5 @@
-"""Depth Anything 3 Small (Apache-2.0): cameras, depth and confidence of any number of photographs."""
+"""Depth Anything 3 Small (Lin et al. 2025, Apache-2.0) as a prior: matches and depth for any number of photographs."""
 
-from splatnode.recon.priors.da3.prior import Config, load
+from splatnode.recon.priors.da3.prior import PACKAGE, WEIGHTS, Config, load
 
-__all__ = ["Config", "load"]
+__all__ = ["PACKAGE", "WEIGHTS", "Config", "load"]

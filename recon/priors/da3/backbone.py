@@ -11,7 +11,7 @@ from splatnode.recon.networks import dinov2
 from splatnode.recon.networks.dinov2 import Dinov2
 from splatnode.recon.networks.rotary import Rotary, grid_positions
 
-_VIEWS_TO_CHOOSE_FROM = 3  # with fewer, the first view is the reference
+_MIN_VIEWS_TO_CHOOSE = 3  # with fewer, the first view is the reference, as in training
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Backbone(Dinov2):
         own = tokens
         patches, last = [], tokens
         for index, block in enumerate(self.blocks):
-            if index == self._joint_from - 1 and cameras is None and len(images) >= _VIEWS_TO_CHOOSE_FROM:
+            if index == self._joint_from - 1 and cameras is None and len(images) >= _MIN_VIEWS_TO_CHOOSE:
                 order = _reference_first(tokens[:, 0])
                 tokens, own = tokens[order], own[order]
             if index == self._joint_from:

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from splatnode.recon.networks.dinov2 import PATCH
-from splatnode.recon.networks.fusion import Scratch, enlarged, resizers
+from splatnode.recon.networks.feature_fusion import Scratch, enlarged, resizers
 from splatnode.recon.networks.transformer import Block, Mlp
 from splatnode.recon.priors.da3.backbone import Size
 
 _DETAIL = 32  # channels at full resolution
-_POSITION_BASE, _POSITION_WEIGHT = 100.0, 0.1
+_POSITION_BASE, _POSITION_WEIGHT = 100.0, 0.1  # of the waves of a pixel's place, as in training
 
 
 class DepthHead(nn.Module):

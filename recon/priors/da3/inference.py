@@ -1,4 +1,4 @@
-"""Keyframes through the network, all of a question at one size."""
+"""Keyframes through the network together, all at one size."""
 
 from __future__ import annotations
 
@@ -33,6 +33,8 @@ class KnownCamera:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
+    """What the network says of a keyframe, and how that was cropped for it."""
+
     estimate: Estimate
     crop: Crop
 

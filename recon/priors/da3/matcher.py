@@ -1,7 +1,7 @@
-"""Matches from far apart: one photograph is drawn as the network says that the other camera saw it, then compared.
+"""Wide-baseline matches: a photograph is warped into the other's view by the network's depth and cameras, then matched.
 
-What is alike is decided by looks alone, anywhere in the two pictures: where the network is right the two look the same
-from one viewpoint; where it is wrong the drawn one shows something else, and matches are lost, but none are made.
+Descriptors alone decide, anywhere in the two pictures: where the network is right, both look the same from one
+viewpoint; where it is wrong, the warped one shows something else, and matches are lost, but none are made up.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ from splatnode.recon.priors.da3.inference import Answer, Network, ask
 
 Array = npt.NDArray[np.float64]
 
-_PATCH_SIZE = 6.0  # of a keypoint, network pixels
-_NEAR = 1.0  # pixel: a point is drawn where the drawing has a pixel that comes from this near
+_KEYPOINT_PX = 6.0  # size of a keypoint, network pixels: its descriptor looks at 6 times as much
+_MAX_DISTANCE_PX = 1.0  # from a feature to the origin of the warped pixel that shows it, network pixels
+_NOWHERE = -1e4  # the origin of pixels that the first photograph does not show: far outside of it
+_MIN_DEPTH = 1e-6  # of a point before the first camera, in the network's unit
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,37 +45,37 @@ class WarpMatcher:
             for keyframe, answer in ((keyframe1, first), (keyframe2, second))
         )
         from_u, from_v = np.moveaxis((origin - 0.5).astype(np.float32), -1, 0)
-        drawn = np.asarray(cv2.remap(grey1, from_u, from_v, cv2.INTER_LINEAR), np.uint8)
-        where1, chosen1 = _drawn_at(first.crop.to_network(keyframe1.features.points), origin)
+        warped = np.asarray(cv2.remap(grey1, from_u, from_v, cv2.INTER_LINEAR), np.uint8)
+        where1, chosen1 = _warped_at(first.crop.to_network(keyframe1.features.points), origin)
         where2 = second.crop.to_network(keyframe2.features.points)
         (chosen2,) = np.nonzero(((where2 >= 0) & (where2 < [second.crop.width, second.crop.height])).all(1))
         # Upright and of one size: both pictures are from one viewpoint.
-        described1 = describe(drawn, where1, _PATCH_SIZE)
-        described2 = describe(grey2, where2[chosen2], _PATCH_SIZE)
+        described1 = describe(warped, where1, _KEYPOINT_PX)
+        described2 = describe(grey2, where2[chosen2], _KEYPOINT_PX)
         found = nearest_neighbours.match(described1, described2, nearest_neighbours.Config())
         return np.stack([chosen1[found[:, 0]], chosen2[found[:, 1]]], 1)
 
 
 def _origin(first: Answer, second: Answer) -> Array:
-    """(H, W, 2): the pixel of the first photograph that each pixel of the second shows; far outside where none."""
+    """(H, W, 2): the pixel of the first photograph that shows what each pixel of the second shows; else _NOWHERE."""
     depth, camera2, camera1 = second.estimate.depth, second.estimate.camera, first.estimate.camera
     v, u = np.mgrid[: depth.shape[0], : depth.shape[1]] + 0.5
     rays = np.stack([u, v, np.ones_like(u)], -1) @ np.linalg.inv(camera2.K).T
     T_first_second = np.linalg.inv(camera1.T_world_camera) @ camera2.T_world_camera
     points = (rays * depth[..., None]) @ T_first_second[:3, :3].T + T_first_second[:3, 3]
-    ahead = points[..., 2] > 1e-6
+    ahead = points[..., 2] > _MIN_DEPTH
     projected = (points @ camera1.K.T)[..., :2] / np.where(ahead, points[..., 2], 1.0)[..., None]
-    inside = ahead & (np.abs(projected) < 1e4).all(-1)
-    return np.where(inside[..., None], projected, -1e4)
+    inside = ahead & (np.abs(projected) < -_NOWHERE).all(-1)
+    return np.where(inside[..., None], projected, _NOWHERE)
 
 
-def _drawn_at(points: Array, origin: Array) -> tuple[Array, npt.NDArray[np.int64]]:
-    """(M, 2) pixels of the drawing that show these of `points` (F, 2) of the first photograph, and which (M,)."""
-    inside = (origin > -1e4).all(-1)
+def _warped_at(points: Array, origin: Array) -> tuple[Array, npt.NDArray[np.int64]]:
+    """(M, 2) pixels of the warped picture that show features `points` (F, 2) of the first photograph; (M,) which."""
+    inside = (origin > _NOWHERE).all(-1)
     rows, columns = np.nonzero(inside)
     if not len(rows) or not len(points):
         return np.zeros((0, 2)), np.zeros(0, np.int64)
     distance, nearest = (np.asarray(found) for found in KDTree(origin[inside]).query(points))
-    (chosen,) = np.nonzero(distance < _NEAR)
+    (chosen,) = np.nonzero(distance < _MAX_DISTANCE_PX)
     pixels = np.stack([columns, rows], 1)[nearest[chosen].astype(np.int64)]
     return pixels.astype(np.float64) + 0.5, chosen

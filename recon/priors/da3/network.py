@@ -16,7 +16,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from splatnode.recon.networks import weight_files
+from splatnode.recon.networks import weight_loading
 from splatnode.recon.priors.da3.backbone import SMALL, Backbone, Size
 from splatnode.recon.priors.da3.head import CameraEncoder, CameraHead, DepthHead
 
@@ -26,8 +26,14 @@ _UNUSED = ("head.scratch.refinenet1_aux", "head.scratch.refinenet2_aux", "head.s
 _UNUSED += ("head.scratch.refinenet4_aux", "head.scratch.output_conv1_aux", "head.scratch.output_conv2_aux")
 
 
+_MIN_UNIT = 0.1  # of lengths: cameras that stand together are not blown up
+_MIN_TANGENT = 1e-6  # of half a field of view, which the network gives from 0 up
+
+
 @dataclass(frozen=True, eq=False)
 class PlacedCamera:
+    """A camera of the network's image."""
+
     T_world_camera: Array  # (4, 4)
     K: Array  # (3, 3) of the network's image
 
@@ -67,9 +73,9 @@ class DepthAnything3(nn.Module):
 
 def load_network(path: Path, size: Size = SMALL) -> DepthAnything3:
     """Raises ValueError where the file is damaged, holds another model or anything but data, and FileNotFoundError."""
-    weights = {name.removeprefix("model."): tensor for name, tensor in weight_files.read_weights(path).items()}
+    weights = {name.removeprefix("model."): tensor for name, tensor in weight_loading.read_weights(path).items()}
     needed = {name: tensor for name, tensor in weights.items() if not name.startswith(_UNUSED)}
-    return weight_files.load_network(partial(DepthAnything3, size), needed, path, "Depth Anything 3 Small")
+    return weight_loading.load_network(partial(DepthAnything3, size), needed, path, "Depth Anything 3 Small")
 
 
 def _brought_near(cameras: Sequence[PlacedCamera]) -> list[PlacedCamera]:
@@ -77,7 +83,7 @@ def _brought_near(cameras: Sequence[PlacedCamera]) -> list[PlacedCamera]:
     to_first = np.linalg.inv(cameras[0].T_world_camera)
     Ts_first_camera = [to_first @ camera.T_world_camera for camera in cameras]
     # The lower of two middle ones, as in its training.
-    unit = max(0.1, float(np.sort([np.linalg.norm(T[:3, 3]) for T in Ts_first_camera])[(len(cameras) - 1) // 2]))
+    unit = max(_MIN_UNIT, float(np.sort([np.linalg.norm(T[:3, 3]) for T in Ts_first_camera])[(len(cameras) - 1) // 2]))
     for T_first_camera in Ts_first_camera:
         T_first_camera[:3, 3] /= unit
     return [PlacedCamera(T, camera.K) for T, camera in zip(Ts_first_camera, cameras, strict=True)]
@@ -94,12 +100,13 @@ def _encoded(cameras: Sequence[PlacedCamera], height: int, width: int) -> Tensor
 
 
 def _decoded(encoded: Tensor, height: int, width: int) -> list[PlacedCamera]:
+    """The cameras of images (height, width) from (S, 9) as `CameraHead` gives them; principal points are central."""
     cameras = []
     for row in encoded.numpy().astype(np.float64):
         T_world_camera = np.eye(4)
         T_world_camera[:3, 3] = row[:3]
         T_world_camera[:3, :3] = Rotation.from_quat(row[3:7]).as_matrix()
-        tangents = np.maximum(np.tan(row[7:9] / 2.0), 1e-6)
+        tangents = np.maximum(np.tan(row[7:9] / 2.0), _MIN_TANGENT)
         K = np.array([[width / 2 / tangents[1], 0, width / 2], [0, height / 2 / tangents[0], height / 2], [0, 0, 1.0]])
         cameras.append(PlacedCamera(T_world_camera, K))
     return cameras

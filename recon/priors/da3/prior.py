@@ -1,4 +1,4 @@
-"""Depth Anything 3 as a prior: it is believed as far as matches bear it out, then told the cameras that they gave."""
+"""Depth Anything 3 as a prior: it proposes matches, and gives depth once it was told the verified cameras."""
 
 from __future__ import annotations
 
@@ -8,30 +8,31 @@ from pathlib import Path
 import msgspec
 
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.networks.weights import find
+from splatnode.recon.networks.weight_folder import find
 from splatnode.recon.priors.da3.inference import KnownCamera, Network, ask
 from splatnode.recon.priors.da3.matcher import WarpMatcher
 from splatnode.recon.priors.da3.network import load_network
-from splatnode.recon.priors.placed import pointmap_of
+from splatnode.recon.priors.network_depth import registered_pointmap
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior
 from splatnode.recon.registration.register import Registration
 
-WEIGHTS = "da3/da3-small.safetensors"
+WEIGHTS = ("da3/da3-small.safetensors",)
+PACKAGE = "safetensors"  # reads them
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     weights: Path | None = None  # None: where `splatnode weights` puts them
     longer_side: int = 504  # of the network's images: what it was published with
     views_at_once: int = 12  # all of them look at each other: memory and time grow with their square
-    seed: int = 0
+    seed: int = 0  # every prior has one; this one draws no random numbers
 
 
 class Da3Prior(Prior):
-    """Its own cameras and depth draw one photograph from another's viewpoint, for matches that are then verified.
+    """Matches by warping one photograph into another's view, depth from the network given registered cameras.
 
-    The cameras are `recon.registration`'s. Depth comes from the network that was told these cameras, brought to the
-    scale of the points that each camera sees.
+    The network's own cameras serve the warping alone; matches are verified as plain ones are. Depth maps are brought
+    to the scale of the registered points that each camera sees.
     """
 
     def __init__(self, network: Network, config: Config) -> None:
@@ -51,11 +52,11 @@ class Da3Prior(Prior):
                 some, ask(self._network, keyframes, self._config.longer_side, known), strict=True
             ):
                 depth, sure = answer.estimate.depth, answer.estimate.confidence
-                found.append(pointmap_of(graph, registration, camera, answer.crop, depth, sure))
+                found.append(registered_pointmap(graph, registration, camera, answer.crop, depth, sure))
             pause()
         return tuple(found)
 
 
 def load(config: Config) -> Da3Prior:
-    """Raises FileNotFoundError or ValueError where there are no weights, or not those of Depth Anything 3 Small."""
-    return Da3Prior(load_network(config.weights or find(WEIGHTS)), config)
+    """Raises WeightsError or FileNotFoundError without weights, ValueError where they are another network's."""
+    return Da3Prior(load_network(config.weights or find(*WEIGHTS)), config)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
-from splatnode.recon.networks.fusion import Fusion
+from splatnode.recon.networks.feature_fusion import Fusion
 
 _WIDTH = 256  # of the fused features
 _LAYER_WIDTHS = (96, 192, 384, 768)

@@ -22,10 +22,17 @@ from splatnode.recon.geometry import Similarity
 Array = npt.NDArray[np.float64]
 Map = npt.NDArray[np.float32]
 
-_SAMPLES = 400  # points of a pair that take part
-_TREES = 60  # random spanning trees that are tried as a start
-_AGREE = 0.1  # of the depth: a pair and a start agree where the pair's median point is that near
+_SAMPLES = 400  # points of a pair that take part: similarities have seven unknowns
+_NUM_TREES = 60  # random spanning trees that are tried as a start
+_TREE_SPREAD = 0.7  # standard deviation of the logarithm of the factors that shuffle the pairs between trees
+_AGREEMENT = 0.1  # of the depth: a pair and a start agree where the pair's median point is that near
 _ROBUST = 0.02  # of the depth: scale of the robust weights
+_MIN_DEPTH = 1e-6  # of a point before its camera, in the pair's unit
+_MIN_WEIGHT = 1e-3  # of a point of the least confidence, whose logarithm is 0
+_FOCAL_ITERATIONS, _MIN_OFFSET_PX = 10, 1e-3  # of Weiszfeld's algorithm; pixels: nearer points weigh no more
+_FIT_ITERATIONS = 8  # of a similarity's reweighting
+_CONVERGED = 1e-7  # largest step of the joint fit, radians and world units, at which it ends
+_MAX_LOG_SCALE_STEP = 0.5  # of one step of the joint fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +47,8 @@ class PairPoints:
 
 @dataclass(frozen=True, eq=False)
 class AlignedView:
+    """A view after global alignment."""
+
     T_world_camera: Array  # (4, 4)
     focal: float  # pixels; the principal point is the image's centre
     depth: Map  # (H, W) z in the camera frame, in units of the world
@@ -88,16 +97,16 @@ def _focal(pairs: Sequence[PairPoints]) -> float:
     for pair in pairs:
         height, width, _ = pair.first.shape
         u, v = np.meshgrid(np.arange(width) + 0.5 - width / 2, np.arange(height) + 0.5 - height / 2)
-        good = pair.first[..., 2] > 1e-6
+        good = pair.first[..., 2] > _MIN_DEPTH
         ratios.append(pair.first[good][:, :2] / pair.first[good][:, 2:])
         offsets.append(np.stack([u[good], v[good]], -1))
-        weights.append(np.log(pair.first_confidence[good]) + 1e-3)
+        weights.append(np.log(pair.first_confidence[good]) + _MIN_WEIGHT)
     ray, pixel, weight = (np.concatenate(parts).astype(np.float64) for parts in (ratios, offsets, weights))
     if not len(ray):
         raise ValueError("a view has no point in front of its camera: its prediction cannot be used")
     focal = float((weight * (ray * pixel).sum(1)).sum() / max((weight * (ray * ray).sum(1)).sum(), 1e-12))
-    for _ in range(10):
-        robust = weight / np.maximum(np.linalg.norm(pixel - focal * ray, axis=1), 1e-3)
+    for _ in range(_FOCAL_ITERATIONS):
+        robust = weight / np.maximum(np.linalg.norm(pixel - focal * ray, axis=1), _MIN_OFFSET_PX)
         focal = float((robust * (ray * pixel).sum(1)).sum() / max((robust * (ray * ray).sum(1)).sum(), 1e-12))
     return focal
 
@@ -114,22 +123,23 @@ def _own_depth(pairs: Sequence[PairPoints]) -> tuple[Map, Map, list[float]]:
 
 def _unit(depth: Map, reference: Map, confidence: Map) -> float:
     """Median ratio of two depth maps over the surer half of the pixels in front of both cameras."""
-    both = (depth > 1e-6) & (reference > 1e-6)
+    both = (depth > _MIN_DEPTH) & (reference > _MIN_DEPTH)
     sure = both & (confidence >= np.median(confidence))
     chosen = sure if sure.any() else both
     return float(np.median(depth[chosen] / reference[chosen])) if chosen.any() else 1.0
 
 
 def _edge(pair: tuple[int, int], points: PairPoints, unit: float, depth: Map, focal: float) -> _Edge:
+    """Samples of the surer half of the second image's points, and of its own `depth` map at the same pixels."""
     height, width = depth.shape
     surest = np.argsort(-points.second_confidence, axis=None, kind="stable")[: height * width // 2]
-    surest = surest[depth.ravel()[surest] > 1e-6]
+    surest = surest[depth.ravel()[surest] > _MIN_DEPTH]
     chosen = surest[:: max(1, len(surest) // _SAMPLES)]
     row, column = np.divmod(chosen, width)
     z = depth.ravel()[chosen].astype(np.float64)
     own = np.stack([(column + 0.5 - width / 2) * z / focal, (row + 0.5 - height / 2) * z / focal, z], -1)
     seen = points.second.reshape(-1, 3)[chosen].astype(np.float64) / unit
-    return _Edge(*pair, seen, own, np.log(points.second_confidence.ravel()[chosen]).astype(np.float64) + 1e-3)
+    return _Edge(*pair, seen, own, np.log(points.second_confidence.ravel()[chosen]).astype(np.float64) + _MIN_WEIGHT)
 
 
 _IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
@@ -138,7 +148,7 @@ _IDENTITY = Similarity(1.0, np.eye(3), np.zeros(3))
 def _procrustes(source: Array, target: Array, weights: Array) -> Similarity:
     """The similarity that carries `source` (S, 3) onto `target`: weighted, and robust by reweighting."""
     fit, robust = _IDENTITY, weights
-    for _ in range(8):
+    for _ in range(_FIT_ITERATIONS):
         share = robust / robust.sum()
         mean_source, mean_target = share @ source, share @ target
         centred_source, centred_target = source - mean_source, target - mean_target
@@ -159,12 +169,12 @@ def _start(edges: Sequence[_Edge], count: int) -> list[Similarity]:
     errors = np.array([_error(edge, _IDENTITY, fit) for edge, fit in zip(edges, relative, strict=True)])
     rng = np.random.default_rng(0)
     best: tuple[float, list[Similarity]] | None = None
-    for _ in range(_TREES):
-        order = np.argsort(errors * rng.lognormal(0.0, 0.7, len(edges)), kind="stable")
+    for _ in range(_NUM_TREES):
+        order = np.argsort(errors * rng.lognormal(0.0, _TREE_SPREAD, len(edges)), kind="stable")
         placed = _along_tree(order.tolist(), edges, relative, count)
-        agreeing = sum(_error(edge, placed[edge.first], placed[edge.second]) < _AGREE for edge in edges)
-        spread = sum(min(_error(edge, placed[edge.first], placed[edge.second]), _AGREE) for edge in edges)
-        score = agreeing - spread / _AGREE
+        agreeing = sum(_error(edge, placed[edge.first], placed[edge.second]) < _AGREEMENT for edge in edges)
+        spread = sum(min(_error(edge, placed[edge.first], placed[edge.second]), _AGREEMENT) for edge in edges)
+        score = agreeing - spread / _AGREEMENT
         if best is None or score > best[0]:
             best = score, placed
     assert best is not None
@@ -220,7 +230,7 @@ def _refined(similarities: list[Similarity], edges: Sequence[_Edge], iterations:
         damped = normal[np.ix_(free, free)] + 1e-9 * np.diag(np.diag(normal)[free]) + 1e-12 * np.eye(len(free))
         step = -np.linalg.solve(damped, gradient[free]).reshape(-1, 7)
         similarities = [similarities[0], *(_moved(s, d) for s, d in zip(similarities[1:], step, strict=True))]
-        if np.abs(step).max() < 1e-7:
+        if np.abs(step).max() < _CONVERGED:
             break
     return similarities
 
@@ -238,10 +248,10 @@ def _motion(points: Array, similarity: Similarity) -> Array:
 
 
 def _moved(similarity: Similarity, step: npt.NDArray[np.floating]) -> Similarity:
+    """The similarity after a `step` (7,) of the joint fit, in the order of `_motion`."""
     rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ similarity.rotation
-    return Similarity(
-        similarity.scale * float(np.exp(np.clip(step[6], -0.5, 0.5))), rotation, similarity.translation + step[3:6]
-    )
+    growth = float(np.exp(np.clip(step[6], -_MAX_LOG_SCALE_STEP, _MAX_LOG_SCALE_STEP)))
+    return Similarity(similarity.scale * growth, rotation, similarity.translation + step[3:6])
 
 
 def _in_first_frame(
@@ -251,7 +261,8 @@ def _in_first_frame(
     depths: Sequence[Map],
     confidences: Sequence[Map],
 ) -> list[AlignedView]:
-    ahead = depths[0][depths[0] > 1e-6]
+    """The views in the frame of view 0, whose median depth becomes 1."""
+    ahead = depths[0][depths[0] > _MIN_DEPTH]
     unit = float(np.median(ahead)) if len(ahead) else 1.0
     views = []
     for view, similarity in enumerate(similarities):

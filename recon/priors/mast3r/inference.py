@@ -14,13 +14,13 @@ from torch import Tensor
 
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.networks.crop import Crop, crop, cropped
-from splatnode.recon.networks.recent import Recent
+from splatnode.recon.networks.lru_cache import LruCache
 from splatnode.recon.priors.mast3r.global_alignment import PairPoints
 from splatnode.recon.priors.mast3r.network import Encoded, Prediction
 
 PATCH = 16
-_KEPT_IMAGES = 32
-_KEPT_PAIRS = 160  # as many as 13 frames have
+_KEPT_IMAGES = 32  # in tokens: 100 MB
+_KEPT_PAIRS = 160  # with their points, up to 1 GB: 13 frames have 156 ordered pairs
 
 
 class Network(Protocol):
@@ -39,8 +39,8 @@ class Asked:
 
     def __init__(self, network: Network, longer_side: int) -> None:
         self._network, self._longer_side = network, longer_side
-        self._encoded: Recent[str, Encoded] = Recent(_KEPT_IMAGES)
-        self._points: Recent[tuple[str, str], PairPoints] = Recent(_KEPT_PAIRS)
+        self._encoded: LruCache[str, Encoded] = LruCache(_KEPT_IMAGES)
+        self._points: LruCache[tuple[str, str], PairPoints] = LruCache(_KEPT_PAIRS)
 
     def crop_of(self, keyframe: Keyframe) -> Crop:
         return crop(keyframe.frame.width, keyframe.frame.height, self._longer_side, PATCH)

@@ -3,17 +3,20 @@
 "Grounding Image Matching in 3D with MASt3R" (Leroy et al. 2024) on "DUSt3R" (Wang et al. 2024) and "CroCo v2"
 (Weinzaepfel et al. 2023): a ViT encodes each image, two decoders look at their own and at the other's tokens, and each
 image's head gives points, confidence and descriptors. Written from the papers; modules carry the names of the official
-checkpoint, which `recon.priors.mast3r.weight_files` reads.
+checkpoint.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from splatnode.recon.networks import weight_loading
 from splatnode.recon.networks.rotary import Rotary, grid_positions
 from splatnode.recon.networks.transformer import Attention, Block, Mlp, PatchEmbedding, attend, by_head
 from splatnode.recon.priors.mast3r.dpt import DensePrediction
@@ -104,6 +107,14 @@ class Mast3r(nn.Module):
             self.downstream_head1(layers1, first.height, first.width),
             self.downstream_head2(layers2, second.height, second.width),
         )
+
+
+def load_network(path: Path, size: Size = PUBLISHED) -> Mast3r:
+    """The network with the weights of `path`: the official file, a dict with `model` and `args`, or a safetensors file.
+
+    Raises ValueError where the file is damaged, holds another model or anything but data, and FileNotFoundError.
+    """
+    return weight_loading.load_network(partial(Mast3r, size), weight_loading.read_weights(path), path, "MASt3R")
 
 
 class _CrossAttention(nn.Module):

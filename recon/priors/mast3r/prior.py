@@ -1,4 +1,4 @@
-"""MASt3R as a prior: it proposes matches and depth, and is believed as far as geometry bears it out."""
+"""MASt3R as a prior: matches by its descriptors, depth by global alignment of its point maps."""
 
 from __future__ import annotations
 
@@ -15,33 +15,36 @@ import torch
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.networks.crop import Crop
-from splatnode.recon.networks.weights import find
+from splatnode.recon.networks.weight_folder import find
 from splatnode.recon.priors.mast3r.global_alignment import align
 from splatnode.recon.priors.mast3r.inference import Asked, Network
-from splatnode.recon.priors.mast3r.network import Prediction
-from splatnode.recon.priors.mast3r.weight_files import LICENCE, load_network
-from splatnode.recon.priors.placed import pointmap_of
+from splatnode.recon.priors.mast3r.network import Prediction, load_network
+from splatnode.recon.priors.network_depth import registered_pointmap
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior
 from splatnode.recon.registration.register import Registration
 
 log = logging.getLogger(__name__)
 
-WEIGHTS = "mast3r/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth"
+WEIGHTS = ("mast3r/MASt3R_ViTLarge_BaseDecoder_512_catmlpdpt_metric.pth",)
+LICENCE = (
+    "MASt3R's weights are licensed CC BY-NC-SA 4.0 (with the terms of its training sets, mapfree among them): "
+    "for non-commercial use only."
+)
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     weights: Path | None = None  # None: where `splatnode weights` puts them
     longer_side: int = 512  # of the network's images: what it was trained with
-    max_neighbours: int = 6  # places: with up to 13 frames every pair is asked about
-    seed: int = 0
+    max_neighbours: int = 6  # places in the circle of frames: of up to 13 frames every pair is asked about
+    seed: int = 0  # every prior has one; global alignment has a fixed one
 
 
 class Mast3rPrior(Prior):
-    """Matches by descriptors, cameras by `recon.registration` from them, depth by global alignment.
+    """Matches between detected features by the network's descriptors, depth by global alignment.
 
-    A match is one between two detected features, and counts only where a pair's epipolar geometry holds it: what the
-    network invents between unrelated photographs is not in agreement with any.
+    A match counts only where it is an inlier of its pair's epipolar geometry: matches that the network invents between
+    unrelated photographs agree with none.
     """
 
     def __init__(self, network: Network, config: Config) -> None:
@@ -58,7 +61,7 @@ class Mast3rPrior(Prior):
         pause()
         crops = [self._asked.crop_of(keyframe) for keyframe in keyframes]
         return tuple(
-            pointmap_of(graph, registration, camera, to, view.depth, view.confidence)
+            registered_pointmap(graph, registration, camera, to, view.depth, view.confidence)
             for camera, view, to in zip(registration.cameras, views, crops, strict=True)
         )
 
@@ -81,8 +84,8 @@ class DescriptorMatcher:
 
 
 def load(config: Config) -> Mast3rPrior:
-    """Raises FileNotFoundError or ValueError where there are no weights, or not MASt3R's."""
-    network = load_network(config.weights or find(WEIGHTS))
+    """Raises WeightsError or FileNotFoundError without weights, ValueError where they are not MASt3R's."""
+    network = load_network(config.weights or find(*WEIGHTS))
     log.info("%s", LICENCE)
     return Mast3rPrior(network, config)
 

@@ -1,17 +1,17 @@
-"""PatchmatchNet (Wang et al. 2021) as a prior: our own cameras, and depth from a small network (MIT licence)."""
+"""PatchmatchNet (Wang et al. 2021) as a prior: depth from a small network in place of PatchMatch stereo."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from splatnode.recon.networks import weight_files
-from splatnode.recon.networks.weights import find
+from splatnode.recon.networks import weight_loading
+from splatnode.recon.networks.weight_folder import find
 from splatnode.recon.priors import classical
 from splatnode.recon.priors.classical import ClassicalPrior
 from splatnode.recon.priors.patchmatchnet.network import PatchmatchNet
 from splatnode.recon.priors.patchmatchnet.stereo import NetworkStereo
 
-WEIGHTS = "patchmatchnet/patchmatchnet_dtu.pth"
+WEIGHTS = ("patchmatchnet/patchmatchnet_dtu.pth",)
 
 
 class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
@@ -19,10 +19,10 @@ class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
 
 
 def load(config: Config) -> ClassicalPrior:
-    """Raises WeightsError where there are no weights, ValueError where they are not PatchmatchNet's."""
-    return ClassicalPrior(config, NetworkStereo(load_network(config.weights or find(WEIGHTS))).depth_maps)
+    """Raises WeightsError or FileNotFoundError without weights, ValueError where they are not PatchmatchNet's."""
+    return ClassicalPrior(config, NetworkStereo(load_network(config.weights or find(*WEIGHTS))).depth_maps)
 
 
 def load_network(path: Path) -> PatchmatchNet:
     """Raises ValueError where the file is damaged or another network's, and FileNotFoundError."""
-    return weight_files.load_network(PatchmatchNet, weight_files.read_weights(path), path, "PatchmatchNet")
+    return weight_loading.load_network(PatchmatchNet, weight_loading.read_weights(path), path, "PatchmatchNet")

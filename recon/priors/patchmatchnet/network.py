@@ -2,8 +2,9 @@
 
 "PatchmatchNet: Learned Multi-View Patchmatch Stereo" (Wang et al. 2021). Each stage proposes depths for every pixel
 (at first all over the range, then around the last estimate and from learned neighbours), warps the sources' features
-at these depths, and scores them; three networks learn where to look, whom to believe and how alike is alike. Written
-from the paper; modules carry the names of the published checkpoint. Pixel centres are at whole numbers in here.
+at these depths, and scores them; three networks learn where to look, which source to believe and how alike features
+have to be. Written from the paper; modules carry the names of the published checkpoint. Pixel centres are at whole
+numbers in this folder's network, sampling and scoring.
 """
 
 from __future__ import annotations
@@ -15,14 +16,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from splatnode.recon.priors.patchmatchnet.pyramid import FeaturePyramid, Refinement
 from splatnode.recon.priors.patchmatchnet.sampling import (
     Source,
     sampled_at,
     sampling_grid,
     square_of_steps,
     warp_between,
-    warped_to,
 )
+from splatnode.recon.priors.patchmatchnet.scoring import Evaluation, Similarity
 
 _FIRST_SAMPLES = 48  # depths over the whole range, before there is an estimate
 
@@ -51,9 +53,9 @@ STAGES = (
 class PatchmatchNet(nn.Module):
     def __init__(self) -> None:
         super().__init__()
-        self.feature = _Features()
+        self.feature = FeaturePyramid()
         self.patchmatch_3, self.patchmatch_2, self.patchmatch_1 = (_Patchmatch(stage) for stage in STAGES)
-        self.upsample_net = _Upsample()
+        self.upsample_net = Refinement()
 
     def forward(
         self, reference: Source, sources: Sequence[Source], near_far: tuple[float, float], generator: torch.Generator
@@ -88,59 +90,6 @@ class _Estimate:
         return _Estimate(depth, self.probability, weights)
 
 
-class _ConvNormRelu(nn.Module):
-    def __init__(self, channels: int, out: int, size: int = 3, stride: int = 1) -> None:
-        super().__init__()
-        self.conv = nn.Conv2d(channels, out, size, stride, size // 2, bias=False)
-        self.bn = nn.BatchNorm2d(out)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.relu(self.bn(self.conv(x)))
-
-
-class _PointwiseNormRelu(nn.Module):
-    """The same on every sample by itself."""
-
-    def __init__(self, channels: int, out: int) -> None:
-        super().__init__()
-        self.conv = nn.Conv3d(channels, out, 1, bias=False)
-        self.bn = nn.BatchNorm3d(out)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return torch.relu(self.bn(self.conv(x)))
-
-
-class _Features(nn.Module):
-    """A feature pyramid: channels 64, 32 and 16 at 1/8, 1/4 and 1/2 of the image's size."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv0, self.conv1 = _ConvNormRelu(3, 8), _ConvNormRelu(8, 8)
-        self.conv2, self.conv3, self.conv4 = _halving(8, 16)
-        self.conv5, self.conv6, self.conv7 = _halving(16, 32)
-        self.conv8, self.conv9, self.conv10 = _halving(32, 64)
-        self.output1 = nn.Conv2d(64, 64, 1, bias=False)
-        self.inner1, self.inner2 = nn.Conv2d(32, 64, 1), nn.Conv2d(16, 64, 1)
-        self.output2, self.output3 = nn.Conv2d(64, 32, 1, bias=False), nn.Conv2d(64, 16, 1, bias=False)
-
-    def forward(self, image: Tensor) -> dict[int, Tensor]:
-        """(C, H / 2^level, W / 2^level) by level, of an image (3, H, W)."""
-        half = self.conv4(self.conv3(self.conv2(self.conv1(self.conv0(image[None])))))
-        quarter = self.conv7(self.conv6(self.conv5(half)))
-        eighth = self.conv10(self.conv9(self.conv8(quarter)))
-        quarter = _doubled(eighth) + self.inner1(quarter)
-        half = _doubled(quarter) + self.inner2(half)
-        return {3: self.output1(eighth)[0], 2: self.output2(quarter)[0], 1: self.output3(half)[0]}
-
-
-def _halving(channels: int, out: int) -> tuple[_ConvNormRelu, _ConvNormRelu, _ConvNormRelu]:
-    return _ConvNormRelu(channels, out, size=5, stride=2), _ConvNormRelu(out, out), _ConvNormRelu(out, out)
-
-
-def _doubled(x: Tensor) -> Tensor:
-    return functional.interpolate(x, scale_factor=2.0, mode="bilinear", align_corners=False)
-
-
 class _Patchmatch(nn.Module):
     def __init__(self, stage: Stage) -> None:
         super().__init__()
@@ -148,8 +97,8 @@ class _Patchmatch(nn.Module):
         # The finest stage proposes nothing from neighbours; the checkpoint holds a convolution for one all the same.
         self.propa_conv = _offsets(stage, max(2 * stage.neighbours, 1))
         self.eval_conv = _offsets(stage, 2 * 9)
-        self.feature_weight_net = _Similarity(stage.groups)
-        self.evaluation = _Evaluation(stage.groups)
+        self.feature_weight_net = Similarity(stage.groups)
+        self.evaluation = Evaluation(stage.groups)
 
     def forward(
         self,
@@ -209,85 +158,6 @@ class _Patchmatch(nn.Module):
         place = (1.0 / samples - farthest) / (nearest - farthest)
         gap = (sampled_at(place, around) - place[:, None]).abs() / self.stage.interval
         return torch.sigmoid(4.0 - 2.0 * gap.clamp(0, 4))
-
-
-class _Evaluation(nn.Module):
-    def __init__(self, groups: int) -> None:
-        super().__init__()
-        self._groups = groups
-        self.pixel_wise_net = _ViewWeight(groups)
-        self.similarity_net = _Similarity(groups)
-
-    def forward(
-        self,
-        own: Tensor,
-        others: Sequence[Tensor],
-        warps: Sequence[tuple[Tensor, Tensor]],
-        samples: Tensor,
-        around: Tensor,
-        support: Tensor,
-        weights: Tensor | None,
-    ) -> tuple[Tensor, Tensor]:
-        """Scores (D, h, w) of the samples, and the sources' weights (S, h, w): found once, then kept."""
-        groups = self._groups
-        total = samples.new_full((1, 1, *samples.shape[1:]), 1e-5)
-        summed = samples.new_zeros((groups, *samples.shape))
-        reference = own.unflatten(0, (groups, -1))[:, :, None]
-        found = []
-        for index, (other, warp) in enumerate(zip(others, warps, strict=True)):
-            warped = warped_to(other, warp, samples).unflatten(0, (groups, -1))
-            similarity = (warped * reference).mean(1)  # (G, D, h, w)
-            weight = self.pixel_wise_net(similarity) if weights is None else weights[index]
-            found.append(weight)
-            summed = summed + similarity * weight
-            total = total + weight
-        scores = self.similarity_net(summed / total)
-        scores = (sampled_at(scores, around) * support).sum(1)
-        return scores, torch.stack(found)
-
-
-class _Similarity(nn.Module):
-    """A score from the correlations of each group of channels."""
-
-    def __init__(self, groups: int) -> None:
-        super().__init__()
-        self.conv0, self.conv1 = _PointwiseNormRelu(groups, 16), _PointwiseNormRelu(16, 8)
-        self.similarity = nn.Conv3d(8, 1, 1)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.similarity(self.conv1(self.conv0(x[None])))[0, 0]
-
-
-class _ViewWeight(nn.Module):
-    """How far a source is to be believed at a pixel: as far as its best sample is."""
-
-    def __init__(self, groups: int) -> None:
-        super().__init__()
-        self.conv0, self.conv1 = _PointwiseNormRelu(groups, 16), _PointwiseNormRelu(16, 8)
-        self.conv2 = nn.Conv3d(8, 1, 1)
-
-    def forward(self, similarity: Tensor) -> Tensor:
-        return self.conv2(self.conv1(self.conv0(similarity[None])))[0, 0].sigmoid().amax(0)
-
-
-class _Upsample(nn.Module):
-    """Depth at twice its size, sharpened along the photograph's edges."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.conv0, self.conv1, self.conv2 = _ConvNormRelu(3, 8), _ConvNormRelu(1, 8), _ConvNormRelu(8, 8)
-        self.deconv = nn.ConvTranspose2d(8, 8, 3, stride=2, padding=1, output_padding=1, bias=False)
-        self.bn = nn.BatchNorm2d(8)
-        self.conv3 = _ConvNormRelu(16, 8)
-        self.res = nn.Conv2d(8, 1, 3, padding=1, bias=False)
-
-    def forward(self, image: Tensor, depth: Tensor, near_far: tuple[float, float]) -> Tensor:
-        near, far = near_far
-        place = ((depth - near) / (far - near))[None, None]
-        detail = torch.relu(self.bn(self.deconv(self.conv2(self.conv1(place)))))
-        detail = self.res(self.conv3(torch.cat([detail, self.conv0(image[None])], 1)))
-        place = functional.interpolate(place, scale_factor=2.0, mode="nearest") + detail
-        return place[0, 0] * (far - near) + near
 
 
 def _offsets(stage: Stage, out: int) -> nn.Conv2d:

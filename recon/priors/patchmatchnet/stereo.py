@@ -10,33 +10,33 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from splatnode.recon.priors import fusion, stereo
-from splatnode.recon.priors.fusion import DepthMap
+from splatnode.recon.priors import consistency, stereo
+from splatnode.recon.priors.consistency import DepthMap
 from splatnode.recon.priors.patchmatch import Planes, make_level
 from splatnode.recon.priors.patchmatchnet.network import PatchmatchNet
 from splatnode.recon.priors.patchmatchnet.sampling import Source
-from splatnode.recon.priors.stereo import Sparse, View
+from splatnode.recon.priors.stereo import SparsePoints, StereoView
 
 Float32 = npt.NDArray[np.float32]
 
 _STRIDE = 8  # sides of the network's images are multiples of it
-_STEP = 0.05  # a relative change of depth from pixel to pixel that is no surface any more
+_STEP = 0.05  # relative change of inverse depth from pixel to pixel from which on two surfaces meet
 
 
 @dataclass(frozen=True, eq=False)
 class NetworkStereo:
-    """What `stereo.depth_maps` does, with a network in place of the search."""
+    """`stereo.depth_maps` with a network in place of the search for planes."""
 
     network: PatchmatchNet
 
     @torch.inference_mode()
     def depth_maps(
         self,
-        views: Sequence[View],
+        views: Sequence[StereoView],
         config: stereo.Config,
         *,
         seed: int = 0,
-        sparse: Sequence[Sparse | None] | None = None,
+        sparse: Sequence[SparsePoints | None] | None = None,
         pause: Callable[[], None] = lambda: None,
     ) -> list[DepthMap]:
         """A depth map for every view, in order. A view that overlaps with no other comes back without any depth.
@@ -58,10 +58,10 @@ class NetworkStereo:
                 found = _resized(depth.clamp(*view.depth_range).numpy(), view.image)
                 inverse_depth = np.reciprocal(found, dtype=np.float32)
             planes.append(_planes(inverse_depth))
-        return fusion.cross_check(levels, planes, config.matching, config.fusion)
+        return consistency.cross_check(levels, planes, config.matching, config.consistency)
 
 
-def _source(view: View) -> Source:
+def _source(view: StereoView) -> Source:
     """The view at a size that fits the network, pixel centres at whole numbers."""
     height, width = (max(1, round(side / _STRIDE)) * _STRIDE for side in view.image.shape[:2])
     image = view.image

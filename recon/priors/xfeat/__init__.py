@@ -1,18 +1,21 @@
-"""XFeat and LighterGlue as a prior: the classical one, with learned matches where its own features find few."""
+"""XFeat (Potje et al. 2024) and LighterGlue as a prior: classical depth, learned matches where plain ones are few."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from splatnode.recon.networks.weights import WeightsError, find
+from splatnode.recon.networks.weight_folder import WeightsError, find
 from splatnode.recon.priors import classical
 from splatnode.recon.priors.classical import ClassicalPrior
 
+WEIGHTS = ("xfeat/xfeat_640x640.onnx", "xfeat/lighterglue_L3.onnx")
+PACKAGE = "onnxruntime"
+
 
 class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
-    features: Path | None = None  # ONNX files; None: where `splatnode weights` puts them
-    matcher: Path | None = None
-    num_keypoints: int = 2000
+    features: Path | None = None  # ONNX file of XFeat; None: where `splatnode weights` puts it
+    matcher: Path | None = None  # ONNX file of LighterGlue; None: the same
+    num_keypoints: int = 2000  # of an image, at most
 
 
 def load(config: Config) -> ClassicalPrior:
@@ -22,6 +25,6 @@ def load(config: Config) -> ClassicalPrior:
         from splatnode.recon.priors.xfeat.network import load_network
     except ModuleNotFoundError as error:
         raise WeightsError("the prior xfeat needs onnxruntime: pip install 'splatnode[xfeat]'") from error
-    features = config.features or find("xfeat/xfeat_640x640.onnx")
-    matcher = config.matcher or find("xfeat/lighterglue_L3.onnx")
+    features = config.features or find(WEIGHTS[0])
+    matcher = config.matcher or find(WEIGHTS[1])
     return ClassicalPrior(config, matcher=XfeatMatcher(load_network(features, matcher), config.num_keypoints))

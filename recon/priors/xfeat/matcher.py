@@ -1,4 +1,4 @@
-"""XFeat's matches in terms of keyframes' points: its keypoints are added to those that a keyframe has."""
+"""XFeat's matches: its keypoints are added to a keyframe's points, which its matches then name."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ import numpy.typing as npt
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.priors.xfeat.network import Keypoints, Xfeat
 
-_REMEMBERED = 64  # keyframes
+_REMEMBERED = 64  # keyframes whose keypoints are kept: half a megabyte each
 
 
 @dataclass(frozen=True, eq=False)
 class _Added:
+    """The keypoints that were added to a keyframe's points."""
+
     first: int  # number of the keyframe's first point that is one of these
     keypoints: Keypoints
 

@@ -14,14 +14,14 @@ import numpy as np
 import numpy.typing as npt
 import onnxruntime
 
-from splatnode.recon.networks.weights import WeightsError
+from splatnode.recon.networks.weight_folder import WeightsError
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 
 _SIDE, _CELL = 640, 8  # the file's input is square; the network was trained on any shape
 _REACH = 2  # pixels: no two keypoints are closer
-_LEAST = 0.05  # of a keypoint's probability
+_MIN_PROBABILITY = 0.05  # of a keypoint, as published
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +34,8 @@ class Keypoints:
 
 @dataclass(frozen=True, eq=False)
 class Xfeat:
+    """The two loaded networks: XFeat's features, and LighterGlue, which matches them."""
+
     features: onnxruntime.InferenceSession
     matcher: onnxruntime.InferenceSession
 
@@ -43,7 +45,9 @@ class Xfeat:
         square = cv2.resize(image, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
         descriptors, logits, reliability = self.features.run(None, {"input": square.transpose(2, 0, 1)[None]})
         probability = _heat(np.asarray(logits)[0])
-        peaks = (probability == cv2.dilate(probability, np.ones((2 * _REACH + 1,) * 2))) & (probability > _LEAST)
+        peaks = (probability == cv2.dilate(probability, np.ones((2 * _REACH + 1,) * 2))) & (
+            probability > _MIN_PROBABILITY
+        )
         row, column = np.nonzero(peaks)
         at = (np.stack([column, row], 1) + 0.5).astype(np.float32)
         score = probability[row, column] * _sampled(np.asarray(reliability)[0], at)[:, 0]

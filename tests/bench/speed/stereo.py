@@ -20,12 +20,12 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import modelled_image
-from splatnode.recon.networks.weights import find
+from splatnode.recon.networks.weight_folder import find
 from splatnode.recon.priors.classical import DepthMaps
-from splatnode.recon.priors.fusion import DepthMap
+from splatnode.recon.priors.consistency import DepthMap
 from splatnode.recon.priors.patchmatchnet import WEIGHTS, load_network
 from splatnode.recon.priors.patchmatchnet.stereo import NetworkStereo
-from splatnode.recon.priors.stereo import Config, Sparse, View, depth_maps, depth_range
+from splatnode.recon.priors.stereo import Config, SparsePoints, StereoView, depth_maps, depth_range
 
 Float64 = npt.NDArray[np.float64]
 LONGER_SIDE = 512  # of the images that stereo works on
@@ -117,13 +117,13 @@ def _mutual_matches(a: npt.NDArray[np.float32], b: npt.NDArray[np.float32]) -> t
     return rows[keep], best[keep]
 
 
-def stereo_view(photo: Photo, depths: Float64, longer_side: int) -> View:
+def stereo_view(photo: Photo, depths: Float64, longer_side: int) -> StereoView:
     image = modelled_image(photo.image, longer_side)
     scale = np.diag([image.shape[1] / photo.image.shape[1], image.shape[0] / photo.image.shape[0], 1.0])
-    return View(image, scale @ photo.K, photo.T_world_camera, depth_range(depths))
+    return StereoView(image, scale @ photo.K, photo.T_world_camera, depth_range(depths))
 
 
-def perturbed(view: View, angle_deg: float, generator: np.random.Generator) -> View:
+def perturbed(view: StereoView, angle_deg: float, generator: np.random.Generator) -> StereoView:
     """The view turned by `angle_deg` about a random axis through its centre."""
     axis = generator.normal(size=3)
     rotation, _ = cv2.Rodrigues(axis / np.linalg.norm(axis) * np.radians(angle_deg))
@@ -133,7 +133,7 @@ def perturbed(view: View, angle_deg: float, generator: np.random.Generator) -> V
 
 
 def seen_twice(
-    views: list[View], index: int, points: Float64, depths: Float64
+    views: list[StereoView], index: int, points: Float64, depths: Float64
 ) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
     """(h, w) pixels that the nearest reference depth puts into another view's image; (h, w) the ones close to it."""
     view = views[index]
@@ -172,7 +172,7 @@ def sparsification(errors: Float64, confidence: Float64) -> tuple[Float64, float
 class Case:
     """Views of a scene with their reference points, at the size that stereo works on."""
 
-    views: list[View]
+    views: list[StereoView]
     points: list[Float64]  # (M, 2) each
     depths: list[Float64]  # (M,) each
     seen_twice: list[npt.NDArray[np.bool_]]  # (h, w) each
@@ -245,7 +245,7 @@ def run(
     sparse = None
     if seeded:
         chosen = [generator.random(len(depths)) < seeded for depths in case.depths]
-        sparse = [Sparse(p[c], d[c]) for p, d, c in zip(case.points, case.depths, chosen, strict=True)]
+        sparse = [SparsePoints(p[c], d[c]) for p, d, c in zip(case.points, case.depths, chosen, strict=True)]
     wall, processor = time.perf_counter(), time.process_time()
     maps = method(views, config, seed=seed, sparse=sparse)
     seconds = {"wall": time.perf_counter() - wall, "cpu": time.process_time() - processor}
@@ -253,7 +253,7 @@ def run(
 
 
 def _patchmatchnet() -> DepthMaps:
-    return NetworkStereo(load_network(find(WEIGHTS))).depth_maps
+    return NetworkStereo(load_network(find(*WEIGHTS))).depth_maps
 
 
 METHODS: dict[str, Callable[[], DepthMaps]] = {"classical": lambda: depth_maps, "patchmatchnet": _patchmatchnet}

@@ -186,7 +186,7 @@ def test_matches_of_photographs_lie_on_the_true_epipolar_lines(shared, weights, 
 
 def test_a_shifted_photograph_gives_shifted_keypoints(shared):
     """Positions are pixel positions: what moves by 32 pixels is found 32 pixels further."""
-    network = load_aliked(shared / "weights" / WEIGHTS)
+    network = load_aliked(shared / "weights" / WEIGHTS[0])
     image = load_scene(shared / "scenes" / "fountain_p11").image("0000.jpg")
     part = torch.from_numpy(image[200:392, 300:588]).permute(2, 0, 1) / 255.0
     with torch.inference_mode():

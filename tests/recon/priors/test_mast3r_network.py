@@ -17,9 +17,8 @@ import pytest
 import torch
 
 from splatnode.recon.networks.rotary import Rotary, grid_positions
-from splatnode.recon.networks.weight_files import check_names_and_shapes
-from splatnode.recon.priors.mast3r.network import Mast3r, Size
-from splatnode.recon.priors.mast3r.weight_files import load_network
+from splatnode.recon.networks.weight_loading import check_names_and_shapes
+from splatnode.recon.priors.mast3r.network import Mast3r, Size, load_network
 from tests.support.generated import generated, generated_weights, shapes_of
 
 TINY = Size(encoder_width=96, encoder_depth=3, encoder_heads=6, decoder_width=64, decoder_depth=12, decoder_heads=4)

@@ -10,12 +10,12 @@ from splatnode.recon.priors import patchmatchnet
 from splatnode.recon.priors.patchmatchnet.network import PatchmatchNet
 from splatnode.recon.priors.patchmatchnet.sampling import Source
 from splatnode.recon.priors.patchmatchnet.stereo import NetworkStereo, _planes
-from splatnode.recon.priors.stereo import Config, View
+from splatnode.recon.priors.stereo import Config, StereoView
 
 HEIGHT, WIDTH, DEPTH = 64, 96, 2.0
 
 
-def views(count: int = 3) -> list[View]:
+def views(count: int = 3) -> list[StereoView]:
     """Cameras side by side before a patterned wall at depth 2: each sees it shifted by four pixels."""
     generator = torch.Generator().manual_seed(0)
     pattern = torch.rand(1, 3, HEIGHT, 2 * WIDTH, generator=generator)
@@ -27,7 +27,7 @@ def views(count: int = 3) -> list[View]:
         T_world_camera = np.eye(4)
         T_world_camera[0, 3] = 0.1 * index
         image = np.ascontiguousarray(wall[:, 4 * index : 4 * index + WIDTH])
-        cameras.append(View(image, K, T_world_camera, (1.0, 6.0)))
+        cameras.append(StereoView(image, K, T_world_camera, (1.0, 6.0)))
     return cameras
 
 
@@ -55,7 +55,7 @@ def test_it_computes_what_the_authors_module_computes(shared):
 
 
 def test_the_depth_of_a_wall(shared):
-    stereo = NetworkStereo(patchmatchnet.load_network(shared / "weights" / patchmatchnet.WEIGHTS))
+    stereo = NetworkStereo(patchmatchnet.load_network(shared / "weights" / patchmatchnet.WEIGHTS[0]))
     for depth_map in stereo.depth_maps(views(), Config(), seed=0):
         known = depth_map.depth > 0
         assert known.mean() > 0.4

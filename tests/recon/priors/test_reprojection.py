@@ -60,13 +60,13 @@ def test_what_is_behind_the_camera_or_unknown_falls_nowhere():
 
 
 def test_a_point_explains_a_pixel_of_its_colour_in_every_channel():
-    falls, alike = reprojection.explained(view(), grey(100), view(x=0.5), grey(110), like=10 / 255 + 1e-6)
+    falls, alike = reprojection.explained(view(), grey(100), view(x=0.5), grey(110), colour_tolerance=10 / 255 + 1e-6)
     expected = np.ones((HEIGHT, WIDTH), bool)
     expected[:, -1] = False
     assert falls.tolist() == expected.tolist() and alike.tolist() == expected.tolist()
     tinted = grey(100)
     tinted[..., 2] = 121
-    falls, alike = reprojection.explained(view(), tinted, view(x=0.5), grey(110), like=10 / 255 + 1e-6)
+    falls, alike = reprojection.explained(view(), tinted, view(x=0.5), grey(110), colour_tolerance=10 / 255 + 1e-6)
     assert falls.tolist() == expected.tolist() and not alike.any()
 
 
@@ -74,7 +74,7 @@ def test_one_of_several_points_that_fall_together_may_explain():
     source = view(focal=2 * FOCAL)
     image = grey(200)
     image[::2, [0, 2, 4, 5]] = 50  # columns 0, 1 2, 3 4 and 5 fall into a column each, and the rows in pairs
-    falls, alike = reprojection.explained(source, image, view(), grey(50), like=0.0)
+    falls, alike = reprojection.explained(source, image, view(), grey(50), colour_tolerance=0.0)
     assert falls.any() and alike.tolist() == falls.tolist()
 
 
@@ -82,7 +82,7 @@ def test_a_point_hides_what_lies_behind_it_by_more_than_the_margin():
     target = view(2.0)
     target.depth[:, :3] = 0  # unknown: nothing there to hide
     for depth, hides in ((1.9, True), (1.98, False), (2.5, False)):
-        hiding = reprojection.hiding(view(depth), target, in_front=0.03)
+        hiding = reprojection.hiding(view(depth), target, tolerance=0.03)
         assert not hiding[:, :3].any() and hiding[:, 3:].all() == hides and hiding[:, 3:].any() == hides
 
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from splatnode.recon.core import library, set_threads
-from splatnode.recon.priors import fusion
+from splatnode.recon.priors import consistency
 from splatnode.recon.priors.patchmatch import Matching, Planes, Search, make_level
 from splatnode.recon.priors.stereo import (
     Config,
-    Sparse,
+    SparsePoints,
     Stage,
-    View,
+    StereoView,
     choose_sources,
     depth_maps,
     depth_range,
@@ -64,8 +64,8 @@ CAMERAS = [camera(x, turn) for x, turn in ((-0.4, -6.0), (0.0, 0.0), (0.4, 6.0))
 
 
 @pytest.fixture(scope="module")
-def views() -> list[View]:
-    return [View(render(T)[0], K, T, (1.5, 12.0)) for T in CAMERAS]
+def views() -> list[StereoView]:
+    return [StereoView(render(T)[0], K, T, (1.5, 12.0)) for T in CAMERAS]
 
 
 @pytest.fixture(scope="module")
@@ -152,29 +152,29 @@ def flat_planes(inverse_depth: float) -> Planes:
     return Planes(values, np.zeros((HEIGHT, WIDTH), np.float32))
 
 
-def check_side_by_side(first: Planes, second: Planes, config: fusion.Config) -> list[fusion.DepthMap]:
+def check_side_by_side(first: Planes, second: Planes, config: consistency.Config) -> list[consistency.DepthMap]:
     """Two cameras side by side before a striped wall at z = 4, with the planes given."""
     stripes = np.repeat((np.arange(WIDTH) % 16 * 10).astype(np.uint8)[None, :, None], HEIGHT, 0).repeat(3, 2)
     levels = [make_level(stripes, K, camera(x, 0.0), (1.0, 10.0), 0) for x in (0.0, 0.4)]
-    return fusion.cross_check(levels, [first, second], Matching(), config)
+    return consistency.cross_check(levels, [first, second], Matching(), config)
 
 
 def test_depth_is_the_mean_of_agreeing_views():
-    first, _ = check_side_by_side(flat_planes(1 / 4.0), flat_planes(1 / 4.02), fusion.Config())
+    first, _ = check_side_by_side(flat_planes(1 / 4.0), flat_planes(1 / 4.02), consistency.Config())
     seen_by_both = first.num_consistent == 1
     assert seen_by_both[:, 20:].all() and not seen_by_both[:, :12].any()
     assert (first.depth[seen_by_both] > 4.001).all() and (first.depth[seen_by_both] < 4.019).all()
 
 
 def test_views_that_disagree_leave_no_depth():
-    first, second = check_side_by_side(flat_planes(1 / 4.0), flat_planes(1 / 6.0), fusion.Config())
+    first, second = check_side_by_side(flat_planes(1 / 4.0), flat_planes(1 / 6.0), consistency.Config())
     assert not first.depth.any() and not second.depth.any()
 
 
 def test_a_wrong_pixel_takes_the_plane_of_its_neighbours_and_counts_as_unconfirmed():
     planes = flat_planes(1 / 4.0)
     planes.values[60, 80, 0] = 1 / 2.0
-    first, _ = check_side_by_side(planes, flat_planes(1 / 4.0), fusion.Config())
+    first, _ = check_side_by_side(planes, flat_planes(1 / 4.0), consistency.Config())
     assert first.depth[60, 80] == pytest.approx(4.0, rel=1e-3)
     assert first.num_consistent[60, 80] == 0
     assert 0 < first.confidence[60, 80] < first.confidence[60, 90]
@@ -196,21 +196,21 @@ def test_sparse_points_replace_the_search_over_the_depth_range(views):
     sources = [views[0], views[2]]
     _, depth, _ = render(CAMERAS[1])
     y, x = np.mgrid[10:HEIGHT:20, 10:WIDTH:20].reshape(2, -1)
-    sparse = Sparse(np.stack([x, y], 1) + 0.5, depth[y, x])
+    sparse = SparsePoints(np.stack([x, y], 1) + 0.5, depth[y, x])
     lost, found = estimate(views[1], sources, config), estimate(views[1], sources, config, sparse=sparse)
     assert np.median(np.abs(found.inverse_depth * depth - 1)) < 0.01
     assert np.median(np.abs(lost.inverse_depth * depth - 1)) > 0.1
 
 
 def test_sources_overlap_and_have_parallax(views):
-    behind = View(views[0].image, K, camera(0.0, 180.0), (1.5, 12.0))
-    same_place = View(views[0].image, K, camera(0.001, 0.0), (1.5, 12.0))
+    behind = StereoView(views[0].image, K, camera(0.0, 180.0), (1.5, 12.0))
+    same_place = StereoView(views[0].image, K, camera(0.001, 0.0), (1.5, 12.0))
     assert choose_sources([views[1], same_place, behind, views[0], views[2]], 0, Config())[:2] in ([3, 4], [4, 3])
     assert 2 not in choose_sources([views[1], same_place, behind, views[0], views[2]], 0, Config())
 
 
 def test_a_view_without_overlap_has_no_depth(views):
-    behind = View(views[0].image, K, camera(0.0, 180.0), (1.5, 12.0))
+    behind = StereoView(views[0].image, K, camera(0.0, 180.0), (1.5, 12.0))
     first, second, third = depth_maps([views[0], views[1], behind], Config())
     assert (first.depth > 0).any() and (second.depth > 0).any()
     assert not third.depth.any() and not third.confidence.any() and not third.normal.any()
@@ -226,9 +226,9 @@ def test_depth_range_covers_the_points_and_ignores_outliers():
 
 def test_wrong_input_says_what_was_expected(views):
     with pytest.raises(ValueError, match="uint8"):
-        View(np.zeros((4, 4, 3), np.float32), K, np.eye(4), (1.0, 2.0))
+        StereoView(np.zeros((4, 4, 3), np.float32), K, np.eye(4), (1.0, 2.0))
     with pytest.raises(ValueError, match="near < far"):
-        View(np.zeros((4, 4, 3), np.uint8), K, np.eye(4), (2.0, 1.0))
+        StereoView(np.zeros((4, 4, 3), np.uint8), K, np.eye(4), (2.0, 1.0))
     with pytest.raises(ValueError, match="one entry a view"):
         depth_maps(views, Config(), sparse=[None])
     with pytest.raises(ValueError, match="sources are needed"):
@@ -236,5 +236,5 @@ def test_wrong_input_says_what_was_expected(views):
 
 
 def test_a_view_without_sparse_points_still_finds_its_sources(views):
-    none = Sparse(np.empty((0, 2)), np.empty(0))
+    none = SparsePoints(np.empty((0, 2)), np.empty(0))
     assert choose_sources(views, 1, Config(), none) == choose_sources(views, 1, Config())

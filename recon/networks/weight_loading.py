@@ -1,4 +1,4 @@
-"""Reads the weights of a network: PyTorch's own format or safetensors, without running anything that is in the file."""
+"""Loads a network from a file of weights, PyTorch's format or safetensors, without running anything in the file."""
 
 from __future__ import annotations
 

@@ -1,56 +1,22 @@
-"""Weights of the optional networks: where they lie, how they are fetched and checked (catalogue.py lists them).
-
-Nothing here is needed for the default reconstruction. `splatnode weights list | fetch | verify`.
-"""
+"""Fetches weights from their official source, and checks them against the digest that their publisher gives."""
 
 from __future__ import annotations
 
-import argparse
 import hashlib
-import json
 import os
 import shutil
 import sys
 import urllib.error
 import urllib.request
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import BinaryIO
 
-from splatnode.capture.process.state_directory import home
-from splatnode.recon.networks.catalogue import CATALOGUE, Weights
+from splatnode.recon.networks.weight_catalogue import Weights
+from splatnode.recon.networks.weight_folder import WeightsError
 
-_CHUNK = 1 << 20
-_TIMEOUT_S = 20.0
-
-
-class WeightsError(ValueError):
-    """Weights that are not there, or not what they should be; the message says what to do."""
-
-
-def folder() -> Path:
-    """Where `fetch` puts weights: $SPLATNODE_WEIGHTS, else splatnode/weights among the user's data."""
-    named = os.environ.get("SPLATNODE_WEIGHTS")
-    if named:
-        return Path(named)
-    data = os.environ.get("XDG_DATA_HOME") or home("SPLATNODE_WEIGHTS") / ".local" / "share"
-    return Path(data) / "splatnode" / "weights"
-
-
-def located(path: str) -> Path | None:
-    """The file `path` in `folder()`, or beside a checkout of the project where developers keep them; else None."""
-    developers = Path(__file__).resolve().parents[3] / "shared" / "weights"
-    places = [folder()] if "SPLATNODE_WEIGHTS" in os.environ else [folder(), developers]
-    return next((place / path for place in places if (place / path).is_file()), None)
-
-
-def find(path: str) -> Path:
-    """The file `path`. Raises WeightsError where it is not there."""
-    found = located(path)
-    if found is None:
-        name = Path(path).stem
-        raise WeightsError(f"no weights {path} in {folder()}: splatnode weights fetch {name}, or list for its source")
-    return found
+_CHUNK = 1 << 20  # bytes that are read at once
+_TIMEOUT_S = 20.0  # without an answer from the server
+_PARTIAL_CONTENT, _RANGE_NOT_SATISFIABLE = 206, 416  # HTTP's status codes
 
 
 def fetch(weights: Weights, to: Path, source: Path | None = None) -> Path:
@@ -97,13 +63,13 @@ def _download(weights: Weights, part: Path) -> None:
     request = urllib.request.Request(weights.url, headers={"Range": f"bytes={have}-"} if have else {})
     try:
         with urllib.request.urlopen(request, timeout=_TIMEOUT_S) as answer:
-            goes_on = have > 0 and answer.status == 206
+            goes_on = have > 0 and answer.status == _PARTIAL_CONTENT
             length = answer.headers.get("Content-Length")
             total = (have if goes_on else 0) + int(length) if length else None
             with part.open("ab" if goes_on else "wb") as file:
                 _copy(answer, file, weights.name, file.tell(), total)
     except urllib.error.HTTPError as error:
-        if error.code == 416 and have:  # nothing is left to send: the digest decides
+        if error.code == _RANGE_NOT_SATISFIABLE and have:  # nothing is left to send: the digest decides
             return
         raise WeightsError(f"{weights.url} answered {error.code} {error.reason}; try again later") from error
     except (urllib.error.URLError, OSError) as error:
@@ -134,54 +100,3 @@ def _sha256(file: Path) -> str:
         for chunk in iter(lambda: stream.read(_CHUNK), b""):
             digest.update(chunk)
     return digest.hexdigest()
-
-
-def _named(names: Sequence[str]) -> list[Weights]:
-    known = {weights.name: weights for weights in CATALOGUE}
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise WeightsError(f"no weights called {unknown[0]!r}; there are: {', '.join(known)}")
-    return [known[name] for name in names] if names else list(CATALOGUE)
-
-
-def _listed(chosen: Sequence[Weights]) -> Iterator[dict[str, object]]:
-    for weights in chosen:
-        where = located(weights.path)
-        yield {
-            "name": weights.name,
-            "what": weights.what,
-            "licence": weights.licence,
-            "source": weights.url or None,
-            "sha256": weights.sha256,
-            "bytes": weights.num_bytes,
-            "found": None if where is None else str(where),
-        }
-
-
-def command(args: argparse.Namespace) -> int:
-    """`splatnode weights`: 0; 75 where something is missing or could not be had."""
-    chosen = _named(args.names)
-    if args.action == "list":
-        for entry in _listed(chosen):
-            if args.json:
-                print(json.dumps(entry))
-            else:
-                print(f"{entry['name']}: {entry['what']}\n    {entry['licence']}; {entry['found'] or 'not here'}")
-        return 0
-    if args.action == "fetch" and not args.names:
-        raise WeightsError(f"say which to fetch: {', '.join(weights.name for weights in CATALOGUE)}")
-    failed = False
-    for weights in chosen:
-        try:
-            if args.action == "fetch":
-                print(f"{weights.name}: {weights.licence}", file=sys.stderr)
-                print(fetch(weights, folder(), args.source))
-            else:
-                wrong = complaint(weights, find(weights.path))
-                failed |= bool(wrong)
-                unknown = "" if weights.sha256 else " (its publisher gives no digest: checked when loaded)"
-                print(f"{weights.name}: {wrong or 'as published' + unknown}")
-        except WeightsError as error:
-            failed = True
-            print(f"{weights.name}: {error}", file=sys.stderr)
-    return 75 if failed else 0

@@ -1,4 +1,4 @@
-"""What was computed lately, so that it need not be computed again."""
+"""A cache of the values that were asked for last."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
 
-class Recent(Generic[K, V]):
-    """The last `maximum` values that were asked for, by key."""
+class LruCache(Generic[K, V]):
+    """Keeps `maximum` values by key; the least recently used one goes first."""
 
     def __init__(self, maximum: int) -> None:
         self._maximum = maximum
         self._values: dict[K, V] = {}  # the one asked for last is last
 
     def get(self, key: K, make: Callable[[], V]) -> V:
-        """The value of `key`, made where it is not kept."""
+        """The value of `key`; `make` makes it where it is not kept."""
         value = self._values.pop(key) if key in self._values else make()
         self._values[key] = value
         if len(self._values) > self._maximum:

@@ -1,4 +1,4 @@
-"""Weights that optional networks take: what there is, under which licence, and where it comes from."""
+"""The catalogue of weights: the files that optional networks take, their licences and where they come from."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 class Weights:
     """One file. `sha256` is None where its publisher gives none: it is then checked when it is loaded."""
 
-    path: str  # inside the weights' folder
-    what: str
+    path: str  # inside the folder of weights
+    what: str  # network it is, and what it gives
     licence: str
     url: str  # of its official source; empty where it has to be made or taken from elsewhere, as `what` tells
     sha256: str | None

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from splatnode.recon.networks import weights
-from splatnode.recon.networks.catalogue import CATALOGUE, Weights
-from splatnode.recon.networks.weights import WeightsError, complaint, fetch, find
+from splatnode.recon.networks.weight_catalogue import CATALOGUE, Weights
+from splatnode.recon.networks.weight_download import complaint, fetch
+from splatnode.recon.networks.weight_folder import WeightsError, find, folder
 
 CONTENT = bytes(range(256)) * 4000
 GOOD = Weights("net/tiny.pth", "a test", "CC0", "", hashlib.sha256(CONTENT).hexdigest(), len(CONTENT))
@@ -116,4 +116,4 @@ def test_the_verb(tmp_path, monkeypatch, capsys):
     assert command_line.main(["weights", "verify", "aliked-t16"]) == 75
     assert command_line.main(["weights", "fetch", "nonsense"]) == 2
     assert command_line.main(["weights", "fetch"]) == 2
-    assert weights.folder() == tmp_path
+    assert folder() == tmp_path

@@ -1,4 +1,4 @@
-"""The fusion of features from coarse to fine in dense prediction transformers (Ranftl et al. 2021)."""
+"""Fusion of features from coarse to fine: the decoder of dense prediction transformers (DPT, Ranftl et al. 2021)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch.nn import functional
 
 
 class Scratch(nn.Module):
-    """Brings images of four widths and sizes to one width and fuses them. The checkpoints call it so."""
+    """Brings feature maps of four widths and sizes to one width, and fuses them. Checkpoints call it `scratch`."""
 
     def __init__(self, widths: Sequence[int], width: int, *, whole_last: bool = True) -> None:
         """`whole_last`: the coarsest fusion has weights for a finer image although there is none."""
@@ -35,7 +35,7 @@ class Scratch(nn.Module):
 
 
 def resizers(widths: Sequence[int]) -> nn.ModuleList:
-    """What brings the images of four layers, all as large as the grid of patches, to 4, 2, 1 and 1/2 times that."""
+    """Modules that bring feature maps of four layers, of the size of the patch grid, to 4, 2, 1 and 1/2 times that."""
     first, second, _, last = widths
     return nn.ModuleList(
         [
@@ -48,6 +48,8 @@ def resizers(widths: Sequence[int]) -> nn.ModuleList:
 
 
 class Fusion(nn.Module):
+    """One step: a coarser map is refined by a finer one, then enlarged. Checkpoints call it `refinenet`."""
+
     def __init__(self, width: int, *, joins: bool = True) -> None:
         """`joins`: whether it can take a finer image in."""
         super().__init__()
@@ -65,6 +67,8 @@ class Fusion(nn.Module):
 
 
 class _Residual(nn.Module):
+    """A residual unit of two convolutions, each after its ReLU."""
+
     def __init__(self, width: int) -> None:
         super().__init__()
         self.conv1 = nn.Conv2d(width, width, 3, padding=1)
@@ -75,5 +79,5 @@ class _Residual(nn.Module):
 
 
 def enlarged(image: Tensor, size: Sequence[int]) -> Tensor:
-    """(S, C, H, W) at `size` (H, W), corners on corners."""
+    """Images (S, C, h, w) as (S, C, H, W) of `size` (H, W), bilinear, corners on corners."""
     return functional.interpolate(image, size=tuple(size), mode="bilinear", align_corners=True)

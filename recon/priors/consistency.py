@@ -1,4 +1,4 @@
-"""Depth maps that agree with each other: what several views see alike is kept, the rest is left out."""
+"""Geometric consistency of depth maps: what other views confirm is kept, what nothing supports is left out."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ from splatnode.recon.priors.patchmatch import Level, Matching, Planes, Transfer,
 
 Float32 = npt.NDArray[np.float32]
 
+MAX_CONSISTENT = 3  # views that agree, beyond which a further one adds nothing to the confidence
+MIN_CONTRAST = 0.5  # grey levels, added before the logarithm: the standard deviation that rounding leaves
+
 
 @dataclass(frozen=True)
 class Confidence:
@@ -26,7 +29,7 @@ class Confidence:
 
     constant: float = -4.3
     per_support: float = 4.95  # share of neighbours on the same plane
-    per_consistent: float = 0.17  # views that agree, up to 3
+    per_consistent: float = 0.17  # views that agree, up to MAX_CONSISTENT
     per_conflicting: float = -0.67  # share of the views that look through the point
     per_log_contrast: float = 0.7  # logarithm of the standard deviation of the window's grey levels
     per_cosine: float = 0.9  # of the angle between line of sight and surface normal
@@ -161,9 +164,9 @@ def confidence(
     log_odds = (
         model.constant
         + model.per_support * support
-        + model.per_consistent * np.minimum(agreement.num_consistent, 3)
+        + model.per_consistent * np.minimum(agreement.num_consistent, MAX_CONSISTENT)
         + model.per_conflicting * agreement.num_conflicting / np.maximum(agreement.num_inside, 1)
-        + model.per_log_contrast * np.log(contrast + 0.5)
+        + model.per_log_contrast * np.log(contrast + MIN_CONTRAST)
         + model.per_cosine * cosine
     )
     return (1 / (1 + np.exp(-log_odds))).astype(np.float32)

@@ -1,4 +1,4 @@
-"""A network's depth map as the point map of a registered camera."""
+"""A network's depth map, up to scale and in a crop, as the point map of a registered camera."""
 
 from __future__ import annotations
 
@@ -9,26 +9,28 @@ import numpy.typing as npt
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.networks.crop import Crop
-from splatnode.recon.priors.classical import modelled_K, sparse_points
 from splatnode.recon.priors.depth_normals import normals_of_depth
 from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors.registered_camera import modelled_K, sparse_points
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 
 Map = npt.NDArray[np.float32]
 
 
-def pointmap_of(
-    graph: ViewGraph, registration: Registration, camera: RegisteredCamera, crop: Crop, depth: Map, sure: Map
+def registered_pointmap(
+    graph: ViewGraph, registration: Registration, camera: RegisteredCamera, crop: Crop, depth: Map, certainty: Map
 ) -> Pointmap:
-    """`depth` (H, W) of the network's image, brought to the scale of the registered points that the camera sees.
+    """The point map from `depth` (H, W) of the network's image, scaled to the registered points that the camera sees.
 
-    `sure` (H, W) is the network's confidence, from 1. Pixels outside the crop are unknown.
+    `certainty` (H, W) is the network's, from 1 up (DUSt3R's confidence); the point map's is 1 - 1 / certainty. Pixels
+    outside the crop are unknown.
     """
     keyframe = graph.keyframes[camera.index]
     K = modelled_K(graph, camera)
-    depth, sure = at_modelled_size(keyframe, crop, depth, unknown=0), at_modelled_size(keyframe, crop, sure, unknown=1)
+    depth = at_modelled_size(keyframe, crop, depth, unknown=0)
+    certainty = at_modelled_size(keyframe, crop, certainty, unknown=1)
     depth = (depth * _scale_to_points(registration, camera, keyframe, depth)).astype(np.float32)
-    confidence = np.where(depth > 0, 1.0 - 1.0 / np.maximum(sure, 1.0), 0).astype(np.float32)
+    confidence = np.where(depth > 0, 1.0 - 1.0 / np.maximum(certainty, 1.0), 0).astype(np.float32)
     return Pointmap(
         name=keyframe.name,
         frame_id=keyframe.frame.frame_id,
@@ -41,7 +43,7 @@ def pointmap_of(
 
 
 def at_modelled_size(keyframe: Keyframe, crop: Crop, values: Map, *, unknown: float) -> Map:
-    """(h, w): the nearest of `values` (H, W) of the network's image, `unknown` outside of it."""
+    """(h, w) at the keyframe's modelled size: the nearest of `values` (H, W) of the network's image; else `unknown`."""
     height, width = keyframe.image.shape[:2]
     step = keyframe.frame.width / width * crop.scale, keyframe.frame.height / height * crop.scale
     u = ((np.arange(width) + 0.5) * step[0] - crop.left - 0.5).astype(np.float32)
@@ -52,7 +54,7 @@ def at_modelled_size(keyframe: Keyframe, crop: Crop, values: Map, *, unknown: fl
 
 
 def _scale_to_points(registration: Registration, camera: RegisteredCamera, keyframe: Keyframe, depth: Map) -> float:
-    """What `depth` (h, w) has to be multiplied by to agree with the registered points, in the median."""
+    """The factor that brings `depth` (h, w) to the registered points' depths, in the median; 1 without such points."""
     there, truth = depth_at_points(registration, camera, keyframe, depth)
     both = (there > 0) & (truth > 0)
     return float(np.median(truth[both] / there[both])) if both.any() else 1.0
@@ -61,7 +63,7 @@ def _scale_to_points(registration: Registration, camera: RegisteredCamera, keyfr
 def depth_at_points(
     registration: Registration, camera: RegisteredCamera, keyframe: Keyframe, depth: Map
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """(M,) `depth` (h, w) where the camera sees the registered points, and (M,) the depth of these."""
+    """(M,) `depth` (h, w) at the pixels where the camera observes registered points; (M,) the points' own depths."""
     points = sparse_points(registration, camera, keyframe.scale)
     pixels = np.floor(points.points).astype(np.int64)
     height, width = depth.shape

@@ -1,0 +1,67 @@
+"""The verb `splatnode weights list | fetch | verify`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator, Sequence
+
+from splatnode.recon.networks.weight_catalogue import CATALOGUE, Weights
+from splatnode.recon.networks.weight_download import complaint, fetch
+from splatnode.recon.networks.weight_folder import WeightsError, find, folder, located
+
+_UNAVAILABLE = 75  # the exit code where something is missing or could not be had: EX_TEMPFAIL
+
+
+def _named(names: Sequence[str]) -> list[Weights]:
+    """The entries of the catalogue, all where none are named. Raises WeightsError for an unknown name."""
+    known = {weights.name: weights for weights in CATALOGUE}
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise WeightsError(f"no weights called {unknown[0]!r}; there are: {', '.join(known)}")
+    return [known[name] for name in names] if names else list(CATALOGUE)
+
+
+def _listed(chosen: Sequence[Weights]) -> Iterator[dict[str, object]]:
+    """What `--json` prints, an entry a line."""
+    for weights in chosen:
+        where = located(weights.path)
+        yield {
+            "name": weights.name,
+            "what": weights.what,
+            "licence": weights.licence,
+            "source": weights.url or None,
+            "sha256": weights.sha256,
+            "bytes": weights.num_bytes,
+            "found": None if where is None else str(where),
+        }
+
+
+def command(args: argparse.Namespace) -> int:
+    """Prints, fetches or checks what `args` name. 0; 75 where something is missing or could not be had."""
+    chosen = _named(args.names)
+    if args.action == "list":
+        for entry in _listed(chosen):
+            if args.json:
+                print(json.dumps(entry))
+            else:
+                print(f"{entry['name']}: {entry['what']}\n    {entry['licence']}; {entry['found'] or 'not here'}")
+        return 0
+    if args.action == "fetch" and not args.names:
+        raise WeightsError(f"say which to fetch: {', '.join(weights.name for weights in CATALOGUE)}")
+    failed = False
+    for weights in chosen:
+        try:
+            if args.action == "fetch":
+                print(f"{weights.name}: {weights.licence}", file=sys.stderr)
+                print(fetch(weights, folder(), args.source))
+            else:
+                wrong = complaint(weights, find(weights.path))
+                failed |= bool(wrong)
+                unknown = "" if weights.sha256 else " (its publisher gives no digest: checked when loaded)"
+                print(f"{weights.name}: {wrong or 'as published' + unknown}")
+        except WeightsError as error:
+            failed = True
+            print(f"{weights.name}: {error}", file=sys.stderr)
+    return _UNAVAILABLE if failed else 0
