@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 SQUARE_TOLERANCE = 0.002  # relative difference of fx and fy below which pixels are square: a pixel in 500
 _NUM_COEFFICIENTS = (4, 5, 8, 12, 14)  # that OpenCV's lens model takes
 _MIN_SIDE = 0.3  # shorter side of the rectangle that is kept, over the undistorted one's: less is no picture
-_POINTS_A_SIDE = 33  # of the picture's border that are undistorted: between two of them a real lens bends by no pixel
+_POINTS_A_SIDE = 33  # of the picture's border that are undistorted, to find the rectangle between them
 _MAX_ROUND_TRIP_PX = 0.5  # from a border point to its ray and back: a model that folds over misses by many pixels
 
 

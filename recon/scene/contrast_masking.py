@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-# Standard deviation of the colours, in [0, 1], around a pixel at which half of a squared difference is visible: about
-# the grain of a plain wall. Half of it changed nothing (`PLAIN` in docs/tried.md).
+# Standard deviation of the colours, in [0, 1], around a pixel at which half of a squared difference is visible.
+# Half as much changed nothing (`PLAIN` in docs/tried.md).
 MASKING_STD = 0.03
 WINDOW_PX = 13.0  # side of the square around a pixel that masks it, at the reference's size: SSIM's window has 11
 

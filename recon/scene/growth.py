@@ -15,7 +15,7 @@ from splatnode.recon.scene import initialisation
 from splatnode.recon.scene.gaussians import concatenate
 from splatnode.recon.scene.scene import Scene
 
-NUM_NEIGHBOURS = 3  # views beside a further one that tell what of it is known, hidden or empty; more change little
+NUM_NEIGHBOURS = 3  # views beside a further one that tell what of it is known, hidden or empty: each costs time
 
 
 def grow(

@@ -11,7 +11,7 @@ from splatnode.recon.networks import dinov2
 from splatnode.recon.networks.dinov2 import Dinov2
 from splatnode.recon.networks.rotary import Rotary, grid_positions
 
-_MIN_VIEWS_TO_CHOOSE = 3  # with fewer, the first view is the reference, as in training
+_MIN_VIEWS_TO_CHOOSE = 3  # with fewer, the first view is the reference
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from splatnode.recon.networks.transformer import Block, Mlp
 from splatnode.recon.priors.da3.backbone import Size
 
 _DETAIL = 32  # channels at full resolution
-_POSITION_BASE, _POSITION_WEIGHT = 100.0, 0.1  # of the waves of a pixel's place, as in training
+_POSITION_BASE, _POSITION_WEIGHT = 100.0, 0.1  # of the waves of a pixel's place, as published
 
 
 class DepthHead(nn.Module):

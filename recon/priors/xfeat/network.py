@@ -45,9 +45,8 @@ class Xfeat:
         square = cv2.resize(image, (_SIDE, _SIDE), interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
         descriptors, logits, reliability = self.features.run(None, {"input": square.transpose(2, 0, 1)[None]})
         probability = _heat(np.asarray(logits)[0])
-        peaks = (probability == cv2.dilate(probability, np.ones((2 * _REACH + 1,) * 2))) & (
-            probability > _MIN_PROBABILITY
-        )
+        highest = cv2.dilate(probability, np.ones((2 * _REACH + 1,) * 2))
+        peaks = (probability == highest) & (probability > _MIN_PROBABILITY)
         row, column = np.nonzero(peaks)
         at = (np.stack([column, row], 1) + 0.5).astype(np.float32)
         score = probability[row, column] * _sampled(np.asarray(reliability)[0], at)[:, 0]
