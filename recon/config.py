@@ -7,15 +7,12 @@ from typing import Annotated, Any
 
 import msgspec
 from msgspec import Meta
-from msgspec.structs import replace
 
 from splatnode.capture.process.config import Plugin, merged, typed
 from splatnode.recon import metric
 from splatnode.recon.frames import screening
 from splatnode.recon.matching import config as matching
 from splatnode.recon.optimize import dropout, refinement
-from splatnode.recon.optimize.control import prune
-from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.priors import classical
 from splatnode.recon.registration import config as registration
 from splatnode.recon.result.export.formats.ply import most_in_ply
@@ -31,8 +28,10 @@ class PriorChoice(Plugin):
     usual = "classical"
 
 
-PRUNING = ControlChoice("prune", prune.Config())
-FITTING = refinement.Config(half_resolution_share=0.0, dssim=0.4, control=PRUNING, dropout=dropout.Config(share=0.4))
+# After each keyframe, for a look at once: nothing is pruned or left out.
+PREVIEW = refinement.Config(
+    iterations=20, half_resolution_share=1.0, dssim=0.2, dropout=dropout.Config(share=0.0), control=None
+)
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,8 +47,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     seeding: seeding.Config = seeding.Config()
     background: background.Config = background.Config()
     pixelwise: pixelwise.Config | None = None  # in place of completion, seeding and background, for comparison
-    preview: refinement.Config = refinement.Config(iterations=20, half_resolution_share=1.0)  # after each keyframe
-    optimize: refinement.Config = FITTING  # after the last one
+    preview: refinement.Config = PREVIEW  # after each keyframe
+    optimize: refinement.Config = refinement.Config()  # after the last one
     metric: metric.Config = metric.Config()  # of what is published
     max_gaussians: Annotated[int, Meta(ge=1)] | None = None  # None: as many as the scene calls for
     max_mb: Annotated[float, Meta(gt=0)] | None = None  # of scene.ply, in 10^6 bytes; None: as large as it gets
@@ -77,10 +76,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 PRESETS: dict[str, Config] = {
-    "preview": Config(size=384, optimize=replace(FITTING, half_resolution_share=0.25, iterations=150)),
-    "fast": Config(optimize=replace(FITTING, iterations=200)),
+    "preview": Config(size=384, optimize=refinement.Config(half_resolution_share=0.25, iterations=150)),
+    "fast": Config(optimize=refinement.Config(iterations=200)),
     "balanced": Config(),
-    "quality": Config(optimize=replace(FITTING, iterations=1500, checkpoints=(150, 500))),
+    "quality": Config(optimize=refinement.Config(iterations=1500, checkpoints=(150, 500))),
 }
 
 

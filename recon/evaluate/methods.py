@@ -16,7 +16,7 @@ from splatnode.capture.frame import Frame
 from splatnode.recon.config import PRESETS, Config
 from splatnode.recon.evaluate import ablation
 from splatnode.recon.evaluate.start import Start, continued, foundation
-from splatnode.recon.optimize import refinement, regularise
+from splatnode.recon.optimize import dropout, refinement, regularise
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import pixelwise
@@ -44,7 +44,9 @@ def _instantsplat(iterations: int, terms: regularise.Config) -> Config:
         pixelwise=pixelwise.Config(),
         optimize=refinement.Config(
             iterations=iterations,
-            half_resolution_share=0.0,
+            dssim=0.2,
+            dropout=dropout.Config(share=0.0),
+            control=None,
             rates=_INSTANTSPLAT_RATES,
             regularise=terms,
         ),

@@ -1,4 +1,4 @@
-"""Adam over all parameters of a scene at once, whose rows come and go."""
+"""Adam (Kingma and Ba 2015, algorithm 1): of all Gaussians at once, whose rows come and go, and of a tangent vector."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from splatnode.recon.core import library
 
 
 class Adam:
-    """Adam (Kingma and Ba 2015, algorithm 1) in one native call; `torch.optim.Adam` in values, but for rounding.
+    """Adam of all parameters in one native call; `torch.optim.Adam` in values, but for rounding.
 
     Parameters are named; rows are Gaussians (or cameras). `lrs` may be changed between steps. A row that is added
     starts with moments of 0 but shares its parameter's count of steps, so its first steps are about three times as
@@ -82,11 +82,37 @@ class Adam:
             self._groups[name] = _Group(_checked(name, param), first, second, group.steps)
 
 
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Adam's state of one parameter after `steps` updates."""
+
+    first: Tensor  # running mean of the gradient
+    second: Tensor  # running mean of its square, element by element
+    steps: int = 0
+
+
+def adam_direction(
+    gradient: Tensor, moments: Moments, betas: tuple[float, float], eps: float = 1e-15
+) -> tuple[Tensor, Moments]:
+    """The direction of Adam's next step, of the gradient's shape, and the moments after it.
+
+    For a parameter on a manifold, such as a camera pose: the gradient is that of a tangent vector at the current point,
+    and the caller moves the point along minus the learning rate times the direction.
+    """
+    steps = moments.steps + 1
+    first = betas[0] * moments.first + (1 - betas[0]) * gradient
+    second = betas[1] * moments.second + (1 - betas[1]) * gradient**2
+    direction = (first / (1 - betas[0] ** steps)) / ((second / (1 - betas[1] ** steps)).sqrt() + eps)
+    return direction, Moments(first, second, steps)
+
+
 @dataclass(eq=False)
 class _Group:
+    """A parameter with its moments, as in `Moments`, which the core updates in place."""
+
     param: Tensor
-    first: Tensor  # moment: running mean of the gradient
-    second: Tensor  # and of its square
+    first: Tensor
+    second: Tensor
     steps: int
 
     @property

@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from splatnode.recon.optimize.refinement import PARAMETERS
-from splatnode.recon.optimize.target import target
-from splatnode.recon.rasterize.gaussian_render import seen
+from splatnode.recon.optimize.training_image import training_image
+from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.scene.scene import Scene, TrainingView
 from splatnode.recon.verification import refusals
@@ -37,8 +37,8 @@ def misfit(scene: Scene) -> float:
 
 
 def _misfit(scene: Scene, view: TrainingView) -> float:
-    photograph = target(view, np.ones((view.height, view.width), np.bool_), _SCALE, _DSSIM)
-    size = photograph.width, photograph.height
-    rgb = seen(scene.gaussians, scene.gaussians.opacities, view.T_world_camera, photograph.K, *size).rgb
+    image = training_image(view, np.ones((view.height, view.width), np.bool_), _SCALE, _DSSIM)
+    camera = Camera(view.T_world_camera, image.K, image.width, image.height)
+    rgb = render_gaussians(scene.gaussians, camera).rgb
     assert rgb is not None  # it was asked for
-    return float(photograph.loss(rgb))
+    return float(image.loss(rgb))

@@ -1,8 +1,9 @@
-"""Doubtful Gaussians left out at random while they are fitted, so that none relies on what stands before or behind it.
+"""Dropout of Gaussians whose depth is uncertain, so that none relies on another in front of it or behind it.
 
-From few photographs, Gaussians along a line of sight share a pixel's colour between them in a way that no other view
-confirms. When any may be missing each must be right by itself (DropGaussian, Park et al. 2025). Beyond the paper, what
-stereo is sure of is never left out: its place is known, and all that it could lose is sharpness.
+With few photographs, Gaussians along a line of sight share a pixel's colour between them in a way that no other view
+confirms. If any of them may be missing from a render, each has to be right by itself (DropGaussian, Park et al. 2025).
+Unlike the paper, which drops all Gaussians alike, the probability follows the confidence of multi-view stereo: where
+the depth is known, dropout could only cost sharpness.
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ from splatnode.recon.geometry import to_camera
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import TrainingView
 
-MOST_OPACITY = 0.9999
+MAX_OPACITY = 0.9999  # of a Gaussian whose opacity makes up for those that are left out
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    share: float = 0.0  # of the Gaussians of which stereo knows nothing, left out of a render; 0: none
-    sure: float = 0.6  # confidence of stereo from which on none is left out; below, in proportion
-    until: float = 0.7  # part of the refinement; after it all are there
+    share: float = 0.4  # probability that a Gaussian of uncertainty 1 is left out of a render; 0: no dropout
+    sure: float = 0.6  # confidence of stereo from which on the uncertainty is 0
+    until: float = 0.7  # share of the refinement after which no Gaussian is left out
 
 
 class Dropout:
-    """Draws what each render leaves out."""
+    """Draws the Gaussians that each render leaves out."""
 
     def __init__(self, config: Config, gaussians: Gaussians, views: Sequence[TrainingView], seed: int) -> None:
         if not 0 <= config.share < 1:
@@ -37,23 +38,26 @@ class Dropout:
         self.follow(gaussians)
 
     def follow(self, gaussians: Gaussians) -> None:
-        """From here on it is asked about these."""
+        """Goes on with `gaussians`, after a density control has changed them."""
         if self._config.share:
-            self._shares = self._config.share * doubt(gaussians, self._views, self._config.sure)
+            self._probabilities = self._config.share * uncertainty(gaussians, self._views, self._config.sure)
 
     def __call__(self, opacities: Tensor, progress: float) -> Tensor:
-        """The opacities (N,) of a render at `progress` in [0, 1]: 0 in some, and the more in the others."""
+        """The opacities (N,) of a render at `progress` in [0, 1]: 0 in what is left out, raised in the rest.
+
+        The opacity of a Gaussian that is drawn with probability p is divided by p, so that its mean is the same.
+        """
         if self._config.share == 0 or progress >= self._config.until:
             return opacities
-        there = torch.rand(len(opacities), generator=self._generator) >= self._shares
-        return (opacities * (there / (1 - self._shares))).clamp(max=MOST_OPACITY)
+        drawn = torch.rand(len(opacities), generator=self._generator) >= self._probabilities
+        return (opacities * (drawn / (1 - self._probabilities))).clamp(max=MAX_OPACITY)
 
 
 @torch.no_grad()
-def doubt(gaussians: Gaussians, views: Sequence[TrainingView], sure: float) -> Tensor:
-    """(N,) from 0 for Gaussians on pixels that stereo is `sure` of to 1 for those of which it knows nothing.
+def uncertainty(gaussians: Gaussians, views: Sequence[TrainingView], sure: float) -> Tensor:
+    """(N,) in [0, 1]: 1 - confidence / `sure` of stereo at the pixel that seeded a Gaussian, at least 0.
 
-    Each is looked up in the view that started it; what none did is doubted. Views without a point map doubt nothing.
+    A Gaussian that no view seeded has 1, one whose view has no point map 0.
     """
     result = torch.ones(len(gaussians))
     for view in views:

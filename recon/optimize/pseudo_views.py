@@ -8,7 +8,10 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from scipy.linalg import expm, logm
+
+from splatnode.recon.rasterize.gaussian_render import Camera
 
 Array = npt.NDArray[np.float64]
 
@@ -22,6 +25,13 @@ class PseudoView:
     width: int
     height: int
     nearest: int  # index of the training view it is closest to
+
+    @property
+    def camera(self) -> Camera:
+        """The same in float32 tensors, to render it."""
+        return Camera(
+            torch.from_numpy(self.T_world_camera).float(), torch.from_numpy(self.K).float(), self.width, self.height
+        )
 
 
 def interpolate(T_start: Array, T_end: Array, share: float) -> Array:

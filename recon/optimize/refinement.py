@@ -17,12 +17,13 @@ from torch import Tensor
 from splatnode.recon.frames import border
 from splatnode.recon.geometry import exp_se3, twist_gradient
 from splatnode.recon.optimize import dropout, regularise
-from splatnode.recon.optimize.adam import Adam
+from splatnode.recon.optimize.adam import Adam, Moments, adam_direction
+from splatnode.recon.optimize.control import prune
 from splatnode.recon.optimize.control.control import Control, ControlChoice, Step
 from splatnode.recon.optimize.pseudo_views import PseudoView
 from splatnode.recon.optimize.regularise import Regularisation
-from splatnode.recon.optimize.target import Target, target
-from splatnode.recon.rasterize.gaussian_render import seen
+from splatnode.recon.optimize.training_image import TrainingImage, training_image
+from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.rasterize.render import Render
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene
@@ -30,6 +31,8 @@ from splatnode.recon.scene.scene import Scene
 Share = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(ge=0, le=1)]
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # of Gaussians, that are optimised
+_SCALES = (1.0, 0.5)  # of the photographs' resolution: full, and half
+_POSE_BETAS = (0.9, 0.99)  # of Adam for the cameras: each gets one gradient in as many steps as there are views
 
 
 class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,15 +51,17 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The refinement of the preset `balanced`."""
+
     iterations: Annotated[int, Meta(ge=0)] = 500
     checkpoints: tuple[int, ...] = (150,)  # iterations after which the scene is shown, besides the last one
-    half_resolution_share: Share = 0.25  # of the iterations, at the start
-    dssim: Share = 0.2  # lambda of (1 - lambda) L1 + lambda D-SSIM
+    half_resolution_share: Share = 0.0  # of the iterations, at the start
+    dssim: Share = 0.4  # lambda of (1 - lambda) L1 + lambda D-SSIM
     dropout: dropout.Config = dropout.Config()
     refine_poses: bool = True
     rates: Rates = Rates()
     regularise: regularise.Config = regularise.Config()  # losses beside the photometric one; none by default
-    control: ControlChoice | None = None  # what adds and takes away Gaussians meanwhile
+    control: ControlChoice | None = ControlChoice("prune", prune.Config())  # density control; None: N stays
 
 
 def refine(
@@ -70,26 +75,31 @@ def refine(
     """
     with _single_torch_thread():
         fit = _Fit(scene, config, seed, max_gaussians)
-        order = np.random.default_rng(seed)
-        started = time.monotonic()
-        queue: list[int] = []
-        for iteration in range(config.iterations):
-            progress = iteration / config.iterations
-            if deadline is not None:
-                now = time.monotonic()
-                if now >= deadline:
-                    break
-                progress = max(progress, (now - started) / max(deadline - started, 1e-9))
-            queue = queue or order.permutation(len(scene.views)).tolist()
+    order = np.random.default_rng(seed)
+    started = time.monotonic()
+    queue: list[int] = []
+    for iteration in range(config.iterations):
+        progress = iteration / config.iterations
+        if deadline is not None:
+            now = time.monotonic()
+            if now >= deadline:
+                break
+            progress = max(progress, (now - started) / max(deadline - started, 1e-9))
+        queue = queue or order.permutation(len(scene.views)).tolist()
+        with _single_torch_thread():
             fit.step(queue.pop(), progress)
-            if iteration + 1 in config.checkpoints and iteration + 1 < config.iterations:
-                yield fit.scene()
-        yield replace(fit.scene(), losses=tuple(fit.losses))
+        if iteration + 1 in config.checkpoints and iteration + 1 < config.iterations:
+            yield fit.scene()
+    yield replace(fit.scene(), losses=tuple(fit.losses))
 
 
 @contextmanager
 def _single_torch_thread() -> Iterator[None]:
-    """The core has its own threads; torch's would only wait for each other over the little that is left to them."""
+    """One thread for torch while a step computes, as many as before after it.
+
+    The core has its own threads; torch's would only wait for each other over the little that is left to them. Their
+    number holds for the whole process, so it is never left changed while the generator is suspended.
+    """
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -115,11 +125,11 @@ class _Fit:
         self._dropout = dropout.Dropout(config.dropout, gaussians, scene.views, seed)
         self._Ts_world_camera = [view.T_world_camera.clone() for view in scene.views]
         self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
-        self._pose_moments = [(torch.zeros(6), torch.zeros(6), 0) for _ in scene.views]
+        self._pose_moments = [Moments(torch.zeros(6), torch.zeros(6)) for _ in scene.views]
         shown = border.valid_masks([view.image for view in scene.views])
-        self._targets = [
-            [target(*each, scale, config.dssim) for each in zip(scene.views, shown, strict=True)]
-            for scale in (1.0, 0.5)
+        self._images = [
+            [training_image(*each, scale, config.dssim) for each in zip(scene.views, shown, strict=True)]
+            for scale in _SCALES
         ]
         self._terms = _terms(scene, config.regularise, seed)
         self._iterations = scene.iterations
@@ -128,15 +138,15 @@ class _Fit:
     def step(self, index: int, progress: float) -> None:
         """One iteration on view `index`; `progress` in [0, 1] sets resolution and step sizes."""
         half = progress < self._config.half_resolution_share
-        photograph = self._targets[half][index]
+        image = self._images[half][index]
         refine_pose = self._config.refine_poses and index > 0
         T_world_camera = self._Ts_world_camera[index].requires_grad_(refine_pose)
         channels = self._terms.channels(progress) if self._terms else ("rgb",)
         opacities = self._dropout(self._gaussians.opacities, progress)
-        size = photograph.width, photograph.height
-        render = seen(self._gaussians, opacities, T_world_camera, photograph.K, *size, channels)
+        camera = Camera(T_world_camera, image.K, image.width, image.height)
+        render = render_gaussians(self._gaussians, camera, channels, opacities=opacities)
         assert render.rgb is not None  # it was asked for
-        loss = photograph.loss(render.rgb)
+        loss = image.loss(render.rgb)
         self.losses.append(float(loss.detach()))
         if self._terms is not None:
             loss = loss + self._regularisation(self._terms, index, render, progress)
@@ -147,10 +157,10 @@ class _Fit:
             gradient = twist_gradient(T_world_camera.detach(), T_world_camera.grad)
             self._move_camera(index, gradient, self._config.rates.final_pose**progress)
         self._iterations += 1
-        self._control_density(index, self._targets[half], progress)
+        self._control_density(index, self._images[half], progress)
         self._adam.zero_grad()
 
-    def _control_density(self, index: int, targets: Sequence[Target], progress: float) -> None:
+    def _control_density(self, index: int, images: Sequence[TrainingImage], progress: float) -> None:
         if self._control is None:
             return
         cameras = tuple(T.detach() for T in self._Ts_world_camera)
@@ -162,7 +172,7 @@ class _Fit:
                 view=index,
                 gaussians=self._gaussians,
                 Ts_world_camera=cameras,
-                targets=targets,
+                images=images,
                 max_gaussians=self._max_gaussians,
             )
         )
@@ -175,18 +185,14 @@ class _Fit:
         """The terms on training view `index`, as rendered, and on a pseudo view."""
 
         def draw(view: PseudoView, channels: Collection[str]) -> Render:
-            camera = torch.from_numpy(view.T_world_camera).float(), torch.from_numpy(view.K).float()
-            return seen(self._gaussians, self._gaussians.opacities, *camera, view.width, view.height, channels)
+            return render_gaussians(self._gaussians, view.camera, channels)
 
         parts = (terms.training_loss(index, render, progress), terms.pseudo_loss(draw, progress))
         return sum((part for part in parts if part is not None), 0.0)
 
     def _move_camera(self, index: int, gradient: Tensor, decay: float) -> None:
         """An Adam step of the camera in its own frame."""
-        first, second, count = self._pose_moments[index]
-        first, second, count = 0.9 * first + 0.1 * gradient, 0.99 * second + 0.01 * gradient**2, count + 1
-        self._pose_moments[index] = (first, second, count)
-        direction = (first / (1 - 0.9**count)) / ((second / (1 - 0.99**count)).sqrt() + 1e-15)
+        direction, self._pose_moments[index] = adam_direction(gradient, self._pose_moments[index], _POSE_BETAS)
         T_world_camera = self._Ts_world_camera[index].detach()
         self._Ts_world_camera[index] = T_world_camera @ exp_se3(-decay * self._pose_rates * direction)
 

@@ -1,8 +1,9 @@
-"""What a camera sees of Gaussians."""
+"""Renders of a scene's Gaussians, as the optimiser and its tests ask for them."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import dataclass
 
 from torch import Tensor
 
@@ -11,25 +12,33 @@ from splatnode.recon.rasterize.render import Render
 from splatnode.recon.scene.gaussians import Gaussians
 
 
-def seen(
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera without distortion."""
+
+    T_world_camera: Tensor  # (4, 4)
+    K: Tensor  # (3, 3), pixels; the centre of the top-left pixel is at (0.5, 0.5)
+    width: int  # pixels
+    height: int
+
+
+def render_gaussians(
     gaussians: Gaussians,
-    opacities: Tensor,  # (N,) in [0, 1], in place of the Gaussians' own
-    T_world_camera: Tensor,  # (4, 4)
-    K: Tensor,  # (3, 3)
-    width: int,
-    height: int,
-    channels: Collection[str] = ("rgb",),
+    camera: Camera,
+    channels: Collection[str] = ("rgb",),  # fields of Render
+    *,
+    opacities: Tensor | None = None,  # (N,) in [0, 1], in place of the Gaussians' own
 ) -> Render:
-    """The render by the core; see `recon.rasterize.cpu.rasterize`."""
+    """The Gaussians as `camera` sees them, by the core, with gradients; see `recon.rasterize.cpu.rasterize`."""
     return rasterize(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
-        opacities,
+        gaussians.opacities if opacities is None else opacities,
         gaussians.sh,
-        T_world_camera,
-        K,
-        width,
-        height,
+        camera.T_world_camera,
+        camera.K,
+        camera.width,
+        camera.height,
         channels=channels,
     )

@@ -66,7 +66,7 @@ def test_of_two_limits_the_one_that_bound_is_named():
 
 
 def test_without_a_control_all_that_begin_stay():
-    config = Config(max_gaussians=1000, optimize=refinement.Config())
+    config = Config(max_gaussians=1000, optimize=refinement.Config(control=None))
     assert hits(config, begun(), refined(1000), SECONDS)[0].would_take == 10_000
 
 

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.recon.config import Config
+from splatnode.recon.config import PREVIEW, Config
 from splatnode.recon.evaluate.appearance import Splats
 from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
 from splatnode.recon.evaluate.metrics import psnr
@@ -39,7 +39,7 @@ from tests.support.synthetic import SMALL, errors, photographs, places, pure_rot
 
 CONFIG = Config(
     size=320,
-    preview=refinement.Config(iterations=5, half_resolution_share=1.0),
+    preview=replace(PREVIEW, iterations=5),
     optimize=refinement.Config(iterations=150, checkpoints=(50,)),
 )
 QUICK = replace(CONFIG, size=160, optimize=refinement.Config(iterations=10, checkpoints=()))

@@ -20,7 +20,7 @@ from splatnode.recon.evaluate.rivals import outcome
 from splatnode.recon.evaluate.rivals.colmap import Model, Placed, mapped
 from splatnode.recon.frames.keyframe import modelled_image
 from splatnode.recon.frames.undistort import undistorted
-from splatnode.recon.optimize import refinement
+from splatnode.recon.optimize import dropout, refinement
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.result.snapshot import Snapshot
@@ -42,7 +42,8 @@ RATES = refinement.Rates(
 OPTIMIZE = refinement.Config(
     iterations=1500,
     checkpoints=(250, 900),
-    half_resolution_share=0.0,
+    dssim=0.2,
+    dropout=dropout.Config(share=0.0),
     refine_poses=False,
     rates=RATES,
     control=ControlChoice("adaptive", adaptive.Config()),

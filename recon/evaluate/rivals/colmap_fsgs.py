@@ -29,7 +29,7 @@ _WHOLE = 1_000_000  # pixels of a patch: all of an image is one, as FSGS correla
 _DEPTH = regularise.Config(
     depth=regularise.Term(0.05, 0.2, 0.95), depth_patch=_WHOLE, depth_share=1.0, min_confidence=0.1
 )
-_CONTROL = proximity.Config(adaptive.Config(gradient=5e-4, start=0.05, end=0.95, reset_every=adaptive.NEVER))
+_CONTROL = proximity.Config(adaptive.Config(min_gradient=5e-4, start=0.05, end=0.95, reset_every=adaptive.NEVER))
 OPTIMIZE = msgspec.structs.replace(
     colmap_3dgs.OPTIMIZE, regularise=_DEPTH, control=ControlChoice("proximity", _CONTROL)
 )

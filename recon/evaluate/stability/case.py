@@ -7,11 +7,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+from msgspec.structs import replace
+
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.recon.config import Config
+from splatnode.recon.config import PREVIEW, Config
 from splatnode.recon.evaluate.stability.places import Photo, Stage
 from splatnode.recon.evaluate.truth import TrueCamera
-from splatnode.recon.optimize import refinement
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code
 
@@ -20,11 +21,8 @@ World = Mapping[str, TrueCamera]  # by the name of the frame
 
 # The verdict stands before the first step of the optimiser, so that few steps at a small size ask the same question.
 # They leave the cameras as they were judged: a handful of steps would move them without improving them.
-LIGHT = Config(
-    size=320,
-    preview=refinement.Config(iterations=2, checkpoints=(), half_resolution_share=1.0, refine_poses=False),
-    optimize=refinement.Config(iterations=6, checkpoints=(), half_resolution_share=1.0, refine_poses=False),
-)
+_STILL = replace(PREVIEW, checkpoints=(), refine_poses=False)
+LIGHT = Config(size=320, preview=replace(_STILL, iterations=2), optimize=replace(_STILL, iterations=6))
 
 
 _WHOLE = (Code.OK, Code.EXPOSURE_SHIFT)  # a scene of all frames: recorded photographs differ in exposure too

@@ -38,14 +38,14 @@ from splatnode.recon.evaluate.stability.probes import (
 )
 from splatnode.recon.evaluate.stability.warps import resized
 from splatnode.recon.evaluate.truth import EvaluationScene
-from splatnode.recon.optimize import refinement
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code
 
 # Enough steps for a picture whose quality means something, at a size at which they are cheap.
 _FITTED = msgspec.structs.replace(
-    LIGHT, optimize=refinement.Config(iterations=80, checkpoints=(), half_resolution_share=0.25)
+    LIGHT,
+    optimize=msgspec.structs.replace(LIGHT.optimize, iterations=80, half_resolution_share=0.25, refine_poses=True),
 )
 _SOAK_FRAMES, _SOAK_VIEWS, _SOAK_MARGIN_MB, _SOAK_GAUSSIANS = 500, 4, 60.0, 8000
 

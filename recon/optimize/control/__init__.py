@@ -1,1 +1,1 @@
-"""How the number of Gaussians changes while they are optimised: control.py is the interface, the rest is one a file."""
+"""Density controls, which change the number of Gaussians during the refinement; control.py is their interface."""

@@ -1,11 +1,11 @@
 """Adaptive density control of 3D Gaussian splatting (Kerbl et al. 2023, section 5).
 
-Where the loss pulls strongly at where Gaussians appear in the image, there are too few: a small one is doubled, a large
-one replaced by two that are drawn from it. What is nearly transparent or too large goes; and once in a while all become
-nearly transparent, so that only what is needed comes back.
+Where the positions in the image have large gradients there are too few Gaussians: a small one is cloned, a large one
+split into two that are drawn from it. Nearly transparent and too large ones are pruned. From time to time all opacities
+are reset to nearly 0, so that only Gaussians that are needed become opaque again.
 
 Shares are of all iterations, of which the publication has 30 000, with a round every 100 and a reset every 3000. In
-shorter runs both are fewer, so that every view is part of a round's mean and opacities can come back after a reset.
+shorter runs both are fewer, so that every view is part of a round's mean and opacities can recover after a reset.
 """
 
 from __future__ import annotations
@@ -20,80 +20,82 @@ from torch import Tensor
 
 from splatnode.recon.optimize.control.control import Change, Step
 from splatnode.recon.rasterize.reference import rotations
-from splatnode.recon.scene.gaussians import Gaussians, concatenate
+from splatnode.recon.scene.gaussians import Gaussians, concatenate, logit
 
-NEVER = 2.0  # a share of the iterations that does not come
+NEVER = 2.0  # for `reset_every`: a share of the iterations that is never reached
+_EXTENT_MARGIN = 1.1  # the extent over the largest distance of a camera from their mean, as in the authors' code
+_PARTS = 2  # into which a large Gaussian is split
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    gradient: float = 2e-4  # mean length, from which on there are too few; positions in halves of the image's sides
-    every: int = 50  # iterations
-    start: float = 500 / 30_000
-    end: float = 0.5
-    reset_every: float = 0.2  # all opacities become at most `reset_opacity`
-    reset_opacity: float = 0.01
-    min_opacity: float = 0.005
-    small: float = 0.01  # of the extent: up to it Gaussians are doubled, beyond it divided
-    largest: float = 0.1  # of the extent, after the first reset
-    largest_px: float = 20.0  # three standard deviations in the training views, after the first reset
-    shrink: float = 1.6  # by which the parts are smaller than what was divided
-    max_gaussians: int = 100_000  # no more are added then
+    min_gradient: float = 2e-4  # mean length of the gradient, from which on a Gaussian is cloned or split
+    every: int = 50  # iterations between rounds
+    start: float = 500 / 30_000  # share of the iterations, of the first round
+    end: float = 0.5  # and of the last
+    reset_every: float = 0.2  # share of the iterations between resets
+    reset_opacity: float = 0.01  # largest opacity after a reset
+    min_opacity: float = 0.005  # below it a Gaussian is pruned
+    clone_scale: float = 0.01  # largest scale of a Gaussian that is cloned and not split, in extents of the scene
+    max_scale: float = 0.1  # after the first reset, in extents of the scene; above it a Gaussian is pruned
+    max_radius_px: float = 20.0  # three standard deviations in a training view, after the first reset; likewise
+    split_factor: float = 1.6  # scale of a Gaussian over that of its parts
+    max_gaussians: int = 100_000  # at which no more are added
 
 
 def extent(Ts_world_camera: Sequence[Tensor]) -> float:
-    """The size of a scene by its cameras: 1.1 times the largest distance from the mean of their centres."""
+    """The extent of a scene: 1.1 times the largest distance of a camera centre from their mean."""
     centres = torch.stack([T[:3, 3] for T in Ts_world_camera])
-    return 1.1 * float((centres - centres.mean(0)).norm(dim=1).max())
+    return _EXTENT_MARGIN * float((centres - centres.mean(0)).norm(dim=1).max())
 
 
 def image_gradient(step: Step) -> Tensor:
-    """(N,) length of the gradient with respect to the positions in the image, in halves of its sides.
+    """(N,) length of the loss's gradient with respect to the positions in the image, in halves of the image's sides.
 
-    From the gradient at the means, as far as these move what is seen: du = f / z dx.
+    It follows from the gradient with respect to the means across the line of sight: du = f / z dx.
     """
-    means, T, target = step.gaussians.means, step.Ts_world_camera[step.view], step.targets[step.view]
+    means, T, image = step.gaussians.means, step.Ts_world_camera[step.view], step.images[step.view]
     assert means.grad is not None
     z = (means.detach() - T[:3, 3]) @ T[:3, 2]
     across = means.grad @ T[:3, :2] * z[:, None]
-    halves = torch.tensor([target.width / 2, target.height / 2]) / torch.diagonal(target.K)[:2]
+    halves = torch.tensor([image.width / 2, image.height / 2]) / torch.diagonal(image.K)[:2]
     return (across * halves).norm(dim=1)
 
 
 def limit(step: Step, config: Config) -> int:
-    """How many Gaussians there may be."""
+    """The largest number of Gaussians that rounds may lead to."""
     return config.max_gaussians if step.max_gaussians is None else min(config.max_gaussians, step.max_gaussians)
 
 
 def densified(
     gaussians: Gaussians, gradient: Tensor, size: float, most: int, config: Config, generator: torch.Generator
 ) -> Change:
-    """Doubles and divides Gaussians by their mean gradient (N,), in a scene of extent `size`, up to `most` of them."""
-    wanting = gradient >= config.gradient
-    if len(gaussians) + int(wanting.sum()) > most:
-        wanting = torch.zeros_like(wanting)
-    large = gaussians.scales.amax(1) > config.small * size
-    doubled = gaussians.subset(wanting & ~large)
-    divided = gaussians.subset(wanting & large)
-    kept = ~(wanting & large)
-    parts = [_drawn_from(divided, config.shrink, generator) for _ in range(2)]
-    grown = concatenate([gaussians.subset(kept), doubled, *parts])
+    """Clones and splits Gaussians by their mean gradient (N,), in a scene of extent `size`; none beyond `most`."""
+    selected = gradient >= config.min_gradient
+    if len(gaussians) + int(selected.sum()) > most:
+        selected = torch.zeros_like(selected)
+    large = gaussians.scales.amax(1) > config.clone_scale * size
+    clones = gaussians.subset(selected & ~large)
+    split = gaussians.subset(selected & large)
+    kept = ~(selected & large)
+    parts = [_drawn_from(split, config.split_factor, generator) for _ in range(_PARTS)]
+    grown = concatenate([gaussians.subset(kept), clones, *parts])
     rows = torch.nonzero(kept)[:, 0]
     return Change(grown, torch.cat([rows, torch.full((len(grown) - len(rows),), -1)]))
 
 
-def _drawn_from(gaussians: Gaussians, shrink: float, generator: torch.Generator) -> Gaussians:
-    """For each Gaussian a smaller one at a point drawn from it."""
+def _drawn_from(gaussians: Gaussians, split_factor: float, generator: torch.Generator) -> Gaussians:
+    """For each Gaussian one that is smaller by `split_factor`, its mean drawn from it."""
     drawn = torch.randn(gaussians.means.shape, generator=generator) * gaussians.scales
     offset = (rotations(gaussians.quats) @ drawn[..., None])[..., 0]
-    return replace(gaussians, means=gaussians.means + offset, log_scales=gaussians.log_scales - math.log(shrink))
+    return replace(gaussians, means=gaussians.means + offset, log_scales=gaussians.log_scales - math.log(split_factor))
 
 
-def footprint_px(gaussians: Gaussians, step: Step) -> Tensor:
+def radius_px(gaussians: Gaussians, step: Step) -> Tensor:
     """(N,) three standard deviations, in pixels, in the training view in which a Gaussian is largest."""
     largest = torch.zeros(len(gaussians))
-    for T, target in zip(step.Ts_world_camera, step.targets, strict=True):
+    for T, image in zip(step.Ts_world_camera, step.images, strict=True):
         z = (gaussians.means - T[:3, 3]) @ T[:3, 2]
-        size = 3.0 * gaussians.scales.amax(1) * float(target.K[0, 0]) / z.clamp_min(1e-6)
+        size = 3.0 * gaussians.scales.amax(1) * float(image.K[0, 0]) / z.clamp_min(1e-6)
         largest = torch.where(z > 0, torch.maximum(largest, size), largest)
     return largest
 
@@ -102,7 +104,7 @@ class AdaptiveControl:
     def __init__(self, config: Config, seed: int) -> None:
         self._config = config
         self._generator = torch.Generator().manual_seed(seed)
-        self._sum = self._count = torch.zeros(0)  # of each Gaussian's gradients since the last round
+        self._sum = self._count = torch.zeros(0)  # of each Gaussian's gradients since the last round, and how many
 
     def after_step(self, step: Step) -> Change | None:
         config = self._config
@@ -119,9 +121,8 @@ class AdaptiveControl:
             self._sum = torch.zeros(0)
         if step.iteration % max(1, round(config.reset_every * step.iterations)) == 0:
             change = change or Change(gaussians, torch.arange(len(gaussians)))
-            ceiling = math.log(config.reset_opacity / (1 - config.reset_opacity))
-            faint = replace(change.gaussians, logit_opacities=change.gaussians.logit_opacities.clamp_max(ceiling))
-            change = Change(faint, change.origin)
+            logits = change.gaussians.logit_opacities.clamp_max(logit(config.reset_opacity))
+            change = Change(replace(change.gaussians, logit_opacities=logits), change.origin)
         return change
 
     def _observe(self, step: Step) -> None:
@@ -135,13 +136,13 @@ class AdaptiveControl:
         config, gaussians = self._config, change.gaussians
         keep = gaussians.opacities >= config.min_opacity
         if step.iteration > config.reset_every * step.iterations:
-            keep &= gaussians.scales.amax(1) <= config.largest * extent(step.Ts_world_camera)
-            keep &= footprint_px(gaussians, step) <= config.largest_px
+            keep &= gaussians.scales.amax(1) <= config.max_scale * extent(step.Ts_world_camera)
+            keep &= radius_px(gaussians, step) <= config.max_radius_px
         return Change(gaussians.subset(keep), change.origin[keep])
 
 
 def is_round(step: Step, config: Config) -> bool:
-    """Whether Gaussians are added and taken away after this iteration."""
+    """Whether Gaussians are added and pruned after this iteration."""
     return config.start <= step.progress <= config.end and step.iteration % config.every == 0
 
 

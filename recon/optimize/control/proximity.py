@@ -1,4 +1,4 @@
-"""Gaussian unpooling of FSGS (Zhu et al. 2024, section 3.2), beside adaptive density control.
+"""Proximity-guided Gaussian unpooling of FSGS (Zhu et al. 2024, section 3.2), after adaptive density control.
 
 Few photographs give few points, far apart. A Gaussian whose nearest neighbours are far away gets new ones half-way to
 each of them, with the neighbour's size and opacity.
@@ -22,25 +22,28 @@ from splatnode.recon.scene.gaussians import Gaussians, concatenate
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     adaptive: adaptive.Config = adaptive.Config()
     neighbours: int = 3
-    far: float = 0.05  # mean distance to them, in parts of the scene's extent; published in units that are not given
+    min_distance: float = 0.05  # mean, to the neighbours, in extents of the scene; the paper's unit is not given
 
 
-def unpooled(gaussians: Gaussians, far: float, neighbours: int) -> Gaussians:
-    """The new Gaussians between each whose `neighbours` are further than `far` in the mean, and these."""
+def unpooled(gaussians: Gaussians, min_distance: float, neighbours: int) -> Gaussians:
+    """The new Gaussians, half-way from each whose mean distance to its `neighbours` is above `min_distance` to these.
+
+    The distance is in units of the world.
+    """
     if len(gaussians) <= neighbours:
         return gaussians.subset(torch.zeros(0, dtype=torch.long))
     found = KDTree(gaussians.means.numpy()).query(gaussians.means.numpy(), neighbours + 1)
     distances, nearest = (torch.from_numpy(np.asarray(each))[:, 1:] for each in found)  # itself comes first
-    lonely = distances.mean(1) > far
-    source = torch.nonzero(lonely)[:, 0].repeat_interleave(neighbours)
-    target = nearest[lonely].flatten()
-    grown = gaussians.subset(target)
-    turned = torch.zeros_like(grown.quats)
-    turned[:, 0] = 1.0
+    isolated = distances.mean(1) > min_distance
+    source = torch.nonzero(isolated)[:, 0].repeat_interleave(neighbours)
+    destination = nearest[isolated].flatten()
+    grown = gaussians.subset(destination)
+    identity = torch.zeros_like(grown.quats)
+    identity[:, 0] = 1.0
     return replace(
         grown,
-        means=(gaussians.means[source] + gaussians.means[target]) / 2,
-        quats=turned,
+        means=(gaussians.means[source] + gaussians.means[destination]) / 2,
+        quats=identity,
         source_frame=gaussians.source_frame[source],
     )
 
@@ -54,8 +57,8 @@ class ProximityControl:
         change = self._adaptive.after_step(step)
         if change is None or not adaptive.is_round(step, self._config.adaptive):
             return change
-        far = self._config.far * adaptive.extent(step.Ts_world_camera)
-        grown = unpooled(change.gaussians, far, self._config.neighbours)
+        min_distance = self._config.min_distance * adaptive.extent(step.Ts_world_camera)
+        grown = unpooled(change.gaussians, min_distance, self._config.neighbours)
         if len(change.gaussians) + len(grown) > adaptive.limit(step, self._config.adaptive):
             return change
         fresh: Tensor = torch.full((len(grown),), -1)

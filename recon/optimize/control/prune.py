@@ -1,9 +1,8 @@
-"""Takes away what explains less than it costs: Gaussians without which no view, photographed or not, would differ."""
+"""Pruning of Gaussians without which no view, photographed or not, would look different."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import msgspec
 import numpy as np
@@ -12,7 +11,7 @@ from torch import Tensor
 
 from splatnode.recon.optimize.control.control import Change, Step
 from splatnode.recon.optimize.pseudo_views import pseudo_views
-from splatnode.recon.rasterize.gaussian_render import seen
+from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.contrast_masking import visibility
 from splatnode.recon.scene.gaussians import Gaussians
@@ -20,21 +19,15 @@ from splatnode.recon.scene.seeding import REFERENCE_PX
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    at: tuple[float, ...] = (0.3,)  # when this part of the refinement is done, rising
+    at: tuple[float, ...] = (0.3,)  # progress at which Gaussians are pruned, rising, in [0, 1]
     least_change: float = 0.005  # squared visible difference of colours in [0, 1], over all pixels, channels, views
-    between: int = 1  # views between the photographs, for each of these, that count as they do
-    off_path: float = 0.3  # how far these may lie beside the path from photograph to photograph, in its steps
+    between: int = 1  # pseudo views a photograph, which count as photographs do
+    off_path: float = 0.3  # largest distance of pseudo views from the path of the cameras, in its steps
     probes: int = 2  # random images a view from which the differences are estimated
-    settled: int = 30  # iterations after which it is told, in less time than was planned, what a Gaussian is worth
-    afterwards: int = 60  # iterations for which there must be time: pruning takes that of 30, and the rest settles
-
-
-@dataclass(frozen=True, eq=False)
-class Camera:
-    T_world_camera: Tensor  # (4, 4)
-    K: Tensor  # (3, 3)
-    width: int
-    height: int
+    # With a deadline: before the first number of iterations the Gaussians are not fitted yet; pruning takes the time of
+    # 30 iterations, and the Gaussians that are left need as many again to close the gaps.
+    min_iterations: int = 30
+    min_remaining_iterations: int = 60
 
 
 def load(config: Config, seed: int) -> Pruning:
@@ -49,30 +42,33 @@ class Pruning:
         self._due = list(config.at)
 
     def after_step(self, step: Step) -> Change | None:
-        if not self._due or step.progress < self._due[0] or not self._settled(step):
+        if not self._due or step.progress < self._due[0] or not self._timely(step):
             return None
         while self._due and step.progress >= self._due[0]:
             self._due.pop(0)
         gaussians = step.gaussians.map(Tensor.detach)
-        cameras = [Camera(T, t.K, t.width, t.height) for T, t in zip(step.Ts_world_camera, step.targets, strict=True)]
+        cameras = [Camera(T, i.K, i.width, i.height) for T, i in zip(step.Ts_world_camera, step.images, strict=True)]
         cameras += between(cameras, self._config.between * len(cameras), self._config.off_path, self._rng)
         worth = changes_without(gaussians, cameras, self._config.probes, self._generator)
-        # What the photographs do not show is what the far shell is for.
-        worth[gaussians.source_frame == SHELL] = torch.inf
+        worth[gaussians.source_frame == SHELL] = torch.inf  # the far shell is for what no photograph shows
         kept = most_worth(worth, self._config.least_change, step.max_gaussians)
         return Change(gaussians.subset(kept), kept)
 
-    def _settled(self, step: Step) -> bool:
-        """Whether the Gaussians were, and can still be, fitted for long enough, or must become fewer all the same."""
-        enough = min(self._config.settled, self._due[0] * step.iterations)
+    def _timely(self, step: Step) -> bool:
+        """Whether the Gaussians have been, and can still be, fitted for long enough, or are more than allowed.
+
+        The iterations that are left follow from the progress, which a deadline hastens.
+        """
+        needed_before = min(self._config.min_iterations, self._due[0] * step.iterations)
         left = step.iteration * (1.0 - step.progress) / max(step.progress, 1e-9)
-        needed = min(self._config.afterwards, 0.5 * (1.0 - self._due[0]) * step.iterations)
+        # Half of what the plan leaves after pruning: a plan that is short from the start is no deadline.
+        needed_after = min(self._config.min_remaining_iterations, 0.5 * (1.0 - self._due[0]) * step.iterations)
         too_many = step.max_gaussians is not None and len(step.gaussians) > step.max_gaussians
-        return (step.iteration > enough and left >= needed) or too_many
+        return (step.iteration > needed_before and left >= needed_after) or too_many
 
 
 def most_worth(worth: Tensor, least: float, limit: int | None) -> Tensor:
-    """The indices, rising, of what is worth at least that much; of these the best where they are more than `limit`."""
+    """The indices, rising, of Gaussians of at least that `worth` (N,); the best `limit` of them where they are more."""
     kept = (worth >= least).nonzero()[:, 0]
     if limit is not None and len(kept) > limit:
         kept = worth.topk(limit).indices.sort().values
@@ -80,23 +76,20 @@ def most_worth(worth: Tensor, least: float, limit: int | None) -> Tensor:
 
 
 def between(cameras: Sequence[Camera], count: int, off_path: float, rng: np.random.Generator) -> list[Camera]:
-    """`count` views where no photograph was taken: what hides behind something in all photographs shows there."""
+    """`count` pseudo views: what is hidden in all photographs shows there. None between fewer than two cameras."""
     if len(cameras) < 2:
         return []
     Ts_world_camera = [camera.T_world_camera.double().numpy() for camera in cameras]
     Ks = [camera.K.double().numpy() for camera in cameras]
     sizes = [(camera.width, camera.height) for camera in cameras]
     views = pseudo_views(Ts_world_camera, Ks, sizes, count, off_path=off_path, rng=rng)
-    return [
-        Camera(torch.from_numpy(view.T_world_camera).float(), torch.from_numpy(view.K).float(), view.width, view.height)
-        for view in views
-    ]
+    return [view.camera for view in views]
 
 
 def changes_without(gaussians: Gaussians, cameras: Sequence[Camera], probes: int, generator: torch.Generator) -> Tensor:
     """(N,) the squared visible difference to all images together if one Gaussian is left out: an estimate.
 
-    What a pixel shows is linear in each opacity, so that leaving a Gaussian out changes it by opacity * derivative.
+    What a pixel shows is linear in each opacity, so leaving a Gaussian out changes it by opacity * derivative.
     The sum over pixels of these squares is the mean square of their sum with random signs (Hutchinson 1990), which
     costs no more than a gradient. Pixels count as if the images were REFERENCE_PX wide.
     """
@@ -104,7 +97,7 @@ def changes_without(gaussians: Gaussians, cameras: Sequence[Camera], probes: int
     total = torch.zeros(len(gaussians))
     for camera in cameras:
         scale = max(camera.width, camera.height) / REFERENCE_PX
-        rgb = seen(gaussians, opacities, camera.T_world_camera, camera.K, camera.width, camera.height).rgb
+        rgb = render_gaussians(gaussians, camera, opacities=opacities).rgb
         assert rgb is not None  # it was asked for
         visible = torch.from_numpy(visibility(rgb.detach().numpy(), scale))
         for _ in range(probes):

@@ -23,6 +23,7 @@ from splatnode.capture.messaging.spool import Spool
 from splatnode.capture.messaging.state import StateClient
 from splatnode.capture.process.folders import LOCK
 from splatnode.capture.status import heartbeats
+from splatnode.recon.config import PREVIEW
 from splatnode.recon.config import Config as Reconstruction
 from splatnode.recon.daemon import membership
 from splatnode.recon.daemon.config import Config
@@ -39,7 +40,7 @@ from tests.support.synthetic import photographs, places
 
 QUICK = Reconstruction(
     size=160,
-    preview=refinement.Config(iterations=2, half_resolution_share=1.0),
+    preview=replace(PREVIEW, iterations=2),
     optimize=refinement.Config(iterations=20, checkpoints=(10,)),
 )
 PATIENCE_S = 120.0

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from splatnode.recon.optimize.adam import Adam
+from splatnode.recon.optimize.adam import Adam, Moments, adam_direction
 
 SHAPES = {"means": (5000, 3), "opacities": (5000,), "sh": (5000, 4, 3), "cameras": (3, 6)}
 
@@ -131,3 +131,19 @@ def test_bad_rows_are_named():
         optimizer.follow({"y": leaf(torch.zeros(3, 3))}, torch.tensor([0, 1, 2]))
     with pytest.raises(ValueError, match=r"lr_factors\['x'\] must be \(4,\)"):
         optimizer.step({"x": torch.ones(3)})
+
+
+def test_the_direction_of_a_tangent_vector_is_adams():
+    """With other decay rates than the default, as the cameras have them."""
+    betas, rate = (0.9, 0.99), 1e-2
+    theirs = leaf(torch.zeros(6))
+    expected = torch.optim.Adam([theirs], lr=rate, betas=betas, eps=1e-15)
+    ours, moments = torch.zeros(6), Moments(torch.zeros(6), torch.zeros(6))
+    for seed in range(5):
+        give_gradients({"pose": theirs}, seed)
+        assert theirs.grad is not None
+        direction, moments = adam_direction(theirs.grad, moments, betas)
+        ours = ours - rate * direction
+        expected.step()
+    assert moments.steps == 5
+    torch.testing.assert_close(ours, theirs.detach(), rtol=1e-5, atol=1e-7)

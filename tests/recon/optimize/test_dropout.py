@@ -1,4 +1,4 @@
-"""Dropout leaves out what is doubtful, and the rest makes up for it."""
+"""Dropout leaves out what is uncertain, and the rest makes up for it."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.recon.optimize.dropout import Config, Dropout, doubt
+from splatnode.recon.optimize.dropout import Config, Dropout, uncertainty
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import TrainingView
@@ -42,20 +42,20 @@ def test_a_share_of_the_unknown_is_left_out_and_the_others_make_up_for_it():
     assert opacities.grad is not None and bool((opacities.grad[~there] == 0).all())
 
 
-def test_the_surer_stereo_is_the_less_is_doubted():
-    assert float(doubt(gaussians(1), [view()], 0.6)) == 1  # no photograph started it
-    assert float(doubt(gaussians(1, 4), [view()], 0.6)) == pytest.approx(0.5)
-    assert float(doubt(gaussians(1, 4), [view()], 0.3)) == pytest.approx(0)
-    assert float(doubt(gaussians(1, 4), [view(None)], 0.6)) == 0
+def test_the_surer_stereo_is_the_less_is_uncertain():
+    assert float(uncertainty(gaussians(1), [view()], 0.6)) == 1  # no photograph started it
+    assert float(uncertainty(gaussians(1, 4), [view()], 0.6)) == pytest.approx(0.5)
+    assert float(uncertainty(gaussians(1, 4), [view()], 0.3)) == pytest.approx(0)
+    assert float(uncertainty(gaussians(1, 4), [view(None)], 0.6)) == 0
 
 
 def test_a_gaussian_is_looked_up_at_its_pixel():
     SEEN.confidence[:, : SEEN.depth.shape[1] // 2] = 0.9
     left = gaussians(1, 4)
     left.means[0, 0] = -0.2
-    assert float(doubt(left, [view()], 0.6)) == 0
+    assert float(uncertainty(left, [view()], 0.6)) == 0
     left.means[0, 0] = -100.0  # beside the image
-    assert float(doubt(left, [view()], 0.6)) == 0
+    assert float(uncertainty(left, [view()], 0.6)) == 0
     SEEN.confidence[:] = 0.3
 
 
@@ -84,8 +84,8 @@ def test_opacities_stay_below_one():
     assert float(dropout(torch.full((100,), 0.9), 0.0).max()) < 1
 
 
-@pytest.mark.parametrize(("config", "progress"), [(Config(share=0.1, until=0.7), 0.7), (Config(), 0.0)])
-def test_in_the_end_and_by_default_all_are_there(config, progress):
+@pytest.mark.parametrize(("config", "progress"), [(Config(share=0.1, until=0.7), 0.7), (Config(share=0.0), 0.0)])
+def test_in_the_end_and_without_a_share_all_are_there(config, progress):
     opacities = torch.rand(100)
     assert Dropout(config, gaussians(100), [view()], seed=0)(opacities, progress) is opacities
 

@@ -12,21 +12,30 @@ import torch
 from msgspec import structs
 
 from splatnode.recon.geometry import exp_se3
-from splatnode.recon.optimize import refinement, regularise
+from splatnode.recon.optimize import dropout, refinement, regularise
 from splatnode.recon.optimize.pseudo_views import PseudoView
 from splatnode.recon.optimize.refinement import Config, Rates, refine
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.rasterize.gaussian_render import seen
+from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
 from tests.support.synthetic import tiny_scene
 
 FROZEN = Rates(means=0.0, quats=0.0, log_scales=0.0, logit_opacities=0.0, sh=0.0)
-QUICK = Config(iterations=12, checkpoints=(), half_resolution_share=0.0)
+
+
+def plain(**changes: object) -> Config:
+    """A refinement that keeps all Gaussians in every render and to the end."""
+    nothing = Config(checkpoints=(), dssim=0.2, dropout=dropout.Config(share=0.0), control=None)
+    return structs.replace(nothing, **changes)
+
+
+QUICK = plain(iterations=12)
 
 
 def render(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
-    return seen(gaussians, gaussians.opacities, view.T_world_camera, view.K, view.width, view.height).rgb.clamp(0, 1)
+    camera = Camera(view.T_world_camera, view.K, view.width, view.height)
+    return render_gaussians(gaussians, camera).rgb.clamp(0, 1)
 
 
 def photographed() -> Scene:
@@ -98,7 +107,7 @@ def pose_error(scene: Scene, truth: Scene) -> float:
 @pytest.mark.parametrize("half_resolution_share", [0.0, 0.3])
 def test_disturbed_gaussians_come_back(truth, half_resolution_share):
     start = disturbed(truth)
-    config = Config(iterations=240, half_resolution_share=half_resolution_share, refine_poses=False)
+    config = plain(iterations=240, half_resolution_share=half_resolution_share, refine_poses=False)
     assert loss(start) > 0.03
     assert loss(last(start, config)) < 0.3 * loss(start)
 
@@ -107,7 +116,7 @@ def test_disturbed_poses_come_back(truth):
     start = turned(truth)
     # Many steps: a ball in the middle of the image hardly tells a turn from a step to the side.
     rates = structs.replace(FROZEN, translation=3e-3, rotation=1e-3)
-    found = last(start, Config(iterations=900, half_resolution_share=0.0, rates=rates))
+    found = last(start, plain(iterations=900, rates=rates))
     assert pose_error(start, truth) > 0.01
     assert pose_error(found, truth) < 0.15 * pose_error(start, truth)
     assert torch.equal(found.views[0].T_world_camera, truth.views[0].T_world_camera)
@@ -143,12 +152,12 @@ def test_the_same_seed_gives_the_same_scene_to_the_bit_and_another_one_does_not(
 
 
 def test_the_scene_is_shown_at_every_checkpoint_and_at_the_end(truth):
-    shown = refine(truth, Config(iterations=9, checkpoints=(2, 6, 9, 50)), seed=0)
+    shown = refine(truth, plain(iterations=9, checkpoints=(2, 6, 9, 50)), seed=0)
     assert [scene.iterations - truth.iterations for scene in shown] == [2, 6, 9]
 
 
 def test_a_checkpoint_keeps_what_it_showed(truth):
-    shown = refine(truth, Config(iterations=4, checkpoints=(2,)), seed=0)
+    shown = refine(truth, plain(iterations=4, checkpoints=(2,)), seed=0)
     first = next(shown)
     means = first.gaussians.means.clone()
     list(shown)
@@ -156,14 +165,14 @@ def test_a_checkpoint_keeps_what_it_showed(truth):
 
 
 def test_no_iterations_give_the_start(truth):
-    (only,) = refine(truth, Config(iterations=0), seed=0)
+    (only,) = refine(truth, plain(iterations=0), seed=0)
     assert only.iterations == truth.iterations and torch.equal(only.gaussians.means, truth.gaussians.means)
 
 
 def test_every_view_takes_its_turn(truth, monkeypatch):
     taken = []
     monkeypatch.setattr(refinement._Fit, "step", lambda fit, index, progress: taken.append(index))
-    last(truth, Config(iterations=9))
+    last(truth, plain(iterations=9))
     assert [sorted(taken[i : i + 3]) for i in (0, 3, 6)] == [[0, 1, 2]] * 3
 
 
@@ -173,7 +182,7 @@ def steps_until(deadline: float, truth: Scene, monkeypatch) -> list[float]:
     clock = itertools.count()
     monkeypatch.setattr(refinement.time, "monotonic", lambda: float(next(clock)))
     monkeypatch.setattr(refinement._Fit, "step", lambda fit, index, share: progress.append(share))
-    assert len(list(refine(truth, Config(iterations=100), seed=0, deadline=deadline))) == 1
+    assert len(list(refine(truth, plain(iterations=100), seed=0, deadline=deadline))) == 1
     return progress
 
 
@@ -195,7 +204,7 @@ def test_the_deadline_holds_on_a_real_clock(truth):
     list(refine(truth, QUICK, seed=0))  # whatever is slow only once
     for seconds in (0.4, 4.0, 40.0):  # a machine that is busy may need more than the first to begin
         started = time.monotonic()
-        end = last(truth, Config(iterations=1_000_000, checkpoints=()), deadline=started + seconds)
+        end = last(truth, plain(iterations=1_000_000), deadline=started + seconds)
         assert seconds <= time.monotonic() - started < seconds + 60.0
         if end.iterations > truth.iterations:
             return
@@ -207,12 +216,26 @@ def test_torch_gets_its_threads_back(truth, wholly):
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        shown = refine(truth, Config(iterations=4, checkpoints=(2,)), seed=0)
+        shown = refine(truth, plain(iterations=4, checkpoints=(2,)), seed=0)
         next(shown)
+        assert torch.get_num_threads() == 2  # while the refinement is suspended
         if wholly:
             list(shown)
         del shown  # as a reader does who has seen enough
         assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
+
+
+def test_torch_has_one_thread_while_a_step_computes(truth, monkeypatch):
+    threads = []
+    step = refinement._Fit.step
+    monkeypatch.setattr(refinement._Fit, "step", lambda *rest: threads.append(torch.get_num_threads()) or step(*rest))
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        last(truth, plain(iterations=2))
+        assert threads == [1, 1] and torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
 
@@ -251,24 +274,24 @@ class Brighter:
 def test_further_losses_count_on_training_views_and_pseudo_views(truth, monkeypatch):
     monkeypatch.setattr(refinement, "Regularisation", Brighter)
     start = replace(truth, views=tuple(map(with_pointmap, truth.views)))
-    config = Config(iterations=8, checkpoints=(), half_resolution_share=0.5)
-    plain = last(start, config)
+    config = plain(iterations=8, half_resolution_share=0.5)
+    unpulled = last(start, config)
     brighter = last(start, structs.replace(config, regularise=regularise.Config(depth=regularise.Term(1.0))))
-    assert brighter.served_by == {"depth": "a wish"} and plain.served_by == {}
+    assert brighter.served_by == {"depth": "a wish"} and unpulled.served_by == {}
     assert Brighter.made.names == ["0.png", "1.png", "2.png"]
     assert Brighter.made.shapes == [(True, (24, 32))] * 4 + [(True, (48, 64))] * 2 + [(False, (48, 64))] * 2
     for shown in truth.views:
-        assert render(brighter.gaussians, shown).mean() > 1.1 * render(plain.gaussians, shown).mean()
+        assert render(brighter.gaussians, shown).mean() > 1.1 * render(unpulled.gaussians, shown).mean()
 
 
 def test_a_term_without_a_point_map_names_the_view(truth):
     with pytest.raises(ValueError, match=r"0\.png has no point map"):
-        last(truth, Config(iterations=1, regularise=regularise.Config(normal=regularise.Term(1.0))))
+        last(truth, plain(iterations=1, regularise=regularise.Config(normal=regularise.Term(1.0))))
 
 
 def test_the_steps_of_cameras_fall_by_a_part_of_their_own(truth):
     def moved(**final: float) -> tuple[float, float]:
-        fit = refinement._Fit(disturbed(truth), Config(rates=Rates(**final)), seed=0)
+        fit = refinement._Fit(disturbed(truth), plain(rates=Rates(**final)), seed=0)
         fit.step(1, progress=1.0)
         scene = fit.scene()
         camera = (scene.views[1].T_world_camera - truth.views[1].T_world_camera).abs().max()

@@ -10,8 +10,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.rasterize.gaussian_render import seen
-from splatnode.recon.scene.background import SHELL, Config, far_shell
+from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
+from splatnode.recon.scene.background import SHELL, Config
 from splatnode.recon.scene.gaussians import Gaussians
 from tests.support.synthetic import plane_pointmap
 
@@ -102,7 +102,7 @@ def test_no_gap_shows_through(yaw_deg):
     view, white = pointmap(turned(yaw_deg)), np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     shell = far_shell([view], [white], Config())
     camera = torch.from_numpy(view.T_world_camera).float(), torch.from_numpy(view.K).float()
-    image = seen(shell, shell.opacities, *camera, WIDTH, HEIGHT).rgb
+    image = render_gaussians(shell, Camera(*camera, WIDTH, HEIGHT)).rgb
     assert image.min() > 0.8
 
 

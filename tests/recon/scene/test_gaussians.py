@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.geometry import Similarity
-from splatnode.recon.rasterize.gaussian_render import seen
+from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.scene.gaussians import SH_C0, Gaussians, concatenate
 from tests.support.synthetic import TinyScene, tiny_scene
 
@@ -22,7 +22,7 @@ def covariances(gaussians: Gaussians) -> np.ndarray:
 
 
 def render(scene: TinyScene, gaussians: Gaussians, T_world_camera: torch.Tensor) -> torch.Tensor:
-    image = seen(gaussians, gaussians.opacities, T_world_camera, scene.Ks[0], scene.width, scene.height).rgb
+    image = render_gaussians(gaussians, Camera(T_world_camera, scene.Ks[0], scene.width, scene.height)).rgb
     assert image is not None
     return image
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from msgspec import structs
 
-from splatnode.recon.config import PRUNING, Config
+from splatnode.recon.config import Config
 from splatnode.recon.evaluate.start import continued, find_start
 from splatnode.recon.optimize import refinement
 from splatnode.recon.result.snapshot import Snapshot
@@ -18,7 +18,7 @@ from splatnode.recon.scene.scene import Scene, TrainingView
 from splatnode.recon.scene.seeding import initial_gaussians
 from tests.support.synthetic import photographs, plane_pointmap, repeated
 
-SHORT = refinement.Config(iterations=20, checkpoints=(), control=PRUNING)
+SHORT = refinement.Config(iterations=20, checkpoints=())
 CONFIG = Config(size=160, optimize=SHORT)
 
 

@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.rasterize.gaussian_render import seen
+from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.seeding import Config, gaussians_from_pointmap, initial_gaussians, redundant_pixels
 from tests.support.synthetic import plane_pointmap, without
@@ -287,6 +287,6 @@ def test_large_pieces_are_not_coarsened_beyond_what_a_partition_takes():
 def render(gaussians: Gaussians, pointmap: Pointmap) -> torch.Tensor:
     height, width = pointmap.depth.shape
     camera = torch.from_numpy(pointmap.T_world_camera).float(), torch.from_numpy(pointmap.K).float()
-    image = seen(gaussians, gaussians.opacities, *camera, width, height).rgb
+    image = render_gaussians(gaussians, Camera(*camera, width, height)).rgb
     assert image is not None
     return image

@@ -9,18 +9,18 @@ from typing import cast
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
-from splatnode.recon.config import Config
+from splatnode.recon.config import PREVIEW, Config
 from splatnode.recon.daemon.checkpoint import checkpoint, saved_judgement
 from splatnode.recon.daemon.checkpoint.saved import GraphRecord
 from splatnode.recon.daemon.checkpoint.store import MADE_ANEW, Store
 from splatnode.recon.daemon.reconstruction import LiveReconstruction
-from splatnode.recon.optimize import refinement
 from splatnode.recon.pipeline import prepare
 from tests.support.synthetic import photographs
 
-CONFIG = Config(size=160, preview=refinement.Config(iterations=1, half_resolution_share=1.0))
+CONFIG = Config(size=160, preview=replace(PREVIEW, iterations=1))
 
 
 @pytest.fixture(scope="module")

@@ -11,13 +11,13 @@ import torch
 from splatnode.recon.optimize.control import adaptive, proximity
 from splatnode.recon.optimize.control.control import Step
 from splatnode.recon.optimize.photometric_loss import PhotometricLoss
-from splatnode.recon.optimize.target import Target
+from splatnode.recon.optimize.training_image import TrainingImage
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.scene.gaussians import Gaussians
 from tests.support.synthetic import tiny_scene
 
 K = torch.tensor([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]])
-TARGET = Target(K, 40, 30, PhotometricLoss(torch.zeros(30, 40, 3)))
+IMAGE = TrainingImage(K, 40, 30, PhotometricLoss(torch.zeros(30, 40, 3)))
 CONFIG = adaptive.Config(every=10, start=0.0, end=1.0, reset_every=0.5)
 
 
@@ -40,7 +40,7 @@ def step(of: Gaussians, iteration: int = 10, gradient: float = 0.0) -> Step:
     of.means.requires_grad_()
     of.means.grad = torch.zeros_like(of.means)
     of.means.grad[0, 0] = gradient
-    return Step(iteration, 100, iteration / 100, 0, of, (torch.eye(4), apart), (TARGET, TARGET), None)
+    return Step(iteration, 100, iteration / 100, 0, of, (torch.eye(4), apart), (IMAGE, IMAGE), None)
 
 
 def test_the_extent_is_that_of_the_cameras():
@@ -53,14 +53,14 @@ def test_the_gradient_in_the_image_is_that_of_moving_what_is_seen():
     of = replace(of, log_scales=torch.full_like(of.log_scales, -3.0), logit_opacities=torch.tensor([2.0]))
     of.means.requires_grad_()
     T = scene.Ts_world_camera[0]
-    target = Target(scene.Ks[0], scene.width, scene.height, TARGET.loss)
+    photograph = TrainingImage(scene.Ks[0], scene.width, scene.height, IMAGE.loss)
 
     def image(K):
         return rasterize(of.means, of.quats, of.scales, of.opacities, of.sh, T, K, scene.width, scene.height)
 
     ramp = torch.linspace(0, 1, scene.width)[None, :, None] + torch.linspace(0, 2, scene.height)[:, None, None]
     (image(scene.Ks[0]).rgb * ramp).sum().backward()
-    found = adaptive.image_gradient(Step(1, 10, 0.1, 0, of, (T,), (target,), None))
+    found = adaptive.image_gradient(Step(1, 10, 0.1, 0, of, (T,), (photograph,), None))
     principal = scene.Ks[0].clone().requires_grad_()  # moving it moves the image of all that is seen
     (image(principal).rgb * ramp).sum().backward()
     halves = torch.tensor([scene.width / 2, scene.height / 2])
@@ -116,7 +116,7 @@ def test_a_gap_is_filled_half_way_to_the_neighbours():
 
 
 def test_unpooling_is_part_of_a_round():
-    config = proximity.Config(CONFIG, far=1.0)
+    config = proximity.Config(CONFIG, min_distance=1.0)
     lonely = gaussians(5)
     lonely.means[4, 0] = 2.0
     change = proximity.load(config, 0).after_step(step(lonely))

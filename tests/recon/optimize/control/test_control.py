@@ -10,11 +10,11 @@ import torch
 from msgspec import structs
 
 from splatnode.recon.optimize.control.control import Change, Step
-from splatnode.recon.optimize.refinement import Config, refine
+from splatnode.recon.optimize.refinement import refine
 from splatnode.recon.scene.scene import Scene
-from tests.recon.optimize.test_refinement import truth  # noqa: F401  a fixture
+from tests.recon.optimize.test_refinement import plain, truth  # noqa: F401  a fixture
 
-QUICK = Config(iterations=6, checkpoints=(), half_resolution_share=0.5)
+QUICK = plain(iterations=6, half_resolution_share=0.5)
 
 
 def controlled(scene: Scene, after_step: Callable[[Step], Change | None]) -> Scene:
@@ -29,8 +29,8 @@ def test_a_control_sees_every_step_with_its_gradients(truth):  # noqa: F811
 
     def watch(step: Step) -> None:
         assert step.gaussians.means.grad is not None and step.gaussians.means.grad.abs().max() > 0
-        assert len(step.Ts_world_camera) == len(step.targets) == 3
-        seen.append((step.iteration, step.iterations, step.view, step.targets[0].width))
+        assert len(step.Ts_world_camera) == len(step.images) == 3
+        seen.append((step.iteration, step.iterations, step.view, step.images[0].width))
 
     controlled(truth, watch)
     assert [entry[:2] for entry in seen] == [(iteration, 6) for iteration in range(1, 7)]

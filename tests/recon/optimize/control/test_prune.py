@@ -10,24 +10,24 @@ import torch
 from msgspec import structs
 
 from splatnode.recon.optimize.control.control import ControlChoice, Step
-from splatnode.recon.optimize.control.prune import Camera, Config, between, changes_without, load, most_worth
-from splatnode.recon.optimize.refinement import Config as Optimising
+from splatnode.recon.optimize.control.prune import Config, between, changes_without, load, most_worth
 from splatnode.recon.optimize.refinement import refine
-from splatnode.recon.optimize.target import Target, target
+from splatnode.recon.optimize.training_image import TrainingImage, training_image
+from splatnode.recon.rasterize.gaussian_render import Camera
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.contrast_masking import visibility
 from splatnode.recon.scene.gaussians import Gaussians, concatenate
 from splatnode.recon.scene.scene import Scene, TrainingView
-from tests.recon.optimize.test_refinement import render, truth  # noqa: F401  a fixture
+from tests.recon.optimize.test_refinement import plain, render, truth  # noqa: F401  a fixture
 
 
-def targets_of(scene: Scene, scale: float = 1.0) -> list[Target]:
-    return [target(view, np.ones(view.image.shape[:2], bool), scale, 0.2) for view in scene.views]
+def images_of(scene: Scene, scale: float = 1.0) -> list[TrainingImage]:
+    return [training_image(view, np.ones(view.image.shape[:2], bool), scale, 0.2) for view in scene.views]
 
 
 def cameras_of(scene: Scene, scale: float = 1.0) -> list[Camera]:
-    targets = zip(scene.views, targets_of(scene, scale), strict=True)
-    return [Camera(view.T_world_camera, each.K, each.width, each.height) for view, each in targets]
+    images = zip(scene.views, images_of(scene, scale), strict=True)
+    return [Camera(view.T_world_camera, each.K, each.width, each.height) for view, each in images]
 
 
 def worth(scene: Scene, probes: int, scale: float = 1.0) -> torch.Tensor:
@@ -67,7 +67,7 @@ def test_of_too_many_the_best_are_kept_in_their_order():
 
 
 def pruned(scene: Scene, config: Config, limit: int | None = None) -> Scene:
-    optimising = Optimising(iterations=4, checkpoints=(), control=ControlChoice("prune", config))
+    optimising = plain(iterations=4, control=ControlChoice("prune", config))
     return list(refine(scene, optimising, seed=0, max_gaussians=limit))[-1]
 
 
@@ -100,7 +100,7 @@ def test_a_limit_is_kept_to_the_one(truth, limit):  # noqa: F811
 
 def test_it_is_done_once_when_it_is_due_however_fast_time_goes(truth):  # noqa: F811
     control = load(Config(at=(0.3, 0.6), least_change=0.0), seed=0)
-    step = Step(9, 9, 0.0, 0, truth.gaussians, [v.T_world_camera for v in truth.views], targets_of(truth), None)
+    step = Step(9, 9, 0.0, 0, truth.gaussians, [v.T_world_camera for v in truth.views], images_of(truth), None)
     changed = [
         control.after_step(replace(step, progress=progress)) is not None for progress in (0.2, 0.4, 0.5, 0.7, 0.95)
     ]
@@ -111,7 +111,7 @@ def test_it_is_done_once_when_it_is_due_however_fast_time_goes(truth):  # noqa: 
 
 def test_in_a_hurry_it_waits_until_the_gaussians_are_fitted_unless_there_are_too_many(truth):  # noqa: F811
     def happens(iteration: int, limit: int | None, progress: float = 0.5) -> bool:
-        scene = truth.gaussians, [v.T_world_camera for v in truth.views], targets_of(truth), limit
+        scene = truth.gaussians, [v.T_world_camera for v in truth.views], images_of(truth), limit
         return load(Config(), seed=0).after_step(Step(iteration, 500, progress, 0, *scene)) is not None
 
     assert not happens(30, None, 0.3) and happens(31, None, 0.3)

@@ -1,4 +1,4 @@
-"""Relocation: what several Gaussians in one place look like, who moves where, and who is shaken."""
+"""Relocation: what several Gaussians in one place look like, who moves where, and who gets noise."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from splatnode.recon.optimize.control.control import ControlChoice
-from splatnode.recon.optimize.control.relocate import Config, divided, relocated, shaken
+from splatnode.recon.optimize.control.relocate import Config, relocated, shared_by, with_noise
 from splatnode.recon.optimize.refinement import Config as Optimising
 from splatnode.recon.optimize.refinement import refine
 from splatnode.recon.scene.gaussians import Gaussians
@@ -29,7 +29,7 @@ def gaussians(opacities: list[float]) -> Gaussians:
 
 @pytest.mark.parametrize(("opacity", "count"), [(0.3, 1), (0.7, 2), (0.9, 5)])
 def test_parts_in_one_place_look_like_the_whole(opacity, count):
-    shared, narrower = divided(torch.tensor([opacity]), torch.tensor([count]))
+    shared, narrower = shared_by(torch.tensor([count]), torch.tensor([opacity]))
     assert 1 - (1 - float(shared)) ** count == pytest.approx(opacity, abs=1e-5)
     x = torch.linspace(-12, 12, 20001).double()
     together = 1 - (1 - shared.double() * torch.exp(-0.5 * (x / narrower.double()) ** 2)) ** count
@@ -52,10 +52,10 @@ def test_where_none_is_dead_or_none_alive_nothing_moves():
         assert after is before and origin.tolist() == [0, 1]
 
 
-def test_the_transparent_are_shaken_within_their_extent_and_the_opaque_stay():
+def test_the_transparent_move_within_their_extent_and_the_opaque_stay():
     before = gaussians([1e-4] * 500 + [0.5] * 500)
     flat = replace(before, log_scales=torch.tensor([0.0, -1.0, -20.0]).repeat(1000, 1))
-    moves = shaken(flat, 0.1, torch.Generator().manual_seed(0)).means - flat.means
+    moves = with_noise(flat, 0.1, torch.Generator().manual_seed(0)).means - flat.means
     spread = moves[:500].std(0)
     assert float(spread[0] / spread[1]) == pytest.approx(float(torch.e**2), rel=0.2)  # as the variances
     assert moves[:, 2].abs().max() == 0

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.recon.optimize.target import target
+from splatnode.recon.optimize.training_image import training_image
 from splatnode.recon.scene.scene import TrainingView
 
 HEIGHT, WIDTH = 24, 40
@@ -16,13 +16,13 @@ def test_only_what_shows_the_scene_is_compared(scale):
     shown = np.ones((HEIGHT, WIDTH), bool)
     image[:3], shown[:3] = 0, False
     K = torch.tensor([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
-    seen = target(TrainingView("a", 0, image, torch.eye(4), K, None, None), shown, scale, 0.2)
-    assert (seen.width, seen.height) == (WIDTH * scale, HEIGHT * scale)
-    torch.testing.assert_close(seen.K[:2], scale * K[:2])
-    grey = torch.full((seen.height, seen.width, 3), 128 / 255, requires_grad=True)
-    assert seen.loss(grey).item() == pytest.approx(0, abs=1e-5)
-    brighter = torch.full((seen.height, seen.width, 3), 0.7, requires_grad=True)
-    seen.loss(brighter).backward()
+    compared = training_image(TrainingView("a", 0, image, torch.eye(4), K, None, None), shown, scale, 0.2)
+    assert (compared.width, compared.height) == (WIDTH * scale, HEIGHT * scale)
+    torch.testing.assert_close(compared.K[:2], scale * K[:2])
+    grey = torch.full((compared.height, compared.width, 3), 128 / 255, requires_grad=True)
+    assert compared.loss(grey).item() == pytest.approx(0, abs=1e-5)
+    brighter = torch.full((compared.height, compared.width, 3), 0.7, requires_grad=True)
+    compared.loss(brighter).backward()
     rows = 3 if scale == 1 else 2  # a pixel of the smaller photograph that mixes both is left out
     assert brighter.grad is not None
     assert not brighter.grad[:rows].any() and bool((brighter.grad[rows:] != 0).all())

@@ -1,0 +1,47 @@
+"""TrainingImage: the photograph of a view at the resolution at which its render is compared with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from splatnode.recon.optimize.photometric_loss import PhotometricLoss
+from splatnode.recon.scene.scene import TrainingView
+
+_WHOLLY_SHOWN = 1e-3  # tolerance on the share of a pixel that shows the scene, above the rounding of the resize
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingImage:
+    K: Tensor  # (3, 3) intrinsics at this size, pixels
+    width: int  # pixels
+    height: int
+    loss: PhotometricLoss  # of a render (height, width, 3), against the photograph where it shows the scene
+
+
+def training_image(view: TrainingView, shown: npt.NDArray[np.bool_], scale: float, dssim: float) -> TrainingImage:
+    """The photograph of `view` at `scale` of its size, with `dssim` the weight of D-SSIM in its loss.
+
+    `shown` (h, w), at the photograph's own size, is False on the black border that undistortion leaves. A pixel of the
+    smaller image is compared only if all pixels that it covers are shown.
+    """
+    K, width, height = scaled(view.K, view.width, view.height, scale)
+    image, weights = view.image, None
+    if (width, height) != (view.width, view.height):
+        image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+    if not shown.all():
+        share = cv2.resize(shown.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+        weights = torch.from_numpy(np.floor(share + np.float32(_WHOLLY_SHOWN)))
+    return TrainingImage(K, width, height, PhotometricLoss(torch.from_numpy(image).float() / 255.0, dssim, weights))
+
+
+def scaled(K: Tensor, width: int, height: int, scale: float) -> tuple[Tensor, int, int]:
+    """Intrinsics, width and height of the same view at `scale` of its resolution."""
+    scaled_width, scaled_height = max(1, round(width * scale)), max(1, round(height * scale))
+    factors = torch.tensor([[scaled_width / width], [scaled_height / height], [1.0]])
+    return K.float() * factors, scaled_width, scaled_height
