@@ -1,7 +1,8 @@
 """YAML and changes to it -> a typed, frozen Struct. What the Struct does not know fails, with what it does know.
 
 Defaults and units live in the Structs; a file and the changes hold only what differs. A field whose type is a Plugin
-names a module by its `kind`: `camera: {kind: folder, folder: photos}` is capture.cameras.folder and its Config.
+names a module by its `kind`: `camera: {kind: folder, folder: photos}` is capture.cameras.folder and its Config. A field
+whose type is a Mapping of Plugins holds several by name, which is also their kind where they say no other.
 """
 
 from __future__ import annotations
@@ -120,6 +121,9 @@ def _checked(raw: Any, schema: Any, where: str) -> Any:
     """`raw` after all its keys were found in `schema`, its plug-ins made; types are msgspec's to check."""
     if not isinstance(raw, Mapping):
         return raw
+    if typing.get_origin(schema) is Mapping:
+        plugin = typing.get_args(schema)[1]
+        return {name: _checked(_of_kind(name, each), plugin, _join(where, str(name))) for name, each in raw.items()}
     if isinstance(schema, type) and issubclass(schema, Plugin):
         return _plugin(raw, schema, where)
     if not _has_fields(schema):
@@ -132,6 +136,10 @@ def _checked(raw: Any, schema: Any, where: str) -> Any:
     if missing:
         raise ConfigError(f"{_join(where, missing[0])}: missing; it has no default")
     return {key: _checked(value, _struct_in(types[key]), _join(where, key)) for key, value in raw.items()}
+
+
+def _of_kind(kind: object, raw: Any) -> Any:
+    return {"kind": kind, **raw} if isinstance(raw, Mapping) else raw
 
 
 def _plugin(raw: Mapping[str, Any], schema: type[Plugin], where: str) -> Plugin:
@@ -155,7 +163,9 @@ def _required(schema: Any) -> list[str]:
 
 
 def _struct_in(annotation: Any) -> Any:
-    """The Struct or dataclass in `annotation`, also where it may be None; otherwise the annotation."""
+    """The Struct or dataclass in `annotation`, also where it may be None; else, and of a Mapping, the annotation."""
+    if typing.get_origin(annotation) is Mapping:
+        return annotation
     return next((choice for choice in typing.get_args(annotation) if _has_fields(choice)), annotation)
 
 

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import msgspec
 
 from splatnode.recon.config import Config
-from splatnode.recon.optimize.regularise import Term
 from splatnode.recon.scene import pixelwise, seeding
 
 BASE, WHOLE = "instantsplat-xl", "paper"
@@ -47,25 +46,23 @@ def variants(methods: Collection[str]) -> list[Variant]:
 
 def configs(whole: Config) -> dict[str, Config]:
     """The variants that are no methods by themselves, by name."""
-    terms = whole.optimize.regularise
+    losses = whole.optimize.regularise.losses
 
-    def with_terms(config: Config, **changes: object) -> Config:
-        changed = msgspec.structs.replace(config.optimize.regularise, **changes)
-        return msgspec.structs.replace(config, optimize=msgspec.structs.replace(config.optimize, regularise=changed))
+    def with_regularise(**changes: object) -> Config:
+        changed = msgspec.structs.replace(whole.optimize.regularise, **changes)
+        return msgspec.structs.replace(whole, optimize=msgspec.structs.replace(whole.optimize, regularise=changed))
 
-    with_one = {
-        f"{BASE}+{part}": with_terms(
-            whole, **{other: getattr(terms, field) if other == field else Term() for other in _LOSSES.values()}
-        )
-        for part, field in _LOSSES.items()
+    with_one = {f"{BASE}+{part}": with_regularise(losses={name: losses[name]}) for part, name in _LOSSES.items()}
+    without_one = {
+        f"{WHOLE}-{part}": with_regularise(losses={name: loss for name, loss in losses.items() if name != left_out})
+        for part, left_out in _LOSSES.items()
     }
-    without_one = {f"{WHOLE}-{part}": with_terms(whole, **{field: Term()}) for part, field in _LOSSES.items()}
     thick = msgspec.structs.replace(whole.pixelwise or pixelwise.Config(), down_sampling=_NO_THINNING)
     fixed = msgspec.structs.replace(whole.optimize, refine_poses=False)
     return {
         **with_one,
         **without_one,
-        f"{WHOLE}-pseudo-views": with_terms(whole, pseudo_views=0),
+        f"{WHOLE}-pseudo-views": with_regularise(pseudo_views=0),
         f"{WHOLE}-down-sampling": msgspec.structs.replace(whole, pixelwise=thick),
         f"{WHOLE}-pose-refinement": msgspec.structs.replace(whole, optimize=fixed),
     }

@@ -6,7 +6,7 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from importlib import import_module
 
@@ -17,6 +17,8 @@ from splatnode.recon.config import PRESETS, Config
 from splatnode.recon.evaluate import ablation
 from splatnode.recon.evaluate.start import Start, continued, foundation
 from splatnode.recon.optimize import dropout, refinement, regularise
+from splatnode.recon.optimize.losses import depth, normal, point_render, semantic
+from splatnode.recon.optimize.losses.loss import LossChoice
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import pixelwise
@@ -38,8 +40,16 @@ _INSTANTSPLAT_RATES = refinement.Rates(
     final_pose=0.01,
 )
 
+# The publication's losses, with its weights and the parts of the refinement in which they count.
+_PAPER_LOSSES = {
+    "point_render": LossChoice("point_render", point_render.Config(0.25, 0.1, 0.8, compare_unseen=True)),
+    "depth": LossChoice("depth", depth.Config(0.05, 0.2, 0.7)),
+    "normal": LossChoice("normal", normal.Config(0.01, 0.2, 0.7)),
+    "semantic": LossChoice("semantic", semantic.Config(0.5, 0.1, 0.8)),
+}
 
-def _instantsplat(iterations: int, terms: regularise.Config) -> Config:
+
+def _instantsplat(iterations: int, losses: Mapping[str, LossChoice]) -> Config:
     return Config(
         pixelwise=pixelwise.Config(),
         optimize=refinement.Config(
@@ -48,7 +58,7 @@ def _instantsplat(iterations: int, terms: regularise.Config) -> Config:
             dropout=dropout.Config(share=0.0),
             control=None,
             rates=_INSTANTSPLAT_RATES,
-            regularise=terms,
+            regularise=regularise.Config(losses),
         ),
     )
 
@@ -59,14 +69,13 @@ def _watched(config: Config) -> Config:
     return msgspec.structs.replace(config, optimize=watched)
 
 
-_NO_TERMS = regularise.Config()
-_PAPER = _instantsplat(1000, regularise.PAPER)
+_PAPER = _instantsplat(1000, _PAPER_LOSSES)
 CONFIGS: dict[str, Config] = {
     name: _watched(config)
     for name, config in {
         **PRESETS,
-        "instantsplat-s": _instantsplat(200, _NO_TERMS),
-        ablation.BASE: _instantsplat(1000, _NO_TERMS),
+        "instantsplat-s": _instantsplat(200, {}),
+        ablation.BASE: _instantsplat(1000, {}),
         ablation.WHOLE: _PAPER,
         **ablation.configs(_PAPER),
     }.items()

@@ -131,7 +131,7 @@ class _Fit:
             [training_image(*each, scale, config.dssim) for each in zip(scene.views, shown, strict=True)]
             for scale in _SCALES
         ]
-        self._terms = _terms(scene, config.regularise, seed)
+        self._regularisation = _regularisation(scene, config.regularise, seed)
         self._iterations = scene.iterations
         self.losses: list[float] = []  # photometric, of each step
 
@@ -141,15 +141,15 @@ class _Fit:
         image = self._images[half][index]
         refine_pose = self._config.refine_poses and index > 0
         T_world_camera = self._Ts_world_camera[index].requires_grad_(refine_pose)
-        channels = self._terms.channels(progress) if self._terms else ("rgb",)
+        channels = self._regularisation.channels(progress) if self._regularisation else ("rgb",)
         opacities = self._dropout(self._gaussians.opacities, progress)
         camera = Camera(T_world_camera, image.K, image.width, image.height)
         render = render_gaussians(self._gaussians, camera, channels, opacities=opacities)
         assert render.rgb is not None  # it was asked for
         loss = image.loss(render.rgb)
         self.losses.append(float(loss.detach()))
-        if self._terms is not None:
-            loss = loss + self._regularisation(self._terms, index, render, progress)
+        if self._regularisation is not None:
+            loss = loss + self._further_losses(self._regularisation, index, render, progress)
         loss.backward()
         self._adam.lrs = {name: rate * self._finals[name] ** progress for name, rate in self._rates.items()}
         self._adam.step()
@@ -181,13 +181,16 @@ class _Fit:
             self._adam.follow(_leaves(change.gaussians), change.origin)
             self._dropout.follow(change.gaussians)
 
-    def _regularisation(self, terms: Regularisation, index: int, render: Render, progress: float) -> Tensor | float:
-        """The terms on training view `index`, as rendered, and on a pseudo view."""
+    def _further_losses(
+        self, regularisation: Regularisation, index: int, render: Render, progress: float
+    ) -> Tensor | float:
+        """The losses beside the photometric one on training view `index`, as rendered, and on a pseudo view."""
 
         def draw(view: PseudoView, channels: Collection[str]) -> Render:
             return render_gaussians(self._gaussians, view.camera, channels)
 
-        parts = (terms.training_loss(index, render, progress), terms.pseudo_loss(draw, progress))
+        on_training_view = regularisation.training_loss(index, render, progress)
+        parts = (on_training_view, regularisation.pseudo_loss(draw, progress))
         return sum((part for part in parts if part is not None), 0.0)
 
     def _move_camera(self, index: int, gradient: Tensor, decay: float) -> None:
@@ -203,7 +206,7 @@ class _Fit:
             for view, T in zip(self._scene.views, self._Ts_world_camera, strict=True)
         )
         learnt = self._gaussians.map(lambda tensor: tensor.detach().clone())
-        served_by = {} if self._terms is None else self._terms.served_by
+        served_by = {} if self._regularisation is None else self._regularisation.served_by
         return Scene(views, learnt, self._iterations, served_by=served_by)
 
 
@@ -212,12 +215,12 @@ def _leaves(gaussians: Gaussians) -> dict[str, Tensor]:
     return {name: getattr(gaussians, name).requires_grad_(True) for name in PARAMETERS}
 
 
-def _terms(scene: Scene, config: regularise.Config, seed: int) -> Regularisation | None:
+def _regularisation(scene: Scene, config: regularise.Config, seed: int) -> Regularisation | None:
     """The losses beside the photometric one; None where all weights are 0.
 
     Raises ValueError where they would compare with what is known of a view, and nothing is.
     """
-    if not any(term.weight for term in config.terms):
+    if not config.weighted:
         return None
     pointmaps = []
     for view in scene.views:

@@ -20,6 +20,8 @@ from splatnode.recon.evaluate.rivals.colmap import Model
 from splatnode.recon.optimize import refinement, regularise
 from splatnode.recon.optimize.control import adaptive, proximity
 from splatnode.recon.optimize.control.control import ControlChoice
+from splatnode.recon.optimize.losses import depth
+from splatnode.recon.optimize.losses.loss import LossChoice
 from splatnode.recon.priors import classical, stereo
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.snapshot import Snapshot
@@ -27,7 +29,7 @@ from splatnode.recon.scene.scene import Scene
 
 _WHOLE = 1_000_000  # pixels of a patch: all of an image is one, as FSGS correlates it
 _DEPTH = regularise.Config(
-    depth=regularise.Term(0.05, 0.2, 0.95), depth_patch=_WHOLE, depth_share=1.0, min_confidence=0.1
+    {"depth": LossChoice("depth", depth.Config(0.05, 0.2, 0.95, patch=_WHOLE, share=1.0))}, min_confidence=0.1
 )
 _CONTROL = proximity.Config(adaptive.Config(min_gradient=5e-4, start=0.05, end=0.95, reset_every=adaptive.NEVER))
 OPTIMIZE = msgspec.structs.replace(

@@ -1,1 +1,1 @@
-"""What the optimiser may minimise besides the photometric loss: one file an equation of the paper."""
+"""Losses beside the photometric one, one a file; loss.py is their interface."""

@@ -13,6 +13,8 @@ from msgspec import structs
 
 from splatnode.recon.geometry import exp_se3
 from splatnode.recon.optimize import dropout, refinement, regularise
+from splatnode.recon.optimize.losses import normal
+from splatnode.recon.optimize.losses.loss import LossChoice
 from splatnode.recon.optimize.pseudo_views import PseudoView
 from splatnode.recon.optimize.refinement import Config, Rates, refine
 from splatnode.recon.priors.pointmap import Pointmap
@@ -31,6 +33,7 @@ def plain(**changes: object) -> Config:
 
 
 QUICK = plain(iterations=12)
+WITH_NORMALS = regularise.Config({"normal": LossChoice("normal", normal.Config(1.0))})
 
 
 def render(gaussians: Gaussians, view: TrainingView) -> torch.Tensor:
@@ -276,7 +279,7 @@ def test_further_losses_count_on_training_views_and_pseudo_views(truth, monkeypa
     start = replace(truth, views=tuple(map(with_pointmap, truth.views)))
     config = plain(iterations=8, half_resolution_share=0.5)
     unpulled = last(start, config)
-    brighter = last(start, structs.replace(config, regularise=regularise.Config(depth=regularise.Term(1.0))))
+    brighter = last(start, structs.replace(config, regularise=WITH_NORMALS))
     assert brighter.served_by == {"depth": "a wish"} and unpulled.served_by == {}
     assert Brighter.made.names == ["0.png", "1.png", "2.png"]
     assert Brighter.made.shapes == [(True, (24, 32))] * 4 + [(True, (48, 64))] * 2 + [(False, (48, 64))] * 2
@@ -284,9 +287,9 @@ def test_further_losses_count_on_training_views_and_pseudo_views(truth, monkeypa
         assert render(brighter.gaussians, shown).mean() > 1.1 * render(unpulled.gaussians, shown).mean()
 
 
-def test_a_term_without_a_point_map_names_the_view(truth):
+def test_a_loss_without_a_point_map_names_the_view(truth):
     with pytest.raises(ValueError, match=r"0\.png has no point map"):
-        last(truth, plain(iterations=1, regularise=regularise.Config(normal=regularise.Term(1.0))))
+        last(truth, plain(iterations=1, regularise=WITH_NORMALS))
 
 
 def test_the_steps_of_cameras_fall_by_a_part_of_their_own(truth):

@@ -1,17 +1,22 @@
-"""The terms of equation 13 together: what is asked for, when, and that a right scene is left alone."""
+"""The losses of equation 13 together: what is rendered, when, and that a right scene costs nothing."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+from msgspec import structs
 
+from splatnode.recon.config import overlaid, preset
+from splatnode.recon.evaluate.methods import CONFIGS
 from splatnode.recon.networks.crop import Crop
+from splatnode.recon.optimize import losses
 from splatnode.recon.optimize.pseudo_views import PseudoView
-from splatnode.recon.optimize.regularise import PAPER, Config, Regularisation, Term
+from splatnode.recon.optimize.regularise import Config, Regularisation
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.render import Render
 
+PAPER = CONFIGS["paper"].optimize.regularise
 WIDTH, HEIGHT = 96, 64
 K = np.array([[90.0, 0.0, 48.0], [0.0, 90.0, 32.0], [0.0, 0.0, 1.0]])
 
@@ -61,46 +66,55 @@ def without_networks(monkeypatch, tmp_path):
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
 
 
+def weighted(**weights: float) -> Config:
+    """A loss of each name with that weight, with all patches of the depth."""
+    chosen = {name: {"weight": weight} for name, weight in weights.items()}
+    if "depth" in chosen:
+        chosen["depth"]["share"] = 1.0
+    return overlaid(preset("balanced"), {"optimize": {"regularise": {"losses": chosen}}}).optimize.regularise
+
+
 def regularisation(config: Config) -> Regularisation:
     pointmaps, images = zip(*(wall(x, i) for i, x in enumerate((0.0, 0.4, 0.8))), strict=True)
     return Regularisation(pointmaps, images, config, seed=0)
 
 
 def test_the_papers_schedule(without_networks):
-    terms = regularisation(PAPER)
-    assert terms.channels(0.05) == ("rgb",)
-    assert terms.channels(0.15) == ("rgb",)
-    assert terms.channels(0.2) == ("rgb", "depth", "normal") == terms.channels(0.69)
-    assert terms.channels(0.7) == ("rgb",)
-    assert terms.pseudo_loss(lambda view, _: truth_at(view), 0.05) is None
-    assert terms.pseudo_loss(lambda view, _: truth_at(view), 0.1) is not None
-    assert terms.pseudo_loss(lambda view, _: truth_at(view), 0.8) is None
-    assert terms.training_loss(0, truth(0.0), 0.1) is None
+    regularised = regularisation(PAPER)
+    assert regularised.channels(0.05) == ("rgb",)
+    assert regularised.channels(0.15) == ("rgb",)
+    assert regularised.channels(0.2) == ("rgb", "depth", "normal") == regularised.channels(0.69)
+    assert regularised.channels(0.7) == ("rgb",)
+    assert regularised.pseudo_loss(lambda view, _: truth_at(view), 0.05) is None
+    assert regularised.pseudo_loss(lambda view, _: truth_at(view), 0.1) is not None
+    assert regularised.pseudo_loss(lambda view, _: truth_at(view), 0.8) is None
+    assert regularised.training_loss(0, truth(0.0), 0.1) is None
 
 
 def test_training_views_that_agree_with_their_point_maps_cost_nothing(without_networks):
-    terms = regularisation(Config(depth=Term(1.0), normal=Term(1.0)))
-    right = terms.training_loss(0, truth(0.0), 0.5)
+    regularised = regularisation(weighted(depth=1.0, normal=1.0))
+    right = regularised.training_loss(0, truth(0.0), 0.5)
     assert right is not None and right.item() == pytest.approx(0.0, abs=1e-4)
-    against = terms.training_loss(0, mirrored(truth(0.0)), 0.5)
+    against = regularised.training_loss(0, mirrored(truth(0.0)), 0.5)
     assert against is not None and against.item() > 1.0
 
 
 def test_a_right_scene_costs_less_from_a_pseudo_view_than_a_shifted_one(without_networks):
     def loss(shift: float) -> float:
-        terms = regularisation(Config(point_render=Term(1.0), depth=Term(1.0), normal=Term(1.0), off_path=0.0))
-        return sum(float(terms.pseudo_loss(lambda view, _: truth_at(view, shift), 0.5)) for _ in range(6))
+        config = structs.replace(weighted(point_render=1.0, depth=1.0, normal=1.0), off_path=0.0)
+        regularised = regularisation(config)
+        return sum(float(regularised.pseudo_loss(lambda view, _: truth_at(view, shift), 0.5)) for _ in range(6))
 
     assert loss(0.0) < 0.6 * loss(0.15)
 
 
-def test_the_total_is_the_weighted_sum_of_its_terms(without_networks):
+def test_the_total_is_the_weighted_sum_of_its_losses(without_networks):
     """Equation 13, on training and pseudo views."""
 
     def loss(**weights: float) -> float:
-        terms = regularisation(Config(depth_share=1.0, **{name: Term(weight) for name, weight in weights.items()}))
-        pseudo = terms.pseudo_loss(lambda view, _: mirrored(truth_at(view)), 0.5)
-        training = terms.training_loss(0, mirrored(truth(0.0)), 0.5)
+        regularised = regularisation(weighted(**weights))
+        pseudo = regularised.pseudo_loss(lambda view, _: mirrored(truth_at(view)), 0.5)
+        training = regularised.training_loss(0, mirrored(truth(0.0)), 0.5)
         return sum(part.item() for part in (pseudo, training) if part is not None)
 
     alone = [loss(point_render=1.0), loss(depth=1.0), loss(normal=1.0)]
@@ -109,11 +123,11 @@ def test_the_total_is_the_weighted_sum_of_its_terms(without_networks):
 
 
 def test_half_size_renders_are_compared_with_half_of_what_is_known(without_networks):
-    terms = regularisation(Config(depth=Term(1.0), normal=Term(1.0), depth_patch=16))
+    regularised = regularisation(weighted(depth=1.0, normal=1.0))
     full = truth(0.0)
     assert full.depth is not None and full.normal is not None
     half = Render(None, full.depth[::2, ::2], full.normal[::2, ::2], None)
-    loss = terms.training_loss(0, half, 0.5)
+    loss = regularised.training_loss(0, half, 0.5)
     assert loss is not None and loss.item() == pytest.approx(0.0, abs=5e-3)
 
 
@@ -125,15 +139,15 @@ def test_which_network_served_is_told(without_networks):
         "semantic": "nothing: no weights",
     }
     assert regularisation(Config()).served_by == {}
-    nothing = regularisation(Config(semantic=Term(1.0)))
+    nothing = regularisation(weighted(semantic=1.0))
     assert nothing.pseudo_loss(lambda view, _: truth_at(view), 0.5) is None  # no view is rendered for it
 
 
-def test_terms_of_weight_zero_ask_for_nothing(without_networks):
-    terms = regularisation(Config())
-    assert terms.channels(0.5) == ("rgb",)
-    assert terms.training_loss(0, truth(0.0), 0.5) is None
-    assert terms.pseudo_loss(lambda view, channels: truth(0.0), 0.5) is None
+def test_losses_of_weight_zero_ask_for_nothing(without_networks):
+    regularised = regularisation(weighted(depth=0.0, point_render=0.0))
+    assert regularised.served_by == {} and regularised.channels(0.5) == ("rgb",)
+    assert regularised.training_loss(0, truth(0.0), 0.5) is None
+    assert regularised.pseudo_loss(lambda view, channels: truth(0.0), 0.5) is None
 
 
 def test_networks_serve_where_their_weights_are(monkeypatch):
@@ -153,8 +167,8 @@ def test_networks_serve_where_their_weights_are(monkeypatch):
         def __call__(self, image):
             return torch.nn.functional.normalize(image.mean((0, 1)), dim=0)
 
-    monkeypatch.setattr("splatnode.recon.optimize.regularise.load_relative", Seer)
-    monkeypatch.setattr("splatnode.recon.optimize.regularise.load_dino", Encoder)
+    monkeypatch.setattr("splatnode.recon.optimize.supervision.load_relative", Seer)
+    monkeypatch.setattr("splatnode.recon.optimize.losses.semantic.load_dino", Encoder)
     pointmaps, images = zip(*(wall(x, i) for i, x in enumerate((0.0, 0.4))), strict=True)
     for pointmap in pointmaps:
         pointmap.depth[:, ::3] = 0  # several views know only a part
@@ -167,3 +181,37 @@ def test_networks_serve_where_their_weights_are(monkeypatch):
     losses = [float(served.training_loss(0, render, progress)) for render in (right, wrong)]
     assert losses[0] < 1e-3 < losses[1]
     assert Regularisation(pointmaps, images, Config(), seed=0).served_by == {}
+
+
+BRIGHTNESS = """
+from splatnode.recon.optimize.losses.loss import Loss, Schedule
+
+class Config(Schedule):
+    wanted: float = 1.0
+
+def prepare(config, supervision, seed):
+    darkness = lambda index, render: config.wanted - render.rgb.mean()
+    return Loss(f"brightness of {len(supervision.images)} photographs", on_training_view=darkness)
+"""
+
+
+def test_a_new_loss_is_one_new_file(tmp_path, monkeypatch):
+    (tmp_path / "brightness.py").write_text(BRIGHTNESS)
+    monkeypatch.setattr(losses, "__path__", [*losses.__path__, str(tmp_path)])
+    config = weighted(brightness=2.0)
+    regularised = regularisation(config)
+    assert regularised.served_by == {"brightness": "brightness of 3 photographs"}
+    loss = regularised.training_loss(0, truth(0.0), 0.5)
+    assert loss is not None and loss.item() == pytest.approx(2 * (1 - truth(0.0).rgb.mean().item()))
+    assert regularised.pseudo_loss(lambda view, _: truth_at(view), 0.5) is None  # no view is rendered for it
+
+
+def test_a_loss_that_is_not_there_is_named_with_those_that_are():
+    with pytest.raises(ValueError, match=r"losses\.depht\.kind: expected one of depth, normal, point_render, semantic"):
+        weighted(depht=1.0)
+
+
+def test_a_loss_may_be_used_twice_under_names_of_its_own():
+    chosen = {"fine": {"kind": "depth", "weight": 1.0, "patch": 16}, "coarse": {"kind": "depth", "weight": 0.5}}
+    changed = overlaid(preset("balanced"), {"optimize": {"regularise": {"losses": chosen}}})
+    assert list(regularisation(changed.optimize.regularise).served_by) == ["fine", "coarse"]

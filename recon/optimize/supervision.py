@@ -1,0 +1,111 @@
+"""What is known of training views and pseudo views beside the photographs: targets that losses compare renders with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch import Tensor
+
+from splatnode.recon.networks.depth_anything import load_relative
+from splatnode.recon.optimize.point_render import PointRender, render_points
+from splatnode.recon.optimize.pseudo_views import PseudoView
+from splatnode.recon.priors.monocular import with_monocular
+from splatnode.recon.priors.pointmap import Pointmap
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceTarget:
+    """The depth and the normals of a view, where they are known."""
+
+    depth: Tensor  # (H, W) z in the camera frame
+    normal: Tensor  # (H, W, 3) camera frame, unit length, facing the camera
+    weights: Tensor  # (H, W) in [0, 1], 0 where nothing is known
+
+
+@dataclass(frozen=True, eq=False)
+class Supervision:
+    """Targets of the C training views and the V pseudo views; each kind is computed when a loss first asks for it."""
+
+    images: Sequence[npt.NDArray[np.uint8]]  # C photographs (H, W, 3) RGB at modelled size
+    pointmaps: Sequence[Pointmap]  # of the same C views
+    pseudo_views: Sequence[PseudoView]  # V of them
+    nearest_points: int  # that are blended in a pixel of a point render
+    min_confidence: float  # of a point or a depth that is used
+
+    @cached_property
+    def surfaces(self) -> tuple[SurfaceTarget, ...]:
+        """Of the training views: depths of a monocular network where there is one, else of the point maps."""
+        return tuple(_from_pointmap(pointmap, self.min_confidence) for pointmap in self._completed[0])
+
+    @property
+    def depth_source(self) -> str:
+        """Where the depths of `surfaces` come from, for the report."""
+        return self._completed[1]
+
+    @cached_property
+    def point_renders(self) -> tuple[PointRender, ...]:
+        """What the point cloud of all point maps shows from each pseudo view."""
+        if not self.pseudo_views:
+            return ()
+        cloud = _cloud(self.pointmaps, self.images, self.min_confidence)
+        return tuple(
+            render_points(*cloud, view.T_world_camera, view.K, view.width, view.height, nearest=self.nearest_points)
+            for view in self.pseudo_views
+        )
+
+    @cached_property
+    def pseudo_surfaces(self) -> tuple[SurfaceTarget, ...]:
+        """Of the pseudo views: depth and normals of the point renders."""
+        return tuple(_from_points(shown) for shown in self.point_renders)
+
+    @cached_property
+    def _completed(self) -> tuple[Sequence[Pointmap], str]:
+        """The point maps with a monocular network's depth, except in views that contradict it, and the source."""
+        network = load_relative()
+        if network is None:
+            return self.pointmaps, "multi-view depth"
+        pairs = list(zip(self.pointmaps, self.images, strict=True))
+        completed = [with_monocular(pointmap, image, network) for pointmap, image in pairs]
+        changed = sum(new is not old for new, (old, _) in zip(completed, pairs, strict=True))
+        source = f"depth of {network.name} (in {changed} of {len(pairs)} views, scaled by multi-view depth)"
+        return completed, source
+
+
+def at_size(target: Tensor, render: Tensor) -> Tensor:
+    """`target` (h, w, ...) sampled at the pixels of `render` (H, W, ...), which has the same view at another size."""
+    if target.shape == render.shape:
+        return target
+    rows, columns = (
+        ((torch.arange(size) + 0.5) * full / size).long()
+        for size, full in zip(render.shape[:2], target.shape[:2], strict=True)
+    )
+    return target[rows][:, columns]
+
+
+def _cloud(
+    pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], min_confidence: float
+) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32], npt.NDArray[np.float32]]:
+    """Points (M, 3), colours (M, 3) and world normals (M, 3) of all confident pixels."""
+    points, colours, normals = [], [], []
+    for pointmap, image in zip(pointmaps, images, strict=True):
+        confident = (pointmap.confidence >= min_confidence) & (pointmap.depth > 0)
+        points.append(pointmap.points[confident])
+        colours.append(image[confident].astype(np.float32) / 255.0)
+        normals.append((pointmap.normal[confident] @ pointmap.T_world_camera[:3, :3].T).astype(np.float32))
+    return np.concatenate(points), np.concatenate(colours), np.concatenate(normals)
+
+
+def _from_pointmap(pointmap: Pointmap, min_confidence: float) -> SurfaceTarget:
+    confident = (pointmap.confidence >= min_confidence) & (pointmap.depth > 0)
+    weights = np.where(confident, pointmap.confidence, 0).astype(np.float32)
+    return SurfaceTarget(*(torch.from_numpy(array) for array in (pointmap.depth, pointmap.normal, weights)))
+
+
+def _from_points(shown: PointRender) -> SurfaceTarget:
+    weights = shown.seen.astype(np.float32)
+    return SurfaceTarget(*(torch.from_numpy(array) for array in (shown.depth, shown.normal, weights)))
