@@ -18,7 +18,7 @@ _TINY = 1e-12  # least divisor, where a sum of weights or a mean may be 0
 _TINY_PRODUCT = 1e-16  # of two variances, likewise
 
 
-class Config(Schedule):
+class Config(Schedule, frozen=True, forbid_unknown_fields=True):
     """The loss of LM-Gaussian, which leaves the size of the patches open.
 
     On sceaux, in 250 iterations, the depth loss alone cost .38 dB with patches of 32 pixels, in which often noise is

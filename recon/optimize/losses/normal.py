@@ -15,7 +15,7 @@ _MIN_SQUARED_LENGTH = 1e-6  # of a rendered normal: thinner coverage has no dire
 _MIN_WEIGHT = 1e-12  # least divisor, where nothing is known
 
 
-class Config(Schedule):
+class Config(Schedule, frozen=True, forbid_unknown_fields=True):
     """The normal loss has no settings of its own."""
 
 

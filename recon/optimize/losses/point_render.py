@@ -11,7 +11,7 @@ from splatnode.recon.optimize.supervision import Supervision
 from splatnode.recon.rasterize.render import Render
 
 
-class Config(Schedule):
+class Config(Schedule, frozen=True, forbid_unknown_fields=True):
     compare_unseen: bool = False  # pull pixels without a point towards white, as the paper writes; else leave them out
 
 

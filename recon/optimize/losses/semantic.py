@@ -20,7 +20,7 @@ from splatnode.recon.optimize.supervision import Supervision
 from splatnode.recon.rasterize.render import Render
 
 
-class Config(Schedule):
+class Config(Schedule, frozen=True, forbid_unknown_fields=True):
     """The semantic loss has no settings of its own."""
 
 

@@ -186,7 +186,7 @@ def test_networks_serve_where_their_weights_are(monkeypatch):
 BRIGHTNESS = """
 from splatnode.recon.optimize.losses.loss import Loss, Schedule
 
-class Config(Schedule):
+class Config(Schedule, frozen=True, forbid_unknown_fields=True):
     wanted: float = 1.0
 
 def prepare(config, supervision, seed):
