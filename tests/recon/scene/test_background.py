@@ -11,7 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
-from splatnode.recon.scene.background import SHELL, Config
+from splatnode.recon.scene.background import SHELL, Config, far_shell
 from splatnode.recon.scene.gaussians import Gaussians
 from tests.support.synthetic import plane_pointmap
 
