@@ -1,4 +1,4 @@
-"""Cycles: what the pairs say, each by itself, must come to nothing around every triangle of frames."""
+"""Cycle consistency: the relative rotations of three pairs, each found by itself, multiply to the identity."""
 
 from __future__ import annotations
 
@@ -10,19 +10,24 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import resection
 from splatnode.recon.registration.register import Registration
 
 Array = npt.NDArray[np.float64]
 
+MIN_INLIER_RATIO = 0.5  # of a relative pose to be believed: most of its matches support it
+MIN_LENGTH = (
+    1e-12  # of two directions, multiplied: shorter ones have no angle between them, and it counts as 90 degrees
+)
+
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    min_matches: int = 40  # of a pair that is heard
+    min_matches: int = 40  # of a pair that is asked
     partners: int = 3  # of each frame, those with most matches
     max_matches: int = 400  # of a pair that are used; more make a relative pose no surer
-    max_error_px: float = 2.5  # of a match, at 1024 px on the longer side
+    max_error_px: float = 2.5  # of a match, at REFERENCE_SIDE
 
 
 @dataclass(frozen=True)
@@ -44,13 +49,13 @@ def measure(
     cameras = {camera.index: camera for camera in registration.cameras}
     rotations: dict[tuple[int, int], Array] = {}
     directions = []
-    for i, j in _heard(list(cameras), pairs, config):
-        scale = max(max(keyframes[k].frame.width, keyframes[k].frame.height) for k in (i, j)) / 1024.0
+    for i, j in _strongest_pairs(list(cameras), pairs, config):
+        scale = max(longer_side(keyframes[k].frame) for k in (i, j)) / REFERENCE_SIDE
         thinned = _thinned(pairs[i, j], config.max_matches)
         limit = config.max_error_px * scale
         rotation, direction, num_inliers = resection.relative_pose(thinned, cameras[i].focal, cameras[j].focal, limit)
-        if 2 * num_inliers < len(thinned.matches):
-            continue  # The pair has no rigid answer for these focal lengths; agreement says so too.
+        if num_inliers < MIN_INLIER_RATIO * len(thinned.matches):
+            continue  # The pair has no rigid answer for these focal lengths; its inlier ratio says so, too.
         rotations[i, j] = rotation
         T_second_first = np.linalg.inv(cameras[j].T_world_camera) @ cameras[i].T_world_camera
         directions.append(_angle_between(direction, T_second_first[:3, 3]))
@@ -67,7 +72,9 @@ def measure(
     )
 
 
-def _heard(frames: Sequence[int], pairs: Mapping[tuple[int, int], TwoView], config: Config) -> list[tuple[int, int]]:
+def _strongest_pairs(
+    frames: Sequence[int], pairs: Mapping[tuple[int, int], TwoView], config: Config
+) -> list[tuple[int, int]]:
     """Pairs of registered frames that are among the strongest of one of the two."""
     strong = [
         key
@@ -75,10 +82,10 @@ def _heard(frames: Sequence[int], pairs: Mapping[tuple[int, int], TwoView], conf
         if key[0] in frames and key[1] in frames and len(pair.matches) >= config.min_matches
     ]
     strong.sort(key=lambda key: (-len(pairs[key].matches), key))
-    heard: set[tuple[int, int]] = set()
+    chosen: set[tuple[int, int]] = set()
     for frame in frames:
-        heard.update([key for key in strong if frame in key][: config.partners])
-    return sorted(heard)
+        chosen.update([key for key in strong if frame in key][: config.partners])
+    return sorted(chosen)
 
 
 def _thinned(pair: TwoView, count: int) -> TwoView:
@@ -91,4 +98,4 @@ def _thinned(pair: TwoView, count: int) -> TwoView:
 
 def _angle_between(one: Array, other: Array) -> float:
     lengths = float(np.linalg.norm(one) * np.linalg.norm(other))
-    return float(np.degrees(np.arccos(np.clip(one @ other / max(lengths, 1e-12), -1.0, 1.0))))
+    return float(np.degrees(np.arccos(np.clip(one @ other / max(lengths, MIN_LENGTH), -1.0, 1.0))))

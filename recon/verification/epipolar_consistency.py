@@ -18,6 +18,17 @@ import numpy.typing as npt
 
 from splatnode.recon.registration.register import Registration
 
+BESIDE_SIDE = 512.0  # longer side at which `beside_px` holds
+CORNER_BLOCK = 5  # pixels across in which a corner is measured
+PLANE_ROUNDS = 4  # of iteratively reweighted least squares: points on other surfaces lose their weight
+SLOPE_PRIOR = 0.3  # points' worth of weight for a slope of zero, which holds back where points do not define it
+PLANE_RESIDUAL = 0.02  # of the median inverse depth, at which a point's weight is half
+SLOPE_RANGE = 0.5, 2.0  # of the inverse depth at a patch's middle: what its plane may reach within the patch
+MIN_DEPTH = 1e-6  # in median depths; what is nearer is behind the camera
+MIN_EPIPOLAR_PX = 0.5  # length of the searched line; of a shorter one the direction is not known, and x is taken
+MIN_LENGTH = 1e-9  # pixels: a division that is not used needs one
+MIN_PATCH_NORM = 1e-3  # grey levels: a patch without any contrast correlates with nothing
+
 Array = npt.NDArray[np.float64]
 Grey = npt.NDArray[np.float32]
 
@@ -28,7 +39,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depths: int = 12  # tried for each patch
     depth_range: float = 1.15  # about the depth of the plane through the points around the patch, as a factor
     neighbours: int = 12  # points that define it
-    beside_px: tuple[float, ...] = (-14.0, -7.0, 7.0, 14.0)  # the rival lines, at 512 px
+    beside_px: tuple[float, ...] = (-14.0, -7.0, 7.0, 14.0)  # the rival lines, pixels at BESIDE_SIDE
     patch: int = 7  # pixels
     min_contrast: float = 4.0  # grey levels (standard deviation) that a patch needs
     min_likeness: float = 0.7  # on one of the lines; a patch that is like nothing is hidden or seen too differently
@@ -103,7 +114,7 @@ def _patches(grey: Grey, config: Config) -> Array:
     """(M, 2) pixels: the best corner of each cell of a grid, where it has contrast."""
     size = max(grey.shape) / config.cells
     rows, columns = (max(1, round(side / size)) for side in grey.shape)
-    corner = cv2.cornerMinEigenVal(grey, 5)
+    corner = cv2.cornerMinEigenVal(grey, CORNER_BLOCK)
     margin = config.patch
     found = []
     for row in range(rows):
@@ -137,12 +148,12 @@ def _planes(pixels: Array, points: Array, depths: Array, config: Config) -> Arra
     middle = np.median(inverse, axis=1)
     weight = np.ones_like(inverse)
     planes = np.zeros((len(pixels), 3))
-    for _ in range(4):  # iteratively reweighted: points on other surfaces do not count
+    for _ in range(PLANE_ROUNDS):
         weighted = design * weight[..., None]
-        normal = np.einsum("mni,mnj->mij", weighted, design) + 0.3 * np.diag([0.0, 1.0, 1.0])
+        normal = np.einsum("mni,mnj->mij", weighted, design) + SLOPE_PRIOR * np.diag([0.0, 1.0, 1.0])
         planes = np.linalg.solve(normal, np.einsum("mni,mn->mi", weighted, inverse)[..., None])[..., 0]
         residual = np.abs(np.einsum("mni,mi->mn", design, planes) - inverse) / middle[:, None]
-        weight = 1.0 / (1.0 + (residual / 0.02) ** 2)
+        weight = 1.0 / (1.0 + (residual / PLANE_RESIDUAL) ** 2)
     planes[:, 1:] /= reach[:, 0]
     return planes
 
@@ -150,7 +161,7 @@ def _planes(pixels: Array, points: Array, depths: Array, config: Config) -> Arra
 def _best_likeness(picture: Picture, other: Picture, config: Config) -> Array:
     """(M, L) highest correlation of each patch along the predicted line and along its rivals."""
     pixels, planes = picture.pixels, picture.planes
-    beside = np.array([0.0, *config.beside_px]) * max(other.grey.shape) / 512.0
+    beside = np.array([0.0, *config.beside_px]) * max(other.grey.shape) / BESIDE_SIDE
     half = config.patch // 2
     dy, dx = np.mgrid[-half : half + 1, -half : half + 1]
     window = np.stack([dx.ravel(), dy.ravel()], 1).astype(np.float64)  # (W, 2)
@@ -161,14 +172,14 @@ def _best_likeness(picture: Picture, other: Picture, config: Config) -> Array:
     moved = other.K @ T[:3, 3]
     factor = np.geomspace(1.0 / config.depth_range, config.depth_range, config.depths)
     inverse = planes[:, :1] + np.einsum("wk,mk->mw", window, planes[:, 1:])  # (M, W)
-    inverse = np.clip(inverse, 0.5 * planes[:, :1], 2.0 * planes[:, :1])
+    inverse = np.clip(inverse, SLOPE_RANGE[0] * planes[:, :1], SLOPE_RANGE[1] * planes[:, :1])
     target = turned[:, None] + (factor[:, None] * inverse[:, None])[..., None] * moved  # (M, D, W, 3)
-    behind = (target[..., 2] < 1e-6).any(2)
-    seen = target[..., :2] / np.maximum(target[..., 2:], 1e-6)
+    behind = (target[..., 2] < MIN_DEPTH).any(2)
+    seen = target[..., :2] / np.maximum(target[..., 2:], MIN_DEPTH)
     middle = seen[:, :, window.shape[0] // 2]  # (M, D, 2)
     along = middle[:, -1] - middle[:, 0]
     length = np.linalg.norm(along, axis=1, keepdims=True)
-    along = np.where(length > 0.5, along / np.maximum(length, 1e-9), np.array([1.0, 0.0]))
+    along = np.where(length > MIN_EPIPOLAR_PX, along / np.maximum(length, MIN_LENGTH), np.array([1.0, 0.0]))
     across = np.stack([-along[:, 1], along[:, 0]], 1)
     wanted = _normalised(_sample(picture.grey, around))
     result = np.full((len(pixels), len(beside)), np.nan)
@@ -198,4 +209,4 @@ def _sample(grey: Grey, places: Array) -> Grey:
 def _normalised(patches: Grey) -> Grey:
     """Patches (..., W) with a mean of 0 and a length of 1."""
     centred = patches - patches.mean(-1, keepdims=True)
-    return centred / np.maximum(np.linalg.norm(centred, axis=-1, keepdims=True), 1e-3)
+    return centred / np.maximum(np.linalg.norm(centred, axis=-1, keepdims=True), MIN_PATCH_NORM)

@@ -9,7 +9,8 @@ import numpy.typing as npt
 
 from splatnode.recon.registration.register import Registration
 
-DARK, BRIGHT = 12.0, 243.0  # grey levels; what is near black or white says nothing about a gain
+DARK, BRIGHT = 12.0, 243.0  # grey levels of 255; what is near black or white says nothing about a gain
+ROUNDS = 3  # each compares a frame with the mean of the others as it is known so far
 
 
 def gains(
@@ -26,7 +27,7 @@ def gains(
         values[mine] = grey[np.clip(at[:, 1], 0, grey.shape[0] - 1), np.clip(at[:, 0], 0, grey.shape[1] - 1)]
     logs = np.where((values > DARK) & (values < BRIGHT), np.log(np.maximum(values, 1.0)), np.nan)
     found = dict.fromkeys(greys, 0.0)
-    for _ in range(3):  # a frame against the mean of the others, as they are known so far
+    for _ in range(ROUNDS):
         corrected = logs - np.array([found.get(int(index), 0.0) for index in registration.observed_by])
         known = np.isfinite(corrected)
         total = np.bincount(registration.observed_point[known], corrected[known], minlength=len(registration.points))

@@ -13,7 +13,7 @@ from splatnode.recon.verification import refit
 
 Array = npt.NDArray[np.float64]
 
-GROUPS = 4  # in which the points are divided, each way
+GROUPS = 4  # in which the points are divided, each way: the quarters of a picture
 
 
 @dataclass(frozen=True)

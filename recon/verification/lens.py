@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import focal
 from splatnode.recon.verification import refit
 
-FREE_RADIAL = 0.3  # sigma of the radial coefficient
+FREE_RADIAL = 0.3  # sigma of the first radial coefficient where it is free
+CORNER = 0.6  # distance of a corner from the middle, over the longer side: that of a picture of 3 x 2
 STEPS = (0.0, 0.35, -0.35)  # of log focal, from which it is set free: a wrong one can be a local minimum
 
 
@@ -39,9 +40,13 @@ def distortion(fit: refit.Fit) -> Distortion:
     held = refit.adjusted(fit)
     num_lenses = len(held.prior.sigmas)
     free = refit.adjusted(replace(held, prior=replace(held.prior, radial_sigmas=np.full(num_lenses, FREE_RADIAL))))
-    corner = 0.6 * 1024.0 * np.array([held.scale[held.problem.lens_of_camera == g].max() for g in range(num_lenses)])
+    corner = (
+        CORNER
+        * REFERENCE_SIDE
+        * np.array([held.scale[held.problem.lens_of_camera == g].max() for g in range(num_lenses)])
+    )
     further = (free.problem.radials - held.problem.radials) * (corner / np.exp(free.problem.log_focals)) ** 2
-    return Distortion(float(np.abs(further).max()), float(free.cost / max(held.cost, 1e-12)))
+    return Distortion(float(np.abs(further).max()), float(free.cost / max(held.cost, refit.MIN_COST)))
 
 
 def freed(fit: refit.Fit) -> tuple[FreedLens, ...]:
@@ -54,7 +59,7 @@ def freed(fit: refit.Fit) -> tuple[FreedLens, ...]:
     starts = [held.problem.log_focals + np.where(told, step, 0.0) for step in STEPS]
     tried = [refit.adjusted(replace(held, prior=prior, problem=replace(held.problem, log_focals=s))) for s in starts]
     free = tried[int(np.argmin([candidate.cost for candidate in tried]))]  # the first NaN, where there is one
-    ratio = float(free.cost / max(held.cost, 1e-12))
+    ratio = float(free.cost / max(held.cost, refit.MIN_COST))
     registered, found = np.exp(held.problem.log_focals), np.exp(free.problem.log_focals)
     return tuple(
         FreedLens(float(fit.told[g]), bool(fit.prior.sigmas[g] == 0), float(registered[g]), float(found[g]), ratio)
@@ -64,7 +69,7 @@ def freed(fit: refit.Fit) -> tuple[FreedLens, ...]:
 
 def voted_focal(keyframes: Sequence[Keyframe], pairs: Sequence[TwoView]) -> float | None:
     """The focal length in pixels that the pairs vote for where all frames have the same size, else None."""
-    sides = {max(keyframe.frame.width, keyframe.frame.height) for keyframe in keyframes}
+    sides = {longer_side(keyframe.frame) for keyframe in keyframes}
     if len(sides) != 1 or not pairs:
         return None
     return focal.vote(pairs, num_candidates=1)[0] * sides.pop()

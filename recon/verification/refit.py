@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.registration import bundle
 from splatnode.recon.registration.register import Registration
@@ -16,7 +16,11 @@ from splatnode.recon.registration.register import Registration
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-FREE_SIGMA = 0.3  # of log focal where nothing is known
+FREE_SIGMA = 0.3  # of log focal where nothing is known: one sigma is a factor of 1.35
+ROBUST_FACTOR = 3.0  # width of the Cauchy loss over the median error
+ROBUST_PX = (0.4, 1.5)  # least and most width of the Cauchy loss, pixels at REFERENCE_SIDE
+MIN_COST = 1e-12  # pixels squared: a smaller cost counts as this one where ratios are taken; made-up data have none
+MIN_SPREAD = 1e-12  # of centres, as MIN_COST: all in one place
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +30,7 @@ class Fit:
     problem: bundle.Problem
     prior: bundle.LensPrior
     loss: bundle.Config
-    scale: Array  # (C,) longer side of each frame's lens over 1024
+    scale: Array  # (C,) longer side of each frame's lens over REFERENCE_SIDE
     told: Array  # (G,) focal length that came with the frames, pixels of the lens; NaN where none did
 
     @property
@@ -58,7 +62,7 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
     camera_of = position[registration.observed_by]
     chosen = _longest(camera_of, registration.observed_point, len(registration.points), tracks_per_camera)
     observed = chosen[registration.observed_point]
-    sides = np.array([max(keyframes[c.index].frame.width, keyframes[c.index].frame.height) for c in cameras])
+    sides = np.array([longer_side(keyframes[c.index].frame) for c in cameras])
     lenses, lens_of_camera = np.unique([camera.lens for camera in cameras], return_inverse=True)
     longer_sides = np.array([sides[lens_of_camera == lens].max() for lens in range(len(lenses))])
     enlarged = longer_sides[lens_of_camera] / sides
@@ -84,10 +88,10 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
         point_of=np.searchsorted(kept, registration.observed_point[observed]),
         pixels=(enlarged[camera_of, None] * (registration.observed_pixels - principal[camera_of]))[observed],
     )
-    scale = longer_sides[lens_of_camera] / 1024.0
+    scale = longer_sides[lens_of_camera] / REFERENCE_SIDE
     prior = bundle.LensPrior(problem.log_focals, sigmas, np.zeros(len(lenses)), np.zeros(len(lenses)))
     errors = bundle.reprojection_errors(problem)
-    robust_px = float(np.clip(3.0 * np.median(errors), *(np.array([0.4, 1.5]) * np.median(scale))))
+    robust_px = float(np.clip(ROBUST_FACTOR * np.median(errors), *(np.array(ROBUST_PX) * np.median(scale))))
     return Fit(problem, prior, bundle.Config(robust_px=robust_px), scale, told)
 
 
@@ -139,7 +143,7 @@ class Shift:
     focal_rel: float  # the largest change of a focal length, of its logarithm
 
 
-LOST = Shift(180.0, 1e3, 10.0)
+LOST = Shift(rotation_deg=180.0, centre_rel=1e3, focal_rel=10.0)  # farther than any limit, and finite
 
 
 def shift(before: Fit, after: Fit) -> Shift:
@@ -156,6 +160,6 @@ def shift(before: Fit, after: Fit) -> Shift:
     spread = np.sqrt(((target - target.mean(0)) ** 2).sum(1).mean())
     return Shift(
         rotation_deg=float(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))).max()),
-        centre_rel=float(np.sqrt(((centres - target) ** 2).sum(1).mean()) / max(spread, 1e-12)),
+        centre_rel=float(np.sqrt(((centres - target) ** 2).sum(1).mean()) / max(spread, MIN_SPREAD)),
         focal_rel=float(np.abs(before.problem.log_focals - after.problem.log_focals).max()),
     )

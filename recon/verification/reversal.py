@@ -9,8 +9,10 @@ import numpy as np
 from splatnode.recon.registration import bundle
 from splatnode.recon.verification import refit
 
-SAME_DEG, SAME_REL = 1.0, 0.03  # of rotations and centres: the mirrored start has found the way back
-NO_RIVAL = 100.0
+# Shifts below which the mirrored start has found its way back to the same answer:
+SAME_DEG = 1.0  # of rotations
+SAME_REL = 0.03  # of centres, relative to their spread
+NO_RIVAL = 100.0  # ratio of costs that stands for the lack of a mirrored answer; far beyond all that counts
 
 
 def mirrored_cost(fit: refit.Fit) -> float:
@@ -25,7 +27,7 @@ def mirrored_cost(fit: refit.Fit) -> float:
     between = refit.shift(whole, other)
     if between.rotation_deg < SAME_DEG and between.centre_rel < SAME_REL:
         return NO_RIVAL
-    return float(np.minimum(NO_RIVAL, other.cost / np.maximum(whole.cost, 1e-12)))
+    return float(np.minimum(NO_RIVAL, other.cost / np.maximum(whole.cost, refit.MIN_COST)))
 
 
 def _mirrored(problem: bundle.Problem) -> bundle.Problem:

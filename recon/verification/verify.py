@@ -27,9 +27,11 @@ from splatnode.recon.verification.epipolar_consistency import Picture
 from splatnode.recon.verification.evidence import CameraEvidence, Evidence
 from splatnode.recon.verification.reflection import Reflection
 
+MIN_SIGMA = 1e-9  # degrees, or of the spread of the centres: smaller ones count as this where ratios are taken
+
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    tracks_per_camera: int = 300  # with which answers are found again
+    tracks_per_camera: int = 300  # of the bundle that is adjusted again
     epipolar_consistency: epipolar_consistency.Config = epipolar_consistency.Config()
     cycles: cycles.Config = cycles.Config()
     reflection: reflection.Config = reflection.Config()
@@ -91,8 +93,8 @@ def verify_further(graph: ViewGraph, registration: Registration, known: Evidence
     measured = {camera.name: camera for camera in _of_cameras(graph, registration, views, config, further)}
     sharper = [
         (
-            before[names[camera.index]].rotation_sigma_deg / max(camera.rotation_sigma_deg, 1e-9),
-            before[names[camera.index]].centre_sigma_rel / max(camera.centre_sigma_rel, 1e-9),
+            before[names[camera.index]].rotation_sigma_deg / max(camera.rotation_sigma_deg, MIN_SIGMA),
+            before[names[camera.index]].centre_sigma_rel / max(camera.centre_sigma_rel, MIN_SIGMA),
         )
         for camera in registration.cameras
         if names[camera.index] in before
