@@ -24,6 +24,14 @@ from splatnode.capture.status import heartbeats
 log = logging.getLogger(__name__)
 
 EXIT_GOOD, EXIT_SILENT = 0, 75
+NOT_PRINTED = {
+    "session",
+    "sequence",
+    "mono_ns",
+    "type",
+    "state",
+    "tracked",
+}  # fields of a heartbeat that tell a user nothing
 
 
 def capture(args: argparse.Namespace) -> int:
@@ -35,7 +43,7 @@ def capture(args: argparse.Namespace) -> int:
 
 
 def record(args: argparse.Namespace) -> int:
-    """Writes all that a camera gives into a folder, until it ends, the time is up, or the process is asked to stop."""
+    """Writes every frame of a camera into a folder, until the camera ends, the time is up, or a signal comes."""
     config = _config(args)
     with Recorder(args.out) as recorder:
         camera = config.camera
@@ -54,7 +62,7 @@ def _config(args: argparse.Namespace) -> CaptureConfig:
 
 
 def _until(reader: Reader, seconds: float | None) -> Iterator[Frame | DroppedFrame]:
-    """The reader's items until its end, or for `seconds` after the first by their stamps."""
+    """The reader's items until its end; with `seconds`, until a frame whose stamp is so much later than the first."""
     last_ns = math.inf
     while reader.state is not State.FINISHED:
         item = reader.next(0.1)
@@ -67,7 +75,7 @@ def _until(reader: Reader, seconds: float | None) -> Iterator[Frame | DroppedFra
 
 
 def find(args: argparse.Namespace) -> int:
-    """Lists the cameras that are connected, in the words of a configuration."""
+    """Lists the cameras that are connected, as lines that can be copied into a configuration."""
     found = {}
     for module in pkgutil.iter_modules(cameras.__path__):
         source = import_module(f"splatnode.capture.cameras.{module.name}")
@@ -85,7 +93,7 @@ def find(args: argparse.Namespace) -> int:
 
 
 def keys(args: argparse.Namespace) -> int:
-    """Makes this machine's keys, or says whom it lets in and whom it expects."""
+    """Makes this machine's keys, allows another machine to connect, or names the server's key."""
     if args.allow:
         name, public = args.allow
         key_files.allow(args.folder, name, public.encode())
@@ -99,7 +107,7 @@ def keys(args: argparse.Namespace) -> int:
 
 
 def status(args: argparse.Namespace) -> int:
-    """Waits for a heartbeat of each process and prints what they say; 75 where one is silent."""
+    """Waits for a heartbeat of each process and prints its fields; returns 75 where one is silent."""
     network = typed(read_yaml(args.config).get("network") or {}, Network, "network") if args.config else Network()
     found = heartbeats(network)
     if args.json:
@@ -113,9 +121,8 @@ def status(args: argparse.Namespace) -> int:
 def _described(room: str, fields: dict[str, object] | None) -> list[str]:
     if fields is None:
         return [f"{room}: silent; is splatnode {room} running, with the same network?"]
-    hidden = {"session", "sequence", "mono_ns", "type", "state", "tracked"}
     lines = [f"{room}: {fields.get('state', 'running')}"]
     for key, value in fields.items():
-        if key not in hidden and value not in ("", None):
+        if key not in NOT_PRINTED and value not in ("", None):
             lines.append(f"  {key.replace('_', ' '):20}{f'{value:.1f}' if isinstance(value, float) else value}")
     return lines

@@ -15,6 +15,8 @@ from splatnode.capture.quality import Limits
 
 
 class Camera(Plugin):
+    """Where frames come from: a module of capture/cameras."""
+
     package = "splatnode.capture.cameras"
 
 
@@ -29,9 +31,10 @@ class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def open_stream(camera: Camera) -> Iterator[Frame | DroppedFrame]:
+    """The frames of the camera that is configured. Raises CameraUnavailable, when it is opened or later."""
     return camera.module.stream(camera.config)
 
 
 def is_live(camera: Camera) -> bool:
-    """Whether it goes on when nobody reads: then the newest frames are wanted, and of a recording all."""
+    """Whether the camera goes on when nobody reads. Of a live camera the newest frames are read, of a recording all."""
     return getattr(camera.module, "LIVE", False)

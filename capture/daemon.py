@@ -18,19 +18,20 @@ from splatnode.capture.messaging.spool import Spool, SpoolFull
 from splatnode.capture.messaging.wire import Numbering, WireError
 from splatnode.capture.preview import encode_preview
 from splatnode.capture.process.logs import event
-from splatnode.capture.process.memory import keep_freed
+from splatnode.capture.process.memory import keep_freed, resident_mb
 from splatnode.capture.process.service_manager import ServiceManager
 from splatnode.capture.reader import Reader, State
 from splatnode.capture.selection import Decision, Selector
-from splatnode.capture.status import HEARTBEAT_S, CaptureStatus, own_rss_mb
+from splatnode.capture.status import HEARTBEAT_S, CaptureStatus
 
 log = logging.getLogger(__name__)
 
-TURN_S = 0.05  # the longest that a request waits for its answer
+POLL_S = 0.05  # longest wait for a frame, and so for the answer to a request that comes meanwhile
+PREVIEW_JITTER = 0.1  # share of the time between previews by which a frame may come too early
 
 
 def capture(config: CaptureConfig) -> None:
-    """Runs until the camera's end, when all its keyframes are acknowledged; a live camera has none.
+    """Runs until a recording has ended and its keyframes are acknowledged; with a live camera, until a signal comes.
 
     Raises CameraUnavailable, AlreadyRunning, NetworkError, OSError. SystemExit and KeyboardInterrupt end it cleanly.
     """
@@ -39,7 +40,7 @@ def capture(config: CaptureConfig) -> None:
     with ExitStack() as resources:
         manager = ServiceManager()
         server = resources.enter_context(KeyframeServer(config.network, Spool(config.spool)))
-        node = _Node(config, server, resources)
+        session = _Session(config, server, resources)
         camera = config.camera
         reader = resources.enter_context(Reader(lambda: open_stream(camera), is_live(camera), config.reader))
         resources.callback(manager.stopping)
@@ -49,20 +50,20 @@ def capture(config: CaptureConfig) -> None:
         if not is_live(camera):
             manager.ready()  # its first frame may be long in coming; a live camera's proves that it is there
         while not (reader.state is State.FINISHED and server.queued == 0):
-            item = reader.next(TURN_S)
+            item = reader.next(POLL_S)
             if isinstance(item, Frame):
-                node.take(item, reader.state)
+                session.take(item, reader.state)
                 manager.ready()
             elif isinstance(item, DroppedFrame):
-                node.drop(item)
+                session.drop(item)
             server.serve(0)
-            node.beat(reader)
-            manager.alive(f"{reader.state.value}: {node.frames} frames, {node.keyframes} keyframes")
-        event(log, logging.INFO, "finished", frames=node.frames, keyframes=node.keyframes)
+            session.beat(reader)
+            manager.alive(f"{reader.state.value}: {session.frames} frames, {session.keyframes} keyframes")
+        event(log, logging.INFO, "finished", frames=session.frames, keyframes=session.keyframes)
 
 
-class _Node:
-    """What one session counts, and where it sends."""
+class _Session:
+    """The counters of one run, and the sockets that it sends to."""
 
     def __init__(self, config: CaptureConfig, server: KeyframeServer, resources: ExitStack) -> None:
         self.config = config
@@ -80,7 +81,7 @@ class _Node:
         self._rate = _Rate()
 
     def take(self, frame: Frame, state: State) -> None:
-        """A frame that the camera gave: as a keyframe where it adds something, and as a preview in any case."""
+        """Sends a frame: as a keyframe where it adds something to those before, and as a preview in any case."""
         self.frames += 1
         self._rate.count()
         decision = self._selector.decide(frame, waiting=self._server.queued)
@@ -89,16 +90,16 @@ class _Node:
             self._offer(frame, decision)
         if decision.candidate:
             self.last_decision = f"{frame.name}: {'taken' if decision.take else 'not taken'}: {decision.reason}"
-        self._show(frame, decision, state)
+        self._send_preview(frame, decision, state)
 
     def drop(self, dropped: DroppedFrame) -> None:
-        """A frame that the camera could not give: recon hears of it too."""
+        """Tells recon of a frame that the camera could not give."""
         self.dropped += 1
         event(log, logging.WARNING, "dropped", name=dropped.name, reason=dropped.reason)
         self._deliver(dropped)
 
     def beat(self, reader: Reader) -> None:
-        """A heartbeat, when it is due."""
+        """Sends a heartbeat, when one is due."""
         if time.monotonic() < self._next_beat:
             return
         self._next_beat = time.monotonic() + HEARTBEAT_S
@@ -122,7 +123,7 @@ class _Node:
             acknowledged=self._server.acknowledged,
             recon_connected=self._server.connected,
             refused_messages=self._server.refused,
-            rss_mb=own_rss_mb(),
+            rss_mb=resident_mb(),
         )
         self._heartbeats.send(status)
 
@@ -134,7 +135,7 @@ class _Node:
         event(log, logging.INFO, "keyframe", name=frame.name, reason=decision.reason, waiting=self._server.queued)
 
     def _deliver(self, item: Frame | DroppedFrame) -> bool:
-        """Into the spool. Where that is full it is said once, and again when there is room."""
+        """Puts a frame into the spool; False where there is no room, which is logged once until there is room again."""
         try:
             self._server.offer(item)
         except (SpoolFull, WireError) as error:
@@ -148,11 +149,11 @@ class _Node:
             self._spool_full = ""
         return True
 
-    def _show(self, frame: Frame, decision: Decision, state: State) -> None:
+    def _send_preview(self, frame: Frame, decision: Decision, state: State) -> None:
         rate = self.config.preview.per_second
         if rate == 0 or frame.stamp_ns < self._next_preview_ns:
             return
-        self._next_preview_ns = frame.stamp_ns + round(0.9e9 / rate)  # cameras jitter: 30 a second of 30 are all
+        self._next_preview_ns = frame.stamp_ns + round(1e9 * (1 - PREVIEW_JITTER) / rate)
         header, arrays = encode_preview(
             frame,
             self._preview_numbers,
@@ -165,7 +166,7 @@ class _Node:
 
 
 class _Rate:
-    """Events a second, over the last seconds."""
+    """Counts events and gives their rate."""
 
     def __init__(self) -> None:
         self._since = time.monotonic()
@@ -175,7 +176,7 @@ class _Rate:
         self._count += 1
 
     def per_second(self) -> float:
-        """Of the time since this was asked last."""
+        """Since the last call."""
         seconds, self._since = time.monotonic() - self._since, time.monotonic()
         rate, self._count = self._count / max(seconds, 1e-6), 0
         return rate

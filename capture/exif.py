@@ -18,7 +18,9 @@ FOCAL_LENGTH_35MM = 0xA405
 Tags = Mapping[int, tuple[float, ...]]
 
 _FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
+_ASPECT_TOLERANCE = 0.02  # relative; cameras round sides to whole blocks of pixels, and a crop changes more
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+_MOST_VALUES = 16  # of a tag; texts, thumbnails and maker notes have more
 _FORMATS = {1: "B", 3: "H", 4: "I", 5: "II", 8: "h", 9: "i", 10: "ii"}  # TIFF type -> struct codes of one value
 # From a fisheye to a long telephoto lens; what lies outside is a wrong tag.
 _PLAUSIBLE_FOCAL = (0.2, 12.0)  # in longer image sides
@@ -46,7 +48,7 @@ def _read_directory(tiff: bytes, offset: int, order: str) -> dict[int, tuple[flo
     (entries,) = struct.unpack_from(order + "H", tiff, offset)
     for entry in range(offset + 2, offset + 2 + 12 * entries, 12):
         tag, kind, count = struct.unpack_from(order + "HHI", tiff, entry)
-        if kind not in _FORMATS or not 1 <= count <= 16:  # texts, thumbnails, maker notes
+        if kind not in _FORMATS or not 1 <= count <= _MOST_VALUES:
             continue
         layout = struct.Struct(order + _FORMATS[kind] * count)
         start = entry + 8 if layout.size <= 4 else struct.unpack_from(order + "I", tiff, entry + 8)[0]
@@ -65,7 +67,7 @@ def exif_intrinsics(tags: Tags, width: int, height: int) -> Intrinsics | None:
     """
     taken = sorted((first(tags, PIXEL_X_DIMENSION) or width, first(tags, PIXEL_Y_DIMENSION) or height))
     shorter, longer = sorted((width, height))  # sorted: programs that turn an image do not always turn its tags
-    if abs(taken[0] * longer / (taken[1] * shorter) - 1) > 0.02:
+    if abs(taken[0] * longer / (taken[1] * shorter) - 1) > _ASPECT_TOLERANCE:
         return None
     focal = _focal_from_35mm(tags, width, height) or _focal_from_sensor(tags, longer / taken[1])
     if focal is None or not _PLAUSIBLE_FOCAL[0] <= focal / longer <= _PLAUSIBLE_FOCAL[1]:

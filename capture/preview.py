@@ -1,4 +1,4 @@
-"""Small pictures of what the camera sees now, for the eye: they may get lost."""
+"""Previews: small JPEG images of what the camera sees now. Some may be lost on the way."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ _LARGEST_SIDE = 4096  # of what is decoded: a JPEG of a few bytes may ask for gi
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     per_second: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # 0: none
-    longer_side: Annotated[int, msgspec.Meta(ge=16, le=2048)] = 480  # at least; less than twice as many
+    longer_side: Annotated[int, msgspec.Meta(ge=16, le=2048)] = (
+        480  # pixels at least; below twice as many, since images are reduced by whole factors
+    )
     jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 75
 
 

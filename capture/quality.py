@@ -1,7 +1,7 @@
-"""Blur, exposure, duplicate: is this frame worth sending?
+"""Image quality: blur, exposure, and whether a frame is a duplicate.
 
-Pure functions give numbers; why_unusable and why_redundant compare them with limits. The limits are wide: a poor frame
-is better judged by the reconstruction, and only a hopeless or redundant one is kept from it.
+Pure functions measure; why_unusable and why_redundant compare what they measure with limits. The limits are wide: only
+a frame that is useless or redundant is left out, and all others are the reconstruction's to judge.
 """
 
 from __future__ import annotations
@@ -19,8 +19,12 @@ Plane = npt.NDArray  # (H, W) grey levels, uint8, or sums of at most BOX of them
 MEASURED_SIDE = 640  # blur is measured with the longer side at most this
 THUMBNAIL_SIDE = 160
 BOX = 15  # pixels of the box that blurs again, a multiple of 3; wider edges cannot be told apart
-EDGE_STEP = 6  # grey levels a pixel; weaker gradients may be noise
-LEAST_EDGES = 0.001  # share of the pixels
+MIN_GRADIENT = 6  # grey levels a pixel; weaker gradients may be noise
+WEAK_SHARE = 0.9  # of the pixels: those with the weakest gradients are no edges
+MIN_EDGE_SHARE = 0.001  # of the pixels; an image with fewer on edges has none to measure
+BLACK, WHITE = 7, 251  # grey levels from which on a pixel shows no detail
+MIN_UNSATURATED, MAX_UNSATURATED = 4, 245  # grey levels between which a change of exposure leaves the contrast
+MIN_COMPARED_SHARE = 0.05  # of the pixels: with fewer that are unsaturated in both images, all are compared
 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -34,18 +38,19 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 @dataclass(frozen=True)
 class Quality:
     blur_px: float | None  # width of the image's edges in its most blurred direction; None: it has no edges
-    dark: float  # share of pixels without detail because they are black
-    bright: float  # the same for white
+    dark: float  # share of pixels that are black and so without detail
+    bright: float  # share of pixels that are white
     contrast: float  # standard deviation of the grey levels, noise averaged out
 
 
 def assess(image: Image) -> Quality:
+    """Blur, exposure and contrast of `image`."""
     pixels = image.shape[0] * image.shape[1]
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     return Quality(
         blur_px=_blur_width(grey),
-        dark=cv2.countNonZero(cv2.inRange(image, (0, 0, 0), (7, 7, 7))) / pixels,
-        bright=cv2.countNonZero(cv2.inRange(image, (251, 251, 251), (255, 255, 255))) / pixels,
+        dark=cv2.countNonZero(cv2.inRange(image, (0,) * 3, (BLACK,) * 3)) / pixels,
+        bright=cv2.countNonZero(cv2.inRange(image, (WHITE,) * 3, (255,) * 3)) / pixels,
         contrast=float(_shrunk(grey, THUMBNAIL_SIDE).std()),
     )
 
@@ -72,9 +77,9 @@ def _edge_width(grey: Plane, step: tuple[int, int]) -> float | None:
     """Pixels along `step` (rows, columns). Whole numbers of 16 bits hold all of it, in a third of floats' time."""
     slope = _slope(grey, step)
     up_to = np.cumsum(cv2.calcHist([slope], [0], None, [256], [0, 256]))  # pixels whose slope is at most 0, 1, ...
-    weakest = max(int(np.searchsorted(up_to, 0.9 * slope.size)), EDGE_STEP)
+    weakest = max(int(np.searchsorted(up_to, WEAK_SHARE * slope.size)), MIN_GRADIENT)
     strong = (slope >= weakest).view(np.uint8)
-    if cv2.countNonZero(strong) < LEAST_EDGES * slope.size:
+    if cv2.countNonZero(strong) < MIN_EDGE_SHARE * slope.size:
         return None
     before = np.multiply(slope, BOX, dtype=np.uint16)
     lost = cv2.subtract(before, _slope(_box_sum(grey, step), step))  # 0 where a slope grows
@@ -116,8 +121,8 @@ def novelty(image: Image, other: Image) -> float:
     if image.shape != other.shape:
         return float("inf")
     a, b = _grey(image, THUMBNAIL_SIDE), _grey(other, THUMBNAIL_SIDE)
-    valid = (np.minimum(a, b) > 4) & (np.maximum(a, b) < 245)
-    if valid.mean() < 0.05:
+    valid = (np.minimum(a, b) > MIN_UNSATURATED) & (np.maximum(a, b) < MAX_UNSATURATED)
+    if valid.mean() < MIN_COMPARED_SHARE:
         valid[:] = True
     a, b = a[valid], b[valid]
     difference = (a - a.mean()) / (a.std() + 1) - (b - b.mean()) / (b.std() + 1)

@@ -18,6 +18,10 @@ from splatnode.capture.unavailable import CameraUnavailable
 
 log = logging.getLogger(__name__)
 
+CLOSE_S = 3.0  # that closing waits for the thread; a driver may hang for ever
+CAPACITY = 2  # frames between the threads; with more, previews would be late
+HAND_OVER_S = 0.1  # between looks at whether to stop, while a recording waits for its reader
+
 Seconds = Annotated[float, msgspec.Meta(gt=0)]
 
 
@@ -37,7 +41,7 @@ class State(Enum):
 
 @dataclass(frozen=True)
 class Failure:
-    """The camera cannot be used, and there is no use in trying again."""
+    """The camera failed for good; opening it again would not help."""
 
     error: Exception
 
@@ -48,13 +52,13 @@ class Reader:
     def __init__(self, open_camera: Callable[[], Iterator[Frame | DroppedFrame]], live: bool, config: Config) -> None:
         self.config = config
         self.why = ""  # of a degraded state
-        self.skipped = 0  # frames of a live camera for which nobody had time
+        self.skipped = 0  # frames of a live camera that a newer one replaced before they were read
         self._open_camera = open_camera
         self._live = live
         self._state = State.STARTING
         self._last = time.monotonic()
         self._stop = threading.Event()
-        self._items: queue.Queue[Frame | DroppedFrame | Failure] = queue.Queue(maxsize=2)
+        self._items: queue.Queue[Frame | DroppedFrame | Failure] = queue.Queue(maxsize=CAPACITY)
         self._thread = threading.Thread(target=self._run, name="camera", daemon=True)
         self._thread.start()
 
@@ -65,9 +69,9 @@ class Reader:
         self.close()
 
     def close(self) -> None:
-        """Lets go of the camera. A driver that hangs is left behind: its thread ends with the process."""
+        """Closes the camera. Where its driver hangs, the thread is left to end with the process."""
         self._stop.set()
-        self._thread.join(timeout=3)
+        self._thread.join(timeout=CLOSE_S)
 
     @property
     def state(self) -> State:
@@ -104,7 +108,10 @@ class Reader:
             self._state = State.FINISHED
 
     def _frames(self) -> Iterator[Frame | DroppedFrame]:
-        """Goes through losses. Raises CameraUnavailable where the camera is not there at first, or for too long."""
+        """The frames; the camera is opened again after a loss.
+
+        Raises CameraUnavailable where it was never there, or is lost for too long.
+        """
         count, pause, lost_at = 0, self.config.first_pause_s, None
         while not self._stop.is_set():
             try:
@@ -124,7 +131,7 @@ class Reader:
                 pause = min(2 * pause, self.config.longest_pause_s)
 
     def _numbered(self, count: int) -> Iterator[Frame | DroppedFrame]:
-        """The camera's frames from one opening to its loss; a stamp that does not grow costs the frame."""
+        """The camera's frames from one opening to its loss. A frame whose stamp does not grow is dropped."""
         newest_ns = -1
         stream = self._open_camera()
         try:
@@ -145,10 +152,10 @@ class Reader:
                 close()
 
     def _hand_over(self, item: Frame | DroppedFrame | Failure) -> None:
-        """To the reader: of a live camera the newest, of a recording all."""
+        """Queues an item for the reader: of a live camera the newest are kept, of a recording all."""
         while not self._stop.is_set():
             try:
-                self._items.put(item, timeout=0 if self._live else 0.1)
+                self._items.put(item, timeout=0 if self._live else HAND_OVER_S)
                 return
             except queue.Full:
                 if self._live:

@@ -1,8 +1,8 @@
-"""Which frames of a stream become keyframes: those that are usable and add parallax or coverage, with the reason why.
+"""Keyframe selection: a frame of a stream is taken if it is usable and adds parallax or coverage; the reason is given.
 
-Corners of the last keyframe are followed through the stream, in small images. What they tell is how much of that view
-has left the picture (coverage), how far it has moved, and how much of the motion no homography explains (parallax).
-The first of these that exceeds its limit makes a candidate; only candidates are examined for blur and exposure.
+Corners of the last keyframe are tracked through the stream, in small images. They tell what share of that view has left
+the image (coverage), how far it has moved (motion), and how much of the motion no homography explains (parallax). The
+first of these that exceeds its limit makes the frame a candidate; only candidates are examined for blur and exposure.
 """
 
 from __future__ import annotations
@@ -18,27 +18,38 @@ import numpy.typing as npt
 from splatnode.capture.frame import Frame, reduced
 from splatnode.capture.quality import Limits, assess, novelty, why_redundant, why_unusable
 
-TRACKED_SIDE = 320  # the longer side of the images in which corners are followed is at least this
-CORNERS = 100
-LEAST_CORNERS = 12  # fewer tell nothing
-ROUND_TRIP_PX = 1.0  # a corner that is followed there and back must come home
-FOLLOWING = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03)  # iterations and pixels at which it is enough
-REMEMBERED_VIEWS = 64  # of which a new one must not be a copy
-DIFFERENT_GIST = 0.3  # mean difference; copies have 0.05, and a look at the gist costs nothing
+TRACKED_SIDE = 320  # pixels: the longer side of the images in which corners are tracked is at least this
+MAX_CORNERS = 100
+CORNER_QUALITY = 0.01  # of the strongest corner's response, Shi and Tomasi's
+CORNER_DISTANCE = 8  # pixels between corners, so that they spread over the image
+MIN_CORNERS = 12  # with fewer the motion is not measured; a homography alone takes 4
+FORWARD_BACKWARD_PX = 1.0  # a corner tracked to the new image and back must end within this of its start
+LUCAS_KANADE = {
+    "winSize": (11, 11),
+    "maxLevel": 3,
+    "flags": cv2.OPTFLOW_USE_INITIAL_FLOW,
+    "criteria": (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 15, 0.03),  # iterations, pixels
+}
+HOMOGRAPHY_PX, HOMOGRAPHY_TRIALS = 1.5, 100  # of RANSAC: an inlier's error, and the number of samples at most
+MAX_COVERAGE = 0.9  # share of lost corners that is always enough, however many frames wait
+REMEMBERED_VIEWS = 64  # newest keyframes of which a new one must not be a copy
+THUMBNAIL = 16, 12  # width and height in pixels
+MAX_THUMBNAIL_DIFFERENCE = 0.3  # mean; copies have 0.05. Others are no copies, which saves a closer comparison
+RETRY_S = 1.0  # after a keyframe that could not be kept
 
 Share = Annotated[float, msgspec.Meta(gt=0, le=1)]
-Picture = npt.NDArray  # (h, w) or (h, w, 3) uint8
+Image = npt.NDArray  # (h, w) or (h, w, 3) uint8
 Points = npt.NDArray  # (P, 1, 2) float32, as OpenCV has them
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     every_frame: bool = False  # photographs: each was taken on purpose, and only unusable ones and copies are left out
-    coverage: Share = 0.25  # share of the last keyframe's corners that are out of the picture
-    motion: Share = 0.08  # median way of the corners, in longer sides of the image
-    parallax: Share = 0.01  # median distance from the way that the best homography explains
-    per_second: Annotated[float, msgspec.Meta(gt=0)] = 8.0  # frames examined; the others only pass
+    coverage: Share = 0.25  # share of the last keyframe's corners that have left the image
+    motion: Share = 0.08  # median displacement of the corners, in longer sides of the image
+    parallax: Share = 0.01  # median residual after the best homography, in longer sides of the image
+    per_second: Annotated[float, msgspec.Meta(gt=0)] = 8.0  # frames examined; the others become no keyframes
     patience_s: Annotated[float, msgspec.Meta(ge=0)] = 0.3  # between examinations of candidates that were unusable
-    backlog: Annotated[int, msgspec.Meta(ge=1)] = 8  # with so many frames waiting for recon, twice as much is asked
+    backlog: Annotated[int, msgspec.Meta(ge=1)] = 8  # with so many frames waiting for recon, limits are twice as high
 
 
 @dataclass(frozen=True)
@@ -50,11 +61,11 @@ class Decision:
 
 @dataclass(frozen=True)
 class Motion:
-    """What the corners of a keyframe did since."""
+    """How the corners of the last keyframe have moved since."""
 
-    lost: float  # share that is out of the picture, or can no longer be recognised
-    median: float  # way, in longer sides
-    parallax: float  # distance from the best homography, in longer sides
+    lost: float  # share that has left the image, or could not be tracked
+    median: float  # displacement, in longer sides
+    parallax: float  # median residual after the best homography, in longer sides
 
 
 @dataclass(frozen=True)
@@ -62,8 +73,8 @@ class _View:
     """A keyframe as it is remembered."""
 
     name: str
-    small: Picture
-    gist: Picture
+    small: Image
+    thumbnail: Image
 
 
 class Selector:
@@ -73,20 +84,20 @@ class Selector:
         self.config = config
         self.limits = limits
         self._views: list[_View] = []  # newest last
-        self._start: Picture | None = None  # the last keyframe as it is followed, grey
+        self._start: Image | None = None  # the last keyframe, small and grey
         self._corners: Points = np.zeros((0, 1, 2), np.float32)
         self._now: Points = self._corners
         self._sharpest_px: float | None = None
         self._next_ns = 0  # nothing is examined before
 
     def decide(self, frame: Frame, waiting: int = 0) -> Decision:
-        """Whether to send this frame; `waiting` frames have been sent and not yet taken over by recon."""
+        """Whether this frame becomes a keyframe; `waiting` frames are not acknowledged by recon yet."""
         if frame.stamp_ns < self._next_ns and not self.config.every_frame:
             return Decision(False, "between two examinations", False)
         self._next_ns = frame.stamp_ns + round(1e9 / self.config.per_second)
         small = reduced(frame.image, TRACKED_SIDE)
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
-        reason, adds = self._what_it_adds(grey, patience=1 + waiting / self.config.backlog)
+        reason, adds = self._what_it_adds(grey, strictness=1 + waiting / self.config.backlog)
         if not adds:
             return Decision(False, reason, False)
         fault = self._fault(frame, small)
@@ -97,27 +108,27 @@ class Selector:
         return Decision(True, reason, True)
 
     def forget_last(self) -> None:
-        """The last frame taken could not be kept: what it showed may be taken again."""
+        """Forgets the last keyframe, which could not be kept: a frame that shows the same may be taken."""
         self._views = self._views[:-1]
         self._start = None
-        self._next_ns += round(1e9)  # nor will there be room in a moment
+        self._next_ns += round(1e9 * RETRY_S)
 
-    def _what_it_adds(self, grey: Picture, patience: float) -> tuple[str, bool]:
+    def _what_it_adds(self, grey: Image, strictness: float) -> tuple[str, bool]:
         if self.config.every_frame:
             return "every frame is taken", True
         if self._start is None or self._start.shape != grey.shape:
             return "first view of this stream", True
-        if len(self._corners) < LEAST_CORNERS:
-            return "the last keyframe has too few corners to follow", True
-        self._now, followed = follow(self._start, grey, self._corners, self._now)
-        motion = measure(self._corners, self._now, followed, max(grey.shape))
-        return what_it_adds(motion, self.config, patience)
+        if len(self._corners) < MIN_CORNERS:
+            return "the last keyframe has too few corners to track", True
+        self._now, tracked = track(self._start, grey, self._corners, self._now)
+        motion = measure(self._corners, self._now, tracked, max(grey.shape))
+        return what_it_adds(motion, self.config, strictness)
 
-    def _fault(self, frame: Frame, small: Picture) -> str | None:
-        """Why the frame cannot be used, or is one that was taken before."""
-        gist = _gist(small)
+    def _fault(self, frame: Frame, small: Image) -> str | None:
+        """Why the frame is unusable, or a copy of a keyframe; None where it is neither."""
+        thumbnail = _thumbnail(small)
         for view in reversed(self._views):
-            if np.abs(gist - view.gist).mean() > DIFFERENT_GIST or view.small.shape != small.shape:
+            if np.abs(thumbnail - view.thumbnail).mean() > MAX_THUMBNAIL_DIFFERENCE or view.small.shape != small.shape:
                 continue
             if why_redundant(novelty(small, view.small), self.limits):
                 return f"duplicate: it shows what {view.name} shows"
@@ -127,58 +138,61 @@ class Selector:
             self._sharpest_px = min(quality.blur_px, self._sharpest_px or quality.blur_px)
         return fault
 
-    def _remember(self, name: str, small: Picture, grey: Picture) -> None:
-        self._views = [*self._views[1 - REMEMBERED_VIEWS :], _View(name, small, _gist(small))]
+    def _remember(self, name: str, small: Image, grey: Image) -> None:
+        self._views = [*self._views[1 - REMEMBERED_VIEWS :], _View(name, small, _thumbnail(small))]
         self._start = grey
-        found = cv2.goodFeaturesToTrack(grey, CORNERS, qualityLevel=0.01, minDistance=8)
+        found = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, qualityLevel=CORNER_QUALITY, minDistance=CORNER_DISTANCE)
         self._corners = self._now = np.zeros((0, 1, 2), np.float32) if found is None else found
 
 
-def follow(
-    start: Picture,  # (h, w) grey
-    now: Picture,  # (h, w) grey
+def track(
+    start: Image,  # (h, w) grey
+    now: Image,  # (h, w) grey
     corners: Points,  # in `start`
-    guess: Points,  # where they were a moment ago
+    guess: Points,  # where they were in the frame before
 ) -> tuple[Points, npt.NDArray[np.bool_]]:
-    """Where the corners are now, and which of them were found: those that are in the picture and come home."""
-    window = {"winSize": (11, 11), "maxLevel": 3, "flags": cv2.OPTFLOW_USE_INITIAL_FLOW, "criteria": FOLLOWING}
-    there, found, _ = cv2.calcOpticalFlowPyrLK(start, now, corners, guess.copy(), **window)
-    back, returned, _ = cv2.calcOpticalFlowPyrLK(now, start, there, corners.copy(), **window)
-    home = np.linalg.norm(back - corners, axis=2).ravel() < ROUND_TRIP_PX
+    """Where the corners are now, and which of them were tracked: in the image, and back to where they started."""
+    there, found, _ = cv2.calcOpticalFlowPyrLK(start, now, corners, guess.copy(), **LUCAS_KANADE)
+    back, returned, _ = cv2.calcOpticalFlowPyrLK(now, start, there, corners.copy(), **LUCAS_KANADE)
+    consistent = np.linalg.norm(back - corners, axis=2).ravel() < FORWARD_BACKWARD_PX
     inside = np.all((there >= 0) & (there < (start.shape[1], start.shape[0])), axis=2).ravel()
-    followed = (found[:, 0] == 1) & (returned[:, 0] == 1) & home & inside
-    return np.where(followed[:, None, None], there, guess), followed
+    tracked = (found[:, 0] == 1) & (returned[:, 0] == 1) & consistent & inside
+    return np.where(tracked[:, None, None], there, guess), tracked
 
 
-def measure(corners: Points, now: Points, followed: npt.NDArray[np.bool_], longer_side: int) -> Motion:
-    """Median way and parallax of the corners that were followed; too few of them tell only that the view is lost."""
-    lost = 1 - float(followed.mean())
-    if followed.sum() < LEAST_CORNERS:
+def measure(corners: Points, now: Points, tracked: npt.NDArray[np.bool_], longer_side: int) -> Motion:
+    """Displacement and parallax of the corners that were tracked; with too few of them the view counts as lost."""
+    lost = 1 - float(tracked.mean())
+    if tracked.sum() < MIN_CORNERS:
         return Motion(1.0, 0.0, 0.0)
-    before, after = corners[followed], now[followed]
-    way = np.linalg.norm(after - before, axis=2)
-    homography, _ = cv2.findHomography(before, after, cv2.RANSAC, 1.5, maxIters=100)
+    before, after = corners[tracked], now[tracked]
+    displacement = np.linalg.norm(after - before, axis=2)
+    homography, _ = cv2.findHomography(before, after, cv2.RANSAC, HOMOGRAPHY_PX, maxIters=HOMOGRAPHY_TRIALS)
     if homography is None:
-        return Motion(lost, float(np.median(way)) / longer_side, 0.0)
-    unexplained = np.linalg.norm(after - cv2.perspectiveTransform(before, homography), axis=2)
-    return Motion(lost, float(np.median(way)) / longer_side, float(np.median(unexplained)) / longer_side)
+        return Motion(lost, float(np.median(displacement)) / longer_side, 0.0)
+    residuals = np.linalg.norm(after - cv2.perspectiveTransform(before, homography), axis=2)
+    return Motion(lost, float(np.median(displacement)) / longer_side, float(np.median(residuals)) / longer_side)
 
 
-def what_it_adds(motion: Motion, config: Config, patience: float = 1.0) -> tuple[str, bool]:
-    """The reason to take a frame, or not to; `patience` of 2 asks for twice as much."""
+def what_it_adds(motion: Motion, config: Config, strictness: float = 1.0) -> tuple[str, bool]:
+    """The reason to take a frame, or not to, and which of the two it is. Limits are multiplied by `strictness`."""
     measured = {
-        "coverage": (motion.lost, min(config.coverage * patience, 0.9), "of the last view is out of the picture"),
-        "parallax": (motion.parallax, config.parallax * patience, "of the longer side is parallax"),
-        "motion": (motion.median, config.motion * patience, "of the longer side is the median motion"),
+        "coverage": (
+            motion.lost,
+            min(config.coverage * strictness, MAX_COVERAGE),
+            "of the last view is out of the image",
+        ),
+        "parallax": (motion.parallax, config.parallax * strictness, "of the longer side is parallax"),
+        "motion": (motion.median, config.motion * strictness, "of the longer side is the median motion"),
     }
     for what, (value, limit, text) in measured.items():
         if value >= limit:
-            return f"{what}: {value:.1%} {text}, {limit:.1%} are asked", True
+            return f"{what}: {value:.1%} {text}, {limit:.1%} are required", True
     values = ", ".join(f"{what} {value:.1%} of {limit:.1%}" for what, (value, limit, _) in measured.items())
     return f"adds too little since the last keyframe: {values}", False
 
 
-def _gist(small: Picture) -> Picture:
+def _thumbnail(small: Image) -> Image:
     """(12, 16) grey levels of unit contrast."""
-    grey = cv2.cvtColor(cv2.resize(small, (16, 12), interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY).astype(float)
+    grey = cv2.cvtColor(cv2.resize(small, THUMBNAIL, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY).astype(float)
     return (grey - grey.mean()) / (grey.std() + 1)

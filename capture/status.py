@@ -1,8 +1,7 @@
-"""How the processes are: heartbeats, and `splatnode status`, which waits for one of each."""
+"""Heartbeats of the processes, and `splatnode status`, which waits for one of each."""
 
 from __future__ import annotations
 
-import os
 import time
 from typing import Any
 
@@ -11,8 +10,9 @@ from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import CAPTURE_STATUS, RECON_STATUS, Service
 from splatnode.capture.messaging.wire import Header
 
-HEARTBEAT_S = 1.0
-WAIT_S = 2.0
+HEARTBEAT_S = 1.0  # between heartbeats of capture
+WAIT_S = 2.0  # for a heartbeat; a process without one is silent
+POLL_S = 0.05
 
 
 class CaptureStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -39,20 +39,14 @@ class CaptureStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     rss_mb: float
 
 
-def own_rss_mb() -> float:
-    """Memory of this process now."""
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
-
-
 class _Listener(Subscriber):
-    """Hears a heartbeat of any process: its fields are shown and not used, so that no room need be imported."""
+    """Receives a heartbeat of any process as plain fields, so that recon need not be imported to show them."""
 
     def __init__(self, service: Service, network: Network) -> None:
         super().__init__(service, network, dict[str, Any])
 
     def _count(self, header: dict[str, Any]) -> None:
-        """One heartbeat is enough, so that losses do not matter."""
+        """Counts nothing: one heartbeat is enough."""
 
 
 def heartbeats(network: Network, wait_s: float = WAIT_S) -> dict[str, dict[str, Any] | None]:
@@ -62,6 +56,6 @@ def heartbeats(network: Network, wait_s: float = WAIT_S) -> dict[str, dict[str, 
         found: dict[str, dict[str, Any] | None] = {"capture": None, "recon": None}
         while time.monotonic() < deadline and None in found.values():
             for room, subscriber in (("capture", capture), ("recon", recon)):
-                if found[room] is None and (message := subscriber.latest(0.05)) is not None:
+                if found[room] is None and (message := subscriber.latest(POLL_S)) is not None:
                     found[room] = message.header
         return found

@@ -24,6 +24,7 @@ from splatnode.capture.unavailable import CameraUnavailable
 log = logging.getLogger(__name__)
 
 LIVE = True
+_MIN_FOCAL = 0.1  # in longer image sides; a device without calibration gives the identity matrix
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -129,7 +130,7 @@ def _control(dai: ModuleType, focus: int) -> Any:
 def _intrinsics(transformation: Any, width: int, height: int) -> Intrinsics | None:
     """For the very pixels that were delivered, cropped and scaled; None where the camera carries no calibration."""
     K = np.array(transformation.getIntrinsicMatrix(), float)
-    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] < 0.1 * max(width, height):  # identity: none
+    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] < _MIN_FOCAL * max(width, height):
         return None
     distortion = tuple(float(value) for value in transformation.getDistortionCoefficients())
     if any(distortion) and "Perspective" not in str(transformation.getDistortionModel()):

@@ -15,7 +15,8 @@ from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.image_file import MAX_PIXELS, SUFFIXES, UnusableImage, decode_image
 from splatnode.capture.pace import FramesPerSecond, Pace, paced
 
-# Photographs that cannot be decoded here: they are named, so that nobody wonders where they went.
+DEFAULT_STEP_NS = 100_000_000  # between two loops of a single photograph, which has no rate
+# Photographs that cannot be decoded here; they are reported as dropped.
 FOREIGN_SUFFIXES = {".heic", ".heif", ".avif", ".jxl", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf"}
 
 
@@ -32,7 +33,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     """The photographs in natural order (img2 before img10); what cannot be used is named and left out.
 
-    Of a capture's other files, none is read: cameras that happen to lie beside the images stay unknown.
+    No other file of the folder is read: true cameras that lie there stay unknown.
     Raises FileNotFoundError or ValueError, with what to do, where there is nothing to stream.
     """
     if recording.is_recording(config.folder):
@@ -46,7 +47,7 @@ def _looped(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: int) -> I
     """The frames `loops` times; stamps and ids go on, and names tell from the second time on which one it is."""
     first_id = first_ns = 0
     for loop in range(loops):
-        last, step = None, round(1e8)
+        last, step = None, DEFAULT_STEP_NS
         for item in once():
             prefix = f"loop{loop}_" if loop else ""
             if isinstance(item, Frame):

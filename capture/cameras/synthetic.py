@@ -1,4 +1,4 @@
-"""A camera that needs no camera: hand-held photographs of a procedural place, with everything known about them.
+"""The built-in capture: rendered hand-held photographs of a procedural place, with known cameras and depth.
 
 The frames carry no intrinsics, as those of an unknown camera do. What is known is for tests and benchmarks:
 scene_cameras, held_out_cameras and depth. The place is made by splatnode.capture.diorama; this file photographs it.
@@ -78,7 +78,7 @@ def depth_map(config: Config, camera: Camera) -> npt.NDArray[np.float32]:
 
 
 def _solids(config: Config) -> tuple[Solid, ...]:
-    """The place, its skins as dense as the picture's samples are on average."""
+    """The place, with about as many texels a metre as the images have samples."""
     return place(
         config.seed, density=float(np.clip(0.25 * max(config.width, config.height) * config.samples, 64, 1024))
     )

@@ -1,1 +1,1 @@
-"""The place that the synthetic camera photographs: solids, their textures, their light and how they stand together."""
+"""The place that the synthetic camera photographs: solids, their textures, their light and their layout."""

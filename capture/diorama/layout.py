@@ -51,8 +51,8 @@ INK, PAPER, CREAM = (44, 42, 46), (240, 234, 220), (232, 220, 196)
 
 
 class Builder:
-    """Collects solids. Their places come from `rng`; every face has random numbers of its own for its texture, so that
-    a place stands the same at every density."""
+    """Collects solids. Their positions come from `rng`; each face has random numbers of its own for its texture, so
+    that a place has the same solids at every density."""
 
     def __init__(self, seed: int, density: float) -> None:
         self.seed, self.density = seed, density

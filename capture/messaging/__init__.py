@@ -1,6 +1,6 @@
-"""How the three processes talk: acknowledged keyframes, previews and heartbeats that may drop, states for late comers.
+"""The three processes' messages over ZeroMQ: keyframes, previews, heartbeats, scenes and commands.
 
-services.py is the table of what is spoken, network.py how it is reached, wire.py what a message looks like. On top of
-them stand keyframes.py (nothing is lost), broadcast.py (newest wins), state.py (newest wins, and late comers get it)
-and commands.py (a question and its answer). A socket belongs to the thread that made it.
+services.py is the table of services, network.py opens their sockets, wire.py encodes messages. The patterns on top are
+keyframes.py (acknowledged, nothing is lost), broadcast.py (PUB/SUB, the newest counts), state.py (the same, and a late
+subscriber gets the last one) and commands.py (request and reply). A socket belongs to the thread that made it.
 """

@@ -1,4 +1,4 @@
-"""Newest wins: previews and heartbeats. Nobody waits for a slow reader; what a reader missed is counted."""
+"""PUB/SUB for previews and heartbeats: the newest counts. Nobody waits for a slow reader; lost messages are counted."""
 
 from __future__ import annotations
 
@@ -16,22 +16,24 @@ from splatnode.capture.messaging.network import Endpoint, Network
 from splatnode.capture.messaging.services import Service
 from splatnode.capture.messaging.wire import Message, WireError, decode, encode
 
+SEND_QUEUE = 16  # messages to one slow reader; a PUB socket drops further ones
+
 
 class Publisher(Endpoint):
-    """Offers `service`. Raises AlreadyRunning where somebody does."""
+    """Offers `service`. Raises AlreadyRunning where another process does."""
 
     def __init__(self, service: Service, network: Network) -> None:
         super().__init__(network, offers=service)
-        self._socket_out = self._bind(service, zmq.PUB, queue=16)
+        self._socket_out = self._bind(service, zmq.PUB, queue=SEND_QUEUE)
 
     def send(self, header: msgspec.Struct, arrays: Sequence[npt.NDArray] = ()) -> None:
         """Never waits. The arrays must not be written to afterwards: they are sent from where they are."""
-        with contextlib.suppress(zmq.Again):  # a PUB drops for each slow reader by itself; this is for closing links
+        with contextlib.suppress(zmq.Again):  # slow readers do not cause it, connections that are being closed do
             self._socket_out.send_multipart(encode(header, arrays), zmq.NOBLOCK, copy=False)
 
 
 class Subscriber(Endpoint):
-    """Hears `service`, whether it is there already or comes later."""
+    """Receives what `service` sends, whether its sender is there already or comes later."""
 
     def __init__(self, service: Service, network: Network, schema: Any, queue: int = 64) -> None:
         """`queue`: messages kept while the reader is away, which should hold the time between two reads."""
@@ -60,7 +62,7 @@ class Subscriber(Endpoint):
 
     def _drain(self) -> Message[Any] | None:
         newest = None
-        for _ in range(self._socket_in.rcvhwm + 1):  # bounded, however fast somebody sends
+        for _ in range(self._socket_in.rcvhwm + 1):  # an end, however fast the sender is
             try:
                 parts = self._socket_in.recv_multipart(zmq.NOBLOCK, copy=False)
             except zmq.Again:

@@ -1,4 +1,4 @@
-"""What capture and recon say about keyframes: frames one way, readiness and acknowledgements the other."""
+"""The messages between capture and recon: frames one way, readiness and acknowledgements the other."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.messaging.spool import Key
 from splatnode.capture.messaging.wire import Header, Message, Numbering, Part, Sequential, SessionId, WireError, encode
 
-_LONGEST_NAME = 255
+_LONGEST_NAME = 255  # characters, as of a file
+_LONGEST_TEXT = 1000  # characters
+_MOST_HELD = 64  # frames that a client may hold without acknowledging them
 
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=_LONGEST_NAME)]
-Text = Annotated[str, msgspec.Meta(max_length=1000)]
+Text = Annotated[str, msgspec.Meta(max_length=_LONGEST_TEXT)]
 
 
 class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="frame"):
@@ -27,7 +29,7 @@ class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True,
 
 
 class DroppedHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="dropped"):
-    """A DroppedFrame: that an image was left out is told like an image."""
+    """A DroppedFrame: recon is told of an image that was left out."""
 
     name: Name
     reason: Text
@@ -36,12 +38,12 @@ class DroppedHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="ready"):
     """The sender takes frames until it has `capacity` that are not acknowledged; `holding` it has received already."""
 
-    capacity: Annotated[int, msgspec.Meta(ge=0, le=64)]
-    holding: Annotated[list[tuple[SessionId, Sequential]], msgspec.Meta(max_length=64)]
+    capacity: Annotated[int, msgspec.Meta(ge=0, le=_MOST_HELD)]
+    holding: Annotated[list[tuple[SessionId, Sequential]], msgspec.Meta(max_length=_MOST_HELD)]
 
 
 class Acknowledge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="acknowledge"):
-    """The sender keeps this frame from now on."""
+    """The sender has this frame on its disk; the receiver may remove it."""
 
     session: SessionId
     sequence: Sequential
@@ -62,7 +64,7 @@ def to_message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
     """The parts of the message that carries `frame`, with the next number."""
     name = frame.name[-_LONGEST_NAME:]
     if isinstance(frame, DroppedFrame):
-        return encode(DroppedHeader(**numbering.next(), name=name, reason=frame.reason[:1000]))
+        return encode(DroppedHeader(**numbering.next(), name=name, reason=frame.reason[:_LONGEST_TEXT]))
     header = FrameHeader(
         **numbering.next(),
         frame_id=frame.frame_id,

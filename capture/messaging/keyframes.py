@@ -6,9 +6,9 @@
                                                  checkpoint
       remove from the spool           <------    Acknowledge(session, sequence)
 
-Whatever dies in between: a frame that is not acknowledged lies in the spool and is sent to the next connection that
-says it is ready and does not hold it. One that was acknowledged is known to recon's checkpoint; should it come again,
-because capture died before it could remove it, it is acknowledged again and not delivered.
+Either process may die at any moment. A frame that is not acknowledged stays in the spool and is sent to the next
+connection that is ready and does not hold it. An acknowledged one is in recon's checkpoint; if it comes again, because
+capture died before it removed it, it is acknowledged again and not delivered.
 """
 
 from __future__ import annotations
@@ -41,13 +41,15 @@ from splatnode.capture.messaging.wire import Numbering, WireError, decode, encod
 log = logging.getLogger(__name__)
 
 READY_EVERY_S = 0.5
-FORGET_CLIENT_S = 20.0  # one that is silent so long is gone
-REMEMBERED = 10_000  # acknowledged frames that recon knows again
+FORGET_CLIENT_S = 20.0  # without a request, a client counts as gone
+REMEMBERED = 10_000  # acknowledged frames that recon recognises if they come again
+QUEUE = 64  # messages in a socket; as many as a client may hold (Ready.capacity)
+MAX_REQUESTS = 1000  # that one call of `serve` reads
 
 
 @dataclass
 class _Client:
-    """What is known about one connection; what was sent over it arrives, or the connection ends."""
+    """One connection. What was sent over it arrives, or the connection ends."""
 
     capacity: int = 0
     outstanding: set[Key] = field(default_factory=set)  # sent or held, not acknowledged
@@ -55,7 +57,7 @@ class _Client:
 
 
 class KeyframeServer(Endpoint):
-    """Capture's end."""
+    """Capture's end: sends what lies in the spool until it is acknowledged."""
 
     def __init__(self, network: Network, spool: Spool) -> None:
         """Takes the spool over and closes it. Raises AlreadyRunning where another process offers keyframes."""
@@ -68,7 +70,7 @@ class KeyframeServer(Endpoint):
         self.refused = 0  # malformed requests
         self.acknowledged = 0
         self._clients: dict[bytes, _Client] = {}
-        self._router = self._bind(CAPTURE_KEYFRAMES, zmq.ROUTER, queue=64)
+        self._router = self._bind(CAPTURE_KEYFRAMES, zmq.ROUTER, queue=QUEUE)
         self._router.router_mandatory = True  # a connection that is gone says so
 
     @property
@@ -92,9 +94,9 @@ class KeyframeServer(Endpoint):
         return key
 
     def serve(self, timeout_s: float) -> None:
-        """Answers what came, waiting at most `timeout_s` for the first."""
+        """Handles the requests that came, waiting at most `timeout_s` for the first."""
         if self._router.poll(max(0, math.ceil(timeout_s * 1000))):
-            for _ in range(1000):
+            for _ in range(MAX_REQUESTS):
                 try:
                     identity, *parts = self._router.recv_multipart(zmq.NOBLOCK)
                 except zmq.Again:
@@ -151,7 +153,7 @@ class KeyframeServer(Endpoint):
 
 
 class KeyframeClient(Endpoint):
-    """Recon's end."""
+    """Recon's end: receives each keyframe once and acknowledges it."""
 
     def __init__(self, network: Network, seen: Iterable[tuple[str, int]] = (), capacity: int = 4) -> None:
         """`seen`: what the checkpoint holds. `capacity`: frames that may be here without being acknowledged."""
@@ -163,7 +165,7 @@ class KeyframeClient(Endpoint):
         self._seen: dict[Key, None] = dict.fromkeys(Key(*pair) for pair in seen)
         self._received: deque[ReceivedFrame] = deque()
         self._ready_said = -math.inf
-        self._dealer = self._connect(CAPTURE_KEYFRAMES, zmq.DEALER, queue=64)
+        self._dealer = self._connect(CAPTURE_KEYFRAMES, zmq.DEALER, queue=QUEUE)
 
     def receive(self, timeout_s: float) -> ReceivedFrame | None:
         """The next frame, oldest first, each once; None where none comes in `timeout_s`. Raises NotAllowed."""
@@ -180,7 +182,7 @@ class KeyframeClient(Endpoint):
             self._dealer.poll(math.ceil(1000 * min(remaining, READY_EVERY_S)))
 
     def acknowledge(self, frame: ReceivedFrame) -> None:
-        """To be called when the frame would survive the death of this process, and not before."""
+        """To be called once the frame is on the disk, so that it survives this process."""
         self._held.pop(frame.key, None)
         self._seen[frame.key] = None
         while len(self._seen) > REMEMBERED:
@@ -197,7 +199,9 @@ class KeyframeClient(Endpoint):
                 frame = received(decode(parts, FrameHeader | DroppedHeader, self.network.limits))
             except WireError as error:
                 self.refused += 1
-                if self.refused.bit_count() == 1:  # at 1, 2, 4, 8, ...: who sends rubbish does not fill the journal
+                if (
+                    self.refused.bit_count() == 1
+                ):  # the 1st, 2nd, 4th, 8th, ...: a faulty sender does not fill the journal
                     log.warning("refused a keyframe (%d so far): %s", self.refused, error)
                 continue
             if frame.key in self._seen:
@@ -217,7 +221,7 @@ class KeyframeClient(Endpoint):
         self._say(Acknowledge(*key))
 
     def _say(self, request: Ready | Acknowledge) -> None:
-        """An acknowledgement that cannot be sent is no loss: the frame comes again and is known."""
+        """Sends a request. Where an acknowledgement cannot be sent, the frame comes again and is recognised."""
         try:
             self._dealer.send_multipart(encode(request), zmq.NOBLOCK)
         except zmq.Again:

@@ -1,4 +1,4 @@
-"""CURVE keys: who this machine is, whom it lets in, and whom it expects to meet.
+"""CURVE keys: this machine's pair, the keys of clients that may connect, and the key of the server.
 
 A folder holds `secret.key` (0600) and `public.key` of this machine, `allowed/NAME.key` with the public keys of other
 machines that may connect here, and, where this machine connects to another one, that one's public key as `server.key`.
@@ -89,7 +89,7 @@ def _read_key(path: Path) -> bytes:
 
 
 class AllowList:
-    """Says at each handshake whether a key may connect; the interface is pyzmq's credentials provider."""
+    """Tells at each handshake whether a key may connect; the interface is that of pyzmq's credentials provider."""
 
     def __init__(self, folder: Path, own: bytes) -> None:
         self.folder = folder

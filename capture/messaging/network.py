@@ -1,9 +1,9 @@
-"""Where services are and how their sockets are opened: ipc in a private folder, or tcp with CURVE keys.
+"""The addresses of services and the options of their sockets: ipc in a private folder, or tcp with CURVE keys.
 
-Measured pitfalls this file is built on: a second bind on an ipc path succeeds and steals it, hence the lock; a queue
-to nobody blocks for ever without a timeout; a pending message keeps a process from ending without LINGER; a plain tcp
-socket hands raw bytes of anybody to the application, hence no tcp without CURVE. Nothing bounds how many parts one
-message has: whoever is let in could fill the memory, which the services' MemoryMax answers.
+ZeroMQ behaves as follows (measured), hence this file. A second bind on an ipc path succeeds and takes it over: a lock
+prevents it. A send without a receiver blocks for ever: no send waits. A pending message keeps a process from ending:
+LINGER is 0. A plain tcp socket gives the application raw bytes from anybody: there is no tcp without CURVE. The number
+of parts of a message is not bounded: a peer that is let in could fill the memory, which the services' MemoryMax limits.
 """
 
 from __future__ import annotations
@@ -33,12 +33,15 @@ log = logging.getLogger(__name__)
 REQUEST_BYTES = 64 << 10  # no request, acknowledgement or subscription is larger
 REQUEST_LIMITS = wire.Limits(header_bytes=REQUEST_BYTES, arrays=0, total_bytes=2 * REQUEST_BYTES)
 _ZAP_DOMAIN = "splatnode"
-_MOST_FAILED_HANDSHAKES = 5  # one may fail because the other process was just ending
+_MAX_FAILED_HANDSHAKES = 5  # in a row; one may fail because the other process was just ending
+_RECONNECT_MS, _MAX_RECONNECT_MS = 100, 1000  # pause before connecting again, doubled up to the second
+_HANDSHAKE_MS = 5000  # a connection whose handshake takes longer is closed
+_HEARTBEAT_MS, _HEARTBEAT_TIMEOUT_MS = 1000, 4000  # over tcp: a dead link is noticed, on both ends
 _LONGEST_IPC_PATH = 107  # sun_path, see unix(7)
 
 
 class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    # Of the ipc sockets and the locks. None: $RUNTIME_DIRECTORY, else $XDG_RUNTIME_DIR/splatnode, else under /tmp.
+    # Of ipc sockets and locks. None: $RUNTIME_DIRECTORY, else $XDG_RUNTIME_DIR/splatnode, else a folder under /tmp.
     directory: Path | None = None
     tcp: str | None = None  # the address to bind or connect to, instead of ipc; needs keys
     keys: Path | None = None  # the folder that `splatnode keys` made
@@ -67,9 +70,9 @@ class NotAllowed(PermissionError):
 
 
 class Endpoint:
-    """Sockets with all that they need; closes everything it opened. Subclasses say what is spoken.
+    """Sockets and what they need; `close` closes all that was opened. Subclasses define what is sent over them.
 
-    One that offers a service holds its lock until the last socket is gone, so that it removes no other's ipc path.
+    One that offers a service holds its lock until its last socket is closed, so that it removes no other's ipc path.
     """
 
     def __init__(self, network: Network, offers: Service | None = None) -> None:
@@ -80,7 +83,7 @@ class Endpoint:
             self._keys = _curve_keys(network)
             self._links: list[_Link] = []
             if offers is not None:
-                _room_for_connections()
+                _raise_file_limit()
                 self._lock(offers)
             self._context = zmq.Context()
             self._resources.callback(self._context.term)
@@ -110,7 +113,7 @@ class Endpoint:
                 socket.curve_server, socket.curve_secretkey = True, self._keys.secret
                 socket.zap_domain = _ZAP_DOMAIN.encode()
             address = _address(self.network, service)
-            if address.startswith("ipc://"):  # the lock is ours: what lies there is a dead process's
+            if address.startswith("ipc://"):  # this process has the lock: a socket that lies there is a dead process's
                 path = Path(address.removeprefix("ipc://"))
                 path.unlink(missing_ok=True)
                 self._resources.callback(path.unlink, missing_ok=True)
@@ -123,7 +126,7 @@ class Endpoint:
             return socket
 
     def _connect(self, service: Service, kind: int, *, queue: int) -> zmq.Socket:
-        """Succeeds whether or not somebody offers the service: it may come later, and go, and come back."""
+        """Succeeds whether or not the service is there: it may start later, end, and start again."""
         with self._closed_on_error():
             socket = self._socket(kind, queue, largest=self.network.max_message_mb << 20)
             if self._keys is not None:
@@ -132,7 +135,7 @@ class Endpoint:
             if kind == zmq.SUB:
                 socket.subscribe(b"")
             if kind == zmq.DEALER:
-                socket.immediate = True  # what is meant for a process that is not there is not kept for a later one
+                socket.immediate = True  # a message to a process that is not there is not kept for a later one
             if self._keys is not None:
                 self._links.append(_Link(self._resources, socket, _address(self.network, service)))
             socket.connect(_address(self.network, service))
@@ -156,15 +159,15 @@ class Endpoint:
         socket.linger = 0
         socket.sndhwm = socket.rcvhwm = queue
         socket.maxmsgsize = largest
-        socket.reconnect_ivl, socket.reconnect_ivl_max = 100, 1000
-        socket.handshake_ivl = 5000
-        if self.network.tcp is not None:  # a dead link is noticed, on both ends
-            socket.heartbeat_ivl, socket.heartbeat_timeout = 1000, 4000
+        socket.reconnect_ivl, socket.reconnect_ivl_max = _RECONNECT_MS, _MAX_RECONNECT_MS
+        socket.handshake_ivl = _HANDSHAKE_MS
+        if self.network.tcp is not None:
+            socket.heartbeat_ivl, socket.heartbeat_timeout = _HEARTBEAT_MS, _HEARTBEAT_TIMEOUT_MS
         return socket
 
 
 class _Link:
-    """What libzmq tells about the handshakes of a connecting socket."""
+    """The handshakes of a connecting socket, as libzmq's monitor reports them."""
 
     def __init__(self, resources: contextlib.ExitStack, socket: zmq.Socket, address: str) -> None:
         self._address = address
@@ -176,20 +179,21 @@ class _Link:
         resources.callback(socket.disable_monitor)
 
     def check(self) -> None:
+        """Raises NotAllowed where the other end refused this machine, or does not have the expected key."""
         while self._monitor.poll(0):
             event = recv_monitor_message(self._monitor)["event"]
             if event == zmq.EVENT_HANDSHAKE_FAILED_AUTH:
                 raise NotAllowed(f"{self._address} does not let this machine in. Run there: splatnode keys --allow")
             self._failures = 0 if event == zmq.EVENT_HANDSHAKE_SUCCEEDED else self._failures + 1
-        if self._failures >= _MOST_FAILED_HANDSHAKES:
+        if self._failures >= _MAX_FAILED_HANDSHAKES:
             raise NotAllowed(f"{self._address} does not have the key that server.key in network.keys expects of it")
 
 
-def _room_for_connections() -> None:
+def _raise_file_limit() -> None:
     """Lets the process have as many open files as the system allows it.
 
-    Every connection takes one, those of strangers too until their handshake fails; where none are left, nothing can be
-    written and libzmq ends the process.
+    Every connection takes one, even that of a client that is refused, until its handshake fails. Without one left,
+    no file can be written and libzmq aborts the process.
     """
     _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
@@ -230,13 +234,13 @@ def _curve_keys(network: Network) -> Keys | None:
     if network.tcp is None:
         return None
     if network.keys is None:
-        raise NetworkError("network.tcp needs network.keys, or anybody could speak. Run: splatnode keys FOLDER")
+        raise NetworkError("network.tcp needs network.keys, or anybody could connect. Run: splatnode keys FOLDER")
     return read_keys(network.keys)
 
 
 @contextlib.contextmanager
 def _authenticator(context: zmq.Context, network: Network, keys: Keys) -> Iterator[None]:
-    """Answers libzmq's question, at each handshake, whether a key may connect (ZAP, RFC 27), in its own thread."""
+    """Decides at each handshake, in its own thread, whether a key may connect (ZAP, ZeroMQ RFC 27)."""
     from zmq.auth.thread import ThreadAuthenticator  # brings asyncio, which ipc does not need
 
     if network.keys is None:

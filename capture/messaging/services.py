@@ -1,4 +1,4 @@
-"""The table of services: all that the processes say to each other goes through one of these."""
+"""The table of services: every message between the processes belongs to one of them."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from enum import Enum
 class Pattern(Enum):
     QUEUE = "ROUTER binds, DEALER connects: acknowledged, nothing is lost"
     BROADCAST = "PUB binds, SUB connects: newest wins, losses are counted"
-    STATE = "PUB and ROUTER bind, SUB and DEALER connect: newest wins, whoever comes late asks for it"
-    COMMANDS = "ROUTER binds, DEALER connects: a question and its answer"
+    STATE = "PUB and ROUTER bind, SUB and DEALER connect: newest wins, late subscribers ask for it"
+    COMMANDS = "ROUTER binds, DEALER connects: request and reply"
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Service:
 
     @property
     def requests(self) -> Service:
-        """Where late comers ask for a state; it has its own socket."""
+        """Where late subscribers ask for the state; it has a socket of its own."""
         return Service(f"{self.name}.requests", self.pattern, self.tcp_port + 1)
 
 

@@ -1,4 +1,4 @@
-"""Keyframes on disk until somebody else holds them: bounded, oldest first, whole or not there.
+"""Keyframes on disk until recon has acknowledged them: bounded, oldest first, whole or not there.
 
 The name of a message's file gives the order, which is kept from one process to the next: what a killed process left is
 delivered before what its successor adds.
@@ -25,17 +25,17 @@ log = logging.getLogger(__name__)
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    directory: Path | None = None  # None: splatnode.capture.process.state_directory
+    directory: Path | None = None  # None: state_directory() of capture/process
     max_frames: Annotated[int, msgspec.Meta(ge=1)] = 200
     max_mb: Annotated[int, msgspec.Meta(ge=1)] = 1024
 
 
 class SpoolFull(RuntimeError):
-    """The bound, or the disk, is reached: no keyframe can be taken until one is acknowledged."""
+    """The spool has reached its bound, or the disk is full: no keyframe can be added until one is acknowledged."""
 
 
 class Key(NamedTuple):
-    """What names a keyframe for ever."""
+    """Identifies a keyframe: the session of the capture process, and the number in it."""
 
     session: str
     sequence: int
@@ -101,14 +101,14 @@ class Spool:
         return read_message(self._files[key])
 
     def remove(self, key: Key) -> None:
-        """Somebody else holds it now. Nothing happens where it is gone already."""
+        """Removes an acknowledged message. Nothing happens where it is gone already."""
         path = self._files.pop(key, None)
         self._bytes.pop(key, None)
         if path is not None:
             path.unlink(missing_ok=True)
 
     def set_aside(self, key: Key) -> None:
-        """Keeps a message that cannot be delivered out of the way of the others, for a human to look at."""
+        """Renames a message that cannot be read, so that it is not delivered and can be examined."""
         path = self._files.pop(key)
         self._bytes.pop(key)
         with contextlib.suppress(OSError):

@@ -1,7 +1,7 @@
-"""A whole state, of which the newest counts, also for those who come late: the scene for the viewers.
+"""A state of which the newest counts, such as the scene for viewers: published, and sent to whoever asks.
 
-It is published whenever it changes. Whoever has just subscribed, or has heard nothing for a while, asks for it and says
-what it has; the answer is the state, or nothing where that is the newest.
+It is published whenever it changes. A client that has just subscribed, or has received nothing for a while, asks for it
+and says which one it has; the reply is the newest state, or nothing where the client has it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,10 @@ from splatnode.capture.messaging.network import REQUEST_LIMITS, Endpoint, Networ
 from splatnode.capture.messaging.services import Service
 from splatnode.capture.messaging.wire import Message, Part, Sequential, SessionId, WireError, decode, encode
 
-ASK_EVERY_S = 1.0
+ASK_EVERY_S = 1.0  # without a state
+MAX_REQUESTS = 1000  # that one call of `serve` reads
+MAX_MESSAGES = 8  # that are read at once; more than both queues hold
+ENDED_SESSIONS = 16  # of senders, whose late messages are known to be old
 
 
 class Want(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="want"):
@@ -32,7 +35,7 @@ class Want(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="want"):
 
 
 class StateServer(Endpoint):
-    """Offers `service`. Raises AlreadyRunning where somebody does."""
+    """Offers `service`. Raises AlreadyRunning where another process does."""
 
     def __init__(self, service: Service, network: Network) -> None:
         super().__init__(network, offers=service)
@@ -49,11 +52,11 @@ class StateServer(Endpoint):
             self._publisher.send_multipart(parts, zmq.NOBLOCK, copy=False)
 
     def serve(self, timeout_s: float) -> None:
-        """Answers those who ask, waiting at most `timeout_s` for the first. To be called several times a second."""
+        """Replies to requests, waiting at most `timeout_s` for the first. To be called several times a second."""
         if not self._router.poll(max(0, math.ceil(timeout_s * 1000))):
             return
-        wanted: dict[bytes, Want] = {}  # one answer to each, however often it asks
-        for _ in range(1000):
+        wanted: dict[bytes, Want] = {}  # one reply to each client, however often it asks
+        for _ in range(MAX_REQUESTS):
             try:
                 identity, *parts = self._router.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
@@ -64,12 +67,12 @@ class StateServer(Endpoint):
                 self.refused += 1
         for identity, want in wanted.items():
             if self._newest is not None and self._newest[0] != (want.session, want.sequence):
-                with contextlib.suppress(zmq.Again):  # it has not taken the last answer yet
+                with contextlib.suppress(zmq.Again):  # the client has not read the last reply yet
                     self._router.send_multipart([identity, *self._newest[1]], zmq.NOBLOCK, copy=False)
 
 
 class StateClient(Endpoint):
-    """Hears `service`, whether it is there already or comes later."""
+    """Receives the states of `service`, whether its sender is there already or comes later."""
 
     def __init__(self, service: Service, network: Network, schema: Any) -> None:
         super().__init__(network)
@@ -77,7 +80,7 @@ class StateClient(Endpoint):
         self.refused = 0  # malformed
         self._session: str | None = None
         self._sequence = 0
-        self._ended: deque[str] = deque(maxlen=16)  # sessions that gave way to another: late messages of theirs are old
+        self._ended: deque[str] = deque(maxlen=ENDED_SESSIONS)
         self._heard = self._asked = -math.inf
         self._subscriber = self._connect(service, zmq.SUB, queue=4)
         self._dealer = self._connect(service.requests, zmq.DEALER, queue=2)
@@ -91,9 +94,9 @@ class StateClient(Endpoint):
         return time.monotonic() - self._heard
 
     def poll(self, timeout_s: float) -> Message[Any] | None:
-        """A state that is newer than the last one given; None where none comes within `timeout_s`.
+        """A state that is newer than the last one returned; None where none comes within `timeout_s`.
 
-        A header with another session than before is a restarted sender's: it knows nothing of what was before.
+        A header with a new session is that of a restarted sender, which does not continue the session before.
         Raises NotAllowed.
         """
         deadline = time.monotonic() + timeout_s
@@ -111,13 +114,13 @@ class StateClient(Endpoint):
     def _ask(self) -> None:
         if min(self.age_s, time.monotonic() - self._asked) < ASK_EVERY_S:
             return
-        with contextlib.suppress(zmq.Again):  # nobody is there: ask again
+        with contextlib.suppress(zmq.Again):  # no sender is there: it asks again later
             self._dealer.send_multipart(encode(Want(self._session, self._sequence)), zmq.NOBLOCK)
             self._asked = time.monotonic()
 
     def _drain(self, socket: zmq.Socket) -> Message[Any] | None:
         newest = None
-        for _ in range(8):
+        for _ in range(MAX_MESSAGES):
             try:
                 parts = socket.recv_multipart(zmq.NOBLOCK, copy=False)
             except zmq.Again:

@@ -2,8 +2,8 @@
 
     [magic, version] [MessagePack: header, (dtype, shape) of each array] [raw array] [raw array] ...
 
-Arrays are little-endian and C-contiguous. Nothing in a message is executed or believed: types are checked by msgspec,
-dtypes come from a list, and each part must be exactly as long as its shape says.
+Arrays are little-endian and C-contiguous. Nothing in a message is executed or trusted: msgspec checks types,
+dtypes come from a list, and each part must be exactly as long as its shape requires.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Numbering:
 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a receiver is ready to look at."""
+    """The largest message that a receiver decodes."""
 
     header_bytes: int = 1 << 20
     arrays: int = 4096
@@ -118,7 +118,7 @@ def _array(name: str, shape: list[int], buffer: memoryview, limits: Limits) -> n
     if math.prod(shape) * dtype.itemsize != buffer.nbytes:
         raise WireError(f"array {name} of shape {shape} does not have {buffer.nbytes} bytes")
     array = np.frombuffer(buffer, dtype).reshape(shape)
-    if not array.flags.aligned:  # where a received message begins is chance; compiled code needs better
+    if not array.flags.aligned:  # a received message may begin at any address; compiled code needs an aligned one
         array = array.copy()
     array.setflags(write=False)
     return array

@@ -1,4 +1,4 @@
-"""The kinds of values that arguments of the command line take. What is wrong with one is said in terms of the user."""
+"""The kinds of values that arguments of the command line take, each with a message for a wrong one."""
 
 from __future__ import annotations
 

@@ -112,8 +112,8 @@ def typed(raw: Mapping[str, Any], schema: type[T], where: str = "") -> T:
     try:
         return msgspec.convert(_checked(raw, schema, where), schema, dec_hook=_decode)
     except msgspec.ValidationError as error:
-        message, _, place = str(error).partition(" - at `$")
-        key = _join(where, place.rstrip("`").lstrip("."))
+        message, _, path = str(error).partition(" - at `$")
+        key = _join(where, path.rstrip("`").lstrip("."))
         raise ConfigError(f"{key or 'configuration'}: {message[0].lower()}{message[1:].replace('`', '')}") from error
 
 

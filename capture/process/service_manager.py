@@ -6,19 +6,21 @@ import os
 import socket
 import time
 
+WATCHDOG_SHARE = 0.25  # of the watchdog's time between two signs of life; sd_watchdog_enabled(3) asks for half at most
+
 
 class ServiceManager:
-    """Tells systemd how the process is; `alive` has to be called while it works, and limits its own rate."""
+    """Tells systemd that the process is ready, alive or stopping. `alive` may be called often and limits its rate."""
 
     def __init__(self) -> None:
         self._address = os.environ.get("NOTIFY_SOCKET", "")
         timeout_s = int(os.environ.get("WATCHDOG_USEC", "0")) / 1e6
-        self._every_s = timeout_s / 4 if timeout_s else 1.0
+        self._every_s = WATCHDOG_SHARE * timeout_s if timeout_s else 1.0
         self._next = 0.0
         self._is_ready = False
 
     def ready(self) -> None:
-        """May be called again and again; the first time counts."""
+        """Only the first call sends."""
         if not self._is_ready:
             self._is_ready = True
             self._notify("READY=1")

@@ -7,7 +7,7 @@ import signal
 import time
 from collections.abc import Callable
 
-_ONE_S = 0.5  # signals closer than this are one: timeout(1) sends each twice
+_REPEATED_S = 0.5  # a signal that comes again sooner is the same one: timeout(1) sends each twice
 
 
 def on_first(numbers: tuple[signal.Signals, ...], stop: Callable[[], object]) -> None:
@@ -19,7 +19,7 @@ def on_first(numbers: tuple[signal.Signals, ...], stop: Callable[[], object]) ->
         if first_s == math.inf:
             first_s = time.monotonic()
             stop()
-        elif time.monotonic() - first_s > _ONE_S:
+        elif time.monotonic() - first_s > _REPEATED_S:
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
 

@@ -19,11 +19,11 @@ from dataclasses import dataclass
 
 from splatnode.capture.video4linux import layout as v4l2
 
-BUFFERS = 4
+BUFFERS = 4  # frames that the driver may fill while nobody reads
 
 
 def _readable(fd: int, timeout_s: float) -> bool:
-    """Whether there is something to read, or a loss to be told of, within the time."""
+    """Whether a frame, or the news that the device is gone, can be read within the time."""
     poller = select.poll()
     poller.register(fd, select.POLLIN)
     return bool(poller.poll(timeout_s * 1000))
@@ -31,7 +31,7 @@ def _readable(fd: int, timeout_s: float) -> bool:
 
 @dataclass(frozen=True)
 class System:
-    """What is asked of the operating system; tests put a driver of their own in its place."""
+    """The system calls that a device makes; tests give a driver of their own."""
 
     open: Callable[[str, int], int] = os.open
     close: Callable[[int], None] = os.close
@@ -118,7 +118,7 @@ class Device:
         return tuple(found)
 
     def set_format(self, pixels: str, width: int, height: int) -> Format:
-        """What the driver made of the wish, which may be something else."""
+        """The format that the driver chose, which may be another one."""
         wish = v4l2.Format(type=v4l2.CAPTURE)
         wish.fmt.pix.width, wish.fmt.pix.height = width, height
         wish.fmt.pix.pixelformat, wish.fmt.pix.field = v4l2.fourcc(pixels), v4l2.FIELD_NONE
@@ -127,7 +127,7 @@ class Device:
         return Format(v4l2.fourcc_name(got.pixelformat), got.width, got.height, got.bytesperline)
 
     def set_rate(self, frames_per_second: float) -> float | None:
-        """What the driver made of the wish; None where the device has no say in it."""
+        """The rate that the driver chose; None where the device's rate cannot be set."""
         wish = v4l2.StreamParameters(type=v4l2.CAPTURE)
         wish.parm.capture.numerator, wish.parm.capture.denominator = 1000, round(1000 * frames_per_second)
         if not self._exists(v4l2.S_PARM, wish):
@@ -171,7 +171,7 @@ class Device:
         return argument.value
 
     def set_control(self, control: int, value: int) -> int:
-        """What the device reads back, which may be something else."""
+        """The value that the device reports afterwards, which may be another one."""
         self._ioctl(v4l2.S_CTRL, v4l2.Control(id=control, value=value))
         return self.get_control(control)
 
@@ -184,7 +184,7 @@ class Device:
                 continue
 
     def _exists(self, request: int, argument: ctypes.Structure, nothing: int = errno.EINVAL) -> bool:
-        """False where the answer is the errno that stands for nothing there."""
+        """Whether the request succeeds; False where its errno is `nothing`, or says that the request is unknown."""
         try:
             self._ioctl(request, argument)
         except OSError as error:

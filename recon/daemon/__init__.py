@@ -1,1 +1,1 @@
-"""The reconstruction as a process that runs for weeks: keyframes in, scenes out, nothing acknowledged lost."""
+"""The reconstruction as a daemon: keyframes in, scenes out; no keyframe that it acknowledged is lost."""

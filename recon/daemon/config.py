@@ -1,4 +1,4 @@
-"""What can be configured in the recon daemon, with defaults and units."""
+"""The configuration of the recon daemon, with defaults and units."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     network: Network = Network()
     reconstruction: Reconstruction = Reconstruction()
     tracking: Tracking = Tracking()  # of the live camera against a finished scene
-    checkpoint: Path | None = None  # None: recon/ in splatnode.capture.process.state_directory
-    out: Path = Path("out")  # each place becomes a folder in it
-    max_views: Annotated[int, msgspec.Meta(ge=4)] = 30  # beyond, those that others show too are given up
+    checkpoint: Path | None = None  # None: recon/ in state_directory() of capture/process
+    out: Path = Path("out")  # the result of each place is a folder in it: scene-0001, ...
+    max_views: Annotated[int, msgspec.Meta(ge=4)] = 30  # beyond, the view that has most in common with another goes
     max_gaussians: Positive = 300_000
-    # Without a keyframe, until all evidence is weighed and the scene made afresh. A verification takes seconds that a
-    # keyframe would have to wait; with one every two seconds there is no time for it.
+    # Without a keyframe, until the whole scene is verified and built anew. A verification takes seconds for which a
+    # keyframe would have to wait: with one every two seconds there is no time for it.
     settle_s: Annotated[float, msgspec.Meta(ge=0)] = 3.0
-    lost_after: Annotated[int, msgspec.Meta(ge=3)] = 3  # keyframes in a row that do not fit: a new place
+    lost_after: Annotated[int, msgspec.Meta(ge=3)] = 3  # so many keyframes in a row that do not fit begin a new place
     status_every_s: Annotated[float, msgspec.Meta(gt=0)] = 1.0

@@ -1,4 +1,4 @@
-"""Small commands to the running daemon."""
+"""Commands to the running daemon, and the verb `retract` that sends one."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from splatnode.capture.messaging.services import RECON_CONTROL
 from splatnode.capture.process.config import load_config
 from splatnode.recon.daemon.config import Config
 
+EXIT_GOOD, EXIT_UNKNOWN_NAME = 0, 2
+
 
 class Retract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="retract"):
-    """Forget the keyframe with this name."""
+    """Remove the keyframe with this name."""
 
     name: str
 
@@ -24,8 +26,8 @@ class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="answe
 
 
 def retract(args: argparse.Namespace) -> int:
-    """Takes a keyframe back; 2 where there is none of that name."""
+    """Asks the daemon to remove a keyframe; returns 2 where there is none of that name."""
     config = load_config(args.config, Config) if args.config else Config()
     answer = ask(RECON_CONTROL, config.network, Retract(args.name), Answer)
     print(answer.message)
-    return 0 if answer.done else 2
+    return EXIT_GOOD if answer.done else EXIT_UNKNOWN_NAME

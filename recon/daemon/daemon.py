@@ -1,4 +1,4 @@
-"""`splatnode recon CONFIG`: the process. Its sockets are in this file, in the main thread; the work is in others.
+"""`splatnode recon CONFIG`: the process. The main thread has the sockets below; other threads do the work.
 
 intake    capture.keyframes -> checkpoint, acknowledged -> inbox
 worker    inbox -> scenes, saved and exported
@@ -26,10 +26,10 @@ from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.process.config import load_config
 from splatnode.capture.process.logs import event, use_structured_lines
+from splatnode.capture.process.memory import resident_mb
 from splatnode.capture.process.service_manager import ServiceManager
 from splatnode.capture.process.state_directory import state_directory
 from splatnode.capture.process.stop_signals import on_first
-from splatnode.capture.status import own_rss_mb
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
 from splatnode.recon.daemon.control import Answer, Retract
@@ -45,13 +45,15 @@ from splatnode.recon.result.message import camera_record, to_message
 
 log = logging.getLogger(__name__)
 
-SERVE_S = 0.05  # between looks at what the threads have made
+SERVE_S = 0.05  # between looks at what the threads have produced
 END_S = 20.0  # for the threads to end; an export takes seconds
-STUCK_S = 300.0  # without the worker getting on: what takes longest, a verification of all views, takes tens of seconds
+STUCK_S = (
+    300.0  # without progress the worker counts as stuck; its longest step, verifying all views, takes tens of seconds
+)
 
 
 def recon(args: argparse.Namespace) -> int:
-    """Runs until SIGTERM or SIGINT; 0 then. The second signal does not wait for what is being written."""
+    """Runs until SIGTERM or SIGINT and returns 0. A second signal ends the process at once."""
     use_structured_lines()
     config = load_config(args.config, Config) if args.config else Config()
     if args.checkpoint:
@@ -97,7 +99,7 @@ class Daemon:
         self._resources.close()
 
     def run(self) -> None:
-        """Until the daemon is told to stop. Raises what ended one of its threads."""
+        """Runs until the daemon is stopped. Raises the error that ended one of its threads."""
         manager = ServiceManager()
         threads = [self._thread(each.run) for each in (self._intake, self._worker, self._watcher)]
         manager.ready()
@@ -112,7 +114,7 @@ class Daemon:
                     next_status_s = time.monotonic() + self._config.status_every_s
                     status = self._status()
                     self._heartbeat.send(status)
-                    if time.monotonic() - self._worker.moved_s < STUCK_S:  # else the service manager starts it anew
+                    if time.monotonic() - self._worker.moved_s < STUCK_S:  # else the service manager restarts it
                         manager.alive(f"{status.state.value}, {status.keyframes} keyframes, {status.verdict}")
         finally:
             self._stopping.set()
@@ -135,12 +137,12 @@ class Daemon:
         return thread
 
     def _end(self, threads: list[threading.Thread]) -> None:
-        """Waits for what must be whole: an export, a frame on its way to the disk."""
+        """Waits until the threads have written what they are writing: an export, a keyframe."""
         deadline = time.monotonic() + END_S
         for thread in threads:
             thread.join(max(0.0, deadline - time.monotonic()))
         if any(thread.is_alive() for thread in threads):
-            log.error("a thread did not end within %d s; what it was writing is left out whole", END_S)
+            log.error("a thread did not end within %d s; the file that it was writing is not there", END_S)
 
     def _publish(self) -> None:
         shown = self._newest.take()
@@ -157,7 +159,7 @@ class Daemon:
         self._store.forget(command.name, "retracted")
         self._inbox.put(LeftOut(command.name), self._stopping)
         event(log, logging.INFO, "retracted", frame=command.name)
-        return Answer(True, f"{command.name} is forgotten; the scene is made anew without it")
+        return Answer(True, f"{command.name} is removed; the scene is built anew without it")
 
     def _status(self) -> ReconStatus:
         snapshot = self._shown.snapshot if self._shown else None
@@ -178,7 +180,7 @@ class Daemon:
             keyframe_s=worker.keyframe_s,
             refused=intake.refused + self._commands.refused + self._scenes.refused,
             duplicates=intake.duplicates,
-            rss_mb=own_rss_mb(),
+            rss_mb=resident_mb(),
             camera_moved=motion.moved if motion else None,
             moved=str(motion) if motion and motion.moved else "",
             tracked=camera_record(tracked) if tracked else None,
@@ -195,7 +197,7 @@ class Daemon:
 
 
 class _Newest:
-    """The newest snapshot that has not been published."""
+    """Holds the newest snapshot that has not been published, between two threads."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -212,7 +214,7 @@ class _Newest:
 
 
 def remove_leftovers(out: Path) -> None:
-    """Temporary files of exports that a killed process had begun."""
+    """Removes temporary files of exports that a killed process had begun."""
     for leftover in (*out.glob("scene-*/.*.tmp"), *out.glob("scene-*/colmap/.*.tmp")):
         event(log, logging.INFO, "removed_leftover", file=leftover)
         leftover.unlink(missing_ok=True)

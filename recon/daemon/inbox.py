@@ -1,4 +1,4 @@
-"""What waits for the worker: keyframes with their features, and what became of others, in the order they came."""
+"""The worker's queue: keyframes with their features, and names of frames that were left out, oldest first."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from splatnode.recon.frames.keyframe import Keyframe
 
 CAPACITY = 32  # events in memory; further keyframes wait with their sender
+WAIT_S = 0.1  # between looks at whether the daemon stops
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +42,12 @@ class Inbox:
         """Waits where the inbox is full, until there is room or the daemon stops."""
         with self._changed:
             while len(self._events) >= CAPACITY and not stopping.is_set():
-                self._changed.wait(0.1)
+                self._changed.wait(WAIT_S)
             self._events.append(event)
             self._changed.notify_all()
 
     def get(self, timeout_s: float) -> list[Event]:
-        """The next event, and with a keyframe those that follow it; none where none comes in time."""
+        """The next event, and after a keyframe all keyframes that follow it; none where none comes in time."""
         with self._changed:
             self._changed.wait_for(lambda: self._events, timeout_s)
             events = [self._events.popleft()] if self._events else []

@@ -1,4 +1,4 @@
-"""The thread that takes keyframes: onto the disk, acknowledged, their features found; whatever the worker does."""
+"""The thread that receives keyframes: stores, acknowledges, extracts features; it does not wait for the worker."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from splatnode.recon.pipeline import prepare
 
 log = logging.getLogger(__name__)
 
-RETRY_S = 1.0  # after the disk refused a frame
+RECEIVE_S = 0.2  # between looks at whether the daemon stops
+RETRY_S = 1.0  # after a frame could not be written
 
 
 class Intake:
@@ -31,7 +32,7 @@ class Intake:
         """Until the daemon stops. Raises NotAllowed."""
         with KeyframeClient(self._network, self._store.seen) as client:
             while not self._stopping.is_set():
-                received = client.receive(timeout_s=0.2)
+                received = client.receive(timeout_s=RECEIVE_S)
                 self.refused, self.duplicates = client.refused, client.duplicates
                 if received is not None:
                     self._take(client, received)

@@ -1,4 +1,4 @@
-"""Where a reconstruction goes: to those who look on, into the checkpoint, and as a result into a folder."""
+"""The outputs of the reconstruction: snapshots for viewers, the checkpoint, and the result folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What the world may see."""
+    """A snapshot that viewers may see, with the id of its scene."""
 
     snapshot: Snapshot
     scene_id: str
@@ -30,23 +30,24 @@ class Output:
     def __init__(
         self, config: Config, store: Store, publish: Callable[[Shown], None], complain: Callable[[str], None]
     ) -> None:
-        """A disk that takes nothing costs time after a restart, or a result: `complain` is told, and all goes on."""
+        """`complain` is called where the disk is full: that costs a result, or time after a restart; no keyframe."""
         self._config, self._store, self._publish, self._complain = config, store, publish, complain
 
     def show(self, work: LiveReconstruction, final: bool = False) -> Snapshot:
+        """Publishes a snapshot of `work` and returns it."""
         snapshot = work.snapshot(final)
         self._publish(Shown(snapshot, self._store.scene_id))
         return snapshot
 
     def save(self, work: LiveReconstruction, final: bool) -> None:
-        """What could be made anew from the keyframes."""
+        """Writes the checkpoint's files that a restart would else have to compute again."""
         try:
             checkpoint.save(self._store, work, final)
         except OSError as error:
-            self._complain(f"the scene cannot be kept ({error.strerror}): make room on the disk")
+            self._complain(f"the scene cannot be saved ({error.strerror}): make room on the disk")
 
     def export(self, snapshot: Snapshot) -> bool:
-        """The result folder, whole or not at all; whether it is there."""
+        """Writes the result folder, all of it or nothing; returns whether it was written."""
         recipe, folder = self._config.reconstruction, self._config.out / self._store.scene_id
         try:
             finish(in_metres(snapshot, recipe.metric), folder, seed=recipe.seed, preset_name="live")

@@ -1,8 +1,8 @@
-"""Has the camera moved? Previews are placed in the finished scene and compared with where the camera stood.
+"""Relocalisation: where in the finished scene a preview was taken, and whether the camera has moved since.
 
-A preview's features are matched with those of the keyframes, whose points the scene's depth makes known; the camera
-follows from these points (P3P in RANSAC, then least squares). Features do not depend on the light, and both positions
-rest on the same points, so that errors of the scene, which are the same in both, cancel.
+A preview's features are matched with those of the keyframes, whose points in the world the scene's depth gives. The
+camera is resected from these points (P3P in RANSAC, then least squares). Features hardly depend on the light, and
+both positions are resected from the same points, so that errors of the scene are the same in both and cancel.
 """
 
 from __future__ import annotations
@@ -25,25 +25,29 @@ from splatnode.recon.result.snapshot import Snapshot
 
 Array = npt.NDArray[np.float64]
 
+RAYLEIGH_MEDIAN = 1.1774  # median length of a 2D normal vector with sigma 1, the square root of 2 ln 2
+MIN_VARIANCE_PX2 = 1e-4  # of a coordinate: a hundredth of a pixel is the best that a feature is located to
+DAMPING = 1e-9  # added to the normal matrix, which points in one line leave singular
+
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    every_s: float = 1.0  # between previews that are looked at; 0: the camera is not watched
+    every_s: float = 1.0  # between previews that are examined; 0: the camera is not tracked
     num_features: int = 2000  # of a preview
-    longer_side: int = 800  # pixels at which they are found
-    keyframes: int = 3  # that a preview is compared with: those that know it best
-    min_alpha: float = 0.8  # of the Gaussians at a keyframe's point
-    min_inliers: int = 20  # points on which a position rests
-    min_share: float = 0.3  # of the matches that it explains; of matches with another place it explains up to 0.2
-    max_error_px: float = 3.0  # of such a point, at `longer_side`
-    independent: int = 50  # points share errors of the scene: more of them are no more certain than so many
-    certainty: float = 0.999
-    shift_px: float = 3.0  # at `longer_side`: a shorter shift of the picture is no motion
-    confirmations: int = 2  # previews in a row
+    longer_side: int = 800  # pixels of the preview in which they are found
+    keyframes: int = 3  # with which a preview is compared: those with the most matches
+    min_alpha: float = 0.8  # rendered opacity at a keyframe's feature; below, its depth is not known well enough
+    min_inliers: int = 20  # points from which a camera is resected
+    min_share: float = 0.3  # inlier ratio; matches with another place reach 0.2
+    max_error_px: float = 3.0  # reprojection error of an inlier, at `longer_side`
+    independent: int = 50  # inliers share errors of the scene: more than so many make the position no more certain
+    certainty: float = 0.999  # that the camera has moved, to say so
+    shift_px: float = 3.0  # median shift of the points in the image, at `longer_side`; a smaller one is no motion
+    confirmations: int = 2  # previews in a row that must show the motion
 
 
 @dataclass(frozen=True, eq=False)
 class Landmarks:
-    """What one keyframe knows."""
+    """The features of one keyframe, with their points in the world."""
 
     name: str
     points: Array  # (M, 3) world
@@ -52,13 +56,13 @@ class Landmarks:
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """Where a preview was taken, and how well that is known."""
+    """Where a preview was taken, with its uncertainty."""
 
     T_world_camera: Array  # (4, 4)
     covariance: Array  # (6, 6) of a small motion in the camera's frame: translation, then rotation vector
     K: Array  # (3, 3) of the preview
-    points: Array  # (N, 3) on which it rests
-    keyframes: tuple[str, ...]  # that know the preview best, the best first
+    points: Array  # (N, 3) world, from which it was resected
+    keyframes: tuple[str, ...]  # with the most matches, the most first
 
 
 @dataclass(frozen=True)
@@ -68,30 +72,30 @@ class Motion:
     moved: bool
     rotation_deg: float
     translation_rel: float
-    shift_px: float  # median shift of the points in the picture, at the configured size
+    shift_px: float  # median shift of the points in the image, at the configured size
     certainty: float  # that the camera is not where it was, in [0, 1]
 
     def __str__(self) -> str:
         return (
             f"turned by {self.rotation_deg:.1f}°, moved by {100 * self.translation_rel:.1f} % of the distance to the "
-            f"scene, {self.shift_px:.0f} px in the picture, certain to {100 * self.certainty:.1f} %"
+            f"scene, {self.shift_px:.0f} px in the image, certain to {100 * self.certainty:.1f} %"
         )
 
 
 def landmarks(snapshot: Snapshot, keyframes: Sequence[Keyframe], config: Config) -> list[Landmarks]:
-    """The features of the snapshot's keyframes, where the Gaussians are dense enough to tell their depth."""
+    """The features of the snapshot's keyframes, where the Gaussians are opaque enough for a depth."""
     cameras = {camera.name: camera for camera in snapshot.cameras}
     known = []
     for keyframe in (keyframe for keyframe in keyframes if keyframe.name in cameras):
         camera, found = cameras[keyframe.name], keyframe.features
-        picture = take_picture(
+        render = take_picture(
             snapshot.gaussians, camera.T_world_camera, camera.K, camera.width, camera.height, channels=("depth",)
         )
         plain = found.tilt == 1.0
         pixels = found.points[found.point_of[plain]] * keyframe.scale
         column, row = np.clip(pixels.astype(int), 0, [camera.width - 1, camera.height - 1]).T
-        depth = picture.depth[row, column].astype(np.float64)
-        good = (depth > 0) & (picture.alpha[row, column] >= config.min_alpha)
+        depth = render.depth[row, column].astype(np.float64)
+        good = (depth > 0) & (render.alpha[row, column] >= config.min_alpha)
         rays = np.c_[pixels, np.ones(len(pixels))] @ np.linalg.inv(camera.K).T
         T_world_camera = camera.T_world_camera
         points = (rays * depth[:, None])[good] @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
@@ -102,48 +106,48 @@ def landmarks(snapshot: Snapshot, keyframes: Sequence[Keyframe], config: Config)
 def locate(
     image: npt.NDArray[np.uint8], K: Array, known: Sequence[Landmarks], config: Config, likely: Sequence[str] = ()
 ) -> Position | None:
-    """Where `image` (H, W, 3) with intrinsics `K` was taken; None where the scene does not know it.
+    """Where `image` (H, W, 3) with intrinsics `K` was taken; None where too few features match the scene's.
 
     `likely` names the keyframes to compare it with; without them it is compared with all.
     """
     found = features.extract(image, _feature_config(config))
-    chosen = [place for place in known if place.name in likely] if likely else list(known)
+    chosen = [each for each in known if each.name in likely] if likely else list(known)
     ratio_test = nearest_neighbours.Config()
-    matches = [nearest_neighbours.match(found.descriptors, place.descriptors, ratio_test) for place in chosen]
+    matches = [nearest_neighbours.match(found.descriptors, each.descriptors, ratio_test) for each in chosen]
     best = sorted(range(len(chosen)), key=lambda i: -len(matches[i]))[: config.keyframes]
     if not best or sum(len(matches[i]) for i in best) < config.min_inliers:
         return None
     pixels = np.concatenate([found.points[matches[i][:, 0]] for i in best])
     points = np.concatenate([chosen[i].points[matches[i][:, 1]] for i in best])
     scale = max(image.shape[:2]) / config.longer_side
-    T_world_camera, inside = _resect(pixels, points, K, config.max_error_px * scale)
-    if inside.sum() < max(config.min_inliers, config.min_share * len(inside)):
+    T_world_camera, inliers = _resect(pixels, points, K, config.max_error_px * scale)
+    if inliers.sum() < max(config.min_inliers, config.min_share * len(inliers)):
         return None
-    covariance = _covariance(T_world_camera, pixels[inside], points[inside], K, config.independent)
-    return Position(T_world_camera, covariance, K, points[inside], tuple(chosen[i].name for i in best))
+    covariance = _covariance(T_world_camera, pixels[inliers], points[inliers], K, config.independent)
+    return Position(T_world_camera, covariance, K, points[inliers], tuple(chosen[i].name for i in best))
 
 
 def motion(before: Position, now: Position, config: Config) -> Motion:
     """How the camera moved between two positions, and how certain that is."""
     T_before_now = np.linalg.inv(before.T_world_camera) @ now.T_world_camera
-    turn = Rotation.from_matrix(T_before_now[:3, :3]).as_rotvec()
-    step = np.concatenate([T_before_now[:3, 3], turn])
-    distance = float(step @ np.linalg.solve(before.covariance + now.covariance, step))
-    (u, v, depth), (u_now, v_now, _) = (_project(place.T_world_camera, now.K, now.points).T for place in (before, now))
+    rotation = Rotation.from_matrix(T_before_now[:3, :3]).as_rotvec()
+    step = np.concatenate([T_before_now[:3, 3], rotation])
+    mahalanobis2 = float(step @ np.linalg.solve(before.covariance + now.covariance, step))
+    (u, v, depth), (u_now, v_now, _) = (_project(each.T_world_camera, now.K, now.points).T for each in (before, now))
     longer_side = 2 * max(now.K[0, 2], now.K[1, 2])
     shift = float(np.median(np.hypot(u - u_now, v - v_now))) * config.longer_side / longer_side
-    certainty = float(chi2.cdf(distance, df=6))
+    certainty = float(chi2.cdf(mahalanobis2, df=6))
     return Motion(
         moved=certainty >= config.certainty and shift >= config.shift_px,
-        rotation_deg=float(np.degrees(np.linalg.norm(turn))),
-        translation_rel=float(np.linalg.norm(step[:3]) / max(np.median(depth), 1e-9)),
+        rotation_deg=float(np.degrees(np.linalg.norm(rotation))),
+        translation_rel=float(np.linalg.norm(step[:3]) / max(np.median(depth), MIN_DEPTH)),
         shift_px=shift,
         certainty=certainty,
     )
 
 
-class Watch:
-    """Remembers where the camera stood and says when it no longer does."""
+class Tracker:
+    """Remembers where the camera stood and tells when it has moved."""
 
     def __init__(self, known: Sequence[Landmarks], config: Config) -> None:
         self._known, self._config = known, config
@@ -151,10 +155,10 @@ class Watch:
         self._in_a_row = 0
         self._likely: tuple[str, ...] = ()
 
-    def look(self, image: npt.NDArray[np.uint8], K: Array) -> tuple[Position | None, Motion | None]:
-        """Where the camera is, and how it moved since it was first seen standing; None for what is not known.
+    def track(self, image: npt.NDArray[np.uint8], K: Array) -> tuple[Position | None, Motion | None]:
+        """Where the camera is, and how it has moved since the first preview that was located; None where unknown.
 
-        `moved` is set once as many previews in a row as configured say so.
+        `moved` is set once the configured number of previews in a row show a motion.
         """
         position = locate(image, K, self._known, self._config, self._likely)
         self._likely = position.keyframes if position else ()
@@ -174,6 +178,7 @@ def _feature_config(config: Config) -> features.Config:
 
 
 def _resect(pixels: Array, points: Array, K: Array, max_error_px: float) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """T_world_camera (4, 4) from pixels (N, 2) of world points (N, 3), and which of them are inliers (N,)."""
     camera = {
         "model": "PINHOLE",
         "width": int(2 * K[0, 2]),
@@ -195,16 +200,16 @@ def _project(T_world_camera: Array, K: Array, points: Array) -> Array:
 
 
 def _covariance(T_world_camera: Array, pixels: Array, points: Array, K: Array, independent: int) -> Array:
-    """(6, 6) of a motion of the camera in its own frame, from the residuals of the points that it rests on."""
+    """(6, 6) of a motion of the camera in its own frame, from the residuals of its inliers."""
     projected = _project(T_world_camera, K, points)
     x, y = (projected[:, 0] - K[0, 2]) / K[0, 0], (projected[:, 1] - K[1, 2]) / K[1, 1]
     inverse, zero = 1 / projected[:, 2], np.zeros(len(points))
-    # Of a point X in the camera: moving the camera by (t, r) moves X by -t - r x X.
+    # Moving the camera by (t, r) moves a point X in its frame by -t - r x X.
     row_u = K[0, 0] * np.stack([-inverse, zero, x * inverse, x * y, -(1 + x * x), y], 1)
     row_v = K[1, 1] * np.stack([zero, -inverse, y * inverse, 1 + y * y, -x * y, -x], 1)
     jacobian = np.concatenate([row_u, row_v])
     residuals = np.linalg.norm(pixels - projected[:, :2], axis=1)
-    # Of one coordinate: the residuals' lengths have Rayleigh's distribution, whose median is 1.1774 sigma.
-    variance = (float(np.median(residuals)) / 1.1774) ** 2 + 1e-4
-    share = max(1.0, len(points) / independent)
-    return share * variance * np.linalg.inv(jacobian.T @ jacobian + 1e-9 * np.eye(6))
+    # Of one coordinate, robustly: the residuals' lengths have Rayleigh's distribution.
+    variance = (float(np.median(residuals)) / RAYLEIGH_MEDIAN) ** 2 + MIN_VARIANCE_PX2
+    dependence = max(1.0, len(points) / independent)
+    return dependence * variance * np.linalg.inv(jacobian.T @ jacobian + DAMPING * np.eye(6))

@@ -1,4 +1,4 @@
-"""The thread that watches the live camera: where it is in the finished scene, and whether it still stands there."""
+"""The thread that tracks the live camera: where it is in the finished scene, and whether it has moved."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from splatnode.capture.messaging.services import CAPTURE_PREVIEW
 from splatnode.capture.messaging.wire import WireError
 from splatnode.capture.preview import PreviewHeader, decode_preview
 from splatnode.capture.process.logs import event
-from splatnode.recon.daemon.tracking import Config, Motion, Watch, landmarks
+from splatnode.recon.daemon.tracking import Config, Motion, Tracker, landmarks
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
@@ -35,7 +35,7 @@ class Watcher:
     def __init__(
         self, network: Network, config: Config, finished: Callable[[], Finished | None], stopping: threading.Event
     ) -> None:
-        """`finished` gives the finished scene, the same as long as it is; None while it changes."""
+        """`finished` returns the finished scene, the same object until it changes; None while it is being changed."""
         self._network, self._config, self._finished, self._stopping = network, config, finished, stopping
         self.tracked: CameraEstimate | None = None  # the live camera in the finished scene, where it is known
         self.motion: Motion | None = None  # since the scene was finished
@@ -45,25 +45,25 @@ class Watcher:
         if self._config.every_s <= 0:
             return
         watched: Finished | None = None
-        watch = None
+        tracker = None
         with Subscriber(CAPTURE_PREVIEW, self._network, PreviewHeader, queue=4) as previews:
             while not self._stopping.wait(self._config.every_s):
                 finished = self._finished()
                 if finished is not watched:
-                    watched, watch, self.motion, self.tracked = finished, None, None, None
+                    watched, tracker, self.motion, self.tracked = finished, None, None, None
                 message = previews.latest(0)
                 if watched is None or message is None:
                     continue
-                if watch is None:
-                    watch = Watch(landmarks(watched.snapshot, watched.keyframes, self._config), self._config)
+                if tracker is None:
+                    tracker = Tracker(landmarks(watched.snapshot, watched.keyframes, self._config), self._config)
                 try:
-                    self._look(watch, decode_preview(message), watched.snapshot)
+                    self._track(tracker, decode_preview(message), watched.snapshot)
                 except WireError as error:
                     log.warning("a preview was refused: %s", error)
 
-    def _look(self, watch: Watch, image: npt.NDArray[np.uint8], snapshot: Snapshot) -> None:
+    def _track(self, tracker: Tracker, image: npt.NDArray[np.uint8], snapshot: Snapshot) -> None:
         height, width = image.shape[:2]
-        position, motion = watch.look(image, preview_intrinsics(snapshot.cameras[-1], width, height))
+        position, motion = tracker.track(image, preview_intrinsics(snapshot.cameras[-1], width, height))
         self.tracked = position and CameraEstimate(
             "live", -1, position.T_world_camera, position.K, width, height, None, None
         )
@@ -73,5 +73,5 @@ class Watcher:
 
 
 def preview_intrinsics(camera: CameraEstimate, width: int, height: int) -> npt.NDArray[np.float64]:
-    """(3, 3) of a picture `width` x `height` by the same camera."""
+    """(3, 3) intrinsic matrix of the same camera's image resized to `width` x `height`."""
     return np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K

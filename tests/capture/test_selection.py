@@ -11,7 +11,7 @@ import pytest
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import Frame
 from splatnode.capture.quality import Limits
-from splatnode.capture.selection import Config, Motion, Selector, follow, measure, what_it_adds
+from splatnode.capture.selection import Config, Motion, Selector, measure, track, what_it_adds
 from tests.support import synthetic
 
 EVERY = Config(per_second=1000.0, patience_s=0.0)
@@ -87,14 +87,14 @@ def test_photographs_are_taken_unless_they_are_copies():
     assert [decision.take for decision in decisions] == [True, True, True, False]
 
 
-def test_corners_are_followed_to_where_they_went():
+def test_corners_are_tracked_to_where_they_went():
     start, now = (cv2.cvtColor(view(left).image, cv2.COLOR_RGB2GRAY) for left in (0, 12))
     corners = cv2.goodFeaturesToTrack(start, 100, 0.01, 8)
-    after, followed = follow(start, now, corners, corners)
-    assert followed.mean() > 0.8
-    error = np.linalg.norm((after - corners)[followed] - (-12, 0), axis=-1)
+    after, tracked = track(start, now, corners, corners)
+    assert tracked.mean() > 0.8
+    error = np.linalg.norm((after - corners)[tracked] - (-12, 0), axis=-1)
     assert np.quantile(error, 0.9) < 0.1  # some at the border see what has come in
-    assert not followed[corners[:, 0, 0] < 10].any()  # these are out of the picture
+    assert not tracked[corners[:, 0, 0] < 10].any()  # these have left the image
 
 
 def test_parallax_is_what_no_homography_explains():

@@ -1,4 +1,4 @@
-"""What the reconstruction knows, as messages for the checkpoint: the view graph and the scene."""
+"""The view graph and the scene as messages for the checkpoint."""
 
 from __future__ import annotations
 
@@ -46,6 +46,7 @@ class SceneRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
+    """Header and arrays of the message that holds `graph`."""
     features = [taken_apart(keyframe.features) for keyframe in graph.keyframes]
     pairs = {key: taken_apart(pair) for key, pair in graph.pairs.items()}
     header = GraphRecord(
@@ -59,7 +60,7 @@ def graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
 
 @dataclass(frozen=True, eq=False)
 class SavedGraph:
-    """By the names of the keyframes."""
+    """Features and pairs by the names of their keyframes."""
 
     features: dict[str, Features]
     pairs: dict[tuple[str, str], TwoView]
@@ -76,6 +77,7 @@ def graph_from(message: Message[GraphRecord]) -> SavedGraph:
 
 
 def scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDArray]]:
+    """Header and arrays of the message that holds `scene`; `final`: it is finished."""
     views = [ViewRecord(view.name, view.rotation_sigma_deg, view.centre_sigma_rel) for view in scene.views]
     cameras = [torch.stack([view.T_world_camera for view in scene.views]), torch.stack([v.K for v in scene.views])]
     gaussians = [getattr(scene.gaussians, field.name) for field in fields(Gaussians)]
@@ -117,6 +119,7 @@ def _plain(number: Any) -> bool | int | float | None:
 
 
 def put_together(kind: type[T], numbers: Numbers, arrays: Any) -> T:
+    """Inverse of `taken_apart`; takes from `arrays` as many as it needs. Raises ValueError where they do not fit."""
     names = [field.name for field in fields(kind)]  # pyright: ignore[reportArgumentType]
     if not set(numbers) <= set(names):
         raise ValueError(f"a {kind.__name__} with {', '.join(sorted(numbers))} is of another version")

@@ -1,14 +1,14 @@
-"""The checkpoint: all that a killed daemon needs to go on where it was.
+"""The checkpoint: all that a daemon needs to continue after it was killed.
 
-    ledger              which frames there are to know about, and where the present place begins
-    frames/<number>     a keyframe as it came; the number is its position in all that ever came
+    ledger              where the present place begins, and which frames are no longer stored
+    frames/<number>     a keyframe as it came; numbers count all keyframes that ever came
     graph               features and matches
     judgement           the cameras that they lead to, the evidence and the verdict
     scene               cameras and Gaussians as they are shown
-    pointmaps           depths of its views, from which it grows
+    pointmaps           depth maps of its views, from which it grows
 
-The last four are made anew where they are missing. A keyframe is the daemon's as soon as its file is there. Every file
-is whole or not there, and has a checksum.
+The last four are computed again where they are missing. A keyframe is acknowledged once its file is there. Every file
+is whole or not there, and has a checksum. A place is what one scene shows.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 
 VERSION = 1
 MADE_ANEW = ("graph", "judgement", "scene", "pointmaps")
-REMEMBERED = 1000  # frames that are gone, in case their sender has not heard that they came
+REMEMBERED = 1000  # removed frames that are recognised if their sender missed the acknowledgement
 REMEMBERED_DROPPED = 100  # names and reasons
 FILE = "{:012d}.frame"
 LIMITS = Limits(header_bytes=64 << 20, arrays=1 << 20, total_bytes=4 << 30)  # of what this process wrote itself
@@ -57,7 +57,7 @@ class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class Ledger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     version: int = VERSION
-    place: int = 1  # counts from the first place that was ever seen
+    place: int = 1  # number of the present place, from 1
     first: int = 0  # number of the present place's first frame
     next: int = 0  # at least this is the number of the next frame
     gone: tuple[tuple[str, int], ...] = ()  # session and sequence of frames that are no longer stored
@@ -72,7 +72,7 @@ class StoredFrame:
 
 
 class Store:
-    """One process at a time uses a directory; any of its threads may call."""
+    """Reads and writes a checkpoint, from any thread. One process at a time uses a directory."""
 
     def __init__(self, directory: Path) -> None:
         """Raises CheckpointError where another process uses it, or where it is of another version or damaged."""
@@ -117,12 +117,12 @@ class Store:
         return [*self.ledger.gone, *self._keys.values()]
 
     def frames(self) -> Iterator[StoredFrame]:
-        """The present place's frames that an earlier process stored, in the order in which they came, each once."""
+        """The present place's frames that an earlier process stored, oldest first; each is returned once."""
         while self._found:
             yield self._found.popleft()
 
     def _read_frames(self) -> Iterator[StoredFrame]:
-        """The stored frames; a damaged one is put aside and named. All are known before another is added."""
+        """The stored frames; a damaged one is renamed and logged."""
         for path in sorted(self._frames.glob("*.frame")):
             try:
                 number = int(path.stem)
@@ -158,14 +158,14 @@ class Store:
             return stored
 
     def forget(self, name: str, reason: str) -> None:
-        """Removes a frame for good, if it is there; that it was there stays known. Raises OSError."""
+        """Removes a frame, if it is there, and records it with the reason as dropped. Raises OSError."""
         with self._writing:
             if name in self._names:
                 number = self._names[name]
                 self._leave_out({number: name}, self._keys[number], (name, reason))
 
     def begin_place(self, first: int) -> None:
-        """Another place begins with frame `first`; what was before is given up."""
+        """Begins another place with frame `first`; the frames before it and their scene are removed."""
         with self._writing:
             before = {number: name for name, number in self._names.items() if number < first}
             gone = (*self.ledger.gone, *(self._keys[number] for number in before))
@@ -176,11 +176,11 @@ class Store:
                 (self.directory / name).unlink(missing_ok=True)
 
     def save(self, name: str, header: msgspec.Struct, arrays: list[Any]) -> None:
-        """Keeps what could be made anew. Raises OSError."""
+        """Writes one of the files that can be computed again. Raises OSError."""
         write_message(self.directory / name, encode(header, arrays))
 
     def load(self, name: str, schema: Any) -> Message[Any] | None:
-        """What was kept under this name; None where it is missing or cannot be used."""
+        """What `save` wrote under this name; None where it is missing or damaged."""
         try:
             return decode(read_message(self.directory / name), schema, LIMITS)
         except FileNotFoundError:

@@ -26,7 +26,7 @@ from splatnode.capture.messaging.spool import Spool
 from splatnode.capture.messaging.state import StateClient, StateServer, Want
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.preview import PreviewHeader
-from splatnode.capture.status import own_rss_mb
+from splatnode.capture.process.memory import resident_mb
 from tests.bench.node.malformed import FRAME, IMAGE, Parts, good_messages, malformed
 
 TENTHS = 10
@@ -73,7 +73,7 @@ def fuzz_sockets(rng: random.Random, count: int) -> dict[str, Any]:
                     refused[name] += receiver(rng, context, Path(folder, f"{name}{tenth}"), goods, batch)
                     sent[name] += batch
                 probe(network, keyframes, scene)
-                memory.append(own_rss_mb())
+                memory.append(resident_mb())
     return {
         "messages": sum(sent.values()),
         "sent": sent,
@@ -192,7 +192,7 @@ def fuzz_ports(rng: random.Random, connections: int) -> dict[str, Any]:
         ):
             keyframes.offer(FRAME)
             scene.publish(good_header(), [IMAGE])
-            before, sent = own_rss_mb(), 0
+            before, sent = resident_mb(), 0
             for index in range(connections):
                 port = network.first_port + rng.choice((0, 1, 3, 4))
                 sent += shout(rng, port)
@@ -207,7 +207,7 @@ def fuzz_ports(rng: random.Random, connections: int) -> dict[str, Any]:
                 "connections": connections,
                 "bytes": sent,
                 "messages_that_reached_the_application": reached,
-                "growth_mb": own_rss_mb() - before,
+                "growth_mb": resident_mb() - before,
             }
 
 

@@ -19,7 +19,7 @@ from typing import Any
 
 from splatnode.capture.messaging.wire import Limits, Message, WireError, decode, encode
 from splatnode.capture.preview import PreviewHeader, decode_preview
-from splatnode.capture.status import own_rss_mb
+from splatnode.capture.process.memory import resident_mb
 from tests.bench.node.attacked import TENTHS, fuzz_ports, fuzz_sockets
 from tests.bench.node.malformed import Parts, good_messages, malformed
 
@@ -61,7 +61,7 @@ def fuzz_decoders(rng: random.Random, count: int) -> dict[str, Any]:
             unchanged += parts == good
             assert_consistent(message, parts, schema, limits)
         if (index + 1) % (count // TENTHS) == 0:
-            memory.append(own_rss_mb())
+            memory.append(resident_mb())
     for good, schema in goods:
         decode(good, schema, limits)
     return {

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.daemon.tracking import Config, Landmarks, Watch, landmarks, locate, motion
+from splatnode.recon.daemon.tracking import Config, Landmarks, Tracker, landmarks, locate, motion
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import features
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
@@ -72,10 +72,10 @@ def test_a_preview_is_placed_where_it_was_taken(known):
 
 
 def test_sensor_noise_and_light_are_no_motion(known):
-    watch = Watch(known, CONFIG)
+    watch = Tracker(known, CONFIG)
     for seed in range(1, 4):
         for image in (preview(seed=seed), darker(preview(seed=10 + seed))):
-            position, found = watch.look(image, stand()[1])
+            position, found = watch.track(image, stand()[1])
             assert position is not None and not found.moved
             assert found.rotation_deg < 0.3 and found.shift_px < CONFIG.shift_px
 
@@ -83,12 +83,12 @@ def test_sensor_noise_and_light_are_no_motion(known):
 @pytest.mark.parametrize(("turn_deg", "step"), [(2.0, 0.0), (-4.0, 0.0), (0.0, 0.15)])
 def test_a_shift_of_some_pixels_is_found_and_measured(known, turn_deg, step):
     """A turn of 2 degrees is 17 px of 480, one of 4 is 34; a step of 0.15 m at about 3.3 m is 20."""
-    watch, K = Watch(known, CONFIG), stand()[1]
-    _, first = watch.look(preview(), K)
+    watch, K = Tracker(known, CONFIG), stand()[1]
+    _, first = watch.track(preview(), K)
     assert not first.moved
     alarms = []
     for seed in (2, 3, 4):
-        _, found = watch.look(darker(preview(moved(turn_deg, step), seed)), K)
+        _, found = watch.track(darker(preview(moved(turn_deg, step), seed)), K)
         alarms.append(found.moved)
     assert alarms == [False, True, True]  # one preview alone is no alarm
     assert found.certainty > 0.999
@@ -102,8 +102,8 @@ def test_a_shift_of_some_pixels_is_found_and_measured(known, turn_deg, step):
 
 
 def test_a_camera_that_comes_back_is_no_longer_moved(known):
-    watch, K = Watch(known, CONFIG), stand()[1]
-    looks = [watch.look(preview(camera), K)[1].moved for camera in (None, moved(4), moved(4), moved(4), None)]
+    watch, K = Tracker(known, CONFIG), stand()[1]
+    looks = [watch.track(preview(camera), K)[1].moved for camera in (None, moved(4), moved(4), moved(4), None)]
     assert looks == [False, False, True, True, False]
 
 
@@ -113,7 +113,7 @@ def test_what_no_camera_could_have_seen_is_not_known(known):
     mirrored = np.ascontiguousarray(preview()[:, ::-1])
     for image in (mirrored, other.image, np.zeros_like(mirrored)):
         assert locate(image, stand()[1], known, CONFIG) is None
-        assert Watch(known, CONFIG).look(image, stand()[1]) == (None, None)
+        assert Tracker(known, CONFIG).track(image, stand()[1]) == (None, None)
 
 
 def test_the_same_position_has_not_moved(known):

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from splatnode.capture.frame import Frame, reduced
 from splatnode.recon.config import Config
 from splatnode.recon.daemon.tracking import Config as Tracking
-from splatnode.recon.daemon.tracking import Watch, landmarks
+from splatnode.recon.daemon.tracking import Tracker, landmarks
 from splatnode.recon.daemon.watcher import preview_intrinsics
 from splatnode.recon.evaluate.splits import load_split
 from splatnode.recon.evaluate.truth import load_scene
@@ -42,13 +42,13 @@ def test_a_camera_that_stands_in_a_real_place_and_then_moves(shared, name):
     for refined in work.refine(work.begun, QUICK.optimize):
         work.show(refined)
     snapshot = work.snapshot(final=True)
-    watch = Watch(landmarks(snapshot, work.graph.keyframes, Tracking()), Tracking())
+    watch = Tracker(landmarks(snapshot, work.graph.keyframes, Tracking()), Tracking())
     stood, went = (next(iter(scene.frames((each,)))) for each in split.train[1:3])
 
     def look(frame: Frame, gain: float, seed: int):
         image = preview(frame, gain, seed)
         height, width = image.shape[:2]
-        return watch.look(image, preview_intrinsics(snapshot.cameras[0], width, height))
+        return watch.track(image, preview_intrinsics(snapshot.cameras[0], width, height))
 
     for seed, gain in enumerate((1.0, 0.7, 1.1)):
         position, motion = look(stood, gain, seed)

@@ -1,0 +1,67 @@
+"""A new camera is one new file in capture/cameras, and nothing elsewhere."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from splatnode import command_line
+from splatnode.capture import cameras
+from splatnode.capture.config import CaptureConfig, is_live, open_stream
+from splatnode.capture.process.config import ConfigError, load_config
+
+CAMERA = '''
+"""Grey frames."""
+
+import msgspec
+import numpy as np
+
+from splatnode.capture.frame import Frame
+
+LIVE = True
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    count: int = 2
+
+
+def stream(config):
+    for index in range(config.count):
+        yield Frame(index, f"{index}.png", index, np.full((48, 64, 3), 128, np.uint8), None)
+
+
+def find():
+    return [{"device": "grey-1", "description": "a camera for the test"}]
+'''
+
+
+@pytest.fixture
+def config(tmp_path, monkeypatch):
+    """A configuration of the new camera, whose file lies where the package's other cameras lie."""
+    (tmp_path / "cameras").mkdir()
+    (tmp_path / "cameras" / "grey.py").write_text(CAMERA)
+    monkeypatch.setattr(cameras, "__path__", [*cameras.__path__, str(tmp_path / "cameras")])
+    (tmp_path / "grey.yaml").write_text("camera: {kind: grey}")
+    yield tmp_path / "grey.yaml"
+    sys.modules.pop("splatnode.capture.cameras.grey", None)
+    vars(cameras).pop("grey", None)
+
+
+def test_its_frames_are_streamed_as_it_is_configured(config):
+    camera = load_config(config, CaptureConfig, ["camera.count=3"]).camera
+    assert [frame.name for frame in open_stream(camera)] == ["0.png", "1.png", "2.png"] and is_live(camera)
+
+
+def test_its_configuration_is_checked_and_it_is_named_among_the_kinds(config):
+    with pytest.raises(ConfigError, match=r"camera\.size: unknown key; allowed here: count"):
+        load_config(config, CaptureConfig, ["camera.size=3"])
+    with pytest.raises(ConfigError, match="expected one of .*folder, grey, synthetic.*got 'gray'"):
+        load_config(config, CaptureConfig, ["camera.kind=gray"])
+
+
+def test_the_command_line_finds_and_records_it(config, tmp_path, capsys):
+    assert command_line.main(["find"]) == 0
+    assert 'camera: {kind: grey, device: "grey-1"}  # a camera for the test' in capsys.readouterr().out
+    assert command_line.main(["record", str(config), "--out", str(tmp_path / "out"), "--set", "camera.count=1"]) == 0
+    assert "1 frames in" in capsys.readouterr().out
