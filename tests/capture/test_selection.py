@@ -46,7 +46,7 @@ def test_a_sliding_camera_gives_one_whenever_it_has_gone_far_enough():
 
 def test_a_view_of_something_else_is_coverage():
     (_, other) = taken([view(0, 0), view(800, 1)])
-    assert other.take and "coverage: 100.0% of the last view is out of the picture" in other.reason
+    assert other.take and "coverage: 100.0% of the last view is out of the image" in other.reason
 
 
 def test_a_view_that_was_taken_before_is_a_copy():
@@ -123,7 +123,7 @@ def test_parallax_is_what_no_homography_explains():
 def test_reasons(motion, what):
     reason, adds = what_it_adds(motion, Config())
     assert adds == (what is not None) and reason.startswith(what or "adds too little")
-    assert not what_it_adds(motion, Config(), patience=10)[1]
+    assert not what_it_adds(motion, Config(), strictness=10)[1]
 
 
 def test_the_built_in_capture_is_taken_whole():

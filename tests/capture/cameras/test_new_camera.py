@@ -45,7 +45,8 @@ def config(tmp_path, monkeypatch):
     (tmp_path / "grey.yaml").write_text("camera: {kind: grey}")
     yield tmp_path / "grey.yaml"
     sys.modules.pop("splatnode.capture.cameras.grey", None)
-    vars(cameras).pop("grey", None)
+    if hasattr(cameras, "grey"):
+        delattr(cameras, "grey")
 
 
 def test_its_frames_are_streamed_as_it_is_configured(config):
