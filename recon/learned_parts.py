@@ -20,6 +20,8 @@ from splatnode.recon.optimize.losses import dino
 
 @dataclass(frozen=True)
 class LearnedPart:
+    """Something that can only be used with weights from elsewhere."""
+
     name: str
     purpose: str
     weights: tuple[str, ...]  # paths in the catalogue

@@ -29,12 +29,15 @@ _KEY_POINTS = 64  # features whose places tell any two photographs apart
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
+    """A frame that was accepted, with what every later stage needs of it."""
+
     frame: Frame  # undistorted, at full size
     image: npt.NDArray[np.uint8]  # (h, w, 3) RGB at modelled size
     features: Features
 
     @property
     def name(self) -> str:
+        """Of the frame: what point maps, views and cameras of it are found by."""
         return self.frame.name
 
     @property

@@ -45,10 +45,10 @@ SMALL = Size()
 class DepthAnythingV2(nn.Module):
     """DINOv2 with the decoder of a dense prediction transformer."""
 
-    def __init__(self, size: Size = SMALL, *, most_m: float | None = None) -> None:
-        """`most_m`: the network answers in metres up to this; None: it answers inverse depths."""
+    def __init__(self, size: Size = SMALL, *, max_m: float | None = None) -> None:
+        """`max_m`: the network answers in metres up to this; None: it answers inverse depths."""
         super().__init__()
-        self._layers, self._most_m = size.layers, most_m
+        self._layers, self._max_m = size.layers, max_m
         self.pretrained = Dinov2(size.vit)
         self.depth_head = _Head(size)
 
@@ -59,10 +59,12 @@ class DepthAnythingV2(nn.Module):
         Sides must be multiples of `dinov2.PATCH`.
         """
         raw = self.depth_head(self.pretrained(image[None], self._layers), *image.shape[1:])[0, 0]
-        return torch.relu(raw) if self._most_m is None else self._most_m * torch.sigmoid(raw)
+        return torch.relu(raw) if self._max_m is None else self._max_m * torch.sigmoid(raw)
 
 
 class _Head(nn.Module):
+    """A dense prediction transformer's decoder (Ranftl et al. 2021)."""
+
     def __init__(self, size: Size) -> None:
         super().__init__()
         self.projects = nn.ModuleList(nn.Conv2d(size.vit.width, each, 1) for each in size.head_layer_widths)
@@ -70,6 +72,7 @@ class _Head(nn.Module):
         self.scratch = _HeadScratch(size.head_layer_widths, size.head_width)
 
     def forward(self, layers: Sequence[Tensor], height: int, width: int) -> Tensor:
+        """(1, 1, height, width) raw values from four layers' tokens (1, 1 + h w, C), the class token first."""
         grid = height // PATCH, width // PATCH
         images = [
             resize(project(tokens[:, 1:].transpose(1, 2).unflatten(2, grid)))
@@ -88,9 +91,9 @@ class _HeadScratch(Scratch):
         )
 
 
-def load_network(path: Path, size: Size = SMALL, *, most_m: float | None = None) -> DepthAnythingV2:
+def load_network(path: Path, size: Size = SMALL, *, max_m: float | None = None) -> DepthAnythingV2:
     """Raises ValueError where the file is damaged, holds another model or anything but data, and FileNotFoundError."""
-    build = partial(DepthAnythingV2, size, most_m=most_m)
+    build = partial(DepthAnythingV2, size, max_m=max_m)
     return weight_loading.load_network(build, weight_loading.read_weights(path), path, "Depth Anything V2 Small")
 
 
@@ -119,4 +122,4 @@ def load_metric() -> Monocular | None:
     path = located(METRIC)
     if path is None:
         return None
-    return Monocular(load_network(path, most_m=INDOORS_M), "Depth Anything V2 Metric Indoor Small")
+    return Monocular(load_network(path, max_m=INDOORS_M), "Depth Anything V2 Metric Indoor Small")

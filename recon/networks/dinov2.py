@@ -31,6 +31,8 @@ SMALL = Size()
 
 
 class Dinov2(nn.Module):
+    """The vision transformer: photographs in, tokens of their patches after chosen blocks out."""
+
     def __init__(self, size: Size = SMALL, *, masks: bool = True, normed_from: int | None = None) -> None:
         """`masks`: whether the checkpoint holds the pre-training's token. Blocks from `normed_from` on are normed."""
         super().__init__()

@@ -13,6 +13,8 @@ from splatnode.recon.networks.rotary import Rotary
 
 
 class PatchEmbedding(nn.Module):
+    """Cuts images into patches and maps each to a token."""
+
     def __init__(self, patch: int, width: int) -> None:
         super().__init__()
         self.proj = nn.Conv2d(3, width, patch, stride=patch)
@@ -23,6 +25,8 @@ class PatchEmbedding(nn.Module):
 
 
 class Attention(nn.Module):
+    """Multi-head self-attention."""
+
     def __init__(self, width: int, heads: int, *, normed: bool = False) -> None:
         """`normed`: queries and keys are normalised, head by head."""
         super().__init__()
@@ -32,6 +36,7 @@ class Attention(nn.Module):
         self.q_norm, self.k_norm = (nn.LayerNorm(width // heads) if normed else nn.Identity() for _ in range(2))
 
     def forward(self, x: Tensor, rotary: Rotary | None) -> Tensor:
+        """(..., N, C) from tokens (..., N, C); `rotary` turns queries and keys by their positions."""
         query, key, value = (by_head(part, self._heads) for part in self.qkv(x).chunk(3, dim=-1))
         query, key = self.q_norm(query), self.k_norm(key)
         if rotary is not None:
@@ -40,6 +45,8 @@ class Attention(nn.Module):
 
 
 class Mlp(nn.Module):
+    """Two linear layers with a GELU between them."""
+
     def __init__(self, width: int, hidden: int, out: int) -> None:
         super().__init__()
         self.fc1 = nn.Linear(width, hidden)
@@ -61,6 +68,8 @@ class _Scale(nn.Module):
 
 
 class Block(nn.Module):
+    """Attention and MLP, each after a layer norm and added to what came in."""
+
     def __init__(
         self, width: int, heads: int, *, scaled: bool = False, normed: bool = False, epsilon: float = 1e-6
     ) -> None:

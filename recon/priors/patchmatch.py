@@ -37,7 +37,7 @@ class Search:
 
     iterations: int  # each visits every pixel once
     perturbation: float  # size of random changes in the first iteration, pixels of parallax; halved in each
-    active_sources: int = 3  # of each pixel, those that explain its plane best: new planes are compared in these
+    active_sources: int = 3  # per pixel: those that explain its plane best; new planes are compared in these alone
     random_starts: int = 0  # planes tried per pixel over the whole depth range before the first iteration
 
 
@@ -53,6 +53,7 @@ class Level:
 
     @property
     def shape(self) -> tuple[int, int]:
+        """(h, w)."""
         return self.grey.shape[0], self.grey.shape[1]
 
 
@@ -65,6 +66,7 @@ class Planes:
 
     @property
     def inverse_depth(self) -> Float32:
+        """(h, w) at the pixels' centres, 0 where unknown."""
         return self.values[..., 0]
 
 

@@ -1,1 +1,1 @@
-"""The scene: cameras and Gaussians, and how they begin and grow (seeding, completion, far background)."""
+"""The scene: training views and Gaussians, and how they begin (completion, seeding, far shell), grow and warp."""

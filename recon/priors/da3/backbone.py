@@ -38,6 +38,8 @@ class Features:
 
 
 class Backbone(Dinov2):
+    """DINOv2 with a token for each view's camera, and attention across views in every second later block."""
+
     def __init__(self, size: Size) -> None:
         super().__init__(size.vit, masks=False, normed_from=size.joint_from)
         self.camera_token = nn.Parameter(torch.zeros(1, 2, size.vit.width))  # of the reference, and of other views

@@ -48,6 +48,8 @@ class Estimate:
 
 
 class DepthAnything3(nn.Module):
+    """A backbone, a head for depth, one for cameras, and an encoder of cameras that are known."""
+
     def __init__(self, size: Size = SMALL) -> None:
         super().__init__()
         self.backbone = nn.ModuleDict({"pretrained": Backbone(size)})

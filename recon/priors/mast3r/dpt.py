@@ -16,6 +16,8 @@ _LAYER_WIDTHS = (96, 192, 384, 768)
 
 
 class DensePrediction(nn.Module):
+    """From tokens of four layers to an image of `channels` at the size of the photograph."""
+
     def __init__(self, encoder_width: int, decoder_width: int, decoder_depth: int, channels: int) -> None:
         super().__init__()
         self._hooks = (0, decoder_depth // 2, decoder_depth * 3 // 4, decoder_depth)

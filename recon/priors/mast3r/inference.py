@@ -26,9 +26,13 @@ _KEPT_PAIRS = 160  # with their points, up to 1 GB: 13 frames have 156 ordered p
 class Network(Protocol):
     """What the prior needs of a network; `Mast3r` is one."""
 
-    def encode(self, image: Tensor) -> Encoded: ...
+    def encode(self, image: Tensor) -> Encoded:
+        """An image as `prepared` gives it, after the encoder."""
+        ...
 
-    def decode(self, first: Encoded, second: Encoded) -> tuple[Prediction, Prediction]: ...
+    def decode(self, first: Encoded, second: Encoded) -> tuple[Prediction, Prediction]:
+        """What the ordered pair says of its two images, in the first camera's frame."""
+        ...
 
 
 class Asked:
@@ -43,6 +47,7 @@ class Asked:
         self._points: LruCache[tuple[str, str], PairPoints] = LruCache(_KEPT_PAIRS)
 
     def crop_of(self, keyframe: Keyframe) -> Crop:
+        """How the keyframe's photograph is scaled and cut for the network."""
         return crop(keyframe.frame.width, keyframe.frame.height, self._longer_side, PATCH)
 
     @torch.inference_mode()

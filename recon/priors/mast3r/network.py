@@ -60,6 +60,8 @@ class Prediction:
 
 
 class Mast3r(nn.Module):
+    """Siamese encoder, two decoders that attend to each other, and a head for each image of a pair."""
+
     def __init__(self, size: Size = PUBLISHED) -> None:
         super().__init__()
         self.size = size

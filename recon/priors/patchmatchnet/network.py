@@ -51,6 +51,8 @@ STAGES = (
 
 
 class PatchmatchNet(nn.Module):
+    """The whole network: features, three stages of PatchMatch from coarse to fine, and a refinement."""
+
     def __init__(self) -> None:
         super().__init__()
         self.feature = FeaturePyramid()
@@ -80,17 +82,22 @@ class PatchmatchNet(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class _Estimate:
+    """What a stage knows of every pixel of the reference, at the stage's size."""
+
     depth: Tensor  # (h, w)
     probability: Tensor  # (D, h, w) of the samples that the depth was made of
     weights: Tensor  # (S, h, w) how far each source is to be believed
 
     def doubled(self) -> _Estimate:
+        """Depth and weights at twice the size, for the next stage."""
         depth = functional.interpolate(self.depth[None, None], scale_factor=2.0, mode="nearest")[0, 0]
         weights = functional.interpolate(self.weights[None], scale_factor=2.0, mode="nearest")[0]
         return _Estimate(depth, self.probability, weights)
 
 
 class _Patchmatch(nn.Module):
+    """One stage: proposes depths around the last estimate, scores them, and takes their mean by score."""
+
     def __init__(self, stage: Stage) -> None:
         super().__init__()
         self.stage = stage
@@ -109,6 +116,7 @@ class _Patchmatch(nn.Module):
         estimate: _Estimate | None,
         generator: torch.Generator,
     ) -> _Estimate:
+        """The estimate from the reference's features `own` (C, h, w), the sources' `others`, and the last estimate."""
         stage = self.stage
         around = sampling_grid(self.eval_conv(own[None])[0], square_of_steps(stage.dilation - 1, centre=True))
         ring = square_of_steps(stage.dilation)

@@ -13,6 +13,8 @@ _MIN_WEIGHT = 1e-5  # of all sources together: a pixel that none is believed at 
 
 
 class Evaluation(nn.Module):
+    """Scores depths by the group-wise correlation of features, averaged over sources and neighbours."""
+
     def __init__(self, groups: int) -> None:
         super().__init__()
         self._groups = groups

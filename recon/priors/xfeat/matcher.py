@@ -21,6 +21,7 @@ class _Added:
     keypoints: Keypoints
 
     def is_in(self, keyframe: Keyframe) -> bool:
+        """Whether the keyframe has them, at `first`."""
         mine = self.keypoints.points
         return np.array_equal(keyframe.features.points[self.first : self.first + len(mine)], mine)
 

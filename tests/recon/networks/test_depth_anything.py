@@ -46,7 +46,7 @@ def test_depths_equal_those_of_the_authors_code(checkpoint):
     inverse = load_network(checkpoint)(image)
     found = [float(value) for value in (inverse[20, 33], inverse[50, 60], inverse.mean(), inverse.std())]
     np.testing.assert_allclose(found, [2.475874662, 2.479676962, 2.064292908, 0.595957160], rtol=2e-6)
-    metres = load_network(checkpoint, most_m=INDOORS_M)(image)
+    metres = load_network(checkpoint, max_m=INDOORS_M)(image)
     torch.testing.assert_close(metres, 20.0 / (1.0 + (-inverse).exp()))
     with pytest.raises(ValueError, match="multiples of 14"):
         load_network(checkpoint)(image[:, :60])
