@@ -26,7 +26,6 @@ NUMERICAL = (
     "recon/scene",
     "recon/test_",
     "recon/verification",
-    "system/test_quality",
 )
 
 

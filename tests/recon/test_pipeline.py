@@ -43,7 +43,7 @@ CONFIG = Config(
     optimize=refinement.Config(iterations=150, checkpoints=(50,)),
 )
 QUICK = replace(CONFIG, size=160, optimize=refinement.Config(iterations=10, checkpoints=()))
-MIN_PSNR = 26.0  # dB, of held-out photographs
+MIN_PSNR = 29.2  # dB, of held-out photographs: 1 dB less than they reach with any instruction set
 MAX_GAUSSIANS = 50_000
 BLURRED = DroppedFrame("blurred.png", "blurred by 9 pixels")
 

@@ -80,7 +80,7 @@ def test_depth_is_right_and_nearly_complete(maps):
         error = np.abs(result.depth[known] / depth[known] - 1)
         assert known.mean() > 0.8
         assert np.median(error) < 0.005
-        assert (error < 0.02).mean() > 0.9
+        assert (error < 0.02).mean() > 0.88  # .916 or more
 
 
 def test_normals_are_those_of_the_planes_and_face_the_camera(maps):

@@ -104,9 +104,9 @@ def test_a_pose_is_found_through_the_rays():
 
 
 def test_nerfmm_learns_a_place_and_its_cameras():
-    config = fit.Config(iterations=40, checkpoints=(10,), rays=128)
+    config = fit.Config(iterations=80, checkpoints=(10,), rays=128)
     snapshots = list(nerfmm.reconstruct(list(photographs()[:3]), 0, config))
-    assert [snapshot.iterations for snapshot in snapshots] == [10, 40, 40]
+    assert [snapshot.iterations for snapshot in snapshots] == [10, 80, 80]
     assert [snapshot.final for snapshot in snapshots] == [False, False, True]
     last = pickle.loads(pickle.dumps(snapshots[-1]))
     assert isinstance(last, FieldSnapshot) and last.appearance.num_gaussians is None

@@ -56,7 +56,7 @@ def test_the_worth_of_a_gaussian_is_what_leaving_it_out_changes(truth):  # noqa:
 
 def test_photographs_of_another_size_are_worth_about_the_same(truth):  # noqa: F811
     ratio = worth(truth, 64, scale=0.5) / worth(truth, 64)
-    assert 0.7 < float(ratio.nanmedian()) < 1.4
+    assert 0.65 < float(ratio.nanmedian()) < 1.55  # 1.36
 
 
 def test_of_too_many_the_best_are_kept_in_their_order():
