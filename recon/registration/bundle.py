@@ -1,7 +1,8 @@
-"""Bundle adjustment for few views: Levenberg-Marquardt on robust reprojection errors, points eliminated by Schur.
+"""Bundle adjustment for few views: Levenberg-Marquardt on robust reprojection errors (Triggs et al., 2000).
 
-The work is done in recon/core/bundle.cpp: a few milliseconds an iteration, so that many hypotheses can be tried. Doing
-it here gives what few views need: priors on the focal length, and the covariance.
+The Schur complement eliminates the points. recon/core/bundle.cpp does the work, in a few milliseconds an iteration, so
+that many hypotheses can be tried. An own bundle adjustment gives what few views need: priors on the lens, and the
+covariance.
 """
 
 from __future__ import annotations
@@ -18,10 +19,17 @@ from splatnode.recon.core import library, pointer
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
+_POSE, _LENS = 6, 4  # parameters of a pose (rotation vector, translation) and of a lens (log focal, radial, shift x, y)
+_MIN_DEPTH = 1e-9  # in the problem's unit of length, in place of 0
+_BEHIND_PX = 1e3  # the error that the robust cost counts for a point behind its camera
+_UNDISTORT_ITERATIONS = 5  # of the fixed-point iteration; radial coefficients are small
+_MIN_CURVATURE = 1e-30  # in place of 0 for a parameter on which no observation depends
+_MIN_EIGENVALUE = 1e-14  # of the information at unit curvature: what is flatter is rounding
+
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """C cameras, G lenses (groups of cameras that share them), P points, O observations."""
+    """C cameras, G lenses (each shared by a group of cameras), P points and O observations of them."""
 
     rotations: Array  # (C, 3, 3) world to camera
     translations: Array  # (C, 3) world to camera
@@ -29,7 +37,7 @@ class Problem:
     log_focals: Array  # (G,) log of the focal length in pixels
     radials: Array  # (G,) first radial coefficient: distorted = undistorted * (1 + k r^2)
     shifts: Array  # (G, 2) of the principal point, pixels
-    points: Array  # (P, 3)
+    points: Array  # (P, 3) world
     camera_of: Index  # (O,)
     point_of: Index  # (O,)
     pixels: Array  # (O, 2) relative to the nominal principal point
@@ -37,14 +45,14 @@ class Problem:
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robust_px: float = 1.0  # scale of the Cauchy loss, pixels
-    noise_px: float = 1.0  # standard deviation that an observation counts with against the priors, pixels
+    noise_px: float = 1.0  # standard deviation of an observation, pixels: its weight against the priors
     max_iterations: int = 40
-    tolerance: float = 1e-5  # relative decrease of the cost at which it stops
+    tolerance: float = 1e-5  # relative decrease of the cost below which it has converged
 
 
 @dataclass(frozen=True, eq=False)
 class LensPrior:
-    """Gaussian priors on each lens' log focal length, radial coefficient and principal point; a sigma of 0 fixes."""
+    """Gaussian priors on the parameters of G lenses; a sigma of 0 fixes the parameter."""
 
     log_focals: Array  # (G,)
     sigmas: Array  # (G,) of log focal
@@ -52,8 +60,34 @@ class LensPrior:
     shift_sigmas: Array  # (G,) pixels around the nominal principal point
 
 
+def without_points(
+    rotations: Array, translations: Array, lens_of_camera: Index, log_focals: Array, radials: Array, shifts: Array
+) -> Problem:
+    """A problem of cameras and lenses that has no points and observations yet. Shapes as in `Problem`."""
+    points, none, pixels = np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros((0, 2))
+    return Problem(rotations, translations, lens_of_camera, log_focals, radials, shifts, points, none, none, pixels)
+
+
+def focal_prior(log_focals: Array, sigmas: Array) -> LensPrior:
+    """A prior under which only focal lengths (G,) are free, within `sigmas` (G,)."""
+    fixed = np.zeros(len(log_focals))
+    return LensPrior(log_focals, sigmas, fixed, fixed)
+
+
+def with_pose(problem: Problem, camera: int, rotation: Array, translation: Array) -> Problem:
+    """The problem with another pose of `camera`, world to camera."""
+    rotations, translations = problem.rotations.copy(), problem.translations.copy()
+    rotations[camera], translations[camera] = rotation, translation
+    return replace(problem, rotations=rotations, translations=translations)
+
+
+def centres(problem: Problem) -> Array:
+    """(C, 3) the cameras' centres in the world."""
+    return -np.einsum("cji,cj->ci", problem.rotations, problem.translations)
+
+
 def project(problem: Problem) -> tuple[Array, Array]:
-    """Predicted pixels (O, 2) relative to the nominal principal point, and depths (O,)."""
+    """Predicted pixels (O, 2) relative to the nominal principal point, and depths (O,) in the cameras."""
     camera, lens = problem.camera_of, problem.lens_of_camera[problem.camera_of]
     in_camera = (
         np.einsum("oij,oj->oi", problem.rotations[camera], problem.points[problem.point_of])
@@ -65,6 +99,16 @@ def project(problem: Problem) -> tuple[Array, Array]:
     return normalised * (focal * distortion)[:, None] + problem.shifts[lens], in_camera[:, 2]
 
 
+def normalise(problem: Problem, camera: Index, pixels: Array) -> Array:
+    """(M, 2) coordinates at depth 1, without distortion, of `pixels` (M, 2) of the cameras `camera` (M,)."""
+    lens = problem.lens_of_camera[camera]
+    distorted = (pixels - problem.shifts[lens]) / np.exp(problem.log_focals[lens])[:, None]
+    result = distorted
+    for _ in range(_UNDISTORT_ITERATIONS if np.any(problem.radials) else 0):
+        result = distorted / (1.0 + problem.radials[lens] * (result**2).sum(1))[:, None]
+    return result
+
+
 def reprojection_errors(problem: Problem) -> Array:
     """(O,) pixels; infinite behind the camera."""
     predicted, depth = project(problem)
@@ -72,13 +116,13 @@ def reprojection_errors(problem: Problem) -> Array:
 
 
 def robust_cost(problem: Problem, config: Config) -> float:
-    """The Cauchy loss of all observations, pixels squared; priors left out. One behind its camera costs as 1000 px."""
-    squared = np.minimum(reprojection_errors(problem), 1e3) ** 2
+    """The Cauchy loss of all observations, pixels squared, without the priors."""
+    squared = np.minimum(reprojection_errors(problem), _BEHIND_PX) ** 2
     return float(config.robust_px**2 * np.log1p(squared / config.robust_px**2).sum())
 
 
 def adjust(problem: Problem, prior: LensPrior, config: Config, fixed_camera: int = 0) -> Problem:
-    """The problem after minimising the robust cost. Camera `fixed_camera` stays where it is."""
+    """The problem with parameters that minimise robust cost and priors; the pose of `fixed_camera` is fixed."""
     problem = _copy(_by_point(problem))
     native, _arrays = _native(problem, prior, config, fixed_camera)
     core = library()
@@ -89,58 +133,70 @@ def adjust(problem: Problem, prior: LensPrior, config: Config, fixed_camera: int
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
-    """What the observations leave open, relative to the fixed camera and with the scale of the scene as it is."""
+    """Covariance of the parameters, relative to the fixed camera and with the scale of the scene held."""
 
     joint: Array  # (6 C, 6 C) of the cameras' rotation vectors (radians) and translations, world to camera
-    log_focals: Array  # (G,) variances
+    log_focals: Array  # (G,) variances; 0 where the focal length is fixed
 
     @property
     def cameras(self) -> Array:
         """(C, 6, 6) the blocks of the single cameras."""
-        count = len(self.joint) // 6
-        return np.stack([self.joint[6 * c : 6 * c + 6, 6 * c : 6 * c + 6] for c in range(count)])
+        blocks = (slice(start, start + _POSE) for start in range(0, len(self.joint), _POSE))
+        return np.stack([self.joint[block, block] for block in blocks])
 
 
 def covariance(problem: Problem, prior: LensPrior, config: Config, fixed_camera: int = 0) -> Covariance:
-    """Inverse of the normal equations at the minimum, times the variance `config.noise_px ** 2` of an observation."""
+    """Inverse of the normal equations at the minimum, times the variance `config.noise_px ** 2` of an observation.
+
+    It is NaN where the normal equations are not finite. Rounding can make variances negative where the problem is
+    nearly singular: `uncertainty.sigmas` takes both for unknown.
+    """
     problem = _by_point(problem)
     native, _arrays = _native(problem, prior, config, fixed_camera)
     count, num_lenses = len(problem.rotations), len(problem.log_focals)
-    information = np.empty((6 * count + 4 * num_lenses,) * 2)
+    information = np.empty((_POSE * count + _LENS * num_lenses,) * 2)
     library().core_bundle_information(ctypes.byref(native), pointer(information))
     free = np.ones(len(information), bool)
-    free[6 * fixed_camera : 6 * fixed_camera + 6] = False
+    free[_POSE * fixed_camera : _POSE * (fixed_camera + 1)] = False
     of_lens = np.stack([prior.sigmas, prior.radial_sigmas, prior.shift_sigmas, prior.shift_sigmas], 1)
-    free[6 * count :] = of_lens.ravel() > 0
-    seen = np.bincount(problem.camera_of, minlength=count) > 0
-    free[: 6 * count] &= np.repeat(seen, 6)
+    free[_POSE * count :] = of_lens.ravel() > 0
+    observed = np.bincount(problem.camera_of, minlength=count) > 0
+    free[: _POSE * count] &= np.repeat(observed, _POSE)
     (kept,) = np.nonzero(free)
-    # Parameters differ in unit: they are scaled to equal curvature. The scale of the scene is free; it is held.
-    unit = 1.0 / np.sqrt(np.maximum(np.diag(information)[kept], 1e-30))
-    free_scale = _growth_of_scene(problem, fixed_camera)[kept] / unit
-    free_scale /= max(float(np.linalg.norm(free_scale)), 1e-30)
-    held = np.outer(free_scale, free_scale)
-    values, vectors = np.linalg.eigh(information[np.ix_(kept, kept)] * unit[:, None] * unit + len(kept) * held)
-    inverse = (vectors / np.maximum(values, 1e-14)) @ vectors.T - held / len(kept)
+    inverse = _gauge_free_inverse(information[np.ix_(kept, kept)], _scale_direction(problem, fixed_camera)[kept])
     full = np.zeros_like(information)
-    full[np.ix_(kept, kept)] = inverse * unit[:, None] * unit * config.noise_px**2
+    full[np.ix_(kept, kept)] = inverse * config.noise_px**2
     return Covariance(
-        joint=full[: 6 * count, : 6 * count],
-        log_focals=np.diag(full)[6 * count :: 4],
+        joint=full[: _POSE * count, : _POSE * count],
+        log_focals=np.diag(full)[_POSE * count :: _LENS],
     )
 
 
-def _growth_of_scene(problem: Problem, fixed_camera: int) -> Array:
-    """(6 C + 4 G,) how the parameters change when the scene grows around the fixed camera: no observation does."""
-    rotations, translations = problem.rotations, problem.translations
-    fixed_centre = -rotations[fixed_camera].T @ translations[fixed_camera]
-    poses = np.zeros((len(rotations), 6))
-    poses[:, 3:] = translations + rotations @ fixed_centre
-    return np.concatenate([poses.ravel(), np.zeros(4 * len(problem.log_focals))])
+def _gauge_free_inverse(information: Array, free_direction: Array) -> Array:
+    """(M, M) inverse of `information` (M, M), with no variance along `free_direction` (M,); NaN where not finite."""
+    # Parameters differ in unit: they are scaled to equal curvature.
+    unit = 1.0 / np.sqrt(np.maximum(np.diag(information), _MIN_CURVATURE))
+    direction = free_direction / unit
+    direction /= max(float(np.linalg.norm(direction)), 1e-30)
+    held = np.outer(direction, direction)
+    scaled = information * unit[:, None] * unit + len(unit) * held
+    if not np.isfinite(scaled).all():
+        return np.full_like(information, np.nan)
+    values, vectors = np.linalg.eigh(scaled)
+    inverse = (vectors / np.maximum(values, _MIN_EIGENVALUE)) @ vectors.T - held / len(unit)
+    return inverse * unit[:, None] * unit
+
+
+def _scale_direction(problem: Problem, fixed_camera: int) -> Array:
+    """(6 C + 4 G,) change of the parameters when the scene is scaled about the fixed camera, which no error sees."""
+    fixed_centre = -problem.rotations[fixed_camera].T @ problem.translations[fixed_camera]
+    poses = np.zeros((len(problem.rotations), _POSE))
+    poses[:, 3:] = problem.translations + problem.rotations @ fixed_centre
+    return np.concatenate([poses.ravel(), np.zeros(_LENS * len(problem.log_focals))])
 
 
 def _by_point(problem: Problem) -> Problem:
-    """The same problem with its observations ordered by point."""
+    """The same problem with its observations sorted by point, as the core needs them."""
     if (np.diff(problem.point_of) >= 0).all():
         return problem
     order = np.argsort(problem.point_of, kind="stable")
@@ -153,7 +209,7 @@ def _by_point(problem: Problem) -> Problem:
 
 
 def _copy(problem: Problem) -> Problem:
-    """The problem with parameters that may be changed in place."""
+    """The problem with copies of its parameters, which the core changes in place."""
     return replace(
         problem,
         **{
@@ -181,7 +237,7 @@ class _Native(ctypes.Structure):
 def _native(
     problem: Problem, prior: LensPrior, config: Config, fixed_camera: int
 ) -> tuple[_Native, list[npt.NDArray[np.generic]]]:
-    """The problem as the core reads it, and the arrays that must live as long."""
+    """The problem as the core reads it, and the arrays that it points into, which must live as long."""
     first = np.searchsorted(problem.point_of, np.arange(len(problem.points) + 1))
     lenses = (problem.log_focals, problem.radials, problem.shifts)
     parameters = (problem.rotations, problem.translations, *lenses, problem.points)
@@ -205,11 +261,4 @@ def _native(
 
 
 def _safe_depth(depth: Array) -> Array:
-    return np.where(np.abs(depth) < 1e-9, 1e-9, depth)
-
-
-def cross_matrix(vectors: Array) -> Array:
-    """(M, 3, 3) matrices with cross_matrix(v) @ x = v x x."""
-    x, y, z = vectors.T
-    zero = np.zeros_like(x)
-    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).reshape(-1, 3, 3)
+    return np.where(np.abs(depth) < _MIN_DEPTH, _MIN_DEPTH, depth)

@@ -1,4 +1,4 @@
-"""What registration can be told: which lenses there may be, and how cameras are found and adjusted."""
+"""The configuration of registration: the lenses, and the mapper."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Cameras of further keyframes beside those that are known: quick, for the moment until all can be done anew.
+"""Continuation: further keyframes registered beside known cameras, quickly, until all can be registered anew.
 
-The known cameras are where the map begins; what is new is placed by the points that it shares with them, and everything
-is adjusted. No other first pairs or focal lengths are tried and no patches aligned, so that errors of the start remain.
+The known cameras start the map; new views are resected from the points that they share with them, and everything is
+adjusted. No other first pair or focal length is tried and no patches are aligned, so that errors of the start remain.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import bundle, finishing, incremental, lenses, mapper, mapping_problem, register
 from splatnode.recon.registration.config import Config
 from splatnode.recon.registration.lenses import Grouping
-from splatnode.recon.registration.mapping_problem import Growth, Lens
+from splatnode.recon.registration.mapping_problem import Lens, PartialMap
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 
 Array = npt.NDArray[np.float64]
@@ -28,30 +28,31 @@ def extended(
     start: Sequence[RegisteredCamera],
     config: Config,
 ) -> Registration | None:
-    """The cameras `start` and those of all keyframes that find their place beside them; None where it fails.
+    """The cameras `start` and those of all keyframes that can be registered beside them; None where it fails.
 
     `start` and `pairs` (i < j) number the keyframes by their positions. The world is as `register` has it.
     """
     grouping = _grouping(keyframes, start)
     if grouping is None:
         return None
-    known = lenses.lenses(keyframes, grouping, pairs, config.lenses)
-    views, in_lens = register.views_of(keyframes, grouping), register.in_pixels_of_lens(pairs, grouping)
-    tracks = config.mapper.growing_tracks
-    of = mapping_problem.survey(views, known, in_lens, tracks, tracks)
-    begun = incremental.quickly_adjusted(of, _begun(keyframes, grouping, known, start), 2.0, config.mapper.incremental)
-    if len(begun.problem.points) < config.mapper.incremental.min_points:
+    known = lenses.candidates(keyframes, grouping, pairs, config.lenses)
+    views, scaled = register.views_of(keyframes, grouping), register.in_lens_pixels(pairs, grouping)
+    max_tracks = config.mapper.max_growing_tracks
+    problem = mapping_problem.prepare(views, known, scaled, max_tracks, max_tracks)
+    first = _known_cameras(keyframes, grouping, known, start)
+    settings = config.mapper.incremental
+    partial = incremental.adjust_quickly(problem, first, incremental.SETTLED_TOLERANCE, settings)
+    if len(partial.estimate.points) < settings.min_points:
         return None
-    grown = incremental.extend(of, begun, config.mapper.incremental)
-    finished = finishing.finish(of, grown, (), config.mapper.finishing)
+    finished = finishing.finish(problem, incremental.extend(problem, partial, settings), (), config.mapper.finishing)
     if finished is None:
         return None
-    built = mapper.as_map(of, finished, 0.0, config.mapper)
-    return register.in_first_camera(built, keyframes, grouping.enlarged)
+    found = mapper.as_map(problem, finished, settings.triangulation.max_error_px)
+    return register.in_first_camera(found, keyframes, grouping.scales)
 
 
 def _grouping(keyframes: Sequence[Keyframe], start: Sequence[RegisteredCamera]) -> Grouping | None:
-    """The frames by the lenses of `start`; None where one of them has no camera in it, or it has them otherwise."""
+    """The frames grouped by lens as the cameras `start` are; None where no grouping fits, or a lens has no camera."""
     for across_sizes in (True, False):
         grouping = lenses.group(keyframes, across_sizes)
         lens_of = {(grouping.lens_of[camera.index], camera.lens) for camera in start}
@@ -60,10 +61,10 @@ def _grouping(keyframes: Sequence[Keyframe], start: Sequence[RegisteredCamera]) 
     return None
 
 
-def _begun(
+def _known_cameras(
     keyframes: Sequence[Keyframe], grouping: Grouping, known: Sequence[Lens], start: Sequence[RegisteredCamera]
-) -> Growth:
-    """The known cameras in the pixels of their lenses, without points."""
+) -> PartialMap:
+    """A map of the known cameras without points, in the pixels of their lenses; only focal lengths are free."""
     count, num_lenses = len(keyframes), len(known)
     rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
     log_focals, radials, shifts = np.zeros(num_lenses), np.zeros(num_lenses), np.zeros((num_lenses, 2))
@@ -71,26 +72,10 @@ def _begun(
         index, lens = camera.index, grouping.lens_of[camera.index]
         rotations[index] = camera.T_world_camera[:3, :3].T
         translations[index] = -rotations[index] @ camera.T_world_camera[:3, 3]
-        log_focals[lens] = np.log(grouping.enlarged[index] * camera.focal)
+        log_focals[lens] = np.log(grouping.scales[index] * camera.focal)
         radials[lens] = camera.radial
         nominal = principal_point(keyframes[index].frame)
-        shifts[lens] = grouping.enlarged[index] * (camera.principal - nominal)
-    problem = bundle.Problem(
-        rotations=rotations,
-        translations=translations,
-        lens_of_camera=np.array(grouping.lens_of),
-        log_focals=log_focals,
-        radials=radials,
-        shifts=shifts,
-        points=np.zeros((0, 3)),
-        camera_of=np.zeros(0, np.int64),
-        point_of=np.zeros(0, np.int64),
-        pixels=np.zeros((0, 2)),
-    )
-    prior = bundle.LensPrior(
-        log_focals=log_focals,
-        sigmas=np.array([lens.sigma for lens in known]),
-        radial_sigmas=np.zeros(num_lenses),
-        shift_sigmas=np.zeros(num_lenses),
-    )
-    return Growth(tuple(camera.index for camera in start), problem, prior, np.zeros(0, np.int64))
+        shifts[lens] = grouping.scales[index] * (camera.principal - nominal)
+    estimate = bundle.without_points(rotations, translations, np.array(grouping.lens_of), log_focals, radials, shifts)
+    prior = bundle.focal_prior(log_focals, np.array([lens.sigma for lens in known]))
+    return PartialMap(tuple(camera.index for camera in start), estimate, prior, np.zeros(0, np.int64))

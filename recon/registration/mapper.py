@@ -1,7 +1,7 @@
-"""Mapping for few views: several first pairs, several focal lengths, and the map that explains most of all matches.
+"""The map of few views: attempts with several first pairs and focal lengths, of which the best is kept.
 
-With a handful of views there is time to try; the attempts are rated by ALL the pairwise matches, those included that a
-map was not built from.
+With a handful of views there is time to try. Attempts are scored by ALL pairwise matches, those included that a map was
+not built from.
 """
 
 from __future__ import annotations
@@ -12,57 +12,55 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-import numpy.typing as npt
 
-from splatnode.recon.registration import bundle, finishing, incremental, mapping_problem, triangulation
-from splatnode.recon.registration.mapping_problem import Growth, Lens, Pairs, Survey, View
-from splatnode.recon.registration.subpixel import Picture
+from splatnode.recon.registration import bundle, finishing, incremental, inliers, mapping_problem, triangulation
+from splatnode.recon.registration.mapping_problem import Lens, MappingProblem, Pair, Pairs, PartialMap, View
+from splatnode.recon.registration.patch_image import PatchImage
 
-Array = npt.NDArray[np.float64]
+_UNEXPLAINED_BY_PLANE = 1.05  # less the planar share of a pair: above 1, so that a planar pair is better than none
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     incremental: incremental.Config = incremental.Config()
     finishing: finishing.Config = finishing.Config()
-    growing_tracks: int = 350  # a view, while views are added: more cost time and change no decision
-    final_tracks: int = 1500  # a view, in the end
-    max_attempts: int = 6  # (focal, first pair) combinations tried
-    score_px: float = 1.25  # error at which a match counts no more for an attempt, at 1024 px on the longer side
-    same_rotation_deg: float = 0.5  # two attempts whose cameras and
-    same_focal: float = 0.02  # focal lengths differ by less have found the same
-    rival_rotation_deg: float = 5.0  # two attempts whose common cameras differ by more contradict each other
+    max_growing_tracks: int = 350  # a view, while views are added; more take time and change no decision
+    max_final_tracks: int = 1500  # a view, in the last adjustment
+    max_attempts: int = 6  # combinations of first pair and focal length
+    score_px: float = 1.25  # error from which on a match scores 0, pixels at REFERENCE_SIDE
+    same_rotation_deg: float = 0.5  # largest rotation between the views of two attempts that found the same map,
+    same_focal: float = 0.02  # and the largest difference of their log focals
 
 
 @dataclass(frozen=True, eq=False)
 class Map:
-    """Registered cameras and points. `problem` numbers the cameras as `views` does."""
+    """Registered views and points. `estimate` has all views of the problem as cameras; only `views` are valid."""
 
-    views: tuple[int, ...]  # indices of the registered views; the first is the world's origin
-    problem: bundle.Problem
+    views: tuple[int, ...]  # the registered ones; the first is the camera that adjustments fixed
+    estimate: bundle.Problem
     prior: bundle.LensPrior
     loss: bundle.Config
-    agreement: dict[tuple[int, int], float]  # share of each pair's inliers that the map explains
-    median_angle_deg: float  # of the points' widest rays
-    rms_px: float  # at 1024 px on the longer side
-    rival: float  # score of the best attempt that found other cameras over the score of this map; 0 without any
+    inlier_ratios: dict[Pair, float]  # the share of each pair's matches that agree with the poses
+    median_angle_deg: float  # of the points' triangulation angles
+    rms_px: float  # of the observations' errors, pixels at REFERENCE_SIDE
 
-    def renumbered(self, number: Sequence[int]) -> Map:
-        """The map of the same views, of which what was view i is now view `number[i]`."""
-        place, new = np.argsort(number), np.asarray(number)
-        problem = replace(
-            self.problem,
-            rotations=self.problem.rotations[place],
-            translations=self.problem.translations[place],
-            lens_of_camera=self.problem.lens_of_camera[place],
-            camera_of=new[self.problem.camera_of],
+    def relabelled(self, number: Sequence[int]) -> Map:
+        """The same map with the views relabelled: new = number[old], a permutation."""
+        old, new = np.argsort(number), np.asarray(number)
+        relabelled = replace(
+            self.estimate,
+            rotations=self.estimate.rotations[old],
+            translations=self.estimate.translations[old],
+            lens_of_camera=self.estimate.lens_of_camera[old],
+            camera_of=new[self.estimate.camera_of],
         )
-        pairs = {(i, j): (min(new[i], new[j]), max(new[i], new[j])) for i, j in self.agreement}
-        agreement = {(int(i), int(j)): self.agreement[old] for old, (i, j) in pairs.items()}
+        ratios = {
+            (int(min(new[i], new[j])), int(max(new[i], new[j]))): ratio for (i, j), ratio in self.inlier_ratios.items()
+        }
         return replace(
             self,
             views=tuple(int(new[view]) for view in self.views),
-            problem=problem,
-            agreement=dict(sorted(agreement.items())),
+            estimate=relabelled,
+            inlier_ratios=dict(sorted(ratios.items())),
         )
 
 
@@ -71,78 +69,78 @@ def build_map(
     lenses: Sequence[Lens],
     pairs: Pairs,
     config: Config,
-    pictures: Sequence[Picture] = (),
+    images: Sequence[PatchImage] = (),
     pause: Callable[[], None] = lambda: None,
 ) -> Map | None:
-    """The best map over several starts, or None when no two views can be connected.
+    """The best map of several attempts, or None when no two views can be registered.
 
-    `pictures`, one a view, make its observations exact. `pause` is called between attempts and may raise.
+    `images`, one a view, make its observations exact to a tenth of a pixel. `pause` is called between attempts and may
+    raise to abandon the work.
     """
-    of = mapping_problem.survey(views, lenses, pairs, config.growing_tracks, config.final_tracks)
-    attempts: list[tuple[float, Growth]] = []
-    for pair, focals in _attempts(lenses, pairs, config.max_attempts):
+    problem = mapping_problem.prepare(views, lenses, pairs, config.max_growing_tracks, config.max_final_tracks)
+    attempts: list[tuple[float, PartialMap]] = []
+    for first, focals in _starts(lenses, pairs, config.max_attempts):
         pause()
-        grown = incremental.grow(of, focals, pair, config.incremental)
-        if grown is None:
+        partial = incremental.grow(problem, focals, first, config.incremental)
+        if partial is None:
             continue
-        found_again = bool(attempts) and _same(max(attempts, key=_score)[1], grown, config)
-        attempts.append((incremental.score(of, grown, config.score_px), grown))
-        if found_again and len(grown.registered) == len(views):
+        found_again = bool(attempts) and _same(max(attempts, key=_score)[1], partial, config)
+        attempts.append((incremental.score(problem, partial, config.score_px), partial))
+        if found_again and len(partial.registered) == len(views):
             break
     if not attempts:
         return None
     pause()
-    best = max(attempts, key=_score)
-    rivals = [
-        score for score, grown in attempts if mapping_problem.difference(best[1], grown)[0] > config.rival_rotation_deg
-    ]
-    finished = finishing.finish(of, best[1], pictures, config.finishing)
-    return None if finished is None else as_map(of, finished, max(rivals, default=0.0) / max(best[0], 1e-9), config)
+    _, best = max(attempts, key=_score)
+    finished = finishing.finish(problem, best, images, config.finishing)
+    return None if finished is None else as_map(problem, finished, config.incremental.triangulation.max_error_px)
 
 
-def _score(attempt: tuple[float, Growth]) -> float:
+def _score(attempt: tuple[float, PartialMap]) -> float:
     return attempt[0]
 
 
-def _same(one: Growth, other: Growth, config: Config) -> bool:
+def _same(one: PartialMap, other: PartialMap, config: Config) -> bool:
+    """Whether two attempts registered the same views with the same poses and focal lengths."""
     if set(one.registered) != set(other.registered):
         return False
-    turned, zoomed = mapping_problem.difference(one, other)
-    return turned < config.same_rotation_deg and zoomed < config.same_focal
+    rotation_deg, log_focal = mapping_problem.difference(one, other)
+    return rotation_deg < config.same_rotation_deg and log_focal < config.same_focal
 
 
-def _attempts(lenses: Sequence[Lens], pairs: Pairs, limit: int) -> list[tuple[tuple[int, int], list[float]]]:
+def _starts(lenses: Sequence[Lens], pairs: Pairs, limit: int) -> list[tuple[Pair, list[float]]]:
     """First pairs with focal lengths (one a lens), the likeliest of both first."""
     first = _first_pairs(pairs)
     num_focals = max(len(lens.focals) for lens in lenses)
     focals = [[lens.focals[min(choice, len(lens.focals) - 1)] for lens in lenses] for choice in range(num_focals)]
-    order = sorted(itertools.product(range(len(first)), range(num_focals)), key=lambda place: (sum(place), place[0]))
+    order = sorted(itertools.product(range(len(first)), range(num_focals)), key=lambda ranks: (sum(ranks), ranks[0]))
     return [(first[pair], focals[choice]) for pair, choice in order[:limit]]
 
 
-def _first_pairs(pairs: Pairs) -> list[tuple[int, int]]:
-    """Pairs with many matches that a plane or a rotation does not explain come first."""
+def _first_pairs(pairs: Pairs) -> list[Pair]:
+    """The pairs, those first that have many matches which neither a plane nor a rotation explains."""
 
-    def strength(key: tuple[int, int]) -> float:
-        view = pairs[key]
-        count = len(view.matches)
-        return count * (1.05 - min(1.0, max(view.num_homography, view.num_rotation) / count)) ** 0.5
+    def strength(key: Pair) -> float:
+        pair = pairs[key]
+        count = len(pair.matches)
+        degenerate = min(1.0, max(pair.num_homography, pair.num_rotation) / count)
+        return count * (_UNEXPLAINED_BY_PLANE - degenerate) ** 0.5
 
     return sorted(pairs, key=lambda key: (-strength(key), key))
 
 
-def as_map(of: Survey, finished: finishing.Finished, rival: float, config: Config) -> Map:
-    """The finished growth with what is known of it."""
-    grown, problem = finished.incremental, finished.incremental.problem
-    centres = -np.einsum("cji,cj->ci", problem.rotations, problem.translations)
-    angles = triangulation.largest_angles(centres, problem.points, problem.camera_of, problem.point_of)
+def as_map(problem: MappingProblem, finished: finishing.Finished, max_error_px: float) -> Map:
+    """The finished map with its quality; matches up to `max_error_px`, at REFERENCE_SIDE, are inliers."""
+    partial, estimate = finished.map, finished.map.estimate
+    angles = triangulation.largest_angles(
+        bundle.centres(estimate), estimate.points, estimate.camera_of, estimate.point_of
+    )
     return Map(
-        views=grown.registered,
-        problem=problem,
-        prior=grown.prior,
+        views=partial.registered,
+        estimate=estimate,
+        prior=partial.prior,
         loss=finished.loss,
-        agreement=mapping_problem.agreement(of, grown, config.incremental.triangulation.max_error_px),
+        inlier_ratios=inliers.inlier_ratios(problem, partial, max_error_px),
         median_angle_deg=float(np.median(angles)),
         rms_px=finished.rms_px,
-        rival=rival,
     )

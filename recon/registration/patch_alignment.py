@@ -1,4 +1,4 @@
-"""Patches of one image found again in others, to a small part of a pixel."""
+"""Affine alignment of image patches to parts of a pixel (Baker and Matthews, 2004)."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Grey = npt.NDArray[np.float32]
 
+MAX_RADIUS = 12  # pixels; `kMaxRadius` of recon/core/align.cpp
+
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    radius: int = 8  # of a patch, pixels; 12 at most
-    max_iterations: int = 20
+    radius: int = 8  # of a patch, pixels; at most MAX_RADIUS
+    max_iterations: int = 20  # of Gauss-Newton
 
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """M patches, each of a reference image, with where it is supposed to lie in a target image.
+    """M patches of reference images, with a first guess of their positions in target images.
 
     Pixels are those of the images given to `align`, the top-left pixel's centre at (0.5, 0.5).
     """
@@ -38,21 +40,23 @@ class Patches:
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
+    """The M patches after alignment."""
+
     target: Array  # (M, 2) pixels
     affine: Array  # (M, 2, 2)
-    correlation: Array  # (M,) of the brightness after the warp; -1 where a patch could not be aligned
-    sigma: Array  # (M,) largest standard deviation of the position, pixels of the target; infinite where not aligned
+    correlation: Array  # (M,) normalised, of grey levels after the warp; -1 where a patch could not be aligned
+    sigma: Array  # (M,) standard deviation of the position along its worst direction, pixels; infinite where it failed
 
 
 def align(images: Sequence[Grey], patches: Patches, config: Config) -> Aligned:
-    """Where the patches lie in their targets, by affine alignment of the brightness up to gain and offset.
+    """Aligns the patches with their targets, by an affine warp and a gain and offset of the grey levels.
 
-    With `max_iterations` 0 nothing moves and the correlation of the first guess is found. `images` are (H, W) float32,
-    grey levels of 0 to 255.
+    `images` are (H, W) float32, grey levels of 0 to 255. With `max_iterations` 0 nothing moves: the result has the
+    correlations of the first guess. Raises ValueError for a radius or an image number out of range.
     """
     count = len(patches.reference)
-    if not 1 <= config.radius <= 12:
-        raise ValueError(f"the radius of a patch must be 1 to 12 pixels, got {config.radius}")
+    if not 1 <= config.radius <= MAX_RADIUS:
+        raise ValueError(f"the radius of a patch must be 1 to {MAX_RADIUS} pixels, got {config.radius}")
     for name, index in (("reference", patches.reference_image), ("target", patches.target_image)):
         if count and not 0 <= index.min() <= index.max() < len(images):
             raise ValueError(f"{name} images must be in [0, {len(images)}), got {index.min()} to {index.max()}")

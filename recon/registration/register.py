@@ -1,4 +1,4 @@
-"""Registration: keyframes in, cameras and sparse points with the evidence for them out."""
+"""Registration: from keyframes and their verified pairs to cameras and sparse points, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -10,43 +10,45 @@ import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import Keyframe, content_key, principal_point
 from splatnode.recon.matching.two_view import TwoView
-from splatnode.recon.registration import bundle, lenses, mapper, subpixel, uncertainty
+from splatnode.recon.registration import bundle, lenses, mapper, uncertainty
 from splatnode.recon.registration.config import Config
 from splatnode.recon.registration.lenses import Grouping
 from splatnode.recon.registration.mapping_problem import View
+from splatnode.recon.registration.patch_image import patch_image
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
+_MIN_DEPTH = 1e-9  # median depth of the points, in the map's unit of length, in place of 0
+
 
 @dataclass(frozen=True, eq=False)
 class RegisteredCamera:
-    """An estimated camera of the frame at full size."""
+    """The estimated camera of a frame, in pixels of the frame at full size."""
 
     index: int  # position among the keyframes
     T_world_camera: Array  # (4, 4)
-    lens: int  # cameras with the same number share focal length and distortion, relative to their longer side
-    focal: float  # pixels of the full-size image
-    principal: Array  # (2,) pixels of the full-size image
+    lens: int  # cameras with the same number share a lens, relative to their longer side
+    focal: float  # pixels
+    principal: Array  # (2,) pixels
     radial: float  # first radial distortion coefficient
-    rotation_sigma_deg: float  # after the best similarity
-    centre_sigma_rel: float  # relative to the spread of the centres, after the best similarity
+    rotation_sigma_deg: float  # after the best similarity; infinite where nothing is known
+    centre_sigma_rel: float  # over the spread of the centres, after the best similarity; infinite likewise
 
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """What is known about the cameras. The world is the first camera's frame; the median depth of the points is 1."""
+    """Cameras and sparse points. The world is the first camera's frame; the median depth of the points is 1."""
 
     cameras: tuple[RegisteredCamera, ...]  # in the order of the keyframes
     points: Array  # (P, 3) world
     observed_by: npt.NDArray[np.int64]  # (O,) keyframe index
     observed_point: npt.NDArray[np.int64]  # (O,)
     observed_pixels: Array  # (O, 2) full-size pixels
-    agreement: dict[tuple[int, int], float]  # share of each pair's matches that the cameras explain
-    focal_sigma: float  # of the logarithm of the least certain focal length
-    median_angle_deg: float
-    rms_px: float  # of the observations, at 1024 px on the longer side
-    rival: float = 0.0  # matches that the best other set of cameras explained, over those that this one does
+    inlier_ratios: dict[tuple[int, int], float]  # the share of each pair's matches that agree with the poses
+    focal_sigma: float  # of the logarithm of the least certain focal length; infinite where nothing is known
+    median_angle_deg: float  # of the points' triangulation angles
+    rms_px: float  # of the observations' errors, pixels at REFERENCE_SIDE
 
 
 def register(
@@ -55,31 +57,30 @@ def register(
     config: Config,
     pause: Callable[[], None] = lambda: None,
 ) -> Registration | None:
-    """Cameras of as many keyframes as hang together, or None when no two do.
+    """The cameras of as many keyframes as can be registered together, or None when no two can.
 
-    `pairs` holds the verified pairs by position (i < j). The answer is the same in whatever order the keyframes come.
-    `pause` may raise to abandon the work.
+    `pairs` holds the verified pairs by position (i < j). The result does not depend on the order of the keyframes.
+    `pause` is called between steps and may raise to abandon the work.
     """
     if not pairs:
         return None
     order = sorted(range(len(keyframes)), key=lambda index: content_key(keyframes[index]))
     ordered = [keyframes[index] for index in order]
-    built = _build(ordered, _renumbered(pairs, np.argsort(order)), config, pause)
+    rank = np.argsort(order)
+    built = _build(ordered, _relabelled(pairs, rank), config, pause)
     if built is None:
         return None
     found, grouping = built
-    place = np.argsort(order)
-    enlarged = [grouping.enlarged[i] for i in place]
-    return in_first_camera(found.renumbered(order), keyframes, enlarged)
+    return in_first_camera(found.relabelled(order), keyframes, [grouping.scales[i] for i in rank])
 
 
-def _renumbered(pairs: Mapping[tuple[int, int], TwoView], place: Index) -> dict[tuple[int, int], TwoView]:
-    """The pairs, sorted, of keyframes of which number i is now number `place[i]`."""
-    renumbered = {}
+def _relabelled(pairs: Mapping[tuple[int, int], TwoView], new: Index) -> dict[tuple[int, int], TwoView]:
+    """The pairs, sorted, with keyframes relabelled: keyframe i becomes keyframe `new[i]`."""
+    relabelled = {}
     for (i, j), pair in pairs.items():
-        first, second = int(place[i]), int(place[j])
-        renumbered[min(first, second), max(first, second)] = pair if first < second else pair.swapped()
-    return dict(sorted(renumbered.items()))
+        first, second = int(new[i]), int(new[j])
+        relabelled[min(first, second), max(first, second)] = pair if first < second else pair.swapped()
+    return dict(sorted(relabelled.items()))
 
 
 def _build(
@@ -88,12 +89,12 @@ def _build(
     config: Config,
     pause: Callable[[], None],
 ) -> tuple[mapper.Map, Grouping] | None:
-    """The map, in the pixels of its lenses, and these: one for all sizes unless the map contradicts that."""
+    """The map, in the pixels of its lenses, and their grouping: one lens for all sizes unless the map disagrees."""
     together, apart = (lenses.group(keyframes, across_sizes) for across_sizes in (True, False))
     built = _map(keyframes, pairs, together, config, pause)
     if built is None or together == apart:
         return None if built is None else (built, together)
-    if not lenses.contradicted(built.problem, built.prior, built.loss, built.views[0], together, config.lenses):
+    if not lenses.sizes_disagree(built.estimate, built.prior, built.loss, built.views[0], together, config.lenses):
         return built, together
     built = _map(keyframes, pairs, apart, config, pause)
     return None if built is None else (built, apart)
@@ -106,22 +107,22 @@ def _map(
     config: Config,
     pause: Callable[[], None],
 ) -> mapper.Map | None:
-    enlarged = grouping.enlarged
-    of_refinement = config.mapper.finishing.subpixel
-    pictures = [
-        subpixel.picture(keyframe.frame.image, principal_point(keyframe.frame), of_refinement).enlarged(enlarged[i])
+    """The map of keyframes with the lenses of `grouping`, in the pixels of these."""
+    settings = config.mapper.finishing.subpixel.patch_image
+    images = [
+        patch_image(keyframe.frame.image, principal_point(keyframe.frame), settings).of_resized(grouping.scales[i])
         for i, keyframe in enumerate(keyframes)
     ]
-    known = lenses.lenses(keyframes, grouping, pairs, config.lenses)
-    views, in_lens = views_of(keyframes, grouping), in_pixels_of_lens(pairs, grouping)
-    return mapper.build_map(views, known, in_lens, config.mapper, pictures, pause)
+    known = lenses.candidates(keyframes, grouping, pairs, config.lenses)
+    views, scaled = views_of(keyframes, grouping), in_lens_pixels(pairs, grouping)
+    return mapper.build_map(views, known, scaled, config.mapper, images, pause)
 
 
 def views_of(keyframes: Sequence[Keyframe], grouping: Grouping) -> list[View]:
     """The keyframes as the mapper sees them, in the pixels of their lenses."""
     return [
         View(
-            points=grouping.enlarged[i] * (keyframe.features.points - principal_point(keyframe.frame)),
+            points=grouping.scales[i] * (keyframe.features.points - principal_point(keyframe.frame)),
             lens=grouping.lens_of[i],
             longer_side=grouping.longer_sides[grouping.lens_of[i]],
         )
@@ -129,52 +130,51 @@ def views_of(keyframes: Sequence[Keyframe], grouping: Grouping) -> list[View]:
     ]
 
 
-def in_pixels_of_lens(pairs: Mapping[tuple[int, int], TwoView], grouping: Grouping) -> dict[tuple[int, int], TwoView]:
+def in_lens_pixels(pairs: Mapping[tuple[int, int], TwoView], grouping: Grouping) -> dict[tuple[int, int], TwoView]:
     """The pairs in the pixels of their frames' lenses."""
-    return {(i, j): pair.scaled(grouping.enlarged[i], grouping.enlarged[j]) for (i, j), pair in pairs.items()}
+    return {(i, j): pair.scaled(grouping.scales[i], grouping.scales[j]) for (i, j), pair in pairs.items()}
 
 
-def in_first_camera(built: mapper.Map, keyframes: Sequence[Keyframe], enlarged: Sequence[float]) -> Registration:
-    """The map with the first registered keyframe as the world's frame and a median point depth of 1.
+def in_first_camera(found: mapper.Map, keyframes: Sequence[Keyframe], scales: Sequence[float]) -> Registration:
+    """The map in the frame of the first registered keyframe, scaled to a median point depth of 1.
 
-    Its pixels are those of the frames `enlarged` to the size of their lens.
+    `scales` are those of the keyframes: pixels of their lens, which the map is in, over their own pixels.
     """
-    problem = built.problem
-    order = sorted(built.views)
-    covariances = bundle.covariance(problem, built.prior, built.loss, built.views[0])
-    _, depths = bundle.project(problem)
-    scale = 1.0 / max(float(np.median(depths)), 1e-9)
-    rotation0, translation0 = problem.rotations[order[0]], problem.translations[order[0]]
-    points = scale * (problem.points @ rotation0.T + translation0)
-    rotation_sigmas, centre_sigmas = uncertainty.camera_sigmas(problem, covariances, order)
+    estimate = found.estimate
+    order = sorted(found.views)
+    covariance = bundle.covariance(estimate, found.prior, found.loss, found.views[0])
+    _, depths = bundle.project(estimate)
+    unit = 1.0 / max(float(np.median(depths)), _MIN_DEPTH)
+    rotation0, translation0 = estimate.rotations[order[0]], estimate.translations[order[0]]
+    rotation_sigmas, centre_sigmas = uncertainty.camera_sigmas(estimate, covariance, order)
     cameras = []
-    for place, i in enumerate(order):
+    for position, i in enumerate(order):
         T_world_camera = np.eye(4)
-        T_world_camera[:3, :3] = rotation0 @ problem.rotations[i].T
-        T_world_camera[:3, 3] = scale * (translation0 - T_world_camera[:3, :3] @ problem.translations[i])
-        lens = problem.lens_of_camera[i]
+        T_world_camera[:3, :3] = rotation0 @ estimate.rotations[i].T
+        T_world_camera[:3, 3] = unit * (translation0 - T_world_camera[:3, :3] @ estimate.translations[i])
+        lens = estimate.lens_of_camera[i]
         cameras.append(
             RegisteredCamera(
                 index=i,
                 T_world_camera=T_world_camera,
                 lens=int(lens),
-                focal=float(np.exp(problem.log_focals[lens])) / enlarged[i],
-                principal=principal_point(keyframes[i].frame) + problem.shifts[lens] / enlarged[i],
-                radial=float(problem.radials[lens]),
-                rotation_sigma_deg=float(rotation_sigmas[place]),
-                centre_sigma_rel=float(centre_sigmas[place]),
+                focal=float(np.exp(estimate.log_focals[lens])) / scales[i],
+                principal=principal_point(keyframes[i].frame) + estimate.shifts[lens] / scales[i],
+                radial=float(estimate.radials[lens]),
+                rotation_sigma_deg=float(rotation_sigmas[position]),
+                centre_sigma_rel=float(centre_sigmas[position]),
             )
         )
     principal = np.stack([principal_point(keyframe.frame) for keyframe in keyframes])
+    camera_of = estimate.camera_of
     return Registration(
         cameras=tuple(cameras),
-        points=points,
-        observed_by=problem.camera_of,
-        observed_point=problem.point_of,
-        observed_pixels=problem.pixels / np.array(enlarged)[problem.camera_of, None] + principal[problem.camera_of],
-        agreement=built.agreement,
-        focal_sigma=float(np.sqrt(covariances.log_focals[problem.lens_of_camera[order]].max())),
-        median_angle_deg=built.median_angle_deg,
-        rms_px=built.rms_px,
-        rival=built.rival,
+        points=unit * (estimate.points @ rotation0.T + translation0),
+        observed_by=camera_of,
+        observed_point=estimate.point_of,
+        observed_pixels=estimate.pixels / np.array(scales)[camera_of, None] + principal[camera_of],
+        inlier_ratios=found.inlier_ratios,
+        focal_sigma=float(uncertainty.sigmas(covariance.log_focals[estimate.lens_of_camera[order]]).max()),
+        median_angle_deg=found.median_angle_deg,
+        rms_px=found.rms_px,
     )

@@ -1,4 +1,4 @@
-"""Tracks: the pixels, in several frames, that pairwise matches say are one point of the scene."""
+"""Tracks: the observations, in several frames, that pairwise matches say are of one scene point."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Index = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """O observations of T tracks, ordered by track."""
+    """O observations of T tracks, sorted by track."""
 
     camera_of: Index  # (O,)
     track_of: Index  # (O,) in [0, T)
@@ -27,9 +27,10 @@ class Tracks:
 
 
 def build(points: Sequence[Array], pairs: Mapping[tuple[int, int], TwoView]) -> Tracks:
-    """Connected components of the matches. `points[i]` (M, 2) are the centred feature pixels of frame i.
+    """Connected components of the matches of all pairs. `points[i]` (M, 2) are frame i's centred feature pixels.
 
-    Where a component holds two features of one frame, that frame's observations of it contradict each other and go.
+    Where a component holds two features of one frame, that frame's observations of it contradict each other and are
+    dropped; so are components that are left with one observation.
     """
     offsets = np.concatenate([[0], np.cumsum([len(frame_points) for frame_points in points])])
     if not pairs:
@@ -41,27 +42,37 @@ def build(points: Sequence[Array], pairs: Mapping[tuple[int, int], TwoView]) -> 
     node = np.unique(np.concatenate([first, second]))
     camera, track = np.searchsorted(offsets, node, side="right") - 1, label[node]
     _, group, count = np.unique(track * len(points) + camera, return_inverse=True, return_counts=True)
-    alone = count[group] == 1
-    node, camera, track = node[alone], camera[alone], track[alone]
-    kept, track, count = np.unique(track, return_inverse=True, return_counts=True)
-    seen_twice = count[track] >= 2
-    node, camera, track = node[seen_twice], camera[seen_twice], track[seen_twice]
+    unique = count[group] == 1
+    node, camera, track = node[unique], camera[unique], track[unique]
+    _, track, count = np.unique(track, return_inverse=True, return_counts=True)
+    observed_twice = count[track] >= 2
+    node, camera, track = node[observed_twice], camera[observed_twice], track[observed_twice]
     kept, track = np.unique(track, return_inverse=True)
     order = np.lexsort((camera, track))
     pixels = np.concatenate([np.asarray(frame_points) for frame_points in points])[node]
     return Tracks(camera[order].astype(np.int64), track[order].astype(np.int64), pixels[order], len(kept))
 
 
-def thin(tracks: Tracks, num_cameras: int, per_camera: int) -> Tracks:
-    """The tracks that are among the `per_camera` longest of at least one of their cameras (ties: spread evenly)."""
-    length = np.bincount(tracks.track_of, minlength=tracks.num_tracks)
-    shuffled = np.random.default_rng(0).permutation(tracks.num_tracks)
-    rank_of_track = np.empty(tracks.num_tracks, np.int64)
-    rank_of_track[np.lexsort((shuffled, -length))] = np.arange(tracks.num_tracks)
-    chosen = np.zeros(tracks.num_tracks, bool)
-    for camera in range(num_cameras):
-        mine = tracks.track_of[tracks.camera_of == camera]
-        chosen[mine[np.argsort(rank_of_track[mine], kind="stable")[:per_camera]]] = True
+def thin(tracks: Tracks, per_camera: int) -> Tracks:
+    """The tracks that `longest` chooses."""
+    chosen = longest(tracks.camera_of, tracks.track_of, tracks.num_tracks, per_camera)
     observed = chosen[tracks.track_of]
     _, track_of = np.unique(tracks.track_of[observed], return_inverse=True)
     return Tracks(tracks.camera_of[observed], track_of, tracks.pixels[observed], int(chosen.sum()))
+
+
+def longest(camera_of: Index, track_of: Index, num_tracks: int, per_camera: int) -> npt.NDArray[np.bool_]:
+    """(T,) whether a track is among the `per_camera` longest of at least one of its cameras.
+
+    `camera_of` (O,) and `track_of` (O,) are the observations. Among tracks of one length a fixed random order decides,
+    which spreads them over the image.
+    """
+    length = np.bincount(track_of, minlength=num_tracks)
+    shuffled = np.random.default_rng(0).permutation(num_tracks)
+    rank = np.empty(num_tracks, np.int64)
+    rank[np.lexsort((shuffled, -length))] = np.arange(num_tracks)
+    chosen = np.zeros(num_tracks, bool)
+    for camera in np.unique(camera_of):
+        own = track_of[camera_of == camera]
+        chosen[own[np.argsort(rank[own], kind="stable")[:per_camera]]] = True
+    return chosen

@@ -1,4 +1,4 @@
-"""Points of the scene from their tracks, given cameras."""
+"""Triangulation: scene points from their tracks and the cameras' poses."""
 
 from __future__ import annotations
 
@@ -9,22 +9,27 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.registration import bundle, resection
+from splatnode.recon.registration import bundle
 from splatnode.recon.registration.tracks import Tracks
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 
+_ROUNDS = 3  # of triangulation: the worst observation of a track is left out twice at most
+_MIN_WEIGHT = 1e-12  # of a homogeneous point of unit length: with less it lies at infinity
+
+
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    max_error_px: float = 2.5  # reprojection error of a kept observation, at 1024 px on the longer side
-    min_angle_deg: float = 1.0  # between the rays of a kept point
+    max_error_px: float = 2.5  # reprojection error of a kept observation, pixels at REFERENCE_SIDE
+    min_angle_deg: float = 1.0  # triangulation angle: the widest between two rays of a kept point
 
 
 def triangulate(matrices: Array, rays: Array, camera_of: Index, track_of: Index, num_tracks: int) -> Array:
-    """(T, 3) points by the direct linear transform from `rays` (O, 2), normalised image coordinates.
+    """(T, 3) points by the direct linear transform (Hartley and Zisserman, 2004, 12.2).
 
-    `matrices` (C, 3, 4) are world to camera. A track with no observation, or one at infinity, is NaN.
+    `rays` (O, 2) are normalised image coordinates, `matrices` (C, 3, 4) world to camera. A point with fewer than two
+    observations, or at infinity, is NaN.
     """
     rows = rays[:, :, None] * matrices[camera_of, 2][:, None, :] - matrices[camera_of, :2]
     rows /= np.linalg.norm(rows, axis=2, keepdims=True)
@@ -35,11 +40,14 @@ def triangulate(matrices: Array, rays: Array, camera_of: Index, track_of: Index,
     with np.errstate(divide="ignore", invalid="ignore"):
         points = homogeneous[:, :3] / homogeneous[:, 3:]
     observed = np.bincount(track_of, minlength=num_tracks) >= 2
-    return np.where((np.abs(homogeneous[:, 3:]) > 1e-12) & observed[:, None], points, np.nan)
+    return np.where((np.abs(homogeneous[:, 3:]) > _MIN_WEIGHT) & observed[:, None], points, np.nan)
 
 
 def largest_angles(centres: Array, points: Array, camera_of: Index, track_of: Index) -> Array:
-    """(T,) the widest angle, in degrees, between two rays that meet in each of `points` (T, 3)."""
+    """(T,) triangulation angles: the widest between two rays of each of `points` (T, 3), degrees.
+
+    `centres` (C, 3) are those of the cameras.
+    """
     directions = np.zeros((len(points), len(centres), 3))
     towards = points[track_of] - centres[camera_of]
     directions[track_of, camera_of] = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
@@ -55,21 +63,21 @@ def retriangulate(
     registered: Sequence[int],
     scale: Array,
     config: Config,
-    widen: float,
+    tolerance: float,
 ) -> tuple[bundle.Problem, Index]:
-    """All points that the registered cameras agree on, and their tracks.
+    """The problem with all points that the registered cameras agree on, and the tracks of these (P,).
 
-    An observation stays when its error is at most `widen` times the limit; the worst one of a track that fails is left
-    out and the track tried again, twice at most.
+    An observation is kept up to `tolerance` times the largest error; `scale` (C,) is each view's longer side over
+    REFERENCE_SIDE. The worst observation of a track that fails is left out and the track tried again.
     """
-    mine = np.isin(all_tracks.camera_of, registered)
-    camera, track, pixels = all_tracks.camera_of[mine], all_tracks.track_of[mine], all_tracks.pixels[mine]
-    rays = resection.normalise(problem, camera, pixels)
+    own = np.isin(all_tracks.camera_of, registered)
+    camera, track, pixels = all_tracks.camera_of[own], all_tracks.track_of[own], all_tracks.pixels[own]
+    rays = bundle.normalise(problem, camera, pixels)
     matrices = np.concatenate([problem.rotations, problem.translations[:, :, None]], 2)
-    limit = widen * config.max_error_px * scale
+    limit = tolerance * config.max_error_px * scale
     errors = np.zeros(0)
     points = np.zeros((all_tracks.num_tracks, 3))
-    for _ in range(3):
+    for _ in range(_ROUNDS):
         points = triangulate(matrices, rays, camera, track, all_tracks.num_tracks)
         errors = bundle.reprojection_errors(
             replace(problem, points=np.nan_to_num(points), camera_of=camera, point_of=track, pixels=pixels)
@@ -81,8 +89,7 @@ def retriangulate(
         if keep.all():
             break
         camera, track, pixels, rays, errors = camera[keep], track[keep], pixels[keep], rays[keep], errors[keep]
-    centres = -np.einsum("cji,cj->ci", problem.rotations, problem.translations)
-    angles = largest_angles(centres, np.nan_to_num(points), camera, track)
+    angles = largest_angles(bundle.centres(problem), np.nan_to_num(points), camera, track)
     count = np.bincount(track, minlength=all_tracks.num_tracks)
     worst = np.zeros(all_tracks.num_tracks)
     np.maximum.at(worst, track, errors)

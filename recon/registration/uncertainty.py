@@ -1,7 +1,7 @@
-"""How uncertain each camera is, whatever world the cameras are given in.
+"""Standard deviations of the cameras' poses, in whatever world frame they are given.
 
-Positions are only known up to a similarity, and errors are measured after the best one has been undone. So is the
-covariance here (an S-transformation: Baarda, 1973): it does not depend on which camera was held still.
+Positions are only known up to a similarity, and errors are measured after the best similarity. So is the covariance
+here (an S-transformation: Baarda, 1973): it does not depend on which camera the bundle adjustment fixed.
 """
 
 from __future__ import annotations
@@ -12,8 +12,22 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.registration import bundle
+from splatnode.recon.registration.cross_product import cross_matrix
 
 Array = npt.NDArray[np.float64]
+
+_ROUNDING = 1e-9  # relative error of a variance: a negative one within it is 0, as that of two cameras' distance is
+_MIN_SPREAD = 1e-12  # of the centres, in the problem's unit of length, in place of 0
+_MIN_SINGULAR = 1e-9  # of the largest singular value: what is smaller is no direction of its own
+
+
+def sigmas(variances: Array) -> Array:
+    """The square roots of `variances`; infinite where one is negative or not finite, which says that nothing is known.
+
+    An infinite sigma fails every limit of the verdict; NaN would pass them.
+    """
+    known = np.isfinite(variances) & (variances >= 0.0)
+    return np.where(known, np.sqrt(np.where(known, variances, 0.0)), np.inf)
 
 
 def camera_sigmas(
@@ -21,33 +35,53 @@ def camera_sigmas(
 ) -> tuple[Array, Array]:
     """Standard deviations (C,) of the orientations, degrees, and of the centres, relative to their spread.
 
-    In the order of `registered`; lengths are those of the error's three components together.
+    In the order of `registered`; each is of the error's three components together. All are infinite where poses or
+    covariance are not finite, single ones where their variance is negative beyond rounding.
     """
     members = list(registered)
     rows = (6 * np.array(members)[:, None] + np.arange(6)).ravel()
     joint = covariance.joint[np.ix_(rows, rows)]
+    rotations, translations = problem.rotations[members], problem.translations[members]
     count = len(members)
-    turns, moves = np.zeros((3 * count, 6 * count)), np.zeros((3 * count, 6 * count))
-    for place, camera in enumerate(members):
-        to_world = problem.rotations[camera].T
-        own = slice(3 * place, 3 * place + 3)
-        turns[own, 6 * place : 6 * place + 3] = to_world
-        # The centre is -R^T t.
-        moves[own, 6 * place : 6 * place + 3] = -to_world @ bundle.cross_matrix(problem.translations[camera][None])[0]
-        moves[own, 6 * place + 3 : 6 * place + 6] = -to_world
-    centres = np.stack([-problem.rotations[c].T @ problem.translations[c] for c in members])
+    if not all(np.isfinite(values).all() for values in (joint, rotations, translations)):
+        return np.full(count, np.inf), np.full(count, np.inf)
+    turns, moves = _by_pose(rotations, translations)
+    centres = np.stack([-R.T @ t for R, t in zip(rotations, translations, strict=True)])
     centred = centres - centres.mean(0)
-    spread = max(float(np.sqrt((centred**2).sum(1).mean())), 1e-12)
-    shifted = np.tile(np.eye(3), (count, 1))
-    turned = np.concatenate([bundle.cross_matrix(centre[None])[0] for centre in centred])
-    turns = _without(shifted) @ turns
-    moves = _without(np.column_stack([shifted, turned / spread, centred.ravel() / spread])) @ moves
-    sigmas = [np.sqrt(np.diag(by @ joint @ by.T).reshape(count, 3).sum(1).clip(0.0)) for by in (turns, moves)]
-    return np.degrees(sigmas[0]), sigmas[1] / spread
+    spread = max(float(np.sqrt((centred**2).sum(1).mean())), _MIN_SPREAD)
+    # The similarity may rotate all cameras alike, and translate, rotate and scale all centres.
+    translated = np.tile(np.eye(3), (count, 1))
+    rotated = np.concatenate([cross_matrix(centre[None])[0] for centre in centred])
+    turns = _without(translated) @ turns
+    moves = _without(np.column_stack([translated, rotated / spread, centred.ravel() / spread])) @ moves
+    rotation_sigmas, centre_sigmas = (sigmas(_variances(by, joint)) for by in (turns, moves))
+    return np.degrees(rotation_sigmas), centre_sigmas / spread
+
+
+def _by_pose(rotations: Array, translations: Array) -> tuple[Array, Array]:
+    """Derivatives (3 C, 6 C) of the orientations and centres in the world by the poses' parameters."""
+    count = len(rotations)
+    turns, moves = np.zeros((3 * count, 6 * count)), np.zeros((3 * count, 6 * count))
+    for index, (rotation, translation) in enumerate(zip(rotations, translations, strict=True)):
+        to_world = rotation.T
+        own = slice(3 * index, 3 * index + 3)
+        turns[own, 6 * index : 6 * index + 3] = to_world
+        # The centre is -R^T t.
+        moves[own, 6 * index : 6 * index + 3] = -to_world @ cross_matrix(translation[None])[0]
+        moves[own, 6 * index + 3 : 6 * index + 6] = -to_world
+    return turns, moves
+
+
+def _variances(by: Array, joint: Array) -> Array:
+    """(C,) the variance of three components together: sums of the diagonal of `by @ joint @ by.T`."""
+    variances, magnitudes = (
+        np.diag(left @ middle @ left.T).reshape(-1, 3).sum(1) for left, middle in ((by, joint), (abs(by), abs(joint)))
+    )
+    return np.where(variances < -_ROUNDING * magnitudes, variances, variances.clip(0.0))
 
 
 def _without(directions: Array) -> Array:
     """The projection that takes out what the columns of `directions` span."""
     u, s, _ = np.linalg.svd(directions, full_matrices=False)
-    basis = u[:, s > 1e-9 * s.max()]
+    basis = u[:, s > _MIN_SINGULAR * s.max()]
     return np.eye(len(directions)) - basis @ basis.T

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.matching.two_view import TwoView
-from splatnode.recon.registration import resection
+from splatnode.recon.registration import epipolar
 from splatnode.recon.registration.register import Registration
 
 Array = npt.NDArray[np.float64]
@@ -53,7 +53,7 @@ def measure(
         scale = max(longer_side(keyframes[k].frame) for k in (i, j)) / REFERENCE_SIDE
         thinned = _thinned(pairs[i, j], config.max_matches)
         limit = config.max_error_px * scale
-        rotation, direction, num_inliers = resection.relative_pose(thinned, cameras[i].focal, cameras[j].focal, limit)
+        rotation, direction, num_inliers = epipolar.relative_pose(thinned, cameras[i].focal, cameras[j].focal, limit)
         if num_inliers < MIN_INLIER_RATIO * len(thinned.matches):
             continue  # The pair has no rigid answer for these focal lengths; its inlier ratio says so, too.
         rotations[i, j] = rotation

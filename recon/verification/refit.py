@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.registration import bundle
+from splatnode.recon.registration import bundle, tracks
 from splatnode.recon.registration.register import Registration
 
 Array = npt.NDArray[np.float64]
@@ -60,7 +60,7 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
     position = np.full(len(keyframes), -1)
     position[[camera.index for camera in cameras]] = np.arange(len(cameras))
     camera_of = position[registration.observed_by]
-    chosen = _longest(camera_of, registration.observed_point, len(registration.points), tracks_per_camera)
+    chosen = tracks.longest(camera_of, registration.observed_point, len(registration.points), tracks_per_camera)
     observed = chosen[registration.observed_point]
     sides = np.array([longer_side(keyframes[c.index].frame) for c in cameras])
     lenses, lens_of_camera = np.unique([camera.lens for camera in cameras], return_inverse=True)
@@ -89,22 +89,10 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
         pixels=(enlarged[camera_of, None] * (registration.observed_pixels - principal[camera_of]))[observed],
     )
     scale = longer_sides[lens_of_camera] / REFERENCE_SIDE
-    prior = bundle.LensPrior(problem.log_focals, sigmas, np.zeros(len(lenses)), np.zeros(len(lenses)))
+    prior = bundle.focal_prior(problem.log_focals, sigmas)
     errors = bundle.reprojection_errors(problem)
     robust_px = float(np.clip(ROBUST_FACTOR * np.median(errors), *(np.array(ROBUST_PX) * np.median(scale))))
     return Fit(problem, prior, bundle.Config(robust_px=robust_px), scale, told)
-
-
-def _longest(camera_of: Index, point_of: Index, num_points: int, per_camera: int) -> npt.NDArray[np.bool_]:
-    """(P,) the points that are among the `per_camera` most often seen of at least one camera; ties fall by chance."""
-    times_seen = np.bincount(point_of, minlength=num_points)
-    rank = np.empty(num_points, np.int64)
-    rank[np.lexsort((np.random.default_rng(0).permutation(num_points), -times_seen))] = np.arange(num_points)
-    chosen = np.zeros(num_points, bool)
-    for camera in np.unique(camera_of):
-        mine = point_of[camera_of == camera]
-        chosen[mine[np.argsort(rank[mine], kind="stable")[:per_camera]]] = True
-    return chosen
 
 
 def adjusted(start: Fit) -> Fit:

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.registration.inliers import pooled_ratio
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.verification import (
     cycles,
@@ -177,9 +178,7 @@ def _disconnected(graph: ViewGraph, registration: Registration) -> tuple[str, ..
 
 def inlier_ratio(graph: ViewGraph, registration: Registration, index: int | None) -> float:
     """The share of matches that the cameras explain, of all verified pairs or of those of the keyframe `index`."""
-    pairs = {key: share for key, share in registration.agreement.items() if index is None or index in key}
-    matched = sum(len(graph.pairs[key].matches) for key in pairs)
-    return sum(share * len(graph.pairs[key].matches) for key, share in pairs.items()) / max(1, matched)
+    return pooled_ratio(registration.inlier_ratios, graph.pairs, index)
 
 
 def pictures(

@@ -49,12 +49,12 @@ def measure(
         for a, b in ((i, j), (j, i))
         if i in pictures and j in pictures
     ]
-    verified = [key for i, j in across if (key := (min(i, j), max(i, j))) in registration.agreement]
+    verified = [key for i, j in across if (key := (min(i, j), max(i, j))) in registration.inlier_ratios]
     return WeakestLink(
         smaller_part=tuple(sorted(min(one, other, key=len))),
         shared_points=int(sum(shared[pair] for pair in across)),
         matches=sum(len(pairs[key].matches) for key in verified),
-        inliers=sum(registration.agreement[key] * len(pairs[key].matches) for key in verified),
+        inliers=sum(registration.inlier_ratios[key] * len(pairs[key].matches) for key in verified),
         patches=epipolar_consistency.pooled(scores, config),
     )
 
@@ -67,7 +67,7 @@ def disconnected(registration: Registration, pairs: Mapping[tuple[int, int], Two
     """
     consistent = [
         key
-        for key, share in registration.agreement.items()
+        for key, share in registration.inlier_ratios.items()
         if share >= MIN_CONSISTENT_SHARE and share * len(pairs[key].matches) >= MIN_CONSISTENT_MATCHES
     ]
     _, *rest = connected_components([camera.index for camera in registration.cameras], consistent)

@@ -31,7 +31,7 @@ class JudgementRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     verdict: Verdict
     evidence: Evidence
     cameras: list[Numbers]
-    agreement: list[tuple[int, int, float]]
+    inlier_ratios: list[tuple[int, int, float]]
     numbers: Numbers  # of the registration
 
 
@@ -63,7 +63,7 @@ def judgement_message(
         verdict=judged.verdict,
         evidence=msgspec.convert(msgspec.to_builtins(evidence, enc_hook=lambda number: number.item()), Evidence),
         cameras=[numbers for numbers, _ in cameras],
-        agreement=[(int(i), int(j), float(share)) for (i, j), share in registration.agreement.items()],
+        inlier_ratios=[(int(i), int(j), float(ratio)) for (i, j), ratio in registration.inlier_ratios.items()],
         numbers={name: float(value) for name, value in kept.items() if isinstance(value, (int, float))},
     )
     arrays = [array for _, of_camera in cameras for array in of_camera]
@@ -74,8 +74,8 @@ def judgement_from(message: Message[JudgementRecord]) -> SavedJudgement:
     """What `judgement_message` was given. Raises ValueError where another version wrote the message."""
     header, arrays = message.header, iter(message.arrays)
     cameras = tuple(put_together(RegisteredCamera, numbers, arrays) for numbers in header.cameras)
-    agreement = {(i, j): share for i, j, share in header.agreement}
-    content: dict[str, Any] = {"cameras": cameras, "agreement": agreement, **header.numbers}
+    inlier_ratios = {(i, j): ratio for i, j, ratio in header.inlier_ratios}
+    content: dict[str, Any] = {"cameras": cameras, "inlier_ratios": inlier_ratios, **header.numbers}
     try:
         registration = Registration(**content, **dict(zip(OF_REGISTRATION, arrays, strict=True)))
     except TypeError as error:

@@ -11,7 +11,7 @@ import pytest
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.matching import two_view
 from splatnode.recon.matching.two_view import TwoView
-from splatnode.recon.registration import focal, mapper, resection, tracks, triangulation
+from splatnode.recon.registration import bundle, epipolar, focal, mapper, resection, tracks, triangulation
 from splatnode.recon.registration.mapping_problem import Lens, View
 
 FOCAL = 900.0
@@ -84,7 +84,7 @@ def built(taken: Photographed, pairs: dict[tuple[int, int], TwoView], focals: tu
 def errors(taken: Photographed, found: mapper.Map) -> tuple[float, float]:
     """Largest error of a relative rotation, degrees, and the largest of a centre, relative to their spread."""
     members = sorted(found.views)
-    state = found.problem
+    state = found.estimate
     estimated = np.stack([_inverse(state.rotations[i], state.translations[i]) for i in members])
     true = taken.Ts_world_camera[members]
     first, second = np.triu_indices(len(members), 1)
@@ -158,17 +158,17 @@ def test_cameras_are_found_whatever_the_first_focal_length(taken, pairs, focals)
     rotation_deg, centre = errors(taken, found)
     assert rotation_deg < 0.15
     assert centre < 0.01
-    assert np.exp(found.problem.log_focals[0]) == pytest.approx(FOCAL, rel=0.01)
+    assert np.exp(found.estimate.log_focals[0]) == pytest.approx(FOCAL, rel=0.01)
     assert found.rms_px == pytest.approx(NOISE_PX * np.sqrt(2.0), rel=0.25)
-    assert min(found.agreement.values()) > 0.95
+    assert min(found.inlier_ratios.values()) > 0.95
 
 
 def test_what_is_known_of_a_lens_stays(taken, pairs):
     views = [View(points, 0, max(SIZE)) for points in taken.pixels]
     found = mapper.build_map(views, [Lens((FOCAL,), 0.0)], pairs, mapper.Config())
     assert found is not None
-    assert np.exp(found.problem.log_focals[0]) == pytest.approx(FOCAL, rel=1e-12)
-    assert found.problem.radials[0] == 0.0 and np.abs(found.problem.shifts).max() == 0.0
+    assert np.exp(found.estimate.log_focals[0]) == pytest.approx(FOCAL, rel=1e-12)
+    assert found.estimate.radials[0] == 0.0 and np.abs(found.estimate.shifts).max() == 0.0
 
 
 def test_a_pair_that_shows_a_double_does_not_bend_the_map(taken, pairs):
@@ -200,12 +200,12 @@ def test_a_view_that_shares_a_handful_of_points_is_placed_by_its_pair():
 
 def test_sampson_errors_are_the_noise_and_infinite_behind(taken, pairs):
     found = built(taken, pairs, (FOCAL,))
-    ahead = resection.pair_errors(found.problem, (0, 3), pairs[0, 3])
+    ahead = epipolar.sampson_errors(found.estimate, (0, 3), pairs[0, 3])
     assert np.median(ahead) == pytest.approx(0.67 * NOISE_PX, rel=0.4)
-    rotations, translations = found.problem.rotations, found.problem.translations
+    rotations, translations = found.estimate.rotations, found.estimate.translations
     towards = rotations[3] @ rotations[0].T @ translations[0]
-    flipped = resection.with_pose(found.problem, 3, rotations[3], 2 * towards - translations[3])
-    behind = resection.pair_errors(flipped, (0, 3), pairs[0, 3])
+    flipped = bundle.with_pose(found.estimate, 3, rotations[3], 2 * towards - translations[3])
+    behind = epipolar.sampson_errors(flipped, (0, 3), pairs[0, 3])
     assert np.isinf(behind).mean() > 0.9
 
 
@@ -228,7 +228,7 @@ def test_tracks_join_matches_and_drop_what_contradicts_itself():
     ]
     # 0-0-0 is whole; 1-1 reaches two features of view 2, which both go; 2-2 is seen twice.
     assert sorted(map(sorted, members)) == [[0, 1], [0, 1], [0, 1, 2]]
-    thinned = tracks.thin(joined, 3, per_camera=1)
+    thinned = tracks.thin(joined, per_camera=1)
     assert thinned.num_tracks == 1
     assert sorted(thinned.camera_of) == [0, 1, 2]
 
@@ -257,5 +257,5 @@ def test_wrong_matches_do_not_hide_how_far_a_pair_moved():
     moved = turned + 0.7 * direction
     rays = moved[:, :2] / moved[:, 2:]
     rays[8:, 1] += generator.choice([-1.0, 1.0], 17) * generator.uniform(0.05, 0.3, 17)
-    assert resection._scale(turned, direction, rays, 0.002, min_points=5) == pytest.approx(0.7, rel=1e-6)
-    assert resection._scale(turned, direction, rays, 0.002, min_points=9) is None
+    assert resection._length(turned, direction, rays, 0.002, min_points=5) == pytest.approx(0.7, rel=1e-6)
+    assert resection._length(turned, direction, rays, 0.002, min_points=9) is None

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
+import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
@@ -11,7 +14,8 @@ from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration import register
+from splatnode.recon.registration import bundle, register
+from splatnode.recon.verification import decision
 from tests.support.synthetic import photographs, renumbered, view_graph
 
 
@@ -25,6 +29,22 @@ def test_the_lens_of_a_frame_that_is_left_out_makes_no_focal_length_uncertain():
     registration = register.register(graph.keyframes, graph.pairs, config)
     assert registration is not None and [camera.index for camera in registration.cameras] == [0, 1, 2]
     assert registration.focal_sigma < 0.5 * config.lenses.voted_sigma
+
+
+@pytest.mark.parametrize("variance", [-1e-6, np.nan, np.inf])
+def test_a_focal_length_without_a_variance_is_infinitely_uncertain(monkeypatch, variance):
+    """The verdict's limit on the focal length's sigma refuses infinity; NaN would pass it."""
+    graph = view_graph(photographs()[:3])
+    covariance = bundle.covariance
+
+    def broken(*problem) -> bundle.Covariance:
+        found = covariance(*problem)
+        return replace(found, log_focals=np.full_like(found.log_focals, variance))
+
+    monkeypatch.setattr(bundle, "covariance", broken)
+    registration = register.register(graph.keyframes, graph.pairs, register.Config())
+    assert registration is not None and registration.focal_sigma == np.inf
+    assert registration.focal_sigma > decision.Config().max_focal_sigma
 
 
 def test_the_robots_own_body_in_the_picture_is_not_what_moves():

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.registration import bundle, subpixel
+from splatnode.recon.registration import bundle, patch_image, subpixel
+from splatnode.recon.registration.patch_image import PatchImage
 from tests.recon.registration.test_patch_alignment import texture
 
 FOCAL = 300.0
@@ -63,36 +64,36 @@ def problem(noise_px: float, views: tuple[int, ...] = (0, 1, 2)) -> bundle.Probl
 
 
 @pytest.fixture(scope="module")
-def pictures() -> list[subpixel.Picture]:
+def images() -> list[PatchImage]:
     middle = np.array(SIZE) / 2.0
-    return [subpixel.picture(image, middle, subpixel.Config()) for image in photographs()]
+    return [patch_image.patch_image(image, middle, patch_image.Config()) for image in photographs()]
 
 
-def test_noisy_observations_become_exact(pictures):
+def test_noisy_observations_become_exact(images):
     noisy = problem(noise_px=0.5)
-    refined = subpixel.refine(noisy, (0, 1, 2), pictures, subpixel.Config())
+    refined = subpixel.refine(noisy, (0, 1, 2), images, subpixel.Config())
     assert len(refined.points) > 70
     assert np.median(bundle.reprojection_errors(noisy)[noisy.camera_of != 1]) > 0.4
     aligned = bundle.reprojection_errors(refined)[refined.camera_of != 1]
     assert np.median(aligned) < 0.05
 
 
-def test_points_are_found_in_a_view_that_had_not_matched_them(pictures):
-    refined = subpixel.refine(problem(0.3, views=(0, 1)), (0, 1, 2), pictures, subpixel.Config())
+def test_points_are_found_in_a_view_that_had_not_matched_them(images):
+    refined = subpixel.refine(problem(0.3, views=(0, 1)), (0, 1, 2), images, subpixel.Config())
     in_third = refined.camera_of == 2
     assert in_third.sum() > 60
     # The reference is camera 0 or 1: where that observation is noisy, the point itself is.
     assert np.median(bundle.reprojection_errors(refined)[in_third]) < 0.5
-    not_registered = subpixel.refine(problem(0.3, views=(0, 1)), (0, 1), pictures, subpixel.Config())
+    not_registered = subpixel.refine(problem(0.3, views=(0, 1)), (0, 1), images, subpixel.Config())
     assert (not_registered.camera_of != 2).all()
 
 
-def test_observations_of_something_else_are_left_out(pictures):
+def test_observations_of_something_else_are_left_out(images):
     start = problem(noise_px=0.1)
     generator = np.random.default_rng(3)
     wrong = (start.camera_of == 2) & (start.point_of < 40)
     pixels = np.where(wrong[:, None], generator.uniform(-80, 80, start.pixels.shape), start.pixels)
-    refined = subpixel.refine(replace(start, pixels=pixels), (0, 1, 2), pictures, subpixel.Config())
+    refined = subpixel.refine(replace(start, pixels=pixels), (0, 1, 2), images, subpixel.Config())
     assert (bundle.reprojection_errors(refined) < 1.0).mean() > 0.97
     assert (np.diff(refined.point_of) >= 0).all()
     assert np.bincount(refined.point_of).min() >= 2
@@ -121,7 +122,7 @@ def test_the_affine_of_a_plane_is_the_derivative_of_its_projection():
 
 def test_large_images_are_shrunk_and_pixels_with_them():
     image = np.zeros((1000, 2000, 3), np.uint8)
-    shrunk = subpixel.picture(image, np.array([990.0, 505.0]), subpixel.Config(longer_side=500))
+    shrunk = patch_image.patch_image(image, np.array([990.0, 505.0]), patch_image.Config(max_longer_side=500))
     assert shrunk.grey.shape == (250, 500)
     np.testing.assert_allclose(shrunk.to_grey(np.array([[10.0, -5.0]])), [[250.0, 125.0]])
     np.testing.assert_allclose(shrunk.from_grey(np.array([[250.0, 125.0]])), [[10.0, -5.0]])

@@ -66,6 +66,41 @@ def test_cameras_that_are_not_registered_are_left_out():
     assert rotations.min() > 0.0
 
 
+def test_a_negative_or_infinite_variance_is_an_infinite_sigma():
+    found = uncertainty.sigmas(np.array([4.0, 0.0, -1e-12, np.nan, np.inf, -np.inf]))
+    np.testing.assert_array_equal(found, [2.0, 0.0, np.inf, np.inf, np.inf, np.inf])
+
+
+def test_a_camera_with_a_negative_variance_is_infinitely_uncertain_and_the_others_are_not():
+    found = bundle.adjust(problem(), PRIOR, CONFIG)
+    covariance = bundle.covariance(found, PRIOR, CONFIG)
+    joint = covariance.joint.copy()
+    joint[12:18, 12:18] -= 10.0 * np.diag(np.diag(joint[12:18, 12:18]))
+    for sigmas in uncertainty.camera_sigmas(found, replace(covariance, joint=joint), ALL):
+        assert np.isinf(sigmas[2]) and not np.isnan(sigmas).any() and np.isfinite(sigmas).any()
+
+
+@pytest.mark.parametrize("spoiled", ["joint", "rotations", "translations"])
+def test_what_is_not_finite_makes_every_camera_infinitely_uncertain(spoiled):
+    found = bundle.adjust(problem(), PRIOR, CONFIG)
+    covariance = bundle.covariance(found, PRIOR, CONFIG)
+    if spoiled == "joint":
+        covariance = replace(covariance, joint=np.full_like(covariance.joint, np.nan))
+    else:
+        found = replace(found, **{spoiled: np.full_like(getattr(found, spoiled), np.inf)})
+    for sigmas in uncertainty.camera_sigmas(found, covariance, ALL):
+        np.testing.assert_array_equal(sigmas, np.full(4, np.inf))
+
+
+def test_a_point_that_is_not_finite_leaves_nothing_known():
+    broken = problem()
+    broken.points[3] = np.nan
+    covariance = bundle.covariance(broken, PRIOR, CONFIG)
+    assert np.isnan(covariance.log_focals).all()
+    for sigmas in uncertainty.camera_sigmas(broken, covariance, ALL):
+        np.testing.assert_array_equal(sigmas, np.full(4, np.inf))
+
+
 def test_two_cameras_have_no_shape_to_be_wrong_in():
     found = bundle.adjust(problem(), PRIOR, CONFIG)
     _, positions = uncertainty.camera_sigmas(found, bundle.covariance(found, PRIOR, CONFIG), (0, 2))

@@ -77,7 +77,7 @@ def registration(indices: tuple[int, ...]) -> Registration:
         observed_by=np.zeros(0, np.int64),
         observed_point=np.zeros(0, np.int64),
         observed_pixels=np.zeros((0, 2)),
-        agreement={},
+        inlier_ratios={},
         focal_sigma=0.01,
         median_angle_deg=10.0,
         rms_px=0.3,

@@ -131,9 +131,10 @@ def test_what_is_finite_is_let_pass():
 
 
 def test_arrays_and_mappings_are_walked_too():
-    found = replace(registration(ALL), points=np.array([[0.0, np.nan, 1.0]]), agreement={(0, 1): math.inf})
-    assert list(not_finite(found)) == [("points",), ("agreement", "(0, 1)")]
-    assert {field.name for field in fields(Registration)} >= {"points", "agreement"} and is_dataclass(RegisteredCamera)
+    found = replace(registration(ALL), points=np.array([[0.0, np.nan, 1.0]]), inlier_ratios={(0, 1): math.inf})
+    assert list(not_finite(found)) == [("points",), ("inlier_ratios", "(0, 1)")]
+    assert {field.name for field in fields(Registration)} >= {"points", "inlier_ratios"}
+    assert is_dataclass(RegisteredCamera)
 
 
 @pytest.mark.filterwarnings("error")

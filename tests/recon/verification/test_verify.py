@@ -137,8 +137,8 @@ def test_points_shared_by_two_frames_are_counted():
 def test_frames_that_pairs_contradict_are_disconnected():
     graph, found = placed()
     assert weakest_link.disconnected(found, graph.pairs) == ()
-    doubted = {key: 0.4 if 3 in key else share for key, share in found.agreement.items()}
-    assert weakest_link.disconnected(replace(found, agreement=doubted), graph.pairs) == (3,)
+    doubted = {key: 0.4 if 3 in key else share for key, share in found.inlier_ratios.items()}
+    assert weakest_link.disconnected(replace(found, inlier_ratios=doubted), graph.pairs) == (3,)
 
 
 def test_the_share_of_points_on_a_plane():

@@ -61,7 +61,7 @@ def test_what_was_judged_and_measured_comes_back_and_is_not_made_anew(store, wor
     assert after.verdict == before.verdict and after.evidence == before.evidence and again.proven == work.proven
     for one, other in zip(after.registration.cameras, before.registration.cameras, strict=True):
         assert np.array_equal(one.T_world_camera, other.T_world_camera) and one.lens == other.lens
-    assert after.registration.agreement == before.registration.agreement
+    assert after.registration.inlier_ratios == before.registration.inlier_ratios
     assert np.array_equal(after.registration.observed_pixels, before.registration.observed_pixels)
     for name, pointmap in work.pointmaps.items():
         known = pointmap.depth > 0
