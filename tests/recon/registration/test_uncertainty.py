@@ -71,11 +71,11 @@ def test_a_negative_or_infinite_variance_is_an_infinite_sigma():
     np.testing.assert_array_equal(found, [2.0, 0.0, np.inf, np.inf, np.inf, np.inf])
 
 
-def test_a_camera_with_a_negative_variance_is_infinitely_uncertain_and_the_others_are_not():
+def test_a_camera_with_a_negative_variance_is_infinitely_uncertain():
     found = bundle.adjust(problem(), PRIOR, CONFIG)
     covariance = bundle.covariance(found, PRIOR, CONFIG)
     joint = covariance.joint.copy()
-    joint[12:18, 12:18] -= 10.0 * np.diag(np.diag(joint[12:18, 12:18]))
+    joint[12:18, 12:18] -= 3.0 * np.diag(np.diag(joint[12:18, 12:18]))
     for sigmas in uncertainty.camera_sigmas(found, replace(covariance, joint=joint), ALL):
         assert np.isinf(sigmas[2]) and not np.isnan(sigmas).any() and np.isfinite(sigmas).any()
 
