@@ -18,7 +18,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.config import read_yaml
 from splatnode.recon.config import Config, overlaid, preset
 from splatnode.recon.evaluate import methods
-from splatnode.recon.evaluate.bench import Entrants, Plan, Scoring, run_bench, told
+from splatnode.recon.evaluate.bench import Entrants, Plan, Scoring, run_bench, run_line
 from splatnode.recon.evaluate.demo import largest_capture_bytes, write_capture
 from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
 from splatnode.recon.evaluate.records import merged, read_bench
@@ -142,7 +142,7 @@ def bench(args: argparse.Namespace) -> int:
         )
         for row in found.rows:
             if row.final:
-                print(told(row))
+                print(run_line(row))
     redraw(found, args.out)
     print(f"results: {args.out}/ (report.html, report.md, bench.json, bench.csv)")
     return EXIT_GOOD

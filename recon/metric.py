@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from splatnode.recon.networks.crop import Crop
 from splatnode.recon.networks.depth_anything import load_metric
-from splatnode.recon.result.picture import take_picture
+from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
@@ -110,7 +110,7 @@ def _ratio(snapshot: Snapshot, camera: CameraEstimate, network: MetricDepth) -> 
     """Metres by scene unit in the median of a view's pixels; None where too few can be compared."""
     metres, crop = network.depth(snapshot.images[camera.name])
     shape = camera.T_world_camera, camera.K, camera.width, camera.height
-    picture = take_picture(snapshot.gaussians, *shape, channels=("depth", "alpha"))
+    picture = render_arrays(snapshot.gaussians, *shape, channels=("depth", "alpha"))
     rows, columns = np.mgrid[: crop.height, : crop.width]
     there = np.floor(crop.to_photograph(np.stack([columns, rows], -1) + 0.5)).astype(np.int64)
     depth, alpha = (channel[there[..., 1], there[..., 0]] for channel in (picture.depth, picture.alpha))

@@ -20,7 +20,9 @@ GOOD_ANGLE_DEG = 12.0  # between two rays to a point: wider adds little to its d
 GOOD_ANGLE = math.radians(GOOD_ANGLE_DEG)
 GOOD_VIEWS = 3  # two confirm each other, the third tells which is wrong
 ENOUGH = 0.03  # a gain below this is not worth a photograph
-LEAST_OVERLAP = 0.5  # part of the points that a new view must share with old ones to be placed among them
+MIN_OVERLAP = 0.5  # part of the points that a new view must share with old ones to be placed among them
+_MIN_SHOWN = 0.2  # part of all points that a new view must show: less is a glance at the scene's edge
+_MIN_FACING = 0.2  # cosine between a surface's normal and the ray to it: flatter, it is seen edge-on
 _STEPS = tuple(math.radians(degrees) for degrees in (8.0, 16.0, 24.0))  # around the scene, from a camera
 _TURNS = {
     "to the right": (1.0, 0.0),
@@ -119,7 +121,7 @@ def _moves(camera: CameraEstimate, cameras: tuple[CameraEstimate, ...], points: 
         for step in _STEPS:
             centre = _walked(camera, pivot, up, right * step, upwards * step)
             shown = _shows(camera, look_at(centre, pivot, up), points)
-            if shown.sum() == 0 or (views[shown] > 0).mean() < LEAST_OVERLAP or shown.mean() < 0.2:
+            if shown.sum() == 0 or (views[shown] > 0).mean() < MIN_OVERLAP or shown.mean() < _MIN_SHOWN:
                 continue
             wider = np.where(shown, np.maximum(angles, _angles_to(_rays(points, centre), sight.rays, points)), angles)
             parallax = (np.minimum(wider, GOOD_ANGLE) - np.minimum(angles, GOOD_ANGLE)).mean() / GOOD_ANGLE
@@ -154,7 +156,7 @@ def _shows(lens: CameraEstimate, T_world_camera: Array, points: Points) -> npt.N
     local = offsets @ T_world_camera[:3, :3]
     ahead = local[:, 2] > 1e-3
     pixels = local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None] * lens.K[[0, 1], [0, 1]] + lens.K[:2, 2]
-    facing = -(offsets * points.normals).sum(1) > 0.2 * np.linalg.norm(offsets, axis=1)
+    facing = -(offsets * points.normals).sum(1) > _MIN_FACING * np.linalg.norm(offsets, axis=1)
     return ahead & facing & (pixels >= 0).all(1) & (pixels < [lens.width, lens.height]).all(1)
 
 

@@ -12,7 +12,7 @@ import cv2
 
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import read_yaml, typed
-from splatnode.recon.result.picture import use_threads
+from splatnode.recon.result.rendering import use_threads
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.pictures import keep_picture, write_movie, write_series
 from splatnode.viewer.probe import Probe, open3d_installed, probe_window

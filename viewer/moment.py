@@ -1,4 +1,4 @@
-"""Moments: what there was to see at one instant, and the bounded memory of them that the time axis goes through."""
+"""Moments: snapshots as they reached the viewer, and the bounded history of them that the time slider goes through."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from splatnode.recon.result.snapshot import Snapshot
 
-MEMORY_BYTES = 256_000_000
+MEMORY_BYTES = 256_000_000  # of a history: some fifty moments of 30 000 Gaussians and 12 cameras
 _SMALLEST = 16  # pixels: a photograph that is drawn smaller is a spot
 
 

@@ -16,8 +16,8 @@ _HIDDEN = 0.3  # how much of a line's colour is left where it is behind somethin
 
 def paint_shapes(canvas: Canvas, shapes: Shapes, T_camera_world: Array, K: Array) -> None:
     """The photographs, the nearest on top, and over them the lines."""
-    placed = [(in_camera(photograph.corners, T_camera_world), photograph) for photograph in shapes.photographs]
-    for corners, photograph in sorted(placed, key=lambda one: -float(one[0][:, 2].mean())):
+    in_front = [(in_camera(photograph.corners, T_camera_world), photograph) for photograph in shapes.photographs]
+    for corners, photograph in sorted(in_front, key=lambda one: -float(one[0][:, 2].mean())):
         _paint_photograph(canvas, photograph, corners, K)
     for lines in shapes.lines:
         _paint_lines(canvas, lines, T_camera_world, K)

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from splatnode.recon.result.picture import take_picture
+from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.viewer.canvas import BACKGROUND, Array, Canvas, Image, empty_canvas
 from splatnode.viewer.overlay import paint_shapes
@@ -45,15 +45,15 @@ def paint_gaussians(
         return empty_canvas(width, height)
     if state.as_points:
         return paint_points(gaussians, np.linalg.inv(T_world_camera), K, state.point_size, width, height)
-    picture = take_picture(
+    rendered = render_arrays(
         gaussians, T_world_camera.astype(np.float64), K.astype(np.float64), width, height, channels=("rgb", "depth")
     )
     planes = [  # 255 * rgb + (1 - alpha) * background, rounded and clipped
-        cv2.addWeighted(picture.rgb[..., channel], 255.0, picture.alpha, -level, level, dtype=cv2.CV_8U)
+        cv2.addWeighted(rendered.rgb[..., channel], 255.0, rendered.alpha, -level, level, dtype=cv2.CV_8U)
         for channel, level in enumerate(BACKGROUND)
     ]
-    np.copyto(picture.depth, np.inf, where=picture.alpha <= 0.5)
-    return Canvas(np.asarray(cv2.merge(planes), np.uint8), picture.depth)
+    np.copyto(rendered.depth, np.inf, where=rendered.alpha <= 0.5)
+    return Canvas(np.asarray(cv2.merge(planes), np.uint8), rendered.depth)
 
 
 def blended(image: Image, photograph: Image, camera: CameraEstimate, K: Array, weight: float) -> Image:

@@ -13,7 +13,7 @@ from splatnode.viewer import words
 from splatnode.viewer.session import Session
 from splatnode.viewer.state import POINT_SIZES, Colouring, Engine, State, go_to_camera, go_to_moment, moment_index
 
-_LINE = 47  # characters
+_LINE = 47  # characters that fit into the panel's width
 _FREE = "free viewpoint"
 _SWITCHES = (
     ("gaussians", "Gaussians (1)"),
@@ -24,8 +24,8 @@ _SWITCHES = (
     ("tracked", "tracked camera (5)"),
     ("advice", "next view (6)"),
 )
-_BUTTONS = (("Pause", "space"), ("Follow", "f"), ("Whole", "r"), ("Save", "s"), ("Help", "h"))
-_LASTING = {"space": "paused", "f": "follow", "h": "help"}  # the keys that switch something on, and what
+_BUTTONS = (("Pause", "space"), ("Follow", "f"), ("Overview", "r"), ("Save", "s"), ("Help", "h"))
+_TOGGLES = {"space": "paused", "f": "follow", "h": "help"}  # key -> the field of the state that it switches on and off
 _GOOD, _BAD = gui.Color(0.5, 0.9, 0.5), gui.Color(1.0, 0.65, 0.4)
 
 
@@ -38,14 +38,14 @@ class Panel:
         self._session: Session | None = None
         self.root = gui.ScrollableVert(round(0.3 * em), gui.Margins(round(0.5 * em)))
         self._labels: dict[str, gui.Label] = {}
-        buttons, self._lasting = gui.Horiz(round(0.3 * em)), dict[str, gui.Button]()
+        buttons, self._toggles = gui.Horiz(round(0.3 * em)), dict[str, gui.Button]()
         for text, key in _BUTTONS:
             button = gui.Button(text)
             button.horizontal_padding_em, button.vertical_padding_em = 0.4, 0.1
             button.set_on_clicked(lambda key=key: command(key))
-            if key in _LASTING:
+            if key in _TOGGLES:
                 button.toggleable = True
-                self._lasting[_LASTING[key]] = button
+                self._toggles[_TOGGLES[key]] = button
             buttons.add_child(button)
         self.root.add_child(buttons)
         pairs = gui.VGrid(2, round(0.3 * em))
@@ -74,7 +74,7 @@ class Panel:
         age = session.source.age_s
         feed = words.feed_line(age, bool(moment and moment.snapshot.final))
         rate = [f"{1 / seconds:.0f} pictures/s ({1000 * seconds:.0f} ms each)"] if seconds else []
-        for field, button in self._lasting.items():
+        for field, button in self._toggles.items():
             button.is_on = getattr(state, field)
         for field, switch in self._switches.items():
             switch.checked = getattr(state, field)

@@ -21,7 +21,7 @@ from splatnode.viewer.paint import blended, caption, paint
 from splatnode.viewer.shapes import Shapes, shapes
 from splatnode.viewer.sources import Source
 from splatnode.viewer.state import State
-from splatnode.viewer.viewpoint import Viewpoint, at_camera, overview, swing
+from splatnode.viewer.viewpoint import Viewpoint, at_camera, overview, turntable_views
 
 Image = npt.NDArray[np.uint8]
 
@@ -72,7 +72,7 @@ def write_movie(moment: Moment, path: Path, width: int, height: int, frames: int
 
 def turntable(moment: Moment, width: int, height: int, frames: int) -> Iterator[Image]:
     """The Gaussians alone, from a closed tour around them."""
-    for view in swing(moment, frames):
+    for view in turntable_views(moment, frames):
         yield paint(moment.snapshot.gaussians, Shapes((), ()), view, State(), width, height)
 
 

@@ -33,7 +33,7 @@ class Pointer:
             self._pressed, self.dragging = None, False
             return True
         elif event.type == gui.MouseEvent.Type.WHEEL:
-            view = self._session.grasped()
+            view = self._session.viewpoint_to_move()
             if view is not None:
                 self._session.move(zoomed(view, _ZOOM_PER_NOTCH**event.wheel_dy))
                 return True
@@ -43,7 +43,7 @@ class Pointer:
         start = self._pressed or (x, y)
         if not self.dragging and max(abs(x - start[0]), abs(y - start[1])) < _CLICK_PX:
             return False
-        view = self._session.grasped()
+        view = self._session.viewpoint_to_move()
         right, down = x - self._last[0], y - self._last[1]
         self._last, self.dragging = (x, y), True
         if view is None:

@@ -34,7 +34,7 @@ os._exit(0)
 @dataclass(frozen=True)
 class Probe:
     window: bool
-    software: bool  # the processor plays the graphics card: Open3D's splats take a second a picture
+    software: bool  # Vulkan runs on the processor: Open3D's splats take a second a picture
     detail: str  # the device, or why there is no window and what to do
 
     @property

@@ -113,7 +113,7 @@ class Session:
             self.state = replace(self.state, camera=None, follow=False)
         self._view, self._touched = view, True
 
-    def grasped(self) -> Viewpoint | None:
+    def viewpoint_to_move(self) -> Viewpoint | None:
         """The viewpoint to start a movement from: at a camera, the pivot lies as deep as the scene's middle."""
         view, moment = self.viewpoint(), self.moment
         if view is None or moment is None or self.camera() is None:

@@ -107,14 +107,14 @@ class Live:
         self._heartbeats.close()
 
     def _listen(self) -> None:
-        told: CameraRecord | None = None  # by the last heartbeat: what has not changed is not drawn again
+        last: CameraRecord | None = None  # of the last heartbeat: what has not changed is not drawn again
         try:
             while not self._closing.is_set():
                 message = self._client.poll(_POLL_S)
                 heartbeat = self._heartbeats.latest(0)
-                if heartbeat is not None and heartbeat.header.tracked != told:
-                    told = heartbeat.header.tracked
-                    tracked = told and camera_from(told)
+                if heartbeat is not None and heartbeat.header.tracked != last:
+                    last = heartbeat.header.tracked
+                    tracked = last and camera_from(last)
                     self._tracked = tracked if tracked and is_camera(tracked) else None
                 if message is None:
                     continue

@@ -21,7 +21,7 @@ from splatnode.viewer.viewpoint import Viewpoint
 
 Image = npt.NDArray[np.uint8]
 
-_SMOOTH_S = 0.04  # a picture that takes longer is painted at half the resolution while the pointer drags it
+_SMOOTH_S = 0.04  # a picture that takes longer is painted at half the resolution during a drag
 # Open3D skips a drawing while the one before is under way, and shows what came into its scene a drawing later: so the
 # window is drawn again. Keys and clicks make it draw by themselves, so that what they change is skipped more often. On
 # software Vulkan each drawing takes 60 ms of a processor, which a node may want.
@@ -31,7 +31,7 @@ _SCENE_REDRAWN_S = (0.0, 0.0, 0.3, 1.0)
 
 
 class Stage:
-    """Two widgets in the same place, of which one is visible. `software`: Vulkan is played by the processor."""
+    """Two widgets in the same place, of which one is visible. `software`: Vulkan runs on the processor."""
 
     def __init__(self, window: gui.Window, software: bool) -> None:
         self.picture = gui.ImageWidget(image3d(np.full((8, 8, 3), BACKGROUND, np.uint8)))
@@ -51,7 +51,7 @@ class Stage:
         return self._painted_s if self.picture.visible else None
 
     def lay_out(self, frame: gui.Rect) -> bool:
-        """Takes the place; whether that is another size."""
+        """Fills `frame`; returns whether the size changed."""
         if (frame.width, frame.height) == self.size:
             return False
         self.picture.frame = self.scene.frame = frame

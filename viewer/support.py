@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.result.picture import take_picture
+from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.viewer.canvas import in_camera
 
@@ -51,9 +51,9 @@ def seen(gaussians: GaussianArrays, camera: CameraEstimate) -> npt.NDArray[np.fl
     ahead = depth > 1e-3
     pixels = points[:, :2] / np.where(ahead, depth, 1.0)[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]
     inside = ahead & (pixels >= 0).all(1) & (pixels < [width, height]).all(1)
-    picture = take_picture(gaussians, camera.T_world_camera, K, width, height, channels=("depth",))
+    rendered = render_arrays(gaussians, camera.T_world_camera, K, width, height, channels=("depth",))
     columns, rows = pixels[inside].astype(np.int64).T
-    surface = np.where(picture.alpha > 0.5, picture.depth, np.inf)[rows, columns]
+    surface = np.where(rendered.alpha > 0.5, rendered.depth, np.inf)[rows, columns]
     result = np.zeros(len(gaussians))
     result[inside] = np.where(depth[inside] <= _BEHIND * surface, camera.K[0, 0] / depth[inside], 0.0)
     return result

@@ -16,6 +16,11 @@ Array = npt.NDArray[np.float64]
 
 _STEEPEST = math.radians(85.0)  # of a viewing direction, from the horizontal
 _NEAREST = 1e-3  # world units, of the pivot
+# The turntable: an ellipse this much wider than where the cameras were, within these half axes.
+_TOUR_MARGIN = 1.1
+_TOUR_WIDTH = math.radians(6.0), math.radians(60.0)
+_TOUR_HEIGHT = math.radians(3.0), math.radians(20.0)
+_TOUR_ALONE = math.radians(25.0), math.radians(8.0)  # around a single camera
 _LENS = np.array([[0.9, 0.0, 0.5], [0.0, 0.9, 0.375], [0.0, 0.0, 1.0]]), 1.0, 0.75  # where no camera suggests one
 
 
@@ -141,7 +146,7 @@ def scene_spread(moment: Moment, pivot: Array) -> float:
     return float(np.median(np.linalg.norm(means - pivot, axis=1))) or 1.0 if len(means) else 1.0
 
 
-def swing(moment: Moment, frames: int) -> list[Viewpoint]:
+def turntable_views(moment: Moment, frames: int) -> list[Viewpoint]:
     """A closed tour, `frames` long, around the pivot: an ellipse a little wider than where the cameras were.
 
     A full circle would mostly show what no photograph shows.
@@ -149,7 +154,7 @@ def swing(moment: Moment, frames: int) -> list[Viewpoint]:
     start = overview(moment)
     cameras = moment.snapshot.cameras
     if len(cameras) < 2:
-        width, height, distance = math.radians(25.0), math.radians(8.0), start.distance
+        (width, height), distance = _TOUR_ALONE, start.distance
     else:
         offsets = np.array([camera.T_world_camera[:3, 3] for camera in cameras]) - start.pivot
         distances = np.linalg.norm(offsets, axis=1)
@@ -158,8 +163,8 @@ def swing(moment: Moment, frames: int) -> list[Viewpoint]:
         side = np.cross(start.up, level)
         azimuths = np.arctan2(offsets @ side, offsets @ level)
         elevations = np.arcsin(np.clip(offsets @ start.up / distances, -1.0, 1.0))
-        width = min(max(1.1 * float(np.ptp(azimuths)) / 2.0, math.radians(6.0)), math.radians(60.0))
-        height = min(max(1.1 * float(np.ptp(elevations)) / 2.0, math.radians(3.0)), math.radians(20.0))
+        width = float(np.clip(_TOUR_MARGIN * np.ptp(azimuths) / 2.0, *_TOUR_WIDTH))
+        height = float(np.clip(_TOUR_MARGIN * np.ptp(elevations) / 2.0, *_TOUR_HEIGHT))
         distance = float(np.median(distances))
         middle = (azimuths.max() + azimuths.min()) / 2.0, (elevations.max() + elevations.min()) / 2.0
         direction = math.cos(middle[1]) * (math.cos(middle[0]) * level + math.sin(middle[0]) * side)

@@ -25,8 +25,9 @@ from splatnode.viewer.session import Session
 from splatnode.viewer.stage import Image, Stage
 from splatnode.viewer.state import Engine, open3d_draws
 
-_CALM_S = 1.0  # after what was last to be done
-_NAP_S = 0.05  # then: Open3D asks a hundred times a second whether there is anything, which takes 2 % of a processor
+_IDLE_AFTER_S = 1.0  # without anything to do, ticks begin to sleep
+_IDLE_SLEEP_S = 0.05  # Open3D ticks a hundred times a second, which would take 2 % of a processor
+_WORDS_EVERY_S = 0.5  # the panel's words are brought up to date: times and ages in them change by themselves
 _PANEL_EMS = 22  # the panel's width, in letter widths of the theme
 _KEYS = {
     gui.KeyName.SPACE: "space",
@@ -45,7 +46,7 @@ def show(
 ) -> None:
     """Opens the window, calls `opened`, and returns when it is closed. Raises what went wrong while it was open.
 
-    `software`: Vulkan is played by the processor. There the project's own rasteriser draws, unless the person asks for
+    `software`: Vulkan runs on the processor. There the project's own rasteriser draws, unless the person asks for
     Open3D; its splat shader is not used even then, because it leaves whole rows of its tiles black.
     """
     # It would say, at each picture, which of the far shell's Gaussians are too wide for it.
@@ -122,11 +123,11 @@ class _Window:
         analysis = self._session.analysis()
         if analysis is not self._analysed:
             self._analysed, news = analysis, True
-        if time.monotonic() - self._words_at > 0.5:
+        if time.monotonic() - self._words_at > _WORDS_EVERY_S:
             self._say()
         if not (news or self._asked):
-            if time.monotonic() - self._busy_at > _CALM_S:
-                time.sleep(_NAP_S)
+            if time.monotonic() - self._busy_at > _IDLE_AFTER_S:
+                time.sleep(_IDLE_SLEEP_S)
             return self._stage.redraws()
         asked, self._asked, self._busy_at = self._asked, False, time.monotonic()
         self._stage.draw(self._session, asked, self._pointer.dragging)

@@ -20,7 +20,7 @@ from scipy.stats import chi2
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import MIN_DEPTH, project, to_camera
 from splatnode.recon.matching import features, nearest_neighbours
-from splatnode.recon.result.picture import take_picture
+from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import Snapshot
 
 Array = npt.NDArray[np.float64]
@@ -88,7 +88,7 @@ def landmarks(snapshot: Snapshot, keyframes: Sequence[Keyframe], config: Config)
     known = []
     for keyframe in (keyframe for keyframe in keyframes if keyframe.name in cameras):
         camera, found = cameras[keyframe.name], keyframe.features
-        render = take_picture(
+        render = render_arrays(
             snapshot.gaussians, camera.T_world_camera, camera.K, camera.width, camera.height, channels=("depth",)
         )
         plain = found.tilt == 1.0

@@ -42,7 +42,7 @@ class Appearance(Protocol):
         """Mean absolute difference to `image` (H, W, 3), scalar, differentiable with respect to the pose (4, 4)."""
         ...
 
-    def picture(self, T_world_camera: Array, K: Array, width: int, height: int) -> Tensor:
+    def render(self, T_world_camera: Array, K: Array, width: int, height: int) -> Tensor:
         """(H, W, 3) the image, in [0, 1]."""
         ...
 
@@ -93,5 +93,5 @@ class Splats:
             raise ValueError("the rasteriser was asked for the channel rgb and gave none")
         return (rgb - image).abs().mean()
 
-    def picture(self, T_world_camera: Array, K: Array, width: int, height: int) -> Tensor:
+    def render(self, T_world_camera: Array, K: Array, width: int, height: int) -> Tensor:
         return torch.from_numpy(render_rgb(self._gaussians, T_world_camera, K, width, height))

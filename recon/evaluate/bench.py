@@ -16,7 +16,7 @@ from splatnode.capture.frame import Frame
 from splatnode.recon.config import Config
 from splatnode.recon.evaluate.appearance import Rasterize
 from splatnode.recon.evaluate.process import call_alone, run_alone
-from splatnode.recon.evaluate.protocol import STAGES, Networks, Poses, Row, Run, Settings, evaluate, shown_to_nobody
+from splatnode.recon.evaluate.protocol import STAGES, Networks, Poses, Row, Run, Settings, evaluate, ignore_render
 from splatnode.recon.evaluate.records import Bench, bench_files, read_bench, run_of, this_machine
 from splatnode.recon.evaluate.renders import Renders
 from splatnode.recon.evaluate.report import report_files
@@ -56,6 +56,8 @@ class Entrants:
 
 @dataclass(frozen=True)
 class Scoring:
+    """How the snapshots of a run are scored."""
+
     rasterize: Rasterize
     networks: Networks
     settings: Settings
@@ -102,7 +104,7 @@ def run_bench(
             bench = msgspec.structs.replace(bench, rows=(*bench.rows, *rows))
             write_files(out_dir, bench_files(bench) | report_files(bench, out_dir))
             left = (time.monotonic() - started) / number * (total - number)
-            logger.info("bench %d/%d, about %.0f min left: %s", number, total, left / 60, told(rows[-1]))
+            logger.info("bench %d/%d, about %.0f min left: %s", number, total, left / 60, run_line(rows[-1]))
     return bench
 
 
@@ -151,12 +153,12 @@ def _run(
     kept = Renders(out_dir, scene.name, views, method, seed, split.test[:: max(1, len(split.test) // _SHOWN)][:_SHOWN])
     poses: Poses = {}
     rows: list[Row] = []
-    for moment in reversed(outcome.moments):  # the end first: from its test poses the search goes on for the others
+    for moment in reversed(outcome.snapshots):  # the end first: from its test poses the search goes on for the others
         peaks = [peak for peak in (moment.peak_rss_mb, start and start.peak_rss_mb) if peak is not None]
         run = Run(method, seed, moment.checkpoint, moment.seconds, max(peaks, default=None))
         shown, networks = kept.keep, scoring.networks
         if moment.checkpoint is not None:
-            shown, networks = shown_to_nobody, networks.quickest
+            shown, networks = ignore_render, networks.quickest
         row = evaluate(
             moment.snapshot,
             scene,
@@ -187,8 +189,8 @@ def _failed_row(scene: EvaluationScene, views: int, method: str, seed: int, erro
     )
 
 
-def told(row: Row) -> str:
-    """A run in a line."""
+def run_line(row: Row) -> str:
+    """What a run scored and took, in one line of text."""
     scene, views, method, seed = run_of(row)
     score = "not scored" if row.psnr is None else f"{row.psnr:.2f} dB, {row.ssim:.3f} SSIM"
     seconds = row.seconds.get("total")

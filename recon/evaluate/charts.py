@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from splatnode.recon.evaluate.ablation import is_variant, variants
 from splatnode.recon.evaluate.protocol import Row, mean
-from splatnode.recon.evaluate.summary import Point, points, shared
+from splatnode.recon.evaluate.summary import MethodMean, method_means, shared
 from splatnode.recon.evaluate.tables import PSNR, SSIM, Measure, lpips, paired
 
 # Okabe and Ito's colours, which people with any colour vision tell apart, and a marker each for print without colour.
@@ -31,7 +31,7 @@ class Quality:
     """A measure of held-out views. Axes are turned so that better is up."""
 
     label: str
-    value: Callable[[Point], float | None]
+    value: Callable[[MethodMean], float | None]
     higher_is_better: bool
 
 
@@ -47,7 +47,9 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     Methods that were made for the ablation are drawn there alone; fields, which have no Gaussians, not in the second.
     """
     files = {}
-    measured = [p for p in points(shared([row for row in rows if not is_variant(row.method)])) if p.psnr is not None]
+    measured = [
+        p for p in method_means(shared([row for row in rows if not is_variant(row.method)])) if p.psnr is not None
+    ]
     if measured:
         files["speed_accuracy.png"] = _png(speed_accuracy(measured))
     if sized := [p for p in measured if p.num_gaussians]:
@@ -58,11 +60,11 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     return files
 
 
-def speed_accuracy(measured: Sequence[Point]) -> Figure:
+def speed_accuracy(measured: Sequence[MethodMean]) -> Figure:
     """Seconds against quality: a curve a method through its checkpoints, a bubble's area is the number of Gaussians."""
     largest = max((p.num_gaussians or 0.0 for p in measured), default=0.0)
 
-    def area(point: Point) -> float:
+    def area(point: MethodMean) -> float:
         share = (point.num_gaussians or 0.0) / largest if largest else 0.0
         return _SMALLEST + (_LARGEST - _SMALLEST) * share
 
@@ -71,7 +73,7 @@ def speed_accuracy(measured: Sequence[Point]) -> Figure:
     return figure
 
 
-def parsimony(measured: Sequence[Point]) -> Figure:
+def parsimony(measured: Sequence[MethodMean]) -> Figure:
     """Number of Gaussians against quality: what a method buys with its scene's size."""
     figure = _grid(measured, "Gaussians (log scale)", lambda p: p.num_gaussians, lambda p: 45.0)
     _head(figure, "Quality of held-out views against the number of Gaussians")
@@ -116,7 +118,10 @@ def pareto_front(pairs: Sequence[tuple[float, float]], higher_is_better: bool) -
 
 
 def _grid(
-    measured: Sequence[Point], x_label: str, x: Callable[[Point], float | None], area: Callable[[Point], float]
+    measured: Sequence[MethodMean],
+    x_label: str,
+    x: Callable[[MethodMean], float | None],
+    area: Callable[[MethodMean], float],
 ) -> Figure:
     """A row of charts a number of views, a column a measure."""
     views = sorted({p.views for p in measured})
@@ -143,11 +148,11 @@ def _grid(
 
 def _chart(
     chart: Axes,
-    here: Sequence[Point],
+    here: Sequence[MethodMean],
     methods: Sequence[str],
     quality: Quality,
-    x: Callable[[Point], float | None],
-    area: Callable[[Point], float],
+    x: Callable[[MethodMean], float | None],
+    area: Callable[[MethodMean], float],
 ) -> None:
     drawn = [(p, cost, value) for p in here if (cost := x(p)) and (value := quality.value(p)) is not None]
     front = pareto_front([(cost, value) for _, cost, value in drawn], quality.higher_is_better)
@@ -190,8 +195,8 @@ def _plain(chart: Axes) -> None:
     chart.tick_params(colors=_MUTED, labelsize=8)
 
 
-def _qualities(measured: Sequence[Point]) -> list[Quality]:
-    """PSNR, SSIM and the LPIPS that was measured at most points, VGG's rather than AlexNet's: checkpoints lack it."""
+def _qualities(measured: Sequence[MethodMean]) -> list[Quality]:
+    """PSNR, SSIM and the LPIPS that was measured more often, VGG's rather than AlexNet's: checkpoints lack it."""
     counts = {quality: sum(quality.value(p) is not None for p in measured) for quality in (_LPIPS_VGG, _LPIPS_ALEX)}
     most = max(counts, key=lambda quality: counts[quality])
     return [_PSNR, _SSIM, *([most] if counts[most] else [])]

@@ -23,8 +23,8 @@ Context = SpawnContext | ForkServerContext
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
-    """A snapshot that is to be scored, with what the run had cost by then."""
+class TimedSnapshot:
+    """A snapshot that is to be scored, with the time and memory that the run had taken by then."""
 
     snapshot: Snapshot
     checkpoint: int | None  # None: the end of the run
@@ -33,14 +33,16 @@ class Moment:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
-    moments: tuple[Moment, ...]
+class RunOutcome:
+    """The snapshots of a run, and why it failed if it did."""
+
+    snapshots: tuple[TimedSnapshot, ...]
     error: str | None
 
 
 def run_alone(
     reconstruct: Callable[[], Iterator[Snapshot]], checkpoints: Sequence[int], timeout_s: float, spent_s: float = 0.0
-) -> Outcome:
+) -> RunOutcome:
     """The snapshots of a run at its checkpoints and at its end. `spent_s` went before it and is added to its time.
 
     The clock runs only while the reconstruction works, not while it is saved. Both the function and what it is bound to
@@ -48,10 +50,10 @@ def run_alone(
     """
     with tempfile.TemporaryDirectory(prefix="splatnode-bench-") as folder:
         error = in_own_process(_run_and_save, (reconstruct, tuple(checkpoints), spent_s, folder), folder, timeout_s)
-        moments = tuple(pickle.loads(path.read_bytes()) for path in sorted(Path(folder).glob("*.moment")))
-    if error is None and not moments:
+        snapshots = tuple(pickle.loads(path.read_bytes()) for path in sorted(Path(folder).glob("*.moment")))
+    if error is None and not snapshots:
         error = "the reconstruction gave no snapshot"
-    return Outcome(moments, error)
+    return RunOutcome(snapshots, error)
 
 
 def call_alone(function: Callable[[], T], timeout_s: float, context: Context | None = None) -> T:
@@ -83,11 +85,11 @@ def in_own_process(
         if process.is_alive():
             process.kill()
             process.join()
-    told = Path(folder, "error.txt")
+    error_file = Path(folder, "error.txt")
     if timed_out:
         return f"stopped after {timeout_s:g} s"
-    if told.exists():
-        return told.read_text()
+    if error_file.exists():
+        return error_file.read_text()
     if process.exitcode != 0:
         return f"the process ended with code {process.exitcode}; -9 mostly means that the memory was used up"
     return None
@@ -126,5 +128,5 @@ def _run_and_save(
 
 def _save(folder: str, number: int, snapshot: Snapshot, checkpoint: int | None, total: float) -> None:
     stages: dict[str, float | None] = {stage: snapshot.seconds.get(stage) for stage in STAGES}
-    moment = Moment(snapshot, checkpoint, {**stages, "total": total}, peak_rss_mb())
+    moment = TimedSnapshot(snapshot, checkpoint, {**stages, "total": total}, peak_rss_mb())
     write_file(Path(folder, f"{number:04d}.moment"), pickle.dumps(moment))

@@ -15,7 +15,7 @@ from splatnode.recon.evaluate.appearance import Appearance, Rasterize, appearanc
 from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
 from splatnode.recon.evaluate.metrics import psnr, ssim
 from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.test_pose import align_test_pose
+from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.frames import border
 from splatnode.recon.frames.keyframe import modelled_image
@@ -24,7 +24,7 @@ from splatnode.recon.networks.lpips import Lpips, load_lpips
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
 STAGES = ("poses", "points", "optimise")
-_FIRST_RATE, _CONTINUED_RATE = 3e-3, 5e-4  # of the search for a test view's pose, in radians and parts of the depth
+_FIRST_RATE, _CONTINUED_RATE = 3e-3, 5e-4  # learning rates of the test-pose search, in radians and parts of the depth
 
 
 @dataclass(frozen=True)
@@ -95,8 +95,8 @@ Show = Callable[[str, Tensor, Tensor], None]  # name of a test view, photograph,
 Poses = MutableMapping[str, npt.NDArray[np.float64]]  # T_world_camera (4, 4) by the name of a test view
 
 
-def shown_to_nobody(name: str, truth: Tensor, image: Tensor) -> None:
-    """What is done with a render that nobody wants to see."""
+def ignore_render(name: str, truth: Tensor, image: Tensor) -> None:
+    """For a caller that wants no renders."""
 
 
 def load_networks(weights_dir: Path | None = None) -> Networks:
@@ -112,7 +112,7 @@ def evaluate(
     rasterize: Rasterize,
     networks: Networks,
     settings: Settings,
-    show: Show = shown_to_nobody,
+    show: Show = ignore_render,
     found: Poses | None = None,
 ) -> Row:
     """Scores a snapshot on the scene's test views. The truth is used here and nowhere earlier.
@@ -202,10 +202,10 @@ def _score_test_views(
         else:
             start = true_to_estimated.camera(scene.cameras[name].T_world_camera)
             steps, levels, rate = settings.alignment_steps, settings.alignment_levels, _FIRST_RATE
-        aligned = align_test_pose(appearance, truth, start, K, steps=steps, levels=levels, learning_rate=rate)
+        aligned = find_test_pose(appearance, truth, start, K, steps=steps, levels=levels, learning_rate=rate)
         T_world_camera = aligned.T_world_camera
         found.setdefault(name, T_world_camera)
-        with_rim = appearance.picture(T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
+        with_rim = appearance.render(T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
         image = with_rim[rows, columns]
         show(name, truth, image)
         scores.append(

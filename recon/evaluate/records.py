@@ -47,8 +47,8 @@ def merged(benches: Sequence[Bench]) -> Bench:
     Machine and command are all that were named.
     """
     if len({bench.settings for bench in benches}) != 1:
-        told = [dataclasses.asdict(bench.settings) for bench in benches]
-        raise ValueError(f"benchmarks can be put together if their views were scored alike, got settings {told}")
+        settings = [dataclasses.asdict(bench.settings) for bench in benches]
+        raise ValueError(f"benchmarks can be put together if their views were scored alike, got settings {settings}")
     last = {run: number for number, bench in enumerate(benches) for run in bench.done()}
     rows = tuple(row for number, bench in enumerate(benches) for row in bench.rows if last.get(run_of(row)) == number)
     machine = {key: value for bench in benches for key, value in bench.machine.items()}

@@ -1,4 +1,4 @@
-"""A benchmark told to people: report.md, and report.html with charts and with renders beside their photographs."""
+"""A benchmark for people to read: report.md, and report.html with charts and with renders beside their photographs."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _STYLE = (
 
 def report_files(bench: Bench, out_dir: Path) -> dict[str, bytes]:
     """report.md and report.html; the latter shows the charts and renders that lie in `out_dir`."""
-    told = tables(bench.rows)
-    return {"report.md": _markdown(bench, told).encode(), "report.html": _html(bench, told, out_dir).encode()}
+    found = tables(bench.rows)
+    return {"report.md": _markdown(bench, found).encode(), "report.html": _html(bench, found, out_dir).encode()}
 
 
 def redraw(bench: Bench, out_dir: Path) -> None:
@@ -62,20 +62,20 @@ def _introduction(bench: Bench) -> str:
     )
 
 
-def _markdown(bench: Bench, told: Sequence[Table]) -> str:
+def _markdown(bench: Bench, found: Sequence[Table]) -> str:
     lines = ["# Benchmark", "", f"Command: `{bench.command}`", "", _introduction(bench)]
-    for table in told:
+    for table in found:
         rows = (table.head, ["---"] * len(table.head), *table.body)
         lines += ["", f"## {table.title}", "", *(f"| {' | '.join(row)} |" for row in rows)]
     return "\n".join(lines) + "\n"
 
 
-def _html(bench: Bench, told: Sequence[Table], out_dir: Path) -> str:
+def _html(bench: Bench, found: Sequence[Table], out_dir: Path) -> str:
     charts = [path.name for path in sorted(out_dir.glob("*.png"))]
     parts = [
         f"<h1>Benchmark</h1><p><code>{html.escape(bench.command)}</code></p><p>{html.escape(_introduction(bench))}</p>",
         *(f'<p><img src="{name}" alt="{name}"></p>' for name in charts),
-        *(_html_table(table) for table in told),
+        *(_html_table(table) for table in found),
         *_galleries([row for row in bench.rows if row.final], out_dir),
     ]
     head = f'<meta charset="utf-8"><title>Benchmark</title><style>{_STYLE}</style>'
@@ -98,8 +98,8 @@ def _galleries(ends: Sequence[Row], out_dir: Path) -> list[str]:
         for row in (row for row in ends if (row.scene, row.views) == (scene, views)):
             for view, path in kept(out_dir, row).items():
                 photograph = _figure(path.parent / PHOTOGRAPH, f"{view}: photograph", out_dir)
-                told = f"{row.method}, seed {row.seed}: {number(row.psnr, 2)} dB over all views"
-                shown.setdefault(view, [photograph]).append(_figure(path, told, out_dir))
+                caption = f"{row.method}, seed {row.seed}: {number(row.psnr, 2)} dB over all views"
+                shown.setdefault(view, [photograph]).append(_figure(path, caption, out_dir))
         if shown:
             parts.append(f"<h2>{html.escape(scene)}, {views} views</h2>")
             parts += [f"<div>{''.join(figures)}</div>" for figures in shown.values()]

@@ -10,8 +10,8 @@ from splatnode.recon.evaluate.protocol import Row, mean
 
 
 @dataclass(frozen=True)
-class Point:
-    """One method at one moment: means over its published runs, None where one of them was not measured."""
+class MethodMean:
+    """A method at a checkpoint or its end: means over its published runs, None where one of them was not measured."""
 
     views: int
     method: str
@@ -43,8 +43,8 @@ def shared(rows: Sequence[Row]) -> list[Row]:
     return [row for row in rows if not common[row.views] or (row.scene, row.seed) in common[row.views]]
 
 
-def points(rows: Sequence[Row]) -> list[Point]:
-    """One Point for each (views, method, checkpoint), in the order of the benchmark; ends come after checkpoints.
+def method_means(rows: Sequence[Row]) -> list[MethodMean]:
+    """One MethodMean for each (views, method, checkpoint), in the order of the benchmark; ends come after checkpoints.
 
     A run that ended before a checkpoint counts there with its end: every point of a curve is over the same runs.
     """
@@ -56,7 +56,7 @@ def points(rows: Sequence[Row]) -> list[Point]:
     for (views, method), runs in sorted(groups.items(), key=lambda item: item[0][0]):
         for moment in sorted({_moment(row) for run in runs.values() for row in run}):
             chosen = [_row_at(run, moment) for run in runs.values()]
-            found.append(_point(views, method, None if moment == math.inf else int(moment), chosen))
+            found.append(_method_mean(views, method, None if moment == math.inf else int(moment), chosen))
     return found
 
 
@@ -71,7 +71,7 @@ def _row_at(run: Sequence[Row], moment: float) -> Row:
     return min(beyond, key=_moment) if beyond else max(run, key=_moment)
 
 
-def _point(views: int, method: str, checkpoint: int | None, rows: Sequence[Row]) -> Point:
+def _method_mean(views: int, method: str, checkpoint: int | None, rows: Sequence[Row]) -> MethodMean:
     """Seconds, Gaussians and bytes are those of the published runs, like the quality that they bought."""
     solved = [row for row in rows if row.psnr is not None]
 
@@ -81,7 +81,7 @@ def _point(views: int, method: str, checkpoint: int | None, rows: Sequence[Row])
     scene_bytes = over_all([row.scene_bytes for row in solved])
     names = ("psnr", "ssim", "lpips_alex", "lpips_vgg", "num_gaussians", "peak_rss_mb")
     poses = ("rotation_error_deg", "centre_error_pct", "focal_error_pct")
-    return Point(
+    return MethodMean(
         views,
         method,
         checkpoint,

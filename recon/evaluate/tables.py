@@ -8,7 +8,7 @@ from statistics import stdev
 
 from splatnode.recon.evaluate import ablation
 from splatnode.recon.evaluate.protocol import Row, mean
-from splatnode.recon.evaluate.summary import Point, points, shared
+from splatnode.recon.evaluate.summary import MethodMean, method_means, shared
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ def tables(rows: Sequence[Row]) -> list[Table]:
     ends = [row for row in rows if row.final]
     compared = [row for row in ends if not ablation.is_variant(row.method)]
     counts = sorted({row.views for row in compared})
-    overview = points(shared(compared))
+    overview = method_means(shared(compared))
     return [
         *(Table(f"{n} views", _HEAD, tuple(_cells(p) for p in overview if p.views == n)) for n in counts),
         *([by_views(shared(compared))] if compared else []),
@@ -143,7 +143,7 @@ _RUN_HEAD = (
 )
 
 
-def _cells(p: Point) -> tuple[str, ...]:
+def _cells(p: MethodMean) -> tuple[str, ...]:
     return (
         p.method,
         f"{p.solved}/{p.runs}",

@@ -23,8 +23,8 @@ from splatnode.recon.result.verdict import Code, Verdict
 
 THUMBNAIL_SIDE = 320  # pixels
 THUMBNAIL_QUALITY = 85  # of 100, as JPEG
-MAX_CAMERAS = 1000
-FIELDS = ("means", "quats", "scales", "opacities", "sh", "source_frame")
+MAX_CAMERAS = 1000  # of a message: bounds what a hostile one can make a viewer allocate
+GAUSSIAN_FIELDS = ("means", "quats", "scales", "opacities", "sh", "source_frame")
 
 Finite = Annotated[float, msgspec.Meta(ge=-1e12, le=1e12)]
 Pixels = Annotated[int, msgspec.Meta(ge=1, le=65536)]
@@ -91,14 +91,14 @@ def to_message(
         final=snapshot.final,
     )
     thumbnails = [to_jpeg(thumbnail(snapshot.images[camera.name]), THUMBNAIL_QUALITY) for camera in snapshot.cameras]
-    return header, [*(getattr(snapshot.gaussians, name) for name in FIELDS), *thumbnails]
+    return header, [*(getattr(snapshot.gaussians, name) for name in GAUSSIAN_FIELDS), *thumbnails]
 
 
 def from_message(message: Message[SceneHeader]) -> LiveScene:
     """The scene in a message. Raises WireError where arrays and header do not belong together."""
     header = message.header
-    gaussians = _gaussians(message.arrays[: len(FIELDS)])
-    thumbnails = message.arrays[len(FIELDS) :]
+    gaussians = _gaussians(message.arrays[: len(GAUSSIAN_FIELDS)])
+    thumbnails = message.arrays[len(GAUSSIAN_FIELDS) :]
     if len(thumbnails) != len(header.cameras):
         raise WireError(f"{len(header.cameras)} cameras with {len(thumbnails)} thumbnails")
     if header.code not in Code.__members__:
@@ -161,12 +161,12 @@ def camera_from(record: CameraRecord) -> CameraEstimate:
 
 
 def _gaussians(arrays: tuple[npt.NDArray, ...]) -> GaussianArrays:
-    if len(arrays) != len(FIELDS):
-        raise WireError(f"{len(arrays)} arrays of Gaussians, expected {', '.join(FIELDS)}")
+    if len(arrays) != len(GAUSSIAN_FIELDS):
+        raise WireError(f"{len(arrays)} arrays of Gaussians, expected {', '.join(GAUSSIAN_FIELDS)}")
     count = len(arrays[0]) if arrays[0].ndim else 0
     bases = arrays[4].shape[1] if arrays[4].ndim == 3 else 0
     expected = [(count, 3), (count, 4), (count, 3), (count,), (count, bases, 3), (count,)]
-    for name, array, shape in zip(FIELDS, arrays, expected, strict=True):
+    for name, array, shape in zip(GAUSSIAN_FIELDS, arrays, expected, strict=True):
         kind = np.int32 if name == "source_frame" else np.float32
         if array.dtype != kind or array.shape != shape:
             raise WireError(f"{name} must be {np.dtype(kind)} {shape}, got {array.dtype} {array.shape}")

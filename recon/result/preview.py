@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.image_file import encode_png
-from splatnode.recon.result.picture import take_picture
+from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 
 Image = npt.NDArray[np.uint8]
@@ -21,7 +21,7 @@ def render_rgb(
     height: int,
 ) -> npt.NDArray[np.float32]:
     """(H, W, 3) the Gaussians' image on black, in [0, 1]."""
-    return np.clip(take_picture(gaussians, T_world_camera, K, width, height).rgb, 0.0, 1.0)
+    return np.clip(render_arrays(gaussians, T_world_camera, K, width, height).rgb, 0.0, 1.0)
 
 
 def render_camera(gaussians: GaussianArrays, camera: CameraEstimate) -> Image:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Scale:
+    """Whether lengths are metres, and how that is known."""
+
     metric: bool = False  # lengths are metres
     source: str | None = None  # of the metres, or why there are none although they were asked for
 

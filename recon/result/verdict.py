@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 
 class Code(enum.Enum):
+    """What a verdict can be. `recon/verification/refusals.py` has the sentences and the advice."""
+
     OK = "OK"
     OK_PARTIAL = "OK_PARTIAL"
     TOO_FEW_VIEWS = "TOO_FEW_VIEWS"

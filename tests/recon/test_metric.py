@@ -15,7 +15,7 @@ from splatnode.recon.metric import Baseline, Config, MetricDepth, by_network, in
 from splatnode.recon.networks.crop import crop
 from splatnode.recon.result.export import export_scene
 from splatnode.recon.result.export.formats.ply import decode as decode_ply
-from splatnode.recon.result.picture import take_picture
+from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.write import finish
@@ -49,7 +49,7 @@ def test_a_known_distance_gives_the_unit(seen):
     np.testing.assert_allclose(metric.gaussians.scales, 4.0 * seen.gaussians.scales, rtol=1e-6)
     assert metric.scale.metric and metric.scale.source == "2 m between a.jpg and b.jpg, known to 0.7 %"
     looks = [
-        take_picture(each.gaussians, camera.T_world_camera, camera.K, camera.width, camera.height).rgb
+        render_arrays(each.gaussians, camera.T_world_camera, camera.K, camera.width, camera.height).rgb
         for each, camera in ((seen, seen.cameras[1]), (metric, metric.cameras[1]))
     ]
     np.testing.assert_allclose(looks[0], looks[1], atol=2e-3)  # the same scene
@@ -73,7 +73,7 @@ def test_a_network_gives_the_unit_where_its_views_agree(seen):
 
         def depth(image: np.ndarray):
             factor, camera = next(asked)
-            truth = take_picture(
+            truth = render_arrays(
                 seen.gaussians, camera.T_world_camera, camera.K, camera.width, camera.height, channels=("depth",)
             )
             to = crop(camera.width, camera.height, max(camera.width, camera.height), 1)

@@ -22,7 +22,7 @@ from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
 from splatnode.recon.evaluate.metrics import psnr
 from splatnode.recon.evaluate.protocol import mean_intrinsics
 from splatnode.recon.evaluate.splits import load_split
-from splatnode.recon.evaluate.test_pose import align_test_pose
+from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -92,7 +92,7 @@ def held_out_psnr(snapshot: Snapshot, index: int) -> float:
     )
     K = mean_intrinsics(snapshot.cameras, SMALL.width, SMALL.height)
     start = to_estimated.camera(T_world_camera)
-    aligned = align_test_pose(Splats(snapshot.gaussians, rasterize), image, start, K, steps=60, levels=2)
+    aligned = find_test_pose(Splats(snapshot.gaussians, rasterize), image, start, K, steps=60, levels=2)
     rendered = render_rgb(snapshot.gaussians, aligned.T_world_camera, K, SMALL.width, SMALL.height)
     return psnr(torch.from_numpy(rendered), image)
 

@@ -113,7 +113,7 @@ def test_a_session_from_the_first_moment_to_a_click():
     centre = project(first.snapshot.cameras[1].T_world_camera[None, :3, 3], view, 100, 80)[0]
     assert session.click(centre[0], centre[1], 100, 80) and session.state.camera == "1.png"
     assert np.array_equal(session.viewpoint().T_world_camera, first.snapshot.cameras[1].T_world_camera)
-    session.move(orbited(session.grasped(), 0.1, 0.0))
+    session.move(orbited(session.viewpoint_to_move(), 0.1, 0.0))
     assert session.state.camera is None
     chosen = session.viewpoint()
     feed.waiting.append(second)
@@ -171,7 +171,7 @@ def test_gaussians_are_painted_again_only_where_they_look_different():
     assert np.array_equal(session.paint(60, 40), without) and session.paintings == 1  # nothing was left behind
     session.press("g")
     session.paint(60, 40)
-    session.move(orbited(session.grasped(), 0.1, 0.0))
+    session.move(orbited(session.viewpoint_to_move(), 0.1, 0.0))
     session.paint(60, 40)
     session.paint(30, 20)
     assert session.paintings == 4

@@ -7,7 +7,7 @@ import pytest
 
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.viewer.canvas import project
-from splatnode.viewer.viewpoint import Viewpoint, look_at, orbited, overview, panned, swing, zoomed
+from splatnode.viewer.viewpoint import Viewpoint, look_at, orbited, overview, panned, turntable_views, zoomed
 from tests.viewer.test_scene import K, camera, moment, wall
 
 UP = np.array([0.0, -1.0, 0.0])
@@ -69,8 +69,8 @@ def test_the_overview_shows_all_cameras_and_the_swing_goes_around():
     assert (np.abs(project(aside[None], overview(there), 100, 80)[0, :2] - [50, 40]) > [50, 40]).any()
     wider = project(np.array([aside, *centres]), overview(there, [aside]), 100, 80)
     assert (wider[:, :2] > 0).all() and (wider[:, :2] < [100, 80]).all()
-    tour = swing(there, 8)
+    tour = turntable_views(there, 8)
     assert len(tour) == 8 and all(np.allclose(view.pivot, tour[0].pivot) for view in tour)
     assert max(view.T_world_camera[0, 3] for view in tour) > 0.15 > -0.15 > min(v.T_world_camera[0, 3] for v in tour)
     for bare in (moment(wall()), moment(GaussianArrays.empty()), moment(wall(), camera(0.0))):
-        assert all(np.isfinite(view.T_world_camera).all() for view in swing(bare, 3))
+        assert all(np.isfinite(view.T_world_camera).all() for view in turntable_views(bare, 3))

@@ -26,8 +26,8 @@ from splatnode.capture.frame import Frame
 from splatnode.recon.clock import Clock
 from splatnode.recon.evaluate.appearance import Splats
 from splatnode.recon.evaluate.rivals import colmap_3dgs, known_depth, outcome
-from splatnode.recon.evaluate.rivals.known_depth import Sight
-from splatnode.recon.evaluate.test_pose import align_test_pose
+from splatnode.recon.evaluate.rivals.known_depth import FrameWithDepth
+from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.optimize import refinement
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import ControlChoice
@@ -66,27 +66,29 @@ def reconstruct(frames: Sequence[Frame], seed: int, config: Config | None = None
 
 
 def _frame_by_frame(
-    frames: Sequence[Frame], known: Sequence[Sight], seed: int, config: Config, clock: Clock
+    frames: Sequence[Frame], known: Sequence[FrameWithDepth], seed: int, config: Config, clock: Clock
 ) -> Iterator[Snapshot]:
     scene = Scene((_view(known[0], np.eye(4)),), _from_depth(known[0], np.eye(4), config))
-    for sight, following in pairwise(known):
-        T_world_camera = _next_pose(sight, scene.views[-1], following, seed, config)
+    for frame, following in pairwise(known):
+        T_world_camera = _next_pose(frame, scene.views[-1], following, seed, config)
         scene = replace(scene, views=(*scene.views, _view(following, T_world_camera)))
         scene = _refined(scene, _TOGETHER, config.growing, seed)
     clock.lap("poses")
     together = msgspec.structs.replace(_TOGETHER, iterations=config.final, checkpoints=(config.final // 3,))
-    refined = refinement.refine(scene, colmap_3dgs.in_extent(together, scene), seed=seed)
-    yield from (outcome.of_scene(frames, each) for each in refined)
+    refined = refinement.refine(scene, colmap_3dgs.in_parts_of_extent(together, scene), seed=seed)
+    yield from (outcome.snapshot_of(frames, each) for each in refined)
 
 
-def _next_pose(sight: Sight, view: TrainingView, following: Sight, seed: int, config: Config) -> np.ndarray:
-    """(4, 4) T_world_camera from which the Gaussians of `sight` alone look like the following frame."""
+def _next_pose(
+    frame: FrameWithDepth, view: TrainingView, following: FrameWithDepth, seed: int, config: Config
+) -> np.ndarray:
+    """(4, 4) T_world_camera from which the Gaussians of `frame` alone look like the following frame."""
     T_world_camera = view.T_world_camera.double().numpy()
-    alone = Scene((view,), _from_depth(sight, T_world_camera, config))
+    alone = Scene((view,), _from_depth(frame, T_world_camera, config))
     fitted = _refined(alone, _ALONE, config.alone, seed)
     image = torch.from_numpy(following.image).float() / 255.0
     look = _Alone(fitted.arrays(), rasterize)
-    aligned = align_test_pose(
+    aligned = find_test_pose(
         look,
         image,
         T_world_camera,
@@ -114,20 +116,20 @@ def _refined(scene: Scene, config: refinement.Config, iterations: int, seed: int
     """One view has no extent: lengths are then in parts of its depth, which is about 1."""
     config = msgspec.structs.replace(config, iterations=iterations)
     if len(scene.views) > 1:
-        config = colmap_3dgs.in_extent(config, scene)
+        config = colmap_3dgs.in_parts_of_extent(config, scene)
     (last,) = deque(refinement.refine(scene, config, seed=seed), maxlen=1)
     return last
 
 
-def _view(sight: Sight, T_world_camera: np.ndarray) -> TrainingView:
-    T, K = torch.from_numpy(T_world_camera).float(), torch.from_numpy(sight.K).float()
-    return TrainingView(sight.name, sight.frame_id, sight.image, T, K, None, None)
+def _view(frame: FrameWithDepth, T_world_camera: np.ndarray) -> TrainingView:
+    T, K = torch.from_numpy(T_world_camera).float(), torch.from_numpy(frame.K).float()
+    return TrainingView(frame.name, frame.frame_id, frame.image, T, K, None, None)
 
 
-def _from_depth(sight: Sight, T_world_camera: np.ndarray, config: Config) -> Gaussians:
+def _from_depth(frame: FrameWithDepth, T_world_camera: np.ndarray, config: Config) -> Gaussians:
     """A Gaussian for every `stride`-th pixel of every such row."""
     chosen = slice(config.stride // 2, None, config.stride), slice(config.stride // 2, None, config.stride)
-    points = world_points(sight.depth, T_world_camera, sight.K)[chosen].reshape(-1, 3)
-    rgb = (sight.image[chosen].reshape(-1, 3) / 255.0).astype(np.float32)
-    frame = np.full(len(points), sight.frame_id, np.int32)
-    return gaussians_at(np.ascontiguousarray(points), rgb, frame, config.opacity)
+    points = world_points(frame.depth, T_world_camera, frame.K)[chosen].reshape(-1, 3)
+    rgb = (frame.image[chosen].reshape(-1, 3) / 255.0).astype(np.float32)
+    source_frame = np.full(len(points), frame.frame_id, np.int32)
+    return gaussians_at(np.ascontiguousarray(points), rgb, source_frame, config.opacity)

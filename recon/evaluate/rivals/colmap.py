@@ -22,7 +22,7 @@ Mapper = Callable[[Path, int], Mapping[int, pycolmap.Reconstruction]]
 
 
 @dataclass(frozen=True, eq=False)
-class Placed:
+class RegisteredFrame:
     """A frame with the camera that was found for it."""
 
     frame: Frame
@@ -32,12 +32,12 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """The largest model. The world is the first placed camera's frame; the points' median depth there is 1."""
+    """The largest model. The world is the first registered camera's frame; the points' median depth there is 1."""
 
-    placed: tuple[Placed, ...]  # in the order of the frames
+    registered: tuple[RegisteredFrame, ...]  # in the order of the frames
     points: Array  # (P, 3) world
     colours: npt.NDArray[np.uint8]  # (P, 3)
-    seen_by: tuple[npt.NDArray[np.int64], ...]  # for each placed frame, the points that it observes
+    observed: tuple[npt.NDArray[np.int64], ...]  # for each registered frame, the points that it observes
 
 
 def incremental(folder: Path, seed: int) -> Mapping[int, pycolmap.Reconstruction]:
@@ -55,7 +55,7 @@ def global_(folder: Path, seed: int) -> Mapping[int, pycolmap.Reconstruction]:
     return pycolmap.global_mapping(folder / "database.db", folder / "images", folder / "models", options)
 
 
-def mapped(frames: Sequence[Frame], seed: int, mapping: Mapper = incremental) -> Model | None:
+def sparse_model(frames: Sequence[Frame], seed: int, mapping: Mapper = incremental) -> Model | None:
     """The largest model that `mapping` makes of the frames; None where it makes none."""
     if len(frames) < 2:
         return None
@@ -106,22 +106,22 @@ def _model(found: pycolmap.Reconstruction, frames: Sequence[Frame]) -> Model:
     Ts = np.stack([_inverse(image.cam_from_world().matrix()) for _, image in images])
     place = {point_id: row for row, point_id in enumerate(found.points3D)}
     points = np.array([point.xyz for point in found.points3D.values()], np.float64).reshape(-1, 3)
-    seen_by = tuple(
+    observed = tuple(
         np.array([place[p.point3D_id] for p in image.points2D if p.has_point3D()], np.int64) for _, image in images
     )
     to_first = np.linalg.inv(Ts[0])
     Ts, points = to_first @ Ts, points @ to_first[:3, :3].T + to_first[:3, 3]
-    depths = [(points[seen] - T[:3, 3]) @ T[:3, 2] for seen, T in zip(seen_by, Ts, strict=True)]
+    depths = [(points[seen] - T[:3, 3]) @ T[:3, 2] for seen, T in zip(observed, Ts, strict=True)]
     scale = 1.0 / float(np.median(np.concatenate(depths)))
     Ts[:, :3, 3] *= scale
     return Model(
         tuple(
-            Placed(frame, T, _intrinsics(found.cameras[image.camera_id]))
+            RegisteredFrame(frame, T, _intrinsics(found.cameras[image.camera_id]))
             for (frame, image), T in zip(images, Ts, strict=True)
         ),
         scale * points,
         np.array([point.color for point in found.points3D.values()], np.uint8).reshape(-1, 3),
-        seen_by,
+        observed,
     )
 
 

@@ -17,7 +17,7 @@ import torch
 from splatnode.capture.frame import Frame
 from splatnode.recon.clock import Clock
 from splatnode.recon.evaluate.rivals import outcome
-from splatnode.recon.evaluate.rivals.colmap import Model, Placed, mapped
+from splatnode.recon.evaluate.rivals.colmap import Model, RegisteredFrame, sparse_model
 from splatnode.recon.frames.keyframe import modelled_image
 from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.optimize import dropout, refinement
@@ -60,38 +60,38 @@ def optimised(
 ) -> Iterator[Snapshot]:
     """The same from what `beginning` makes of COLMAP's model and the seed."""
     clock = Clock()
-    model = mapped(frames, seed)
+    model = sparse_model(frames, seed)
     clock.lap("poses")
-    if model is None or len(model.placed) < outcome.MIN_CAMERAS:
+    if model is None or len(model.registered) < outcome.MIN_CAMERAS:
         yield outcome.refused(frames, clock)
         return
     scene = beginning(model, seed)
     clock.lap("points")
-    refined = refinement.refine(scene, in_extent(config, scene), seed=seed)
-    yield from outcome.told((outcome.of_scene(frames, each) for each in refined), clock)
+    refined = refinement.refine(scene, in_parts_of_extent(config, scene), seed=seed)
+    yield from outcome.numbered((outcome.snapshot_of(frames, each) for each in refined), clock)
 
 
 def begin(model: Model, _seed: int) -> Scene:
     """The model's cameras, and a Gaussian for each of its points."""
     rgb = (model.colours / 255.0).astype(np.float32)
     first_seen = np.zeros(len(model.points), np.int32)
-    for placed, seen in reversed(list(zip(model.placed, model.seen_by, strict=True))):
-        first_seen[seen] = placed.frame.frame_id
+    for registered, seen in reversed(list(zip(model.registered, model.observed, strict=True))):
+        first_seen[seen] = registered.frame.frame_id
     gaussians = gaussians_at(model.points.astype(np.float32), rgb, first_seen, _OPACITY)
-    return Scene(tuple(map(view, model.placed)), gaussians)
+    return Scene(tuple(map(view, model.registered)), gaussians)
 
 
-def view(placed: Placed) -> TrainingView:
-    """A placed frame without its lens' distortion, at modelled size."""
-    frame = undistorted(replace(placed.frame, intrinsics=placed.intrinsics))
+def view(registered: RegisteredFrame) -> TrainingView:
+    """A registered frame without its lens' distortion, at modelled size."""
+    frame = undistorted(replace(registered.frame, intrinsics=registered.intrinsics))
     assert frame.intrinsics is not None  # COLMAP's
     image = modelled_image(frame.image, SIZE)
     K = frame.intrinsics.resized(image.shape[1], image.shape[0]).K
-    T_world_camera = torch.from_numpy(placed.T_world_camera).float()
+    T_world_camera = torch.from_numpy(registered.T_world_camera).float()
     return TrainingView(frame.name, frame.frame_id, image, T_world_camera, torch.from_numpy(K).float(), None, None)
 
 
-def in_extent(config: refinement.Config, scene: Scene) -> refinement.Config:
+def in_parts_of_extent(config: refinement.Config, scene: Scene) -> refinement.Config:
     """The configuration with the means' step size in parts of the extent of the scene."""
     means = config.rates.means * adaptive.extent([view.T_world_camera for view in scene.views])
     return msgspec.structs.replace(config, rates=msgspec.structs.replace(config.rates, means=means))

@@ -47,7 +47,7 @@ def with_depth(model: Model, seed: int) -> Scene:
     scene = colmap_3dgs.begin(model, seed)
     Ts, Ks = ([getattr(view, name).double().numpy() for view in scene.views] for name in ("T_world_camera", "K"))
     views, sparse = [], []
-    for view, T, K, seen in zip(scene.views, Ts, Ks, model.seen_by, strict=True):
+    for view, T, K, seen in zip(scene.views, Ts, Ks, model.observed, strict=True):
         points = (model.points[seen] - T[:3, 3]) @ T[:3, :3]
         points = points[points[:, 2] > 0]
         pixels = points @ K.T

@@ -25,8 +25,8 @@ _SERVED_BY = {"depth": "multi-view depth"}
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """A photograph with its depth. Where its camera stood is not said."""
+class FrameWithDepth:
+    """A photograph with its depth. The pose of its camera is not given."""
 
     name: str
     frame_id: int
@@ -36,23 +36,23 @@ class Sight:
 
 
 def optimised(
-    frames: Sequence[Frame], seed: int, learnt: Callable[[tuple[Sight, ...], Clock], Iterable[Snapshot]]
+    frames: Sequence[Frame], seed: int, learnt: Callable[[tuple[FrameWithDepth, ...], Clock], Iterable[Snapshot]]
 ) -> Iterator[Snapshot]:
-    """The snapshots that `learnt` makes of the sights; one refusal where fewer than three frames have a depth.
+    """The snapshots that `learnt` makes of the frames with their depth; one refusal where fewer than three have one.
 
     The clock is for what `learnt` does before its first snapshot.
     """
     clock = Clock()
-    known = sights(frames, seed)
+    known = frames_with_depth(frames, seed)
     clock.lap("points")
     if len(known) < outcome.MIN_CAMERAS:
         yield outcome.refused(frames, clock)
     else:
-        yield from outcome.told(learnt(known, clock), clock, _SERVED_BY)
+        yield from outcome.numbered(learnt(known, clock), clock, _SERVED_BY)
 
 
-def sights(frames: Sequence[Frame], seed: int) -> tuple[Sight, ...]:
-    """The frames whose depth is known, in their order; none where our own verdict is that they make no scene."""
+def frames_with_depth(frames: Sequence[Frame], seed: int) -> tuple[FrameWithDepth, ...]:
+    """The frames whose depth is known, in their order; none where splatnode itself refuses the frames."""
     work = Reconstruction(Config(seed=seed))
     for frame in frames:
         work.take(frame)
@@ -61,7 +61,9 @@ def sights(frames: Sequence[Frame], seed: int) -> tuple[Sight, ...]:
         return ()
     views = sorted(work.begun.views, key=lambda view: view.frame_id)
     return tuple(
-        Sight(view.name, view.frame_id, view.image, _everywhere(view.pointmap, view.image), view.K.double().numpy())
+        FrameWithDepth(
+            view.name, view.frame_id, view.image, _everywhere(view.pointmap, view.image), view.K.double().numpy()
+        )
         for view in views
         if view.pointmap is not None
     )

@@ -17,8 +17,8 @@ from splatnode.capture.frame import Frame
 from splatnode.recon.clock import Clock
 from splatnode.recon.evaluate.rivals import outcome
 from splatnode.recon.evaluate.rivals.nerf import fit
+from splatnode.recon.evaluate.rivals.nerf.appearance import snapshot_of_field
 from splatnode.recon.evaluate.rivals.nerf.cameras import Focal
-from splatnode.recon.evaluate.rivals.nerf.look import of_field
 from splatnode.recon.frames.keyframe import modelled_image
 from splatnode.recon.result.snapshot import Snapshot
 
@@ -34,4 +34,4 @@ def reconstruct(frames: Sequence[Frame], seed: int, config: fit.Config = OPTIMIZ
         return
     images = [torch.from_numpy(modelled_image(frame.image, SIZE)).float() / 255.0 for frame in frames]
     learnt = fit.learn(images, Focal(1.0), config, seed=seed)
-    yield from outcome.told((of_field(frames, frames, each) for each in learnt), clock)
+    yield from outcome.numbered((snapshot_of_field(frames, frames, each) for each in learnt), clock)

@@ -18,10 +18,10 @@ from torch.nn import functional
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.evaluate.rivals import known_depth
-from splatnode.recon.evaluate.rivals.known_depth import Sight
+from splatnode.recon.evaluate.rivals.known_depth import FrameWithDepth
 from splatnode.recon.evaluate.rivals.nerf import fit
+from splatnode.recon.evaluate.rivals.nerf.appearance import snapshot_of_field, spread_pixels
 from splatnode.recon.evaluate.rivals.nerf.cameras import Focal
-from splatnode.recon.evaluate.rivals.nerf.look import lattice, of_field
 from splatnode.recon.evaluate.rivals.nerfmm import OPTIMIZE, SIZE
 from splatnode.recon.frames.keyframe import modelled_image
 from splatnode.recon.result.snapshot import Snapshot
@@ -36,45 +36,49 @@ def reconstruct(frames: Sequence[Frame], seed: int, config: fit.Config = OPTIMIZ
     return known_depth.optimised(frames, seed, lambda known, _clock: _learnt(frames, known, seed, config))
 
 
-def _learnt(frames: Sequence[Frame], known: Sequence[Sight], seed: int, config: fit.Config) -> Iterator[Snapshot]:
+def _learnt(
+    frames: Sequence[Frame], known: Sequence[FrameWithDepth], seed: int, config: fit.Config
+) -> Iterator[Snapshot]:
     by_name = {frame.name: frame for frame in frames}
-    placed = [by_name[sight.name] for sight in known]
-    views = [_look(sight) for sight in known]
-    focal = Focal(float(np.mean([sight.K[0, 0] / max(sight.image.shape) for sight in known]))).requires_grad_(False)
-    terms = Terms(views, focal)
+    registered = [by_name[frame.name] for frame in known]
+    views = [_view_with_depth(frame) for frame in known]
+    focal = Focal(float(np.mean([frame.K[0, 0] / max(frame.image.shape) for frame in known]))).requires_grad_(False)
+    terms = ExtraLosses(views, focal)
     learnt = fit.learn(
         [view.image for view in views], focal, config, seed=seed, further=terms, beside=(terms.scales, terms.offsets)
     )
-    yield from (of_field(frames, placed, each) for each in learnt)
+    yield from (snapshot_of_field(frames, registered, each) for each in learnt)
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class ViewWithDepth:
     image: Tensor  # (h, w, 3)
     depth: Tensor  # (h, w), whose median is 1
 
 
-def _look(sight: Sight) -> Look:
-    image = modelled_image(sight.image, SIZE)
-    depth = cv2.resize(sight.depth, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_NEAREST)
-    return Look(torch.from_numpy(image).float() / 255.0, torch.from_numpy(depth / np.float32(np.median(depth))).float())
+def _view_with_depth(frame: FrameWithDepth) -> ViewWithDepth:
+    image = modelled_image(frame.image, SIZE)
+    depth = cv2.resize(frame.depth, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_NEAREST)
+    return ViewWithDepth(
+        torch.from_numpy(image).float() / 255.0, torch.from_numpy(depth / np.float32(np.median(depth))).float()
+    )
 
 
-class Terms:
+class ExtraLosses:
     """The losses beside the colours', with the scale and offset of each view's depth; the first one's is the unit."""
 
-    def __init__(self, views: Sequence[Look], focal: Focal) -> None:
+    def __init__(self, views: Sequence[ViewWithDepth], focal: Focal) -> None:
         self._views, self._focal = views, focal
         self.scales = nn.Parameter(torch.ones(len(views) - 1))
         self.offsets = nn.Parameter(torch.zeros(len(views) - 1))
 
-    def __call__(self, glance: fit.Glance) -> Tensor:
-        columns, rows = glance.pixels.long().unbind(1)
-        loss = _DEPTH * (glance.seen.depth - self._depth(glance.view)[rows, columns]).abs().mean()
-        if glance.progress >= _PAIRS_UNTIL:
+    def __call__(self, step: fit.Step) -> Tensor:
+        columns, rows = step.pixels.long().unbind(1)
+        loss = _DEPTH * (step.rays.depth - self._depth(step.view)[rows, columns]).abs().mean()
+        if step.progress >= _PAIRS_UNTIL:
             return loss
-        first = min(glance.view, len(self._views) - 2)
-        Ts = [glance.cameras.T_world_camera(index) for index in (first, first + 1)]
+        first = min(step.view, len(self._views) - 2)
+        Ts = [step.cameras.T_world_camera(index) for index in (first, first + 1)]
         T_second_first = torch.linalg.inv(Ts[1]) @ Ts[0]
         cloud = self.cloud(first) @ T_second_first[:3, :3].T + T_second_first[:3, 3]
         return loss + _CLOUD * chamfer(cloud, self.cloud(first + 1)) + _SURFACE * self.surface(first, cloud)
@@ -104,7 +108,7 @@ class Terms:
         depth = self._views[index].depth
         return depth if index == 0 else self.scales[index - 1] * depth + self.offsets[index - 1]
 
-    def _K(self, view: Look) -> Tensor:
+    def _K(self, view: ViewWithDepth) -> Tensor:
         return self._focal.K(view.image.shape[1], view.image.shape[0])
 
 
@@ -114,5 +118,5 @@ def chamfer(a: Tensor, b: Tensor) -> Tensor:
     return distances.amin(1).mean() + distances.amin(0).mean()
 
 
-def _pixels(view: Look) -> Tensor:
-    return lattice(view.image.shape[1], view.image.shape[0], _POINTS)
+def _pixels(view: ViewWithDepth) -> Tensor:
+    return spread_pixels(view.image.shape[1], view.image.shape[0], _POINTS)

@@ -1,4 +1,4 @@
-"""What a rival tells. It publishes whatever it finds: its only refusal is to find nothing."""
+"""The snapshots and verdicts of a rival. It publishes whatever it finds: its only refusal is to find nothing."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from splatnode.recon.scene.scene import Scene
 MIN_CAMERAS = 3  # a model of two cameras counts as no answer, for every method
 
 
-def verdict(frames: Sequence[Frame], placed: Collection[str]) -> Verdict:
-    """What to say when cameras of the frames named `placed` were found."""
-    missing = tuple(frame.name for frame in frames if frame.name not in placed)
-    told = f"{len(placed)} of {len(frames)} frames were placed."
-    if len(placed) < MIN_CAMERAS:
-        return Verdict(Code.NO_OVERLAP, told, "", missing)
-    return Verdict(Code.OK_PARTIAL if missing else Code.OK, told, "", missing, publishable=True)
+def verdict(frames: Sequence[Frame], registered: Collection[str]) -> Verdict:
+    """What to say when cameras of the frames named `registered` were found."""
+    missing = tuple(frame.name for frame in frames if frame.name not in registered)
+    sentence = f"{len(registered)} of {len(frames)} frames were placed."
+    if len(registered) < MIN_CAMERAS:
+        return Verdict(Code.NO_OVERLAP, sentence, "", missing)
+    return Verdict(Code.OK_PARTIAL if missing else Code.OK, sentence, "", missing, publishable=True)
 
 
 def refused(frames: Sequence[Frame], clock: Clock) -> Snapshot:
@@ -39,7 +39,7 @@ def refused(frames: Sequence[Frame], clock: Clock) -> Snapshot:
     )
 
 
-def of_scene(frames: Sequence[Frame], scene: Scene) -> Snapshot:
+def snapshot_of(frames: Sequence[Frame], scene: Scene) -> Snapshot:
     """What is published of Gaussians and the cameras that they were fitted with."""
     return Snapshot(
         sequence=0,
@@ -53,7 +53,7 @@ def of_scene(frames: Sequence[Frame], scene: Scene) -> Snapshot:
     )
 
 
-def told(
+def numbered(
     snapshots: Iterable[Snapshot], clock: Clock, served_by: Mapping[str, str] = MappingProxyType({})
 ) -> Iterator[Snapshot]:
     """The snapshots that an optimisation gives, numbered and timed as "optimise", and the last one again as final.

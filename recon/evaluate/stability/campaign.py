@@ -11,7 +11,7 @@ from pathlib import Path
 
 from splatnode.recon.evaluate.records import this_machine
 from splatnode.recon.evaluate.stability.case import Row
-from splatnode.recon.evaluate.stability.places import Places, Stage
+from splatnode.recon.evaluate.stability.places import Places, Sampler
 from splatnode.recon.evaluate.stability.summary import report
 from splatnode.recon.evaluate.stability.trial import Trial, run_trial
 from splatnode.recon.result.export.staged import json_bytes, write_file
@@ -87,7 +87,7 @@ def _results(plan: Plan, places: Places, todo: Sequence[tuple[Row, int, str]]) -
 
 
 def _run(row: Row, seed: int, method: str, places: Places, timeout_s: float) -> Trial:
-    case = row.make(Stage(places, row.name, seed))
+    case = row.make(Sampler(places, row.name, seed))
     return run_trial(case, row.number, row.name, seed, method, timeout_s)
 
 

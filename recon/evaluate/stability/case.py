@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.config import PREVIEW, Config
-from splatnode.recon.evaluate.stability.places import Photo, Stage
+from splatnode.recon.evaluate.stability.places import Photo, Sampler
 from splatnode.recon.evaluate.truth import TrueCamera
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code
@@ -36,7 +36,7 @@ class Demand(enum.Enum):
 
 @dataclass(frozen=True)
 class Measured:
-    """What a row measures besides the verdict, and whether that is within the row's limits."""
+    """What a row measures besides the verdict; `held` tells whether it is within the row's limits."""
 
     values: Mapping[str, float]
     held: bool
@@ -68,10 +68,10 @@ class Row:
 
     number: int
     name: str
-    make: Callable[[Stage], Case]
+    make: Callable[[Sampler], Case]
 
 
-def row(number: int, name: str) -> Callable[[Callable[[Stage], Case]], Row]:
+def row(number: int, name: str) -> Callable[[Callable[[Sampler], Case]], Row]:
     """Makes the decorated function a row of the matrix."""
     return partial(Row, number, name)
 
@@ -110,7 +110,7 @@ def accepted(photos: Sequence[Photo], note: str, *codes: Code, probe: Probe | No
 
 
 def refused(photos: Sequence[Photo], note: str, *codes: Code) -> Case:
-    """Photographs from which nothing can be told for certain, though what is published is compared with the truth."""
+    """Photographs that are not enough: a refusal is right, and a scene that is published is compared with the truth."""
     return Case(described(photos, note), all_at_hand(photos), Demand.REFUSE, frozenset(codes), (world(photos),))
 
 

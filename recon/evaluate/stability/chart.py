@@ -29,7 +29,7 @@ _COLOURS = {
     Outcome.FALSE_ACCEPT: "#D55E00",
     Outcome.FAILED: "#7F7F7F",
 }
-_TOLD = {
+_OUTCOME_LABELS = {
     Outcome.ACCEPTED: "published,\nright",
     Outcome.FALSE_ACCEPT: "published,\nwrong",
     Outcome.REFUSED: "refused,\nfitting code",
@@ -37,7 +37,7 @@ _TOLD = {
     Outcome.FALSE_REFUSE: "refused,\nwas enough",
     Outcome.FAILED: "no\nanswer",
 }
-_ASKED = {Demand.ACCEPT: "should accept", Demand.REFUSE: "should refuse", Demand.EITHER: "either"}
+_DEMAND_LABELS = {Demand.ACCEPT: "should accept", Demand.REFUSE: "should refuse", Demand.EITHER: "either"}
 _CELL, _LINE, _NAMES, _TABLE = 0.86, 0.17, 2.3, 2.1  # inches
 
 
@@ -71,21 +71,21 @@ def figure_of(content: Mapping) -> Figure:
     figure.text(
         0.1 / width, 1.0 - 0.28 / height, "How often the answer is wrong: the stability matrix", color=_INK, fontsize=12
     )
-    handles = [Patch(color=_COLOURS[found], label=told.replace("\n", " ")) for found, told in _TOLD.items()]
+    handles = [Patch(color=_COLOURS[found], label=text.replace("\n", " ")) for found, text in _OUTCOME_LABELS.items()]
     figure.legend(handles=handles, loc="lower left", ncols=3 if width < 10 else 6, frameon=False, fontsize=7.5)
     return figure
 
 
 def _table(axes: Axes, summary: Mapping) -> None:
     """Counts of outcomes by what was asked, and the rates with their 95 % intervals."""
-    columns = list(_TOLD)
+    columns = list(_OUTCOME_LABELS)
     axes.set_xlim(-1.2, len(columns))
-    axes.set_ylim(len(_ASKED), -1.0)
+    axes.set_ylim(len(_DEMAND_LABELS), -1.0)
     axes.axis("off")
     for x, found in enumerate(columns):
-        axes.text(x + 0.5, -0.12, _TOLD[found], ha="center", va="bottom", fontsize=6.5, color=_MUTED)
-    for y, (demand, told) in enumerate(_ASKED.items()):
-        axes.text(-0.08, y + 0.5, told, ha="right", va="center", fontsize=7.5, color=_INK)
+        axes.text(x + 0.5, -0.12, _OUTCOME_LABELS[found], ha="center", va="bottom", fontsize=6.5, color=_MUTED)
+    for y, (demand, text) in enumerate(_DEMAND_LABELS.items()):
+        axes.text(-0.08, y + 0.5, text, ha="right", va="center", fontsize=7.5, color=_INK)
         for x, found in enumerate(columns):
             count = summary["confusion"][demand.value][found.value]
             colour = _COLOURS[found] if count else "#FAFAFA"

@@ -43,14 +43,14 @@ def stability(args: argparse.Namespace) -> int:
     for method in dict.fromkeys(trial["method"] for trial in trials):
         summary = summarise(trials, method)
         print(
-            f"{method}: {summary.trials} trials, false accepts {_told(summary.false_accept)}, "
-            f"false refusals {_told(summary.false_refuse)}, other codes {_told(summary.other_code)}"
+            f"{method}: {summary.trials} trials, false accepts {_rate_text(summary.false_accept)}, "
+            f"false refusals {_rate_text(summary.false_refuse)}, other codes {_rate_text(summary.other_code)}"
         )
     print(f"results: {args.out}/ (stability.json, stability.png)")
     return 0
 
 
-def _told(rate: Rate) -> str:
+def _rate_text(rate: Rate) -> str:
     if rate.rate is None or rate.low is None or rate.high is None:
         return "not tried"
     return f"{rate.count}/{rate.of} = {rate.rate:.1%} ({rate.low:.1%} to {rate.high:.1%})"

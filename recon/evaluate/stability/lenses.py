@@ -8,86 +8,88 @@ from dataclasses import replace
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.evaluate.stability import warps
 from splatnode.recon.evaluate.stability.case import Case, accepted, either, refused, row
-from splatnode.recon.evaluate.stability.places import Photo, Stage
+from splatnode.recon.evaluate.stability.places import Photo, Sampler
 from splatnode.recon.result.verdict import Code
 
 _DOUBTS = (Code.FOCAL_SUSPECT, Code.MIXED_CAMERAS, Code.AMBIGUOUS, Code.BASELINE_TOO_SMALL)
 
 
 @row(19, "true focal length given")
-def true_focal(stage: Stage) -> Case:
-    photos = _told(stage.photos(4), 1.0, "given")
+def true_focal(sampler: Sampler) -> Case:
+    photos = _with_focal_length(sampler.photos(4), 1.0, "given")
     return accepted(photos, "4 frames with their true focal length")
 
 
 @row(19, "wrong focal length given")
-def wrong_focal(stage: Stage) -> Case:
-    factor = (0.7, 1.4)[stage.seed % 2]
-    photos = _told(stage.photos(5), factor, "given")
+def wrong_focal(sampler: Sampler) -> Case:
+    factor = (0.7, 1.4)[sampler.seed % 2]
+    photos = _with_focal_length(sampler.photos(5), factor, "given")
     return refused(photos, f"given focal length x{factor}", Code.FOCAL_SUSPECT)
 
 
 @row(19, "EXIF lies")
-def exif_lies(stage: Stage) -> Case:
-    factor = (0.7, 1.4)[stage.seed % 2]
-    photos = _told(stage.photos(5), factor, "exif")
+def exif_lies(sampler: Sampler) -> Case:
+    factor = (0.7, 1.4)[sampler.seed % 2]
+    photos = _with_focal_length(sampler.photos(5), factor, "exif")
     return either(photos, f"EXIF focal length x{factor}", *_DOUBTS)
 
 
 @row(20, "radial distortion")
-def distortion(stage: Stage) -> Case:
-    k1 = (-0.1, 0.1)[stage.seed % 2]
-    photos = [warps.distorted(photo, k1) for photo in stage.photos(5)]
+def distortion(sampler: Sampler) -> Case:
+    k1 = (-0.1, 0.1)[sampler.seed % 2]
+    photos = [warps.distorted(photo, k1) for photo in sampler.photos(5)]
     return accepted(photos, f"k1 {k1:+}", Code.OK_PARTIAL)
 
 
 @row(20, "strong radial distortion")
-def strong_distortion(stage: Stage) -> Case:
-    k1 = (-0.3, 0.3)[stage.seed % 2]
-    photos = [warps.distorted(photo, k1) for photo in stage.photos(5)]
+def strong_distortion(sampler: Sampler) -> Case:
+    k1 = (-0.3, 0.3)[sampler.seed % 2]
+    photos = [warps.distorted(photo, k1) for photo in sampler.photos(5)]
     return either(photos, f"k1 {k1:+}", *_DOUBTS)
 
 
 @row(21, "rolling shutter")
-def rolling_shutter(stage: Stage) -> Case:
-    shift = (0.002, 0.01)[stage.seed % 2]
-    photos = [warps.rolled(photo, shift * (-1) ** number) for number, photo in enumerate(stage.photos(4))]
+def rolling_shutter(sampler: Sampler) -> Case:
+    shift = (0.002, 0.01)[sampler.seed % 2]
+    photos = [warps.rolled(photo, shift * (-1) ** number) for number, photo in enumerate(sampler.photos(4))]
     note = f"rows shifted by {shift:.1%} in turns"
     return (
-        accepted(photos, note) if stage.seed % 2 == 0 else either(photos, note, Code.BLUR, *_DOUBTS, Code.MOVING_SCENE)
+        accepted(photos, note)
+        if sampler.seed % 2 == 0
+        else either(photos, note, Code.BLUR, *_DOUBTS, Code.MOVING_SCENE)
     )
 
 
 @row(22, "portrait and landscape")
-def turned(stage: Stage) -> Case:
-    photos = [warps.on_its_side(photo) if number % 2 else photo for number, photo in enumerate(stage.photos(4))]
+def turned(sampler: Sampler) -> Case:
+    photos = [warps.on_its_side(photo) if number % 2 else photo for number, photo in enumerate(sampler.photos(4))]
     return accepted(photos, "2 on their side", Code.OK_PARTIAL)
 
 
 @row(22, "two resolutions")
-def two_resolutions(stage: Stage) -> Case:
-    photos = [warps.resized(photo, 0.6) if number % 2 else photo for number, photo in enumerate(stage.photos(4))]
+def two_resolutions(sampler: Sampler) -> Case:
+    photos = [warps.resized(photo, 0.6) if number % 2 else photo for number, photo in enumerate(sampler.photos(4))]
     return accepted(photos, "2 at 60 %", Code.OK_PARTIAL)
 
 
 @row(22, "crops")
-def crops(stage: Stage) -> Case:
-    rng = stage.rng
+def crops(sampler: Sampler) -> Case:
+    rng = sampler.rng
     photos = [
         warps.cropped(photo, 0.75, *rng.uniform(size=2)) if number % 2 else photo
-        for number, photo in enumerate(stage.photos(5))
+        for number, photo in enumerate(sampler.photos(5))
     ]
     return either(photos, "2 cropped off-centre to 75 %", *_DOUBTS)
 
 
-def _told(photos: Sequence[Photo], factor: float, source: str) -> list[Photo]:
+def _with_focal_length(photos: Sequence[Photo], factor: float, source: str) -> list[Photo]:
     """The photographs with their true focal length times `factor` as what `source` says of them."""
-    told = []
+    changed = []
     for photo in photos:
         if photo.camera is None:
             raise ValueError(f"{photo.name} must have a true camera")
         height, width = photo.image.shape[:2]
         K = photo.camera.K_for(width, height)
         focal = factor * K[0, 0], factor * K[1, 1]
-        told.append(replace(photo, intrinsics=Intrinsics(width, height, *focal, K[0, 2], K[1, 2], source)))
-    return told
+        changed.append(replace(photo, intrinsics=Intrinsics(width, height, *focal, K[0, 2], K[1, 2], source)))
+    return changed

@@ -1,4 +1,7 @@
-"""All rows: every `Row` that a family of them defines, by number. A new row is one function in one of the files."""
+"""All rows, by number: every `Row` of the modules in `_FAMILIES`.
+
+A new row is one function in one of these files; a new file of rows is that file and its name in `_FAMILIES`.
+"""
 
 from __future__ import annotations
 

@@ -22,19 +22,23 @@ T = TypeVar("T")
 Image = npt.NDArray[np.uint8]
 Poses = npt.NDArray[np.float64]  # (M, 4, 4) T_world_camera
 
-NEIGHBOUR_DEG = 12.0  # between neighbours of a set, as people take photographs
-OVERLAP_DEG = 20.0  # beyond, photographs may share too little: a refusal would be no mistake
-TELLING_DEG = 8.0  # below, a set's views are as good as parallel: its focal length trades against its depth
-_LONGEST_STRIDE = 4
+USUAL_STEP_DEG = 12.0  # of rotation between neighbours of a set, as people take photographs
+MAX_STEP_DEG = 20.0  # beyond, photographs may share too little: a refusal would be no mistake
+MIN_SPAN_DEG = 8.0  # below, a set's views are as good as parallel: its focal length trades against its depth
+_LONGEST_STRIDE = 4  # photographs of the capture between two neighbours of a set, at most
+_USUAL_STEP_RANGE = 0.5, 5.0  # of the median step: shorter ones are pauses, longer ones are gaps in the capture
+_MIN_PHOTOGRAPHS = 6  # of a recorded scene; with fewer, few rows find a set in it
 
 _BUILT_IN_SEEDS = (0, 1, 2, 3)
 _BUILT_IN_VIEWS = 12
-_STILL_PX = 1e-6  # of the focal length: centres this close together are one
-_ALONG = 0.9  # share of the motion that is along the view
+_STILL_REL = 1e-6  # of the largest coordinate: centres this close together are one
+_MIN_SHARE_ALONG_VIEW = 0.9  # share of the motion that is along the view
 
 
 @dataclass(frozen=True, eq=False)
 class Photo:
+    """A photograph as a row changes it, with the camera that is true of what it then shows."""
+
     name: str
     image: Image  # (H, W, 3) RGB
     camera: TrueCamera | None  # of `image`; None: it belongs nowhere
@@ -75,8 +79,8 @@ class Places:
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
-    """What a row may draw from. Seeds take turns through the places, so that each row sees as many as it can."""
+class Sampler:
+    """Draws photographs for a row. Seeds take turns through the places, so that a row sees as many as it can."""
 
     places: Places
     row_name: str
@@ -87,17 +91,17 @@ class Stage:
         """Fresh at every call, the same for the same row and seed."""
         return np.random.default_rng([self.seed, zlib.crc32(self.row_name.encode())])
 
-    def in_turn(self) -> list[Place]:
+    def places_in_turn(self) -> list[Place]:
         """All places in which the camera moved to the side, that of this seed first."""
         return _rotated(self.places.walked, self._turn)
 
     def window(
-        self, count: int, apart_from: Sequence[Photo] = (), step_deg: float = NEIGHBOUR_DEG
+        self, count: int, apart_from: Sequence[Photo] = (), step_deg: float = USUAL_STEP_DEG
     ) -> tuple[Place, list[int]]:
         """A place that none of the photographs `apart_from` shows, and positions of `count` that overlap well there.
 
         They are neighbours as far apart as `step_deg` allows, so that the camera has moved; where none are as close,
-        neighbours within `OVERLAP_DEG`. Raises ValueError where no place has as many.
+        neighbours within `MAX_STEP_DEG`. Raises ValueError where no place has as many.
         """
         shown = {photo.place for photo in apart_from}
         places = [place for place in self.places.walked if place.name not in shown]
@@ -106,13 +110,13 @@ class Stage:
         if not fitting:
             raise ValueError(
                 f"row {self.row_name!r} needs a place with {count} photographs that follow each other at "
-                f"{OVERLAP_DEG:g} degrees or less, and turn {TELLING_DEG:g} degrees in all; give more scenes"
+                f"{MAX_STEP_DEG:g} degrees or less, and turn {MIN_SPAN_DEG:g} degrees in all; give more scenes"
             )
         place, starts, stride = _rotated(fitting, self._turn)[0]
         start = int(self.rng.choice(starts))
         return place, [start + stride * i for i in range(count)]
 
-    def photos(self, count: int, apart_from: Sequence[Photo] = (), step_deg: float = NEIGHBOUR_DEG) -> list[Photo]:
+    def photos(self, count: int, apart_from: Sequence[Photo] = (), step_deg: float = USUAL_STEP_DEG) -> list[Photo]:
         """The photographs of `window`."""
         place, indices = self.window(count, apart_from, step_deg)
         return place.photos(indices)
@@ -136,25 +140,26 @@ def _rotated(items: Sequence[T], turn: int) -> list[T]:
 
 
 def neighbours(Ts_world_camera: Poses, count: int, step_deg: float) -> tuple[list[int], int]:
-    """Where sets of `count` cameras may start, and the stride between them: the longest that keeps to `step_deg`."""
+    """Where sets of `count` cameras may start (indices), and their stride: the longest that keeps to `step_deg`."""
     starts, stride = _strided(Ts_world_camera, count, _LONGEST_STRIDE, partial(_overlap, step_deg))
-    return (starts, stride) if starts else _strided(Ts_world_camera, count, 1, partial(_overlap, OVERLAP_DEG))
+    return (starts, stride) if starts else _strided(Ts_world_camera, count, 1, partial(_overlap, MAX_STEP_DEG))
 
 
 def parallel(Ts_world_camera: Poses, count: int) -> tuple[list[int], int]:
     """The same for cameras that look in one direction, by which a focal length can hardly be told."""
-    return _strided(Ts_world_camera, count, _LONGEST_STRIDE, lambda chosen: _span_deg(chosen) < TELLING_DEG)
+    return _strided(Ts_world_camera, count, _LONGEST_STRIDE, lambda chosen: _span_deg(chosen) < MIN_SPAN_DEG)
 
 
 def _strided(everyone: Poses, count: int, longest: int, fits: Callable[[Poses], bool]) -> tuple[list[int], int]:
-    """Where `count` cameras that fit and that stepped usual steps may start, at the longest stride that has any."""
-    usual = float(np.median(_steps(everyone)))
+    """The starts of sets of `count` cameras that fit and whose steps are usual, at the longest stride that has any."""
+    median = float(np.median(_steps(everyone)))
+    least, most = (factor * median for factor in _USUAL_STEP_RANGE)
     for stride in range(longest, 0, -1):
         starts = []
         for start in range(len(everyone) - stride * (count - 1)):
             chosen = everyone[start : start + stride * count : stride]
             steps = _steps(chosen)
-            if (steps >= 0.5 * usual).all() and (steps <= 5.0 * usual).all() and fits(chosen):
+            if (steps >= least).all() and (steps <= most).all() and fits(chosen):
                 starts.append(start)
         if starts:
             return starts, stride
@@ -164,7 +169,7 @@ def _strided(everyone: Poses, count: int, longest: int, fits: Callable[[Poses], 
 def _overlap(limit_deg: float, chosen: Poses) -> bool:
     """Whether each camera sees what the next one sees, and three or more turn enough to tell their focal length."""
     turns = angles_deg(chosen[:-1, :3, :3], chosen[1:, :3, :3])
-    return bool((turns <= limit_deg).all()) and (len(chosen) < 3 or _span_deg(chosen) >= TELLING_DEG)
+    return bool((turns <= limit_deg).all()) and (len(chosen) < 3 or _span_deg(chosen) >= MIN_SPAN_DEG)
 
 
 def _span_deg(chosen: Poses) -> float:
@@ -178,7 +183,7 @@ def _steps(chosen: Poses) -> npt.NDArray[np.float64]:
 
 
 def renamed(photos: Sequence[Photo], mark: str) -> list[Photo]:
-    """The photographs under names of their own, for sets in which names would meet twice."""
+    """The photographs under names of their own, for sets in which a name would occur twice."""
     return [replace(photo, name=f"{mark}_{photo.name}") for photo in photos]
 
 
@@ -204,10 +209,10 @@ def motion(Ts_world_camera: Poses) -> str:
     centres = Ts_world_camera[:, :3, 3]
     steps = np.diff(centres, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
-    if lengths.max(initial=0.0) <= _STILL_PX * (1.0 + float(np.abs(centres).max(initial=0.0))):
+    if lengths.max(initial=0.0) <= _STILL_REL * (1.0 + float(np.abs(centres).max(initial=0.0))):
         return "turned"
     along = np.abs((steps * Ts_world_camera[:-1, :3, 2]).sum(1))
-    return "forward" if along.sum() > _ALONG * lengths.sum() else "walked"
+    return "forward" if along.sum() > _MIN_SHARE_ALONG_VIEW * lengths.sum() else "walked"
 
 
 def far_apart(place: Place, count: int, least_deg: float, rng: np.random.Generator) -> list[int] | None:
@@ -232,6 +237,8 @@ def built_in(out: Path, seed: int) -> Place:
 def _recorded(folder: Path) -> Place:
     scene = load_scene(folder)
     names = tuple(name for name in scene.paths if name in scene.cameras)
-    if len(names) < 6:
-        raise ValueError(f"{folder} must have at least 6 photographs with true cameras, has {len(names)}")
+    if len(names) < _MIN_PHOTOGRAPHS:
+        raise ValueError(
+            f"{folder} must have at least {_MIN_PHOTOGRAPHS} photographs with true cameras, has {len(names)}"
+        )
     return Place(scene, names)

@@ -20,10 +20,10 @@ from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.snapshot import Snapshot
 
-_OVERFIT_DB = 0.3  # that ten times the iterations may lose
-_MORE_GAUSSIANS = 0.2  # of the count, that ten times the budget may add
-_INCREMENTAL_SHARE = 0.03  # of the quality, that frames one by one may lose
-_REPEATS = 2
+_MAX_OVERFIT_DB = 0.3  # PSNR that ten times the iterations may lose
+_MAX_CHANGE = 0.2  # of the number of Gaussians, between a budget and ten times that budget
+_MAX_LOSS_ONE_BY_ONE = 0.03  # share of the PSNR that may be lost when frames come one by one
+_REPEATS = 2  # further runs that must give the same bits
 
 
 def same_cameras(photos: Sequence[Photo], *, rotation_deg: float, centre_pct: float) -> Probe:
@@ -77,7 +77,7 @@ def _trained_longer(
     long = splatnode(list(same), msgspec.structs.replace(config, optimize=longer))
     before, after = (_held_out_psnr(found, scene, test, config) for found in (snapshot, long))
     values = {"psnr": before, "psnr_ten_times_longer": after}
-    return Measured(values, held=after > before - _OVERFIT_DB)
+    return Measured(values, held=after > before - _MAX_OVERFIT_DB)
 
 
 def ignores_a_bigger_budget(photos: Sequence[Photo]) -> Probe:
@@ -89,7 +89,7 @@ def _bigger_budget(same: Sequence[Frame], snapshot: Snapshot, config: Config) ->
     count = len(snapshot.gaussians)
     wide = splatnode(list(same), msgspec.structs.replace(config, max_gaussians=10 * count))
     values = {"num_gaussians": count, "with_ten_times_the_budget": len(wide.gaussians)}
-    return Measured(values, held=abs(len(wide.gaussians) - count) <= _MORE_GAUSSIANS * count)
+    return Measured(values, held=abs(len(wide.gaussians) - count) <= _MAX_CHANGE * count)
 
 
 def as_good_as_a_batch(photos: Sequence[Photo], scene: EvaluationScene, test: Sequence[str]) -> Probe:
@@ -103,7 +103,7 @@ def _as_good_as_a_batch(
     batch = splatnode(list(same), config)
     one_by_one, at_once = (_held_out_psnr(found, scene, test, config) for found in (snapshot, batch))
     values = {"psnr_one_by_one": one_by_one, "psnr_at_once": at_once}
-    return Measured(values, held=one_by_one > (1.0 - _INCREMENTAL_SHARE) * at_once)
+    return Measured(values, held=one_by_one > (1.0 - _MAX_LOSS_ONE_BY_ONE) * at_once)
 
 
 def _held_out_psnr(snapshot: Snapshot, scene: EvaluationScene, test: tuple[str, ...], config: Config) -> float:

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.config import Config
-from splatnode.recon.evaluate.rivals.colmap import Mapper, Placed, global_, incremental, mapped
+from splatnode.recon.evaluate.rivals.colmap import Mapper, RegisteredFrame, global_, incremental, sparse_model
 from splatnode.recon.evaluate.rivals.outcome import verdict
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 
@@ -23,13 +23,13 @@ def glomap(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:
 
 def _reconstructed(frames: Iterable[Frame | DroppedFrame], config: Config, mapping: Mapper) -> Snapshot:
     usable = [frame for frame in frames if isinstance(frame, Frame)]
-    model = mapped(usable, config.seed, mapping)
-    placed = () if model is None else model.placed
-    told = verdict(usable, {each.frame.name for each in placed})
+    model = sparse_model(usable, config.seed, mapping)
+    registered = () if model is None else model.registered
+    found = verdict(usable, {each.frame.name for each in registered})
     return Snapshot(
         sequence=1,
-        verdict=told,
-        cameras=tuple(map(_camera, placed)) if told.publishable else (),
+        verdict=found,
+        cameras=tuple(map(_camera, registered)) if found.publishable else (),
         gaussians=GaussianArrays.empty(),
         images={},
         dropped=(),
@@ -38,8 +38,15 @@ def _reconstructed(frames: Iterable[Frame | DroppedFrame], config: Config, mappi
     )
 
 
-def _camera(placed: Placed) -> CameraEstimate:
-    frame = placed.frame
+def _camera(registered: RegisteredFrame) -> CameraEstimate:
+    frame = registered.frame
     return CameraEstimate(
-        frame.name, frame.frame_id, placed.T_world_camera, placed.intrinsics.K, frame.width, frame.height, None, None
+        frame.name,
+        frame.frame_id,
+        registered.T_world_camera,
+        registered.intrinsics.K,
+        frame.width,
+        frame.height,
+        None,
+        None,
     )

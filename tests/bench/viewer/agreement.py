@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from splatnode.recon.result.picture import take_picture
+from splatnode.recon.result.rendering import render_arrays
 from splatnode.viewer.sources import load_result
 from splatnode.viewer.state import State
 
@@ -30,7 +30,7 @@ def agreement(result: Path) -> dict:
         extrinsics = np.linalg.inv(camera.T_world_camera)
         renderer.setup_camera(camera.K, extrinsics, width, height)
         theirs = np.asarray(renderer.render_to_image()).astype(float)
-        ours = 255.0 * np.clip(take_picture(gaussians, camera.T_world_camera, camera.K, width, height).rgb, 0, 1)
+        ours = 255.0 * np.clip(render_arrays(gaussians, camera.T_world_camera, camera.K, width, height).rgb, 0, 1)
         shifts = {f"{x},{y}": float(np.abs(np.roll(theirs, (y, x), (0, 1)) - ours)[4:-4, 4:-4].mean())
                   for x in (-1, 0, 1) for y in (-1, 0, 1)}  # fmt: skip
         difference = np.abs(theirs - ours)

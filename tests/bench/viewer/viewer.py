@@ -107,7 +107,7 @@ class Tour(Session):
         if len(self.ticks) > VIEWS + 3:
             raise TourOver
         came = super().receive()
-        view = self.grasped()
+        view = self.viewpoint_to_move()
         if view is not None:
             self.move(orbited(view, 0.02, 0.0))
         return came or view is not None

@@ -162,7 +162,7 @@ def test_bench_of_refusals_is_a_result_without_renders(scene_folder, tmp_path, i
 def test_process_that_dies_or_takes_too_long_is_told(scene_folder):
     frames = load_scene(scene_folder).frames(SPLIT.train)
     dead = run_alone(partial(reconstruct, frames, "killed", 0), (), timeout_s=60)
-    assert dead.moments == () and dead.error is not None and "code 7" in dead.error
+    assert dead.snapshots == () and dead.error is not None and "code 7" in dead.error
     late = run_alone(partial(reconstruct, frames, "exact", 0), (), timeout_s=0.05)
     assert late.error == "stopped after 0.05 s"
 

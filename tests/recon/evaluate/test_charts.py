@@ -11,7 +11,7 @@ import pytest
 from splatnode.recon.evaluate.protocol import Row, Settings
 from splatnode.recon.evaluate.records import Bench, bench_files, merged, read_bench
 from splatnode.recon.evaluate.report import redraw
-from splatnode.recon.evaluate.summary import points, shared
+from splatnode.recon.evaluate.summary import method_means, shared
 from splatnode.recon.evaluate.tables import PSNR, by_views, paired, tables
 
 pytest.importorskip("matplotlib", reason="charts need matplotlib (pip install 'splatnode[bench]')")
@@ -45,7 +45,7 @@ def bench(*rows: Row) -> Bench:
 
 
 def test_means_are_over_the_same_runs_at_every_point():
-    found = {(p.method, p.checkpoint): p for p in points(ROWS)}
+    found = {(p.method, p.checkpoint): p for p in method_means(ROWS)}
     assert list(found) == [("fast", 100), ("fast", None), ("slow", None)]
     assert found["fast", 100].psnr == 22.0  # 20 at the checkpoint, and 24 of the run that was over by then
     assert found["fast", 100].seconds == 2.5
@@ -82,15 +82,15 @@ def test_charts_are_drawn_from_the_rows_alone():
 
 
 def test_every_curve_has_every_moment_and_lpips_only_where_measured():
-    axes = speed_accuracy([p for p in points(ROWS) if p.psnr is not None]).axes
+    axes = speed_accuracy([p for p in method_means(ROWS) if p.psnr is not None]).axes
     assert [a.get_ylabel() for a in axes] == ["PSNR (dB)", "SSIM"]
     curves = [tuple(np.asarray(data).tolist() for data in line.get_data()) for line in axes[0].lines]
     assert ([2.5, 3.0], [22.0, 23.0]) in curves and ([10.0], [26.0]) in curves
     measured = [replace(r, lpips_vgg=0.2) for r in ROWS]
-    axes = speed_accuracy(points(measured)[:2]).axes
+    axes = speed_accuracy(method_means(measured)[:2]).axes
     assert axes[2].get_ylabel() == "LPIPS VGG (axis turned)" and axes[2].yaxis_inverted()
     ends_alone = [replace(r, lpips_alex=0.1, lpips_vgg=0.2 if r.final else None) for r in ROWS]
-    assert speed_accuracy(points(ends_alone)).axes[2].get_ylabel() == "LPIPS Alex (axis turned)"
+    assert speed_accuracy(method_means(ends_alone)).axes[2].get_ylabel() == "LPIPS Alex (axis turned)"
 
 
 ABLATION = [

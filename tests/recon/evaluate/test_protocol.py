@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.evaluate.protocol import Run, evaluate, mean_intrinsics
-from splatnode.recon.evaluate.test_pose import align_test_pose
+from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.frames import border
 from splatnode.recon.rasterize.cpu import rasterize
@@ -142,9 +142,9 @@ def test_another_moment_of_a_run_goes_on_from_the_poses_that_were_found(scene_fo
 
     def align(*scene_and_view, steps, levels, **rate):
         searched.append((steps, levels))
-        return align_test_pose(*scene_and_view, steps=steps, levels=levels, **rate)
+        return find_test_pose(*scene_and_view, steps=steps, levels=levels, **rate)
 
-    monkeypatch.setattr("splatnode.recon.evaluate.protocol.align_test_pose", align)
+    monkeypatch.setattr("splatnode.recon.evaluate.protocol.find_test_pose", align)
     poses: dict[str, np.ndarray] = {}
     end, earlier = (score(perfect_snapshot(), scene_folder, found=poses, continued_steps=2) for _ in range(2))
     assert searched == [(QUICK.alignment_steps, 1)] * 2 + [(2, 1)] * 2

@@ -8,7 +8,7 @@ import torch
 
 from splatnode.recon.evaluate.appearance import Splats
 from splatnode.recon.evaluate.camera_errors import angles_deg
-from splatnode.recon.evaluate.test_pose import align_test_pose
+from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.geometry import exp_se3
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.preview import render_rgb
@@ -41,7 +41,7 @@ def test_test_pose_is_found_again(levels, steps):
     gaussians, true = make_wall(), motion(5, 0.05)
     image = torch.from_numpy(render_rgb(gaussians, true, K, WIDTH, HEIGHT))
     start = true @ motion(6, 0.02)
-    found = align_test_pose(Splats(gaussians, rasterize), image, start, K, steps=steps, levels=levels)
+    found = find_test_pose(Splats(gaussians, rasterize), image, start, K, steps=steps, levels=levels)
     assert float(np.linalg.norm(start[:3, 3] - true[:3, 3])) > 0.02
     assert float(np.linalg.norm(found.T_world_camera[:3, 3] - true[:3, 3])) < 0.002
     assert angles_deg(found.T_world_camera[:3, :3], true[:3, :3]) < 0.03
@@ -52,6 +52,6 @@ def test_test_pose_is_found_again(levels, steps):
 def test_search_never_ends_worse_than_it_started():
     gaussians = make_wall()
     image = torch.from_numpy(render_rgb(gaussians, np.eye(4), K, WIDTH, HEIGHT))
-    found = align_test_pose(Splats(gaussians, rasterize), image, np.eye(4), K, steps=3, levels=2, learning_rate=0.5)
+    found = find_test_pose(Splats(gaussians, rasterize), image, np.eye(4), K, steps=3, levels=2, learning_rate=0.5)
     assert found.loss == pytest.approx(0.0, abs=1e-6)
     assert np.array_equal(found.T_world_camera, np.eye(4))

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from splatnode.recon.evaluate.rivals.nerf.cameras import Cameras, Focal
 from splatnode.recon.evaluate.rivals.nerf.field import Field
-from splatnode.recon.evaluate.rivals.nerf.volume import Seen, see
+from splatnode.recon.evaluate.rivals.nerf.volume_rendering import RenderedRays, render_rays
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -37,12 +37,12 @@ class Learnt:
 
 
 @dataclass(frozen=True, eq=False)
-class Glance:
+class Step:
     """What an iteration has rendered, for further losses."""
 
     view: int
     pixels: Tensor  # (M, 2)
-    seen: Seen
+    rays: RenderedRays
     cameras: Cameras
     progress: float  # of all iterations, in [0, 1)
 
@@ -53,7 +53,7 @@ def learn(
     config: Config,
     *,
     seed: int,
-    further: Callable[[Glance], Tensor] | None = None,
+    further: Callable[[Step], Tensor] | None = None,
     beside: Sequence[nn.Parameter] = (),
 ) -> Iterator[Learnt]:
     """The field at every checkpoint and at the end.
@@ -81,11 +81,11 @@ def learn(
         height, width = images[view].shape[:2]
         pixels = torch.rand((config.rays, 2), generator=draws) * torch.tensor([width, height])
         pixels = pixels.floor() + 0.5
-        seen = see(field, cameras.T_world_camera(view), focal.K(width, height), pixels, draws)
+        rays = render_rays(field, cameras.T_world_camera(view), focal.K(width, height), pixels, draws)
         columns, rows = pixels.long().unbind(1)
-        loss = (seen.rgb - images[view][rows, columns]).square().mean()
+        loss = (rays.rgb - images[view][rows, columns]).square().mean()
         if further is not None:
-            loss = loss + further(Glance(view, pixels, seen, cameras, progress))
+            loss = loss + further(Step(view, pixels, rays, cameras, progress))
         adam.zero_grad()
         loss.backward()
         adam.step()

@@ -12,11 +12,11 @@ from torch import nn
 from splatnode.recon.evaluate.appearance import FieldSnapshot
 from splatnode.recon.evaluate.rivals import nerfmm, nope_nerf
 from splatnode.recon.evaluate.rivals.nerf import fit
+from splatnode.recon.evaluate.rivals.nerf.appearance import FieldAppearance, spread_pixels
 from splatnode.recon.evaluate.rivals.nerf.cameras import Cameras, Focal
 from splatnode.recon.evaluate.rivals.nerf.field import Field, encoded
-from splatnode.recon.evaluate.rivals.nerf.look import FieldLook, lattice
-from splatnode.recon.evaluate.rivals.nerf.volume import FAR, NEAR, SAMPLES, Seen, see
-from splatnode.recon.evaluate.test_pose import align_test_pose
+from splatnode.recon.evaluate.rivals.nerf.volume_rendering import FAR, NEAR, SAMPLES, RenderedRays, render_rays
+from splatnode.recon.evaluate.test_pose import find_test_pose
 from tests.support.synthetic import photographs
 
 K = torch.tensor([[40.0, 0, 16], [0, 40, 12], [0, 0, 1]])
@@ -31,7 +31,7 @@ class Wall(nn.Module):
 
 def test_a_wall_is_seen_where_it_stands():
     pixels = torch.tensor([[16.0, 12.0], [24.0, 20.0]])
-    seen = see(Wall(), torch.eye(4), K, pixels)
+    seen = render_rays(Wall(), torch.eye(4), K, pixels)
     step = (1 / NEAR - 1 / FAR) / SAMPLES  # of inverse depth
     assert ((1 / seen.depth - 0.5).abs() <= step).all()
     assert torch.allclose(seen.rgb[0, :2], torch.zeros(2))
@@ -43,7 +43,7 @@ def test_a_fog_of_even_density_weighs_by_its_depth():
         def forward(self, points, directions):
             return torch.ones(len(points)), torch.ones(len(points), 3)
 
-    seen = see(Fog(), torch.eye(4), K, torch.tensor([[16.0, 12.0]]))
+    seen = render_rays(Fog(), torch.eye(4), K, torch.tensor([[16.0, 12.0]]))
     assert torch.allclose(seen.rgb, torch.ones(1, 3))
     assert float(seen.depth) == pytest.approx(NEAR + 1.0, abs=0.25)  # the mean free path, as the samples resolve it
 
@@ -73,12 +73,12 @@ def test_gradients_of_pose_and_focal_length():
     T = torch.eye(4, dtype=torch.float64, requires_grad=True)
     intrinsics = K.double().requires_grad_()
     assert torch.autograd.gradcheck(
-        lambda *camera: see(field, *camera, pixels).rgb, (T, intrinsics), eps=1e-7, atol=1e-4
+        lambda *camera: render_rays(field, *camera, pixels).rgb, (T, intrinsics), eps=1e-7, atol=1e-4
     )
 
 
 def test_the_lattice_covers_an_image():
-    pixels = lattice(40, 30, 400)
+    pixels = spread_pixels(40, 30, 400)
     assert (pixels % 1 == 0.5).all() and (pixels.amax(0) < torch.tensor([40, 30])).all()
     counts = torch.histogramdd(pixels, [4, 3], range=[0.0, 40.0, 0.0, 30.0]).hist
     assert counts.min() >= 25  # of 33 on average
@@ -92,13 +92,13 @@ class Painted(nn.Module):
 
 
 def test_a_pose_is_found_through_the_rays():
-    look = FieldLook(Painted())
+    look = FieldAppearance(Painted())
     intrinsics = K.double().numpy()
-    image = look.picture(np.eye(4), intrinsics, 32, 24)
+    image = look.render(np.eye(4), intrinsics, 32, 24)
     start = np.eye(4)
     start[:3, 3] = [0.08, -0.05, 0.0]
     before = float(look.difference(image, torch.from_numpy(start).float(), K))
-    aligned = align_test_pose(look, image, start, intrinsics, steps=60)
+    aligned = find_test_pose(look, image, start, intrinsics, steps=60)
     assert aligned.loss < 0.2 * before
     assert look.depth(np.eye(4)) == pytest.approx(1.5, rel=0.1)
 
@@ -131,15 +131,15 @@ def test_chamfer_by_hand():
     assert float(nope_nerf.chamfer(a, a.flip(0))) == pytest.approx(0, abs=1e-6)
 
 
-def wall(shift: float) -> nope_nerf.Look:
+def wall(shift: float) -> nope_nerf.ViewWithDepth:
     """A wall at depth 1, whose colours run across, from a camera that stands `shift` to the right."""
     u = torch.arange(32) + 0.5
     across = ((u - 16) / 40 + shift).expand(24, 32)
-    return nope_nerf.Look(torch.stack([across * 0.5 + 0.5] * 3, -1), torch.ones(24, 32))
+    return nope_nerf.ViewWithDepth(torch.stack([across * 0.5 + 0.5] * 3, -1), torch.ones(24, 32))
 
 
 def test_the_next_view_shows_the_same_colours_from_where_it_stands():
-    terms = nope_nerf.Terms([wall(0.0), wall(0.1)], Focal(40 / 32))
+    terms = nope_nerf.ExtraLosses([wall(0.0), wall(0.1)], Focal(40 / 32))
     at = torch.tensor([0.0, 0.05, 0.1], requires_grad=True)
     losses = [terms.surface(0, terms.cloud(0) - torch.stack([x, *torch.zeros(2)])) for x in at]
     assert float(losses[0].detach()) == pytest.approx(0.05, rel=0.05)  # half of the shift
@@ -149,9 +149,9 @@ def test_the_next_view_shows_the_same_colours_from_where_it_stands():
 
 
 def test_the_field_s_depth_pulls_at_the_scale_of_the_map():
-    terms = nope_nerf.Terms([wall(0.0), wall(0.1)], Focal(40 / 32))
-    seen = Seen(torch.zeros(1, 3), torch.tensor([3.0]))
-    late = fit.Glance(1, torch.tensor([[16.5, 12.5]]), seen, Cameras(2), progress=0.9)
+    terms = nope_nerf.ExtraLosses([wall(0.0), wall(0.1)], Focal(40 / 32))
+    seen = RenderedRays(torch.zeros(1, 3), torch.tensor([3.0]))
+    late = fit.Step(1, torch.tensor([[16.5, 12.5]]), seen, Cameras(2), progress=0.9)
     loss = terms(late)
     assert float(loss.detach()) == pytest.approx(0.04 * 2.0)
     loss.backward()

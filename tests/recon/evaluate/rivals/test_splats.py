@@ -15,7 +15,7 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.recon.evaluate.metrics import psnr
 from splatnode.recon.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs
-from splatnode.recon.evaluate.rivals.colmap import mapped
+from splatnode.recon.evaluate.rivals.colmap import sparse_model
 from splatnode.recon.frames.keyframe import modelled_image
 from splatnode.recon.optimize import refinement
 from splatnode.recon.optimize.control import adaptive, proximity
@@ -34,7 +34,7 @@ def frames() -> list[Frame]:
 
 @pytest.fixture(scope="module")
 def model(frames):
-    found = mapped(frames, 0)
+    found = sparse_model(frames, 0)
     assert found is not None
     return found
 
@@ -70,10 +70,10 @@ def last(snapshots: Iterator[Snapshot]) -> Snapshot:
 
 
 def test_a_model_s_world_is_its_first_camera_at_a_depth_of_1(model):
-    assert np.allclose(model.placed[0].T_world_camera, np.eye(4))
+    assert np.allclose(model.registered[0].T_world_camera, np.eye(4))
     depths = [
         (model.points[seen] - each.T_world_camera[:3, 3]) @ each.T_world_camera[:3, 2]
-        for each, seen in zip(model.placed, model.seen_by, strict=True)
+        for each, seen in zip(model.registered, model.observed, strict=True)
     ]
     assert np.median(np.concatenate(depths)) == pytest.approx(1.0)
 
@@ -81,16 +81,16 @@ def test_a_model_s_world_is_its_first_camera_at_a_depth_of_1(model):
 def test_3dgs_starts_from_colmap_s_points(model):
     scene = colmap_3dgs.begin(model, 0)
     assert len(scene.gaussians) == len(model.points)
-    assert [view.name for view in scene.views] == [each.frame.name for each in model.placed]
-    rates = colmap_3dgs.in_extent(colmap_3dgs.OPTIMIZE, scene).rates
-    centres = np.stack([each.T_world_camera[:3, 3] for each in model.placed])
+    assert [view.name for view in scene.views] == [each.frame.name for each in model.registered]
+    rates = colmap_3dgs.in_parts_of_extent(colmap_3dgs.OPTIMIZE, scene).rates
+    centres = np.stack([each.T_world_camera[:3, 3] for each in model.registered])
     spread = np.linalg.norm(centres - centres.mean(0), axis=1).max()
     assert rates.means == pytest.approx(1.6e-4 * 1.1 * spread, rel=1e-5)
 
 
 def test_fsgs_knows_the_depth_of_colmap_s_points(model):
     scene = colmap_fsgs.with_depth(model, 0)
-    for view, seen in zip(scene.views, model.seen_by, strict=True):
+    for view, seen in zip(scene.views, model.observed, strict=True):
         T, K = view.T_world_camera.double().numpy(), view.K.double().numpy()
         points = (model.points[seen] - T[:3, 3]) @ T[:3, :3]
         columns, rows = (points @ K.T / points[:, 2:])[:, :2].astype(int).T

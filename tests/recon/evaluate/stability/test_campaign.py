@@ -75,7 +75,7 @@ def test_a_campaign_goes_on_where_it_was_stopped(tmp_path, places, monkeypatch):
         )
 
     monkeypatch.setattr(campaign, "run_trial", fake)
-    rows = tuple(Row(number, "quick", lambda stage: case(one_frame)) for number in (1, 2))
+    rows = tuple(Row(number, "quick", lambda sampler: case(one_frame)) for number in (1, 2))
     run_campaign(Plan(rows, (0,), ("splatnode",)), places, tmp_path, "command")
     assert tried == [(1, 0), (2, 0)]
     trials = run_campaign(Plan(rows, (0, 1), ("splatnode",), jobs=2), places, tmp_path, "command")

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.evaluate.stability import pixels, warps
+from splatnode.recon.evaluate.stability import corruptions, warps
 from splatnode.recon.evaluate.stability.places import Photo
 from splatnode.recon.evaluate.truth import TrueCamera
 
@@ -124,16 +124,18 @@ def test_a_rolling_shutter_shifts_the_first_rows_against_the_last(photo):
 def test_pixel_changes_do_what_they_say():
     rng = np.random.default_rng(0)
     grey = np.full((60, 80, 3), 100, np.uint8)
-    assert pixels.noisy(grey, 3.0, rng).astype(float).std() == pytest.approx(3.0, abs=0.1)
+    assert corruptions.noisy(grey, 3.0, rng).astype(float).std() == pytest.approx(3.0, abs=0.1)
     ones = np.ones(3)
-    assert np.array_equal(pixels.exposed(grey, 1.0, 1.0, ones), grey)
-    assert (pixels.exposed(grey, 2.0, 1.0, ones) == 200).all() and (pixels.exposed(grey, 3.0, 1.0, ones) == 255).all()
-    dark = pixels.vignetted(grey, 0.6)
+    assert np.array_equal(corruptions.exposed(grey, 1.0, 1.0, ones), grey)
+    assert (corruptions.exposed(grey, 2.0, 1.0, ones) == 200).all() and (
+        corruptions.exposed(grey, 3.0, 1.0, ones) == 255
+    ).all()
+    dark = corruptions.vignetted(grey, 0.6)
     assert dark[30, 40, 0] == 100 and dark[0, 0, 0] == 40
-    assert pixels.in_low_light(grey, 400.0, rng).mean() == pytest.approx(25.0, abs=0.5)
-    assert np.array_equal(pixels.motion_blurred(grey, 11, 30.0), grey)
-    noise = pixels.static_noise(60, 80, rng)
-    smeared = pixels.motion_blurred(noise, 11, 0.0).astype(float)
+    assert corruptions.in_low_light(grey, 400.0, rng).mean() == pytest.approx(25.0, abs=0.5)
+    assert np.array_equal(corruptions.motion_blurred(grey, 11, 30.0), grey)
+    noise = corruptions.static_noise(60, 80, rng)
+    smeared = corruptions.motion_blurred(noise, 11, 0.0).astype(float)
     assert np.abs(np.diff(smeared, axis=1)).mean() < 0.4 * np.abs(np.diff(smeared, axis=0)).mean()
 
 
@@ -141,8 +143,8 @@ def test_pixel_changes_do_what_they_say():
     ("side", "inside"), [(0, np.s_[:, :20]), (1, np.s_[:15]), (2, np.s_[:, -20:]), (3, np.s_[-15:])]
 )
 def test_texture_is_lost_on_the_side_that_was_asked(side, inside):
-    noise = pixels.static_noise(60, 80, np.random.default_rng(0))
-    flat = pixels.flattened(noise, 0.25, side)
+    noise = corruptions.static_noise(60, 80, np.random.default_rng(0))
+    flat = corruptions.flattened(noise, 0.25, side)
     changed = (flat != noise).any(2)
     assert changed[inside].mean() > 0.95 and changed.sum() == changed[inside].sum()
 
@@ -150,9 +152,9 @@ def test_texture_is_lost_on_the_side_that_was_asked(side, inside):
 def test_a_patch_is_pasted_also_over_the_edge():
     black, white = np.zeros((20, 30, 3), np.uint8), np.full((8, 8, 3), 255, np.uint8)
     whole = np.ones((8, 8), np.float32)
-    assert (pixels.pasted(black, white, whole, -4, 16)[..., 0] > 0).sum() == 4 * 4
-    assert np.array_equal(pixels.pasted(black, white, whole, 30, 0), black)
-    assert pixels.ellipse(200, 300).mean() == pytest.approx(np.pi / 4, abs=0.05)
+    assert (corruptions.pasted(black, white, whole, -4, 16)[..., 0] > 0).sum() == 4 * 4
+    assert np.array_equal(corruptions.pasted(black, white, whole, 30, 0), black)
+    assert corruptions.ellipse(200, 300).mean() == pytest.approx(np.pi / 4, abs=0.05)
     assert np.array_equal(
-        *np.split(pixels.repeated_half(pixels.static_noise(4, 8, np.random.default_rng(0))), 2, axis=1)
+        *np.split(corruptions.repeated_half(corruptions.static_noise(4, 8, np.random.default_rng(0))), 2, axis=1)
     )

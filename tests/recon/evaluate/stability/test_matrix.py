@@ -10,7 +10,7 @@ from splatnode.recon.evaluate.stability.case import Demand
 from splatnode.recon.evaluate.stability.matrix import ROWS, chosen
 from splatnode.recon.evaluate.stability.places import (
     Places,
-    Stage,
+    Sampler,
     far_apart,
     load_places,
     motion,
@@ -41,13 +41,13 @@ def test_neighbours_are_as_far_apart_as_they_may_be():
 
 
 def test_seeds_take_turns_through_the_places(places):
-    stages = [Stage(places, "a row", seed) for seed in range(3)]
-    assert {stage.photos(3)[0].place for stage in stages} == {"east", "south", "west"}
-    for stage in stages:
-        here = stage.photos(3)
-        (elsewhere,) = stage.photos(1, here)
+    stages = [Sampler(places, "a row", seed) for seed in range(3)]
+    assert {sampler.photos(3)[0].place for sampler in stages} == {"east", "south", "west"}
+    for sampler in stages:
+        here = sampler.photos(3)
+        (elsewhere,) = sampler.photos(1, here)
         assert elsewhere.place != here[0].place
-        assert len({photo.place for photo in stage.one_of_each(5)}) == 3
+        assert len({photo.place for photo in sampler.one_of_each(5)}) == 3
     with pytest.raises(ValueError, match="row 'a row' needs a place with 13 photographs"):
         stages[0].photos(13)
 
@@ -91,7 +91,7 @@ SLOW = {"tiny baseline", "forward motion", "clean, parallel views", "a huge file
 
 @pytest.mark.parametrize("row", [row for row in ROWS if row.name not in SLOW], ids=lambda r: r.name)
 def test_rows_make_the_same_case_again(row, places):
-    first, again = (row.make(Stage(places, row.name, 1)) for _ in range(2))
+    first, again = (row.make(Sampler(places, row.name, 1)) for _ in range(2))
     given, same = list(first.source()), list(again.source())
     assert len(given) > 0 and len({frame.name for frame in given}) == len(given)
     frames = [frame for frame in given if isinstance(frame, Frame)]

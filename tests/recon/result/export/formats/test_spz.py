@@ -14,7 +14,7 @@ from splatnode.recon.result.export.axes import least_turned
 from splatnode.recon.result.export.formats.spz import decode as decode_spz
 from splatnode.recon.result.export.formats.spz import encode_spz
 from splatnode.recon.result.export.prepare import take
-from splatnode.recon.result.picture import take_picture
+from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import GaussianArrays
 from tests.support.exported import make_gaussians, same_rotations
 
@@ -46,7 +46,7 @@ def test_the_picture_does_not_depend_on_the_order_and_hardly_on_the_rounding():
     K, T_world_camera = np.array([[60.0, 0, 40], [0, 60, 30], [0, 0, 1]]), np.eye(4)
     T_world_camera[2, 3] = -8.0
     written, other, exact = (
-        take_picture(each, T_world_camera, K, 80, 60).rgb
+        render_arrays(each, T_world_camera, K, 80, 60).rgb
         for each in (decode_spz(encode_spz(gaussians)), decode_spz(encode_spz(shuffled)), gaussians)
     )
     assert np.abs(exact).max() > 0.5 and np.abs(written - other).max() < 1e-5

@@ -1,4 +1,4 @@
-"""What goes wrong between the scene and the file: changes of an image (H, W, 3) that leave its camera as it was."""
+"""Corruptions of an image (H, W, 3) uint8 RGB: what light, sensor, shutter and file do. The camera stays as it was."""
 
 from __future__ import annotations
 

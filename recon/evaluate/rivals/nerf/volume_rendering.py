@@ -1,4 +1,4 @@
-"""Volume rendering: what a camera's rays see of a radiance field."""
+"""Volume rendering: the colours and depths that a radiance field gives along rays."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ _OPAQUE = 30.0  # optical depth behind which nothing is seen; the numbers that w
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class RenderedRays:
     rgb: Tensor  # (M, 3)
     depth: Tensor  # (M,) expected z in the camera frame
 
 
-def see(
+def render_rays(
     field: Field,
     T_world_camera: Tensor,  # (4, 4)
     K: Tensor,  # (3, 3)
     pixels: Tensor,  # (M, 2) u, v
     jitter: torch.Generator | None = None,
-) -> Seen:
+) -> RenderedRays:
     """Colours and depths of pixels, differentiable in field, pose and K. `jitter` moves the samples at random."""
     rays = torch.cat([(pixels - K[:2, 2]) / torch.diagonal(K)[:2], torch.ones_like(pixels[:, :1])], 1)
     directions = rays @ T_world_camera[:3, :3].T
@@ -39,7 +39,7 @@ def see(
     unit = functional.normalize(directions, dim=1)[:, None].expand_as(points)
     density, rgb = field(points.reshape(-1, 3), unit.reshape(-1, 3))
     weights = _weights(density.view(z.shape), z * directions.norm(dim=1, keepdim=True))
-    return Seen((weights[..., None] * rgb.view(*z.shape, 3)).sum(1), (weights * z).sum(1))
+    return RenderedRays((weights[..., None] * rgb.view(*z.shape, 3)).sum(1), (weights * z).sum(1))
 
 
 def _weights(density: Tensor, distance: Tensor) -> Tensor:

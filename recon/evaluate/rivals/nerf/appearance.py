@@ -14,15 +14,15 @@ from splatnode.recon.evaluate.appearance import FieldSnapshot
 from splatnode.recon.evaluate.rivals import outcome
 from splatnode.recon.evaluate.rivals.nerf.field import Field
 from splatnode.recon.evaluate.rivals.nerf.fit import Learnt
-from splatnode.recon.evaluate.rivals.nerf.volume import see
+from splatnode.recon.evaluate.rivals.nerf.volume_rendering import render_rays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 
 Array = npt.NDArray[np.float64]
-LATTICE = 128  # pixels on which an image is compared
+COMPARED_PIXELS = 128  # pixels on which an image is compared
 _CHUNK = 1024  # rays that are rendered at a time
 
 
-class FieldLook:
+class FieldAppearance:
     """`recon.evaluate.appearance.Appearance` of a field, whose parameters are constants here."""
 
     num_gaussians = None
@@ -39,42 +39,46 @@ class FieldLook:
         K = torch.tensor([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
         with torch.no_grad():
             return float(
-                see(self._field, torch.from_numpy(T_world_camera).float(), K, lattice(100, 100)).depth.median()
+                render_rays(
+                    self._field, torch.from_numpy(T_world_camera).float(), K, spread_pixels(100, 100)
+                ).depth.median()
             )
 
     def difference(self, image: Tensor, T_world_camera: Tensor, K: Tensor) -> Tensor:
         """On the same pixels whenever it is asked, evenly spread over the image."""
-        pixels = lattice(image.shape[1], image.shape[0])
+        pixels = spread_pixels(image.shape[1], image.shape[0])
         columns, rows = pixels.long().unbind(1)
-        return (see(self._field, T_world_camera, K, pixels).rgb - image[rows, columns]).abs().mean()
+        return (render_rays(self._field, T_world_camera, K, pixels).rgb - image[rows, columns]).abs().mean()
 
-    def picture(self, T_world_camera: Array, K: Array, width: int, height: int) -> Tensor:
+    def render(self, T_world_camera: Array, K: Array, width: int, height: int) -> Tensor:
         v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
         T, intrinsics = torch.from_numpy(T_world_camera).float(), torch.from_numpy(K).float()
         with torch.no_grad():
             parts = torch.stack([u, v], -1).view(-1, 2).split(_CHUNK)
-            rgb = torch.cat([see(self._field, T, intrinsics, part).rgb for part in parts])
+            rgb = torch.cat([render_rays(self._field, T, intrinsics, part).rgb for part in parts])
         return rgb.view(height, width, 3)
 
 
-def lattice(width: int, height: int, count: int = LATTICE) -> Tensor:
+def spread_pixels(width: int, height: int, count: int = COMPARED_PIXELS) -> Tensor:
     """(M, 2) centres of pixels that cover an image evenly: the additive sequence of the plastic number."""
     plastic = 1.32471795724474602596
     shares = torch.arange(1, count + 1)[:, None] * torch.tensor([1 / plastic, 1 / plastic**2]) % 1.0
     return (shares * torch.tensor([width, height])).floor() + 0.5
 
 
-def of_field(frames: Sequence[Frame], placed: Sequence[Frame], learnt: Learnt) -> FieldSnapshot:
-    """A field and the cameras that were learnt with it, those of the frames `placed`."""
+def snapshot_of_field(frames: Sequence[Frame], registered: Sequence[Frame], learnt: Learnt) -> FieldSnapshot:
+    """A field and the cameras that were learnt with it, those of the frames `registered`."""
     return FieldSnapshot(
         sequence=0,
-        verdict=outcome.verdict(frames, {frame.name for frame in placed}),
-        cameras=tuple(_camera(frame, T, learnt.focal) for frame, T in zip(placed, learnt.Ts_world_camera, strict=True)),
+        verdict=outcome.verdict(frames, {frame.name for frame in registered}),
+        cameras=tuple(
+            _camera(frame, T, learnt.focal) for frame, T in zip(registered, learnt.Ts_world_camera, strict=True)
+        ),
         gaussians=GaussianArrays.empty(),
         images={},
         dropped=(),
         iterations=learnt.iterations,
-        appearance=FieldLook(learnt.field),
+        appearance=FieldAppearance(learnt.field),
     )
 
 

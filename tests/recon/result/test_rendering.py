@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.rasterize import cpu, reference
-from splatnode.recon.result.picture import NEAR, take_picture
+from splatnode.recon.result.rendering import NEAR, render_arrays
 from splatnode.recon.result.snapshot import GaussianArrays
 from tests.support.synthetic import TinyScene, tiny_scene
 
@@ -35,7 +35,7 @@ def test_every_channel_equals_the_rasterisers(bases):
     )  # fmt: skip
     T_world_camera, K = scene.Ts_world_camera[1].numpy(), scene.Ks[1].numpy()
     channels = ("rgb", "depth", "normal", "alpha")
-    picture = take_picture(arrays(scene), T_world_camera, K, scene.width, scene.height, channels=channels)
+    picture = render_arrays(arrays(scene), T_world_camera, K, scene.width, scene.height, channels=channels)
     for name in channels:
         assert np.array_equal(getattr(picture, name), getattr(render, name).numpy()), name
     assert picture.alpha.max() > 0.5
@@ -44,7 +44,7 @@ def test_every_channel_equals_the_rasterisers(bases):
 def test_channels_that_nobody_asked_for_are_empty():
     scene = tiny_scene()
     camera = scene.Ts_world_camera[0].numpy(), scene.Ks[0].numpy(), scene.width, scene.height
-    picture = take_picture(arrays(scene), *camera, channels=("depth",))
+    picture = render_arrays(arrays(scene), *camera, channels=("depth",))
     assert picture.depth.shape == (scene.height, scene.width) and picture.rgb.size == 0 and picture.normal.size == 0
 
 
@@ -53,11 +53,11 @@ def test_what_cannot_be_drawn_is_refused():
     camera = scene.Ts_world_camera[0].numpy(), scene.Ks[0].numpy(), scene.width, scene.height
     whole = arrays(scene)
     with pytest.raises(ValueError, match="must have the shapes"):
-        take_picture(replace(whole, scales=whole.scales[:-1]), *camera)
+        render_arrays(replace(whole, scales=whole.scales[:-1]), *camera)
     with pytest.raises(ValueError, match="opacities must be from 0 to 1"):
-        take_picture(replace(whole, opacities=whole.opacities + 2), *camera)
+        render_arrays(replace(whole, opacities=whole.opacities + 2), *camera)
     with pytest.raises(ValueError, match="channels must be of"):
-        take_picture(whole, *camera, channels=("colour",))
+        render_arrays(whole, *camera, channels=("colour",))
 
 
 def test_the_near_plane_is_the_definitions():

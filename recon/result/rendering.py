@@ -1,4 +1,4 @@
-"""Pictures of Gaussians with NumPy alone: previews and the viewer run without torch. There are no gradients."""
+"""Renders of Gaussians with NumPy alone: previews and the viewer run without torch. There are no gradients."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NEAR = 0.01  # world units; splatnode.recon.rasterize.reference has it too, but 
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class RenderedArrays:
     """The channels of `recon.rasterize.render.Render`; one that was not asked for is empty, (0, 0) or (0, 0, 3)."""
 
     rgb: Array  # (H, W, 3) on black, not clipped
@@ -27,11 +27,11 @@ class Picture:
 
 
 def use_threads(threads: int) -> None:
-    """Bounds the processors that a picture takes. Raises ValueError below 1."""
+    """Bounds the processors that a render takes. Raises ValueError below 1."""
     set_threads(threads)
 
 
-def take_picture(
+def render_arrays(
     gaussians: GaussianArrays,
     T_world_camera: npt.NDArray[np.float64],  # (4, 4) rigid
     K: npt.NDArray[np.float64],  # (3, 3)
@@ -39,8 +39,8 @@ def take_picture(
     height: int,
     *,
     channels: Collection[str] = ("rgb",),
-) -> Picture:
-    """The image of the Gaussians, as `recon.rasterize.reference.rasterize` defines it, by the compiled core.
+) -> RenderedArrays:
+    """The Gaussians rendered by the compiled core, as `recon.rasterize.reference.rasterize` defines it.
 
     Raises ValueError where shapes or values are not what they must be.
     """
@@ -81,7 +81,7 @@ def take_picture(
     }
     addresses = {name: image.ctypes.data if image.size else None for name, image in images.items()}
     raster_forward(source, RasterImages(**addresses))
-    return Picture(
+    return RenderedArrays(
         rgb=images["rgb"].transpose(1, 2, 0),
         depth=images["depth"][0],
         normal=images["normal"].transpose(1, 2, 0),
