@@ -1,4 +1,4 @@
-"""Mutual nearest-neighbour matches with the ratio test, in one native sweep."""
+"""Mutual nearest neighbours with the ratio test (Lowe, 2004), in one native sweep over all descriptor pairs."""
 
 from __future__ import annotations
 
@@ -11,29 +11,32 @@ from splatnode.recon.core import library, pointer
 Bytes = npt.NDArray[np.uint8]
 Index = npt.NDArray[np.int64]
 
-QUANTISED_NORM = 175.0  # of a descriptor in bytes: with rounding at most 181, so that products fit 16 bits
-_SCORE_OFFSET = 16320  # as in recon/core/match.cpp
+QUANTISED_NORM = 175.0  # length of a descriptor in bytes: with rounding at most 181, so that products fit 16 bits
+_MAX_BYTE = 127  # the core multiplies signed bytes
+_MAX_DESCRIPTORS = 65535  # that recon/core/match.cpp is written for
+_SCORE_OFFSET = 16320  # `kOffset` of recon/core/match.cpp: keeps scores positive
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    ratio: float = 0.85  # nearest over second-nearest distance; looser than usual, geometry decides later
+    ratio: float = 0.85  # most of the nearest distance over the second nearest; loose, because geometry decides later
 
 
 def quantise(descriptors: npt.NDArray[np.float32]) -> Bytes:
-    """(M, 128) non-negative descriptors of unit length as bytes below 128; costs 2 % of a descriptor's length."""
-    return np.minimum(np.rint(descriptors * QUANTISED_NORM), 127).astype(np.uint8)
+    """`descriptors` (M, 128), not negative and of unit length, as bytes below 128; rounding costs 2 % of the length."""
+    return np.minimum(np.rint(descriptors * QUANTISED_NORM), _MAX_BYTE).astype(np.uint8)
 
 
 def match(descriptors1: Bytes, descriptors2: Bytes, config: Config) -> Index:
-    """(M, 2) indices into both sets: each is the other's nearest neighbour and clearly nearer than the next.
+    """(M, 2) indices into both sets: each is the other's nearest neighbour, and clearly nearer than the second nearest.
 
-    The most distinct matches come first. Both are `quantise`d, (*, 128), of at most 65535 rows.
+    The most distinct match comes first: the one with the lowest ratio of distances. Raises ValueError unless both are
+    (*, 128) bytes, as `quantise` makes them, of at most 65535 rows.
     """
     for descriptors in (descriptors1, descriptors2):
         if descriptors.dtype != np.uint8 or descriptors.ndim != 2 or descriptors.shape[1] != 128:
             raise ValueError(f"descriptors must be (M, 128) uint8, got {descriptors.shape} {descriptors.dtype}")
-        if len(descriptors) > 65535:
-            raise ValueError(f"at most 65535 descriptors can be matched, got {len(descriptors)}")
+        if len(descriptors) > _MAX_DESCRIPTORS:
+            raise ValueError(f"at most {_MAX_DESCRIPTORS} descriptors can be matched, got {len(descriptors)}")
     count1, count2 = len(descriptors1), len(descriptors2)
     if count1 < 2 or count2 < 2:
         return np.zeros((0, 2), np.int64)

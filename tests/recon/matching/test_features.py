@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from splatnode.capture.frame import Frame
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features, nearest_neighbours, pair_matching
+from splatnode.recon.matching.two_view import TwoView
 
 
 @pytest.fixture(scope="module")
@@ -89,3 +92,13 @@ def test_frames_without_features_are_compared_without_a_pair():
     plain = pair_matching.match_plain(keyframes[0], keyframes[1], config.pair_matching)
     assert plain.geometry is None and plain.log10_nfa == 0.0 and plain.matches.shape == (0, 2)
     assert pair_matching.match_tilted(keyframes[0], keyframes[1], plain, config.pair_matching).geometry is None
+
+
+def test_the_motion_of_a_resized_copy_is_none():
+    """A frame beside the same frame at half its size: in pixels of one size, nothing moved."""
+    points = np.random.default_rng(0).uniform(-300, 300, (9, 2))
+    pair = TwoView(np.zeros((9, 2), np.int64), points, 0.5 * points, 9, -20.0, 9, 9, 1.0, 1.0)
+    assert pair_matching.median_motion_px(pair, 640, 320) == 0.0
+    moved = pair.scaled(1.0, 2.0)
+    assert pair_matching.median_motion_px(moved, 640, 640) == 0.0
+    assert pair_matching.median_motion_px(replace(moved, points2=points + [5.0, 0.0]), 640, 640) == pytest.approx(8.0)
