@@ -87,7 +87,7 @@ def run(
 ) -> Snapshot:
     """The final snapshot; every one is given to `show`."""
     snapshot = None
-    for snapshot in reconstruct(list(frames), config):
+    for snapshot in reconstruct(frames, config):
         show(snapshot)
     if snapshot is None:
         raise AssertionError("reconstruct always yields a last snapshot")

@@ -20,6 +20,10 @@ class Clock:
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
         self.last = now
 
+    def deadline(self, budget_s: float | None) -> float | None:
+        """When, by `time.monotonic()`, so many seconds since the start are over; None: never."""
+        return None if budget_s is None else self.started + budget_s
+
     def resume(self) -> None:
         """Goes on as if no time had passed since the last lap: the work lay by."""
         gap = time.monotonic() - self.last

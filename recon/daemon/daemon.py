@@ -36,7 +36,7 @@ from splatnode.recon.daemon.control import Answer, Retract
 from splatnode.recon.daemon.disk_space import DiskSpace
 from splatnode.recon.daemon.inbox import Inbox, LeftOut
 from splatnode.recon.daemon.intake import Intake
-from splatnode.recon.daemon.output import Shown
+from splatnode.recon.daemon.output import Published
 from splatnode.recon.daemon.status import ReconStatus, State
 from splatnode.recon.daemon.watcher import Watcher
 from splatnode.recon.daemon.worker import Worker
@@ -89,7 +89,7 @@ class Daemon:
         self._watcher = Watcher(network, config.tracking, lambda: self._worker.finished, stopping)
         self._numbering = Numbering()
         self._started_s = time.monotonic()
-        self._shown: Shown | None = None
+        self._shown: Published | None = None
         self._errors: list[BaseException] = []
 
     def __enter__(self) -> Daemon:
@@ -201,13 +201,13 @@ class _Newest:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._shown: Shown | None = None
+        self._shown: Published | None = None
 
-    def put(self, shown: Shown) -> None:
+    def put(self, shown: Published) -> None:
         with self._lock:
             self._shown = shown
 
-    def take(self) -> Shown | None:
+    def take(self) -> Published | None:
         with self._lock:
             shown, self._shown = self._shown, None
             return shown

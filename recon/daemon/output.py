@@ -10,7 +10,7 @@ from splatnode.capture.process.logs import event
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
-from splatnode.recon.daemon.reconstruction import LiveReconstruction
+from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.metric import in_metres
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.write import finish
@@ -19,7 +19,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class Published:
     """A snapshot that viewers may see, with the id of its scene."""
 
     snapshot: Snapshot
@@ -28,18 +28,15 @@ class Shown:
 
 class Output:
     def __init__(
-        self, config: Config, store: Store, publish: Callable[[Shown], None], complain: Callable[[str], None]
+        self, config: Config, store: Store, publish: Callable[[Published], None], complain: Callable[[str], None]
     ) -> None:
         """`complain` is called where the disk is full: that costs a result, or time after a restart; no keyframe."""
         self._config, self._store, self._publish, self._complain = config, store, publish, complain
 
-    def show(self, work: LiveReconstruction, final: bool = False) -> Snapshot:
-        """Publishes a snapshot of `work` and returns it."""
-        snapshot = work.snapshot(final)
-        self._publish(Shown(snapshot, self._store.scene_id))
-        return snapshot
+    def publish(self, snapshot: Snapshot) -> None:
+        self._publish(Published(snapshot, self._store.scene_id))
 
-    def save(self, work: LiveReconstruction, final: bool) -> None:
+    def save(self, work: IncrementalReconstruction, final: bool) -> None:
         """Writes the checkpoint's files that a restart would else have to compute again."""
         try:
             checkpoint.save(self._store, work, final)

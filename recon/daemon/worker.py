@@ -17,11 +17,12 @@ from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
 from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
-from splatnode.recon.daemon.output import Output, Shown
-from splatnode.recon.daemon.reconstruction import LiveReconstruction
+from splatnode.recon.daemon.output import Output, Published
 from splatnode.recon.daemon.status import State
 from splatnode.recon.daemon.watcher import Finished
 from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.modelling import Shown
 from splatnode.recon.result.snapshot import Snapshot
 
 log = logging.getLogger(__name__)
@@ -42,7 +43,7 @@ class Worker:
         config: Config,
         store: Store,
         inbox: Inbox,
-        publish: Callable[[Shown], None],
+        publish: Callable[[Published], None],
         stopping: threading.Event,
     ) -> None:
         limit = min(config.max_gaussians, config.reconstruction.max_gaussians or config.max_gaussians)
@@ -50,7 +51,7 @@ class Worker:
         self._config, self._store, self._inbox = config, store, inbox
         self._output = Output(config, store, publish, self._complain)
         self._stopping = stopping
-        self._work = LiveReconstruction(self._recipe)
+        self._work = IncrementalReconstruction(self._recipe)
         self._settled = True  # nothing can be made better before the next keyframe
         self.state = State.WAITING
         self.problem = ""
@@ -86,7 +87,8 @@ class Worker:
 
     def _restore(self) -> None:
         """Goes on where an earlier process was."""
-        found = checkpoint.restore(self._store, self._work)
+        found = checkpoint.restore(self._store, self._recipe)
+        self._work = found.work
         self._settled = found.final or not found.keyframes
         if not found.keyframes:
             return
@@ -108,11 +110,11 @@ class Worker:
             self._show_grown(arrived)
         if strangers and self._receive(strangers):
             self._show_grown(arrived)
-        self.state = State.LOST if membership.strangers(self._work) else State.GROWING
+        self.state = State.LOST if self._strangers() else State.GROWING
 
     def _show_grown(self, arrived: Sequence[Arrived]) -> None:
         """The scene with the keyframes that have come to belong to it."""
-        self._work.work_in()
+        self._work.update(self._unless_stopping)
         snapshot = self._show()
         if arrived:
             self.keyframe_s = time.monotonic() - arrived[0].at_s
@@ -136,7 +138,9 @@ class Worker:
     def _added(self, keyframes: list[Keyframe]) -> set[str]:
         """Adds keyframes to the view graph; names those that do not fit at once, which are set aside."""
         try:
-            return membership.add(self._work, keyframes)
+            return membership.add(self._work, keyframes, self._unless_stopping)
+        except _Abandoned:
+            raise
         except Exception as error:  # one bad frame must not keep others out
             self._work.retract([keyframe.name for keyframe in keyframes])
             if len(keyframes) > 1:
@@ -151,7 +155,7 @@ class Worker:
         They are judged thoroughly with all others, as long as what waits can wait; if they are too many, in any case.
         If that does not help them, another place begins with them.
         """
-        lost = len(membership.strangers(self._work)) >= self._config.lost_after
+        lost = len(self._strangers()) >= self._config.lost_after
         pause = partial(self._pause, math.inf if lost else time.monotonic() + PATIENCE_S)
         aside = [keyframe.name for keyframe in self._work.aside]
         joined = membership.connected(self._work, pause) and (
@@ -163,7 +167,7 @@ class Worker:
 
     def _lost(self, newest: Collection[str]) -> bool:
         """Says which of the newest keyframes do not fit; where too many in a row do not, another place begins."""
-        strangers = membership.strangers(self._work)
+        strangers = self._strangers()
         for keyframe in strangers:
             if keyframe.name in newest:
                 event(log, logging.WARNING, "does_not_fit", frame=keyframe.name, scene=self._store.scene_id)
@@ -179,9 +183,9 @@ class Worker:
         before = self._store.scene_id
         self._store.begin_place(strangers[0].frame.frame_id)
         event(log, logging.WARNING, "another_place", before=before, now=self._store.scene_id)
-        self._work = LiveReconstruction(self._recipe)
+        self._work = IncrementalReconstruction(self._recipe)
         for keyframe in strangers:
-            self._work.add(keyframe)
+            self._work.add(keyframe, self._unless_stopping)
 
     def _make_room(self, coming: int) -> None:
         """Gives up views that can be spared, so that there are not more than configured."""
@@ -195,7 +199,6 @@ class Worker:
     def _leave_out(self, names: Sequence[str]) -> None:
         """The checkpoint no longer has these frames; the scene forgets them, too."""
         known = [name for name in names if name in self._work.names]
-        self._work.dropped = self._store.dropped
         self._work.retract(names)
         if known:
             self._settled, self.finished, self.state = False, None, State.GROWING
@@ -206,7 +209,6 @@ class Worker:
     def _forget(self, name: str, reason: str) -> None:
         self._store.forget(name, reason)
         self._work.retract([name])
-        self._work.dropped = self._store.dropped
 
     def _settle(self) -> None:
         """Makes the scene afresh from all keyframes and refines it. Raises _Abandoned when something comes."""
@@ -215,14 +217,14 @@ class Worker:
         steps = msgspec.structs.replace(config, checkpoints=tuple(range(STEP, config.iterations, STEP)))
         fitted = set(self._work.names)
         membership.prove(self._work, self._pause)
-        for keyframe in membership.contradicting(self._work):
+        for keyframe in membership.contradicting(self._work, self._pause):
             self._forget(keyframe.name, "it contradicts the scene")
         self._lost(fitted)
-        self._work.estimate(self._pause)
-        refined = None
+        self._work.rebuild(self._pause)
+        refined = Shown()
         for refined in self._work.refine(self._work.begun, steps):
             self._pause()
-            if refined.iterations in config.checkpoints:
+            if refined.scene is not None and refined.scene.iterations in config.checkpoints:
                 self._work.show(refined)
                 self._show()
         self._settled = True
@@ -232,7 +234,7 @@ class Worker:
         if shown:
             exported = self._output.export(snapshot)
             self._output.save(self._work, final=exported)  # what is kept as final is not exported after a restart
-        self.state = State.WAITING if not shown else State.LOST if membership.strangers(self._work) else State.IDLE
+        self.state = State.WAITING if not shown else State.LOST if self._strangers() else State.IDLE
 
     def _pause(self, until_s: float = 0.0) -> None:
         """Raises _Abandoned if the daemon stops, and from `until_s` (monotonic) on if something has come."""
@@ -240,9 +242,18 @@ class Worker:
         if self._stopping.is_set() or (len(self._inbox) and self.moved_s > until_s):
             raise _Abandoned
 
+    def _unless_stopping(self) -> None:
+        """Raises _Abandoned if the daemon stops: what may be shown soon is not abandoned for what comes next."""
+        self._pause(math.inf)
+
+    def _strangers(self) -> list[Keyframe]:
+        return membership.strangers(self._work, self._unless_stopping)
+
     def _show(self, final: bool = False) -> Snapshot:
-        snapshot = self._output.show(self._work, final)
-        self.finished = Finished(snapshot, tuple(self._work.graph.keyframes)) if final else None
+        self._work.estimate_soon(self._unless_stopping)
+        snapshot = self._work.snapshot(self._store.dropped, final)
+        self._output.publish(snapshot)
+        self.finished = Finished(snapshot, self._work.graph.keyframes) if final else None
         return snapshot
 
     def _complain(self, problem: str) -> None:

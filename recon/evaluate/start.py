@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.recon.clock import Clock
 from splatnode.recon.config import Config
-from splatnode.recon.pipeline import Reconstruction, finished
+from splatnode.recon.estimation import Estimate
+from splatnode.recon.pipeline import estimate_frames, model
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
 
 
 @dataclass(frozen=True, eq=False)
 class Start:
-    """A reconstruction that has its points and no Gaussians yet; it is sent from process to process."""
+    """Cameras and depth, no Gaussians yet; it is sent from process to process, and serves several reconstructions."""
 
-    work: Reconstruction
-    seconds: float  # that it took so far
+    estimate: Estimate
+    dropped: list[DroppedFrame]
+    clock: Clock
     peak_rss_mb: float | None
+
+    @property
+    def seconds(self) -> float:
+        """That it took so far."""
+        return self.clock.last - self.clock.started
 
 
 def foundation(config: Config) -> Config:
@@ -35,20 +43,14 @@ def foundation(config: Config) -> Config:
 
 
 def find_start(frames: Sequence[Frame], config: Config) -> Start:
-    """Cameras and points as `config` finds them, or a verdict that forbids them."""
-    work = Reconstruction(config)
-    for frame in frames:
-        work.take(frame)
-    work.find_points()
-    return Start(work, work.clock.last - work.clock.started, peak_rss_mb())
+    """Cameras and depth as `config` finds them, or a verdict that forbids them."""
+    clock = Clock()
+    estimate, dropped = estimate_frames(frames, config, clock)
+    return Start(estimate, dropped, clock, peak_rss_mb())
 
 
 def continued(start: Start, config: Config) -> Iterator[Snapshot]:
-    """What `reconstruct` gives from here on with `config`, of the same foundation; its clock goes on where it stopped.
-
-    A start serves one reconstruction: another one needs a copy of its own.
-    """
-    work = start.work
-    work.config = config
-    work.clock.resume()
-    yield from finished(work, at_once=True)
+    """What `reconstruct` gives from here on with `config`; the clock goes on where it stopped."""
+    clock = replace(start.clock, seconds=dict(start.clock.seconds))
+    clock.resume()
+    yield from model(start.estimate, start.dropped, config, clock)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import cv2
 import msgspec
@@ -11,8 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture import quality
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.result.verdict import Code
+
+REMEMBERED_REJECTED = 100  # frames of a stream: more of them change no verdict
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -44,6 +46,49 @@ def summarise(frame: Frame) -> FrameSummary:
     size = max(1, round(frame.width * scale)), max(1, round(frame.height * scale))
     thumbnail = cv2.resize(frame.image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
     return FrameSummary(frame.name, quality.assess(frame.image), thumbnail, (frame.width, frame.height))
+
+
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """The frames of a stream that were kept so far, by name, and those that were rejected, the latest last."""
+
+    summaries: Mapping[str, FrameSummary] = field(default_factory=dict)
+    rejected: tuple[Rejected, ...] = ()
+
+    def with_frame(self, frame: Frame, config: Config) -> tuple[Screened, list[Rejected]]:
+        """With a further frame, and which frames are rejected now that there is this one too: it, or earlier ones."""
+        summaries = {**self.summaries, frame.name: summarise(frame)}
+        _, rejected = screen(list(summaries.values()), config)
+        for each in rejected:
+            del summaries[each.name]
+        return Screened(summaries, (*self.rejected, *rejected)[-REMEMBERED_REJECTED:]), rejected
+
+    def with_known(self, frame: Frame) -> Screened:
+        """With a frame that was screened elsewhere."""
+        return (
+            self
+            if frame.name in self.summaries
+            else replace(self, summaries={**self.summaries, frame.name: summarise(frame)})
+        )
+
+    def without(self, names: Collection[str]) -> Screened:
+        """Without these frames, which are neither kept nor rejected."""
+        return replace(self, summaries={name: summary for name, summary in self.summaries.items() if name not in names})
+
+
+def screen_all(
+    frames: Iterable[Frame | DroppedFrame], config: Config
+) -> tuple[list[Frame], list[DroppedFrame], tuple[Rejected, ...]]:
+    """The frames that are worth working on; those that were left out, here or before; why, of those here."""
+    screened, kept, dropped = Screened(), dict[str, Frame](), list[DroppedFrame]()
+    for frame in frames:
+        if isinstance(frame, DroppedFrame):
+            dropped.append(frame)
+            continue
+        screened, rejected = screened.with_frame(frame, config)
+        dropped += [DroppedFrame(each.name, each.reason) for each in rejected]
+        kept = {name: each for name, each in {**kept, frame.name: frame}.items() if name in screened.summaries}
+    return list(kept.values()), dropped, screened.rejected
 
 
 def screen(summaries: Sequence[FrameSummary], config: Config) -> tuple[list[int], list[Rejected]]:

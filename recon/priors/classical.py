@@ -8,7 +8,8 @@ from typing import Protocol
 import msgspec
 
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.matching.view_graph import Matcher, ViewGraph
+from splatnode.recon.matching.match import Matcher
+from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors import stereo
 from splatnode.recon.priors.consistency import DepthMap
 from splatnode.recon.priors.pointmap import Pointmap

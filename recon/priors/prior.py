@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Protocol
 
-from splatnode.recon.matching.view_graph import Matcher, ViewGraph
+from splatnode.recon.matching.match import Matcher
+from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.registration.register import Registration
 

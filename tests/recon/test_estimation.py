@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 from splatnode.recon.config import Config
-from splatnode.recon.estimation import FOR_NOW, Judging
+from splatnode.recon.estimation import PROVISIONAL
 from splatnode.recon.geometry import align_cameras
+from splatnode.recon.incremental import IncrementalReconstruction, Known
 from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.memory import Memory
 from splatnode.recon.registration import continuation, register
 from splatnode.recon.verification import reflection
 from tests.support.synthetic import photographs, places, view_graph
@@ -25,9 +27,10 @@ def graph() -> ViewGraph:
     return view_graph(photographs()[:4])
 
 
-@pytest.fixture
-def judging() -> Judging:
-    return Judging(CONFIG)
+def holding(graph: ViewGraph, memory: Memory | None = None) -> IncrementalReconstruction:
+    """A reconstruction that has the keyframes of `graph`, and remembers these estimates."""
+    known = Known(graph, ViewGraph(graph.config), memory=memory or Memory())
+    return IncrementalReconstruction(CONFIG, known)
 
 
 def first(graph: ViewGraph, count: int) -> ViewGraph:
@@ -55,51 +58,55 @@ def test_a_lens_of_which_nothing_is_known_has_to_be_registered(graph):
     assert continuation.extended(keyframes, graph.pairs, known.cameras, REGISTRATION) is None
 
 
-def test_a_further_keyframe_is_accepted_for_now_and_then_for_good(graph, judging):
-    assert not judging.soon(first(graph, 3), []).verdict.provisional
-    soon = judging.soon(graph, [])
-    assert soon.verdict.publishable and soon.verdict.provisional and FOR_NOW in soon.verdict.message
-    assert [camera.name for camera in soon.evidence.cameras] == [keyframe.name for keyframe in graph.keyframes]
-    assert judging.proven == {keyframe.name for keyframe in graph.keyframes[:3]}
-    thorough = judging.thorough(graph, [])
-    assert thorough.verdict.publishable and not thorough.verdict.provisional
-    assert judging.proven == {keyframe.name for keyframe in graph.keyframes}
-    assert judging.soon(graph, []) is thorough
+def test_a_further_keyframe_is_accepted_provisionally_and_then_for_good(graph):
+    before = holding(first(graph, 3))
+    assert not before.estimate_soon().verdict.provisional
+    work = holding(graph, before.known.memory)
+    soon = work.estimate_soon()
+    assert soon.verdict.publishable and soon.verdict.provisional and PROVISIONAL in soon.verdict.message
+    assert [camera.name for camera in soon.evidence.cameras] == graph.names
+    assert work.proven == set(graph.names[:3])
+    thorough = work.estimate_thoroughly()
+    assert thorough.publishable and not thorough.verdict.provisional and work.proven == set(graph.names)
+    assert work.estimate_soon() is thorough
 
 
-def test_a_mirrored_photograph_is_not_accepted_for_now(graph, judging):
+def test_a_mirrored_photograph_is_not_accepted_provisionally(graph):
     """Where a place is symmetric, the mirror image of a photograph fits to the pixel: only its details tell."""
     photograph = graph.keyframes[3]
     features = replace(
         photograph.features, descriptors=reflection.mirrored_descriptors(photograph.features.descriptors)
     )
-    fitting = first(graph, 4)
-    fitting.keyframes = [*graph.keyframes[:3], replace(photograph, features=features)]
-    assert judging.soon(first(graph, 3), []).verdict.publishable
-    assert judging.quickly(fitting, []) is None
-    assert judging.quickly(graph, []).verdict.publishable  # the same photograph as it is
+    fitting = replace(graph, keyframes=(*graph.keyframes[:3], replace(photograph, features=features)))
+    before = holding(first(graph, 3))
+    assert before.estimate_soon().publishable
+    assert holding(fitting, before.known.memory).estimate_quickly() is None
+    assert holding(graph, before.known.memory).estimate_quickly().publishable  # the same photograph as it is
 
 
-def test_another_place_is_not_accepted_for_now(judging):
+def test_another_place_is_not_accepted_provisionally():
     frames = places(seeds=(0, 1))
     here_and_there = view_graph([*frames[:3], frames[4]])
-    assert judging.soon(first(here_and_there, 3), []).verdict.publishable
-    assert not judging.soon(here_and_there, []).verdict.provisional
+    before = holding(first(here_and_there, 3))
+    assert before.estimate_soon().publishable
+    assert not holding(here_and_there, before.known.memory).estimate_soon().verdict.provisional
 
 
-def test_work_that_is_abandoned_leaves_what_was_known(graph, judging):
+def test_work_that_is_abandoned_leaves_what_was_known(graph):
     def pause() -> None:
         raise InterruptedError
 
-    judging.soon(first(graph, 3), [])
+    before = holding(first(graph, 3))
+    before.estimate_soon()
+    work = holding(graph, before.known.memory)
     with pytest.raises(InterruptedError):
-        judging.thorough(graph, [], pause)
-    assert judging.soon(graph, []).verdict.provisional
+        work.estimate_thoroughly(pause)
+    assert work.known.memory is before.known.memory and work.estimate_soon().verdict.provisional
 
 
-def test_a_thorough_judgement_can_be_abandoned_at_any_of_its_stages(graph):
-    whole, calls = Judging(CONFIG), []
-    whole.thorough(_not_compared(graph), [], lambda: calls.append(None))
+def test_a_thorough_estimate_can_be_abandoned_at_any_of_its_stages(graph):
+    fresh, calls = match_later(graph), []
+    holding(fresh).estimate_thoroughly(lambda: calls.append(None))
     assert len(calls) > 6 + 3  # pairs, attempts at a map, what speaks for it
     for moment in (1, len(calls) // 2, len(calls)):
         left = iter(range(moment - 1))
@@ -108,27 +115,36 @@ def test_a_thorough_judgement_can_be_abandoned_at_any_of_its_stages(graph):
             if next(left, None) is None:
                 raise InterruptedError
 
-        judging = Judging(CONFIG)
-        compared = _not_compared(graph)
+        work = holding(fresh)
         with pytest.raises(InterruptedError):
-            judging.thorough(compared, [], pause)
-        assert judging.proven == frozenset() and judging.thorough(compared, []).verdict.publishable
+            work.estimate_thoroughly(pause)
+        assert work.proven == frozenset() and work.remembered() is None
+        assert len(work.graph.pending) == max(6 - moment, 0)  # what was compared by then is kept
+        assert work.estimate_thoroughly().publishable
 
 
-def test_what_was_refused_is_remembered_whatever_the_order(judging):
+def test_what_was_refused_is_remembered_whatever_the_order():
     frames = places(seeds=(0, 1))
-    strange = view_graph([frames[0], frames[3]])
-    assert not judging.thorough(strange, []).verdict.publishable
-    names = [keyframe.name for keyframe in strange.keyframes]
-    assert judging.refused(names[::-1]) and not judging.refused(names[:1])
+    work = holding(view_graph([frames[0], frames[3]]))
+    assert not work.estimate_thoroughly().publishable
+    assert work.was_refused(work.names[::-1]) and not work.was_refused(work.names[:1])
 
 
-def _not_compared(graph: ViewGraph) -> ViewGraph:
+def test_a_snapshot_computes_nothing(graph):
+    work = holding(graph)
+    with pytest.raises(RuntimeError, match="estimate_soon"):
+        work.snapshot()
+    work.estimate_soon()
+    assert work.snapshot().verdict.publishable
+    work.retract({graph.names[0]})
+    with pytest.raises(RuntimeError, match="estimate_soon"):
+        work.snapshot()
+
+
+def match_later(graph: ViewGraph) -> ViewGraph:
     """The same keyframes, nothing known of their pairs."""
-    fresh = ViewGraph(CONFIG.matching)
-    fresh.keyframes = list(graph.keyframes)
-    fresh.pending = set(itertools.combinations(range(len(fresh.keyframes)), 2))
-    return fresh
+    pending = frozenset(itertools.combinations(range(len(graph.keyframes)), 2))
+    return ViewGraph(CONFIG.matching, graph.keyframes, pending=pending)
 
 
 def _of(graph: ViewGraph):

@@ -25,9 +25,10 @@ from splatnode.recon.evaluate.splits import load_split
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.geometry import align_cameras
+from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.optimize import refinement
-from splatnode.recon.pipeline import Reconstruction, reconstruct
+from splatnode.recon.pipeline import reconstruct, reconstruct_stream
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.registration import register
 from splatnode.recon.result.preview import render_rgb
@@ -52,7 +53,7 @@ BLURRED = DroppedFrame("blurred.png", "blurred by 9 pixels")
 def streamed() -> list[Snapshot]:
     """All snapshots of a stream of six photographs, with a dropped one after the third."""
     frames = photographs()
-    return list(reconstruct(iter([*frames[:3], BLURRED, *frames[3:]]), CONFIG))
+    return list(reconstruct_stream([*frames[:3], BLURRED, *frames[3:]], CONFIG))
 
 
 @pytest.fixture(scope="module")
@@ -193,13 +194,14 @@ def test_a_scene_that_its_refinement_ruined_is_no_result():
 
 def test_a_new_estimate_is_shown_after_a_ruined_scene():
     wild = replace(QUICK.optimize.rates, means=1.0, log_scales=1.0)
-    work = Reconstruction(replace(QUICK, optimize=replace(QUICK.optimize, rates=wild)))
+    work = IncrementalReconstruction(replace(QUICK, optimize=replace(QUICK.optimize, rates=wild)))
     for frame in three():
         work.take(frame)
-    work.estimate()
-    assert not list(work.refine(work.begun, work.config.optimize)) and work.snapshot().verdict.code is Code.DIVERGED
-    work.estimate()
-    work.show(work.begun)
+    work.rebuild()
+    *_, ruined = work.refine(work.begun, work.config.optimize)
+    work.show(ruined)
+    assert ruined.scene is None and work.snapshot().verdict.code is Code.DIVERGED
+    work.update()
     assert work.snapshot().verdict.publishable and work.scene is not None
 
 
@@ -213,7 +215,7 @@ def test_time_counts_from_the_first_frame_and_a_readers_time_is_waiting():
             yield frame
 
     seconds: dict[str, float] = {}
-    for snapshot in reconstruct(slow_camera(), QUICK):
+    for snapshot in reconstruct_stream(slow_camera(), QUICK):
         seconds = snapshot.seconds
         time.sleep(0.1)
     assert 0.2 <= seconds["wait"] < seconds["total"] < time.monotonic() - taken[0]
@@ -222,7 +224,7 @@ def test_time_counts_from_the_first_frame_and_a_readers_time_is_waiting():
 @pytest.mark.parametrize("frames", [[], [BLURRED]], ids=["none", "all dropped"])
 @pytest.mark.parametrize("stream", [False, True])
 def test_no_usable_frame_is_a_verdict_not_an_error(frames, stream):
-    *_, final = reconstruct(iter(frames) if stream else frames, CONFIG)
+    *_, final = (reconstruct_stream if stream else reconstruct)(frames, CONFIG)
     assert final.final and final.verdict.code == Code.TOO_FEW_VIEWS and not final.verdict.publishable
     assert final.dropped == tuple(frames) and len(final.gaussians) == 0
 

@@ -30,14 +30,15 @@ def camera(index: int) -> np.ndarray:
 
 def graph_of(count: int) -> ViewGraph:
     """Views in a row; the nearer two are, the more matches they have."""
-    graph = ViewGraph(matching.Config())
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH + 16 * count, 3)).astype(np.uint8)
-    for index in range(count):
-        image = np.ascontiguousarray(noise[:, index : index + WIDTH])
-        graph.keyframes.append(Keyframe(Frame(index, f"{index:02d}.png", 0, image, None), image, NO_FEATURES))
+    images = [np.ascontiguousarray(noise[:, index : index + WIDTH]) for index in range(count)]
+    keyframes = [
+        Keyframe(Frame(index, f"{index:02d}.png", 0, image, None), image, NO_FEATURES)
+        for index, image in enumerate(images)
+    ]
     pairs = [(i, j) for i in range(count) for j in range(i + 1, count)]
-    graph.pairs.update({(i, j): SimpleNamespace(matches=np.zeros((100 - 9 * (j - i), 2))) for i, j in pairs})
-    return graph
+    matches = {(i, j): SimpleNamespace(matches=np.zeros((100 - 9 * (j - i), 2))) for i, j in pairs}
+    return ViewGraph(matching.Config(), tuple(keyframes), matches)
 
 
 def registration_of(count: int, world: Similarity | None = None) -> Registration:

@@ -20,7 +20,8 @@ from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
 from splatnode.recon.frames.keyframe import Keyframe, modelled_image
 from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features
-from splatnode.recon.matching.view_graph import Matcher, ViewGraph
+from splatnode.recon.matching.match import Matcher, match
+from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.gaussians import Gaussians
@@ -127,11 +128,8 @@ def view_graph(
 ) -> ViewGraph:
     """The frames as keyframes, each compared with all before it."""
     config = config or matching.Config()
-    graph = ViewGraph(config, matcher)
-    for frame in frames:
-        found = features.extract(frame.image, config.features)
-        graph.add(Keyframe(frame, modelled_image(frame.image, 320), found))
-    return graph
+    found = ((frame, features.extract(frame.image, config.features)) for frame in frames)
+    return match((Keyframe(frame, modelled_image(frame.image, 320), known) for frame, known in found), config, matcher)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,59 +7,90 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from splatnode.capture.frame import Frame
-from splatnode.recon.daemon.checkpoint import saved, saved_judgement
+from splatnode.recon.config import Config
+from splatnode.recon.daemon.checkpoint import saved, saved_estimate
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.daemon.reconstruction import LiveReconstruction
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.pipeline import prepare
+from splatnode.recon.frames.screening import Screened
+from splatnode.recon.incremental import IncrementalReconstruction, Known
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.memory import Memory
+from splatnode.recon.modelling import shown
+from splatnode.recon.preparation import prepare
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class Restored:
+    work: IncrementalReconstruction
     keyframes: int
     new: list[Keyframe]  # that the reconstruction does not know yet
     final: bool  # whether its scene is as good as it gets
 
 
-def save(store: Store, work: LiveReconstruction, final: bool) -> None:
+def save(store: Store, work: IncrementalReconstruction, final: bool) -> None:
     """Keeps what `work` knows; whether its scene is `final`. Raises OSError."""
     store.save("graph", *saved.graph_message(work.graph))
-    judged = work.judge()
-    if judged.registration is not None and judged.verdict.publishable:
-        store.save("judgement", *saved_judgement.judgement_message(judged, work.names, work.proven))
+    estimate = work.remembered()
+    if estimate is not None and estimate.publishable:
+        store.save("judgement", *saved_estimate.estimate_message(estimate, work.proven))
     if work.scene is not None:
-        store.save("pointmaps", *saved_judgement.pointmaps_message(work.pointmaps))
+        store.save("pointmaps", *saved_estimate.pointmaps_message(work.known.pointmaps))
         store.save("scene", *saved.scene_message(work.scene, final))
 
 
-def restore(store: Store, work: LiveReconstruction) -> Restored:
-    """Gives `work` what the checkpoint holds."""
-    work.dropped = store.dropped
+def restore(store: Store, config: Config) -> Restored:
+    """The reconstruction that the checkpoint holds."""
     frames = [stored.frame for stored in store.frames()]
     try:
-        return _restored(store, frames, work)
+        return _restored(store, frames, config)
     except ValueError as error:
         log.warning("the checkpoint's scene is made anew: %s", error)
-        return Restored(len(frames), [prepare(frame, work.config) for frame in frames], final=False)
+        keyframes = [prepare(frame, config) for frame in frames]
+        return Restored(IncrementalReconstruction(config), len(frames), keyframes, final=False)
 
 
-def _restored(store: Store, frames: Sequence[Frame], work: LiveReconstruction) -> Restored:
+def _restored(store: Store, frames: Sequence[Frame], config: Config) -> Restored:
     record = store.load("graph", saved.GraphRecord)
-    graph = saved.graph_from(record) if record is not None else saved.SavedGraph({}, {}, [])
-    keyframes = {frame.name: prepare(frame, work.config, graph.features.get(frame.name)) for frame in frames}
+    before = saved.graph_from(record) if record is not None else saved.SavedGraph({}, {}, [])
+    keyframes = {frame.name: prepare(frame, config, before.features.get(frame.name)) for frame in frames}
     record = store.load("scene", saved.SceneRecord)
     scene = saved.scene_from(record, keyframes) if record is not None else None
     final = record is not None and record.header.final and scene is not None
-    record = store.load("judgement", saved_judgement.JudgementRecord)
-    judged = saved_judgement.judgement_from(record) if record is not None else None
-    record = store.load("pointmaps", saved_judgement.PointmapsRecord)
-    pointmaps = saved_judgement.pointmaps_from(record, keyframes) if record is not None else {}
-    known = [keyframe for name, keyframe in keyframes.items() if name in graph.features]
-    work.restore(known, graph.pairs, graph.pending)
-    if judged is not None and list(judged.names) == work.names:
-        work.restore_judgement(judged.judgement, judged.proven)
-    work.pointmaps = pointmaps
-    work.show(scene)
-    return Restored(len(keyframes), [k for name, k in keyframes.items() if name not in graph.features], final)
+    record = store.load("pointmaps", saved_estimate.PointmapsRecord)
+    graph = _graph(config, [keyframes[name] for name in keyframes if name in before.features], before)
+    known = Known(
+        graph,
+        beside=ViewGraph(config.matching),
+        screened=_screened(graph),
+        memory=_memory(store, graph),
+        pointmaps=saved_estimate.pointmaps_from(record, keyframes) if record is not None else {},
+        show=shown(scene, config),
+    )
+    new = [keyframe for name, keyframe in keyframes.items() if name not in before.features]
+    return Restored(IncrementalReconstruction(config, known), len(keyframes), new, final)
+
+
+def _graph(config: Config, keyframes: Sequence[Keyframe], before: saved.SavedGraph) -> ViewGraph:
+    """The view graph of the keyframes, with what an earlier process knew of their pairs."""
+    position = {keyframe.name: index for index, keyframe in enumerate(keyframes)}
+    pairs = {(position[i], position[j]): pair for (i, j), pair in before.pairs.items() if {i, j} <= position.keys()}
+    pending = {(position[i], position[j]) for i, j in before.pending if {i, j} <= position.keys()}
+    return ViewGraph(config.matching, tuple(keyframes), pairs, frozenset(pending))
+
+
+def _screened(graph: ViewGraph) -> Screened:
+    screened = Screened()
+    for keyframe in graph.keyframes:
+        screened = screened.with_known(keyframe.frame)
+    return screened
+
+
+def _memory(store: Store, graph: ViewGraph) -> Memory:
+    """With the estimate of just these keyframes, if the checkpoint has one."""
+    record = store.load("judgement", saved_estimate.EstimateRecord)
+    if record is None or record.header.names != graph.names:
+        return Memory()
+    estimate = saved_estimate.estimate_from(record, graph)
+    return Memory(recent=(((tuple(graph.names), 0), estimate),), proven=frozenset(record.header.proven))

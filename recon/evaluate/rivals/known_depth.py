@@ -16,7 +16,8 @@ from splatnode.capture.frame import Frame
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import Config
 from splatnode.recon.evaluate.rivals import outcome
-from splatnode.recon.pipeline import Reconstruction
+from splatnode.recon.modelling import begin_scene
+from splatnode.recon.pipeline import estimate_frames
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import completion
@@ -53,13 +54,12 @@ def optimised(
 
 def frames_with_depth(frames: Sequence[Frame], seed: int) -> tuple[FrameWithDepth, ...]:
     """The frames whose depth is known, in their order; none where splatnode itself refuses the frames."""
-    work = Reconstruction(Config(seed=seed))
-    for frame in frames:
-        work.take(frame)
-    work.estimate()
-    if work.begun is None:
+    config = Config(seed=seed)
+    estimate, _ = estimate_frames(frames, config, Clock())
+    begun = begin_scene(estimate, config)
+    if begun is None:
         return ()
-    views = sorted(work.begun.views, key=lambda view: view.frame_id)
+    views = sorted(begun.views, key=lambda view: view.frame_id)
     return tuple(
         FrameWithDepth(
             view.name, view.frame_id, view.image, _everywhere(view.pointmap, view.image), view.K.double().numpy()

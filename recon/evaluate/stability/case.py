@@ -60,6 +60,7 @@ class Case:
     worlds: tuple[World, ...] = ()
     config: Config = LIGHT
     probe: Probe | None = None  # runs where splatnode has published a scene
+    stream: bool = False  # the frames come one at a time
 
 
 @dataclass(frozen=True)

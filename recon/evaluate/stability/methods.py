@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.config import Config
-from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.pipeline import reconstruct, reconstruct_stream
 from splatnode.recon.result.snapshot import Snapshot
 
 Method = Callable[[Iterable[Frame | DroppedFrame], Config], Snapshot]
@@ -21,10 +21,19 @@ def splatnode(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapsho
     return last
 
 
-def by_name(name: str) -> Method:
-    """Raises ValueError for a method that there is not, or that needs a package that is not installed."""
+def splatnode_stream(frames: Iterable[Frame | DroppedFrame], config: Config) -> Snapshot:
+    """The last snapshot of frames that come one at a time."""
+    (last,) = deque(reconstruct_stream(frames, config), maxlen=1)
+    return last
+
+
+def by_name(name: str, stream: bool = False) -> Method:
+    """The method; `stream`: for frames that come one at a time, if it can.
+
+    Raises ValueError for a method that there is not, or that needs a package that is not installed.
+    """
     if name == "splatnode":
-        return splatnode
+        return splatnode_stream if stream else splatnode
     if name not in NAMES:
         raise ValueError(f"no method {name!r}; there are: {', '.join(NAMES)}")
     try:

@@ -56,7 +56,7 @@ _SOAK_GAUSSIANS = 8000  # the budget of the soak
 def incremental(sampler: Sampler) -> Case:
     photos, scene, test = _every_second(sampler, 4)
     probe = as_good_as_a_batch(photos, scene, test)
-    return replace(accepted(photos, "one by one", probe=probe), source=one_by_one(photos), config=_FITTED)
+    return replace(accepted(photos, "one by one", probe=probe), source=one_by_one(photos), config=_FITTED, stream=True)
 
 
 @row(26, "damaged files")

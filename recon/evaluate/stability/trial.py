@@ -117,7 +117,7 @@ def _context() -> ForkServerContext:
 def _work(case: Case, method: str) -> Answer:
     """The other process, in a session of its own: who interrupts a campaign must not make a trial fail."""
     os.setsid()
-    reconstruct = by_name(method)
+    reconstruct = by_name(method, case.stream)
     started, worked = time.perf_counter(), time.process_time()
     snapshot = reconstruct(case.source(), case.config)
     seconds, processor_seconds = time.perf_counter() - started, time.process_time() - worked

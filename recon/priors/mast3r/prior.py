@@ -68,7 +68,7 @@ class Mast3rPrior(Prior):
 
 @dataclass(frozen=True, eq=False)
 class DescriptorMatcher:
-    """A `recon.matching.view_graph.Matcher` by the network's descriptors at the features that keyframes have."""
+    """A `recon.matching.match.Matcher` by the network's descriptors at the features that keyframes have."""
 
     asked: Asked
 

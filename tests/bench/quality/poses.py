@@ -22,7 +22,7 @@ from splatnode.recon.evaluate.splits import load_split
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
 from splatnode.recon.frames.keyframe import Keyframe, modelled_image
 from splatnode.recon.matching import features
-from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.matching.match import match
 from splatnode.recon.registration import register
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.verification.decision import decide, refuse_before_registration
@@ -58,12 +58,11 @@ class Row:
 def measure(scene: EvaluationScene, names: tuple[str, ...], config: Config) -> Row:
     """One set of photographs from pixels to a verdict."""
     frames = scene.frames(names)
-    graph = ViewGraph(config.matching)
     processor, laps = time.process_time(), [time.perf_counter()]
     found = [features.extract(frame.image, config.matching.features) for frame in frames]
     laps.append(time.perf_counter())
-    for frame, of_frame in zip(frames, found, strict=True):
-        graph.add(Keyframe(frame, modelled_image(frame.image, config.size), of_frame))
+    pictures = [modelled_image(frame.image, config.size) for frame in frames]
+    graph = match(map(Keyframe, frames, pictures, found), config.matching)
     laps.append(time.perf_counter())
     registration = register.register(graph.keyframes, graph.pairs, config.registration)
     laps.append(time.perf_counter())

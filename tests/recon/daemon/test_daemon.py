@@ -252,7 +252,7 @@ def test_another_place_begins_another_scene_and_the_old_one_is_exported(config, 
 
 
 def test_keyframes_that_do_not_fit_at_once_join_the_scene_when_all_are_judged_together(config, peer, monkeypatch):
-    monkeypatch.setattr("splatnode.recon.estimation.BEYOND_DOUBT", 10**6)  # points: nothing fits at once
+    monkeypatch.setattr("splatnode.recon.estimation.MIN_CONFIRMED_POINTS", 10**6)  # points: nothing fits at once
     frames = photographs()
     with running(replace(config, lost_after=3)):
         offer_when_three_are_shown(peer, frames)
@@ -265,8 +265,8 @@ def test_keyframes_that_do_not_fit_at_once_join_the_scene_when_all_are_judged_to
 def test_a_keyframe_that_cannot_be_worked_in_keeps_no_other_out(config, peer, monkeypatch):
     add = membership.add
 
-    def failing(work, keyframes):
-        strangers = add(work, keyframes)
+    def failing(work, keyframes, pause):
+        strangers = add(work, keyframes, pause)
         if any(keyframe.name == frames[1].name for keyframe in keyframes):
             raise ArithmeticError("for the test")
         return strangers

@@ -35,13 +35,16 @@ class FakeReconstruction:
     @property
     def graph(self) -> Any:
         keyframes = [each for each in self._all if each.name in self.names]
-        return SimpleNamespace(keyframes=keyframes, components=self._components, complete=lambda pause: pause())
+        return SimpleNamespace(keyframes=keyframes, components=self._components)
 
     @property
     def aside(self) -> list[SimpleNamespace]:
         return [each for each in self._all if each.name not in self.names]
 
-    def add(self, added: SimpleNamespace) -> None:
+    def complete(self, pause: Callable[[], None]) -> None:
+        pause()
+
+    def add(self, added: SimpleNamespace, pause: Callable[[], None]) -> None:
         self._all.append(added)
         self.names.append(added.name)
 
@@ -51,35 +54,35 @@ class FakeReconstruction:
     def bring_back(self, names: Collection[str]) -> None:
         self.names = [each.name for each in self._all if each.name in {*self.names, *names}]
 
-    def refused(self, names: Collection[str]) -> bool:
+    def was_refused(self, names: Collection[str]) -> bool:
         return frozenset(names) in self.refusals
 
-    def judge(self) -> Any:
-        return self.judge_quickly() or self.judge_thoroughly()
+    def estimate_soon(self, pause: Callable[[], None]) -> Any:
+        return self.estimate_quickly() or self.estimate_thoroughly(pause)
 
-    def judge_quickly(self) -> Any:
+    def estimate_quickly(self) -> Any:
         if self.proven == frozenset(self.names):
-            return self._judged(("late", "far", "other") if self._called("late") < 2 else ("far", "other"))
-        judged = self._judged(("late", "far", "other"))
-        all_placed = len(judged.registration.cameras) == len(self.names)
-        return judged if judged.verdict.publishable and all_placed else None
+            return self._estimated(("late", "far", "other") if self._called("late") < 2 else ("far", "other"))
+        estimated = self._estimated(("late", "far", "other"))
+        all_placed = len(estimated.placed) == len(self.names)
+        return estimated if estimated.verdict.publishable and all_placed else None
 
-    def judge_thoroughly(self, pause: Callable[[], None] = lambda: None) -> Any:
+    def estimate_thoroughly(self, pause: Callable[[], None] = lambda: None) -> Any:
         pause()
-        judged = self._judged(("late", "far", "other") if self._called("late") < 2 else ("far", "other"), "worse")
-        if judged.verdict.publishable:
+        estimated = self._estimated(("late", "far", "other") if self._called("late") < 2 else ("far", "other"), "worse")
+        if estimated.verdict.publishable:
             self.proven = frozenset(self.names)
         else:
             self.refusals.append(frozenset(self.names))
-        return judged
+        return estimated
 
     def _called(self, word: str) -> int:
         return sum(word in name for name in self.names)
 
-    def _judged(self, not_placed: tuple[str, ...], *spoiling: str) -> Any:
-        cameras = [SimpleNamespace(index=i) for i, name in enumerate(self.names) if not name.endswith(not_placed)]
+    def _estimated(self, not_placed: tuple[str, ...], *spoiling: str) -> Any:
         verdict = Verdict(Code.OK, "", "", publishable=not any(map(self._called, ("bad", *spoiling))))
-        return SimpleNamespace(registration=SimpleNamespace(cameras=cameras), verdict=verdict)
+        placed = {name for name in self.names if not name.endswith(not_placed)} if verdict.publishable else set()
+        return SimpleNamespace(placed=placed, verdict=verdict)
 
     def _components(self) -> list[list[int]]:
         others = [index for index, name in enumerate(self.names) if "other" in name]
@@ -118,7 +121,7 @@ def test_keyframes_that_only_all_together_have_a_place_join_the_scene():
     assert work.names == ["0", "1", "2", "3-late", "4-late"] and membership.strangers(work) == []
 
 
-def test_what_was_refused_once_is_not_judged_again_and_stays_aside():
+def test_what_was_refused_once_is_not_estimated_again_and_stays_aside():
     work = reconstruction("0", "1", "2")
     come(work, "3-bad")
     assert not membership.join(work, ["3-bad"]) and len(work.refusals) == 1
@@ -129,9 +132,9 @@ def test_what_was_refused_once_is_not_judged_again_and_stays_aside():
 def test_frames_with_which_most_of_the_scene_has_no_place_do_not_join_it():
     work = reconstruction("0", "1", "2")
     come(work, "3-far")
-    work.judge_thoroughly = lambda pause: work._judged(("0", "1"))  # of the scene, one of three is left
+    work.estimate_thoroughly = lambda pause: work._estimated(("0", "1"))  # of the scene, one of three is left
     assert not membership.join(work, ["3-far"]) and named(work.aside) == ["3-far"]
-    work.judge_thoroughly = lambda pause: work._judged(("0",))
+    work.estimate_thoroughly = lambda pause: work._estimated(("0",))
     assert membership.join(work, ["3-far"])
 
 
@@ -196,7 +199,6 @@ def test_a_scene_that_was_never_proven_is_not_taken_apart():
     ],
 )
 def test_the_older_of_the_two_most_alike_is_given_up(matches, spared):
-    graph = ViewGraph(matching.Config())
-    graph.keyframes.extend(keyframe(str(i)) for i in range(6))
-    graph.pairs.update({pair: SimpleNamespace(matches=range(count)) for pair, count in matches.items()})
+    pairs: Any = {pair: SimpleNamespace(matches=range(count)) for pair, count in matches.items()}
+    graph = ViewGraph(matching.Config(), tuple(keyframe(str(i)) for i in range(6)), pairs)
     assert membership.most_redundant(graph) == spared

@@ -16,7 +16,8 @@ from splatnode.recon.daemon.watcher import preview_intrinsics
 from splatnode.recon.evaluate.splits import load_split
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.optimize import refinement
-from splatnode.recon.pipeline import Reconstruction
+from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.preparation import prepare
 
 QUICK = replace(Config(), size=256, optimize=refinement.Config(iterations=10))
 
@@ -35,14 +36,9 @@ def test_a_camera_that_stands_in_a_real_place_and_then_moves(shared, name):
     folder = shared / "scenes" / name
     scene = load_scene(folder)
     split = load_split(folder, list(scene.paths), 6)
-    work = Reconstruction(QUICK)
-    for frame in scene.frames(split.train[:4]):
-        work.take(frame)
-    work.estimate()
-    for refined in work.refine(work.begun, QUICK.optimize):
-        work.show(refined)
-    snapshot = work.snapshot(final=True)
-    watch = Tracker(landmarks(snapshot, work.graph.keyframes, Tracking()), Tracking())
+    frames = list(scene.frames(split.train[:4]))
+    *_, snapshot = reconstruct(frames, QUICK)
+    watch = Tracker(landmarks(snapshot, [prepare(frame, QUICK) for frame in frames], Tracking()), Tracking())
     stood, went = (next(iter(scene.frames((each,)))) for each in split.train[1:3])
 
     def look(frame: Frame, gain: float, seed: int):

@@ -13,8 +13,9 @@ import pytest
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features, pair_matching, tilting
+from splatnode.recon.matching.match import FIRST_COMPARISONS, completed, match, matched_soon
 from splatnode.recon.matching.pair_matching import MatchedPair
-from splatnode.recon.matching.view_graph import FIRST_COMPARISONS, ViewGraph
+from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import register
 from tests.support.synthetic import photographs, places, view_graph
 
@@ -57,16 +58,23 @@ def compared(monkeypatch) -> list[tuple[str, ...]]:
     monkeypatch.setattr(pair_matching, "match_plain", compare)
     monkeypatch.setattr(pair_matching, "match_tilted", match_tilted)
     monkeypatch.setattr("splatnode.recon.matching.view_graph.content_key", lambda keyframe: keyframe.name)
-    monkeypatch.setattr(features, "add_tilted", lambda found, *others: found)
-    monkeypatch.setattr("splatnode.recon.matching.view_graph.replace", lambda keyframe, **changes: keyframe)
+    monkeypatch.setattr("splatnode.recon.matching.match._with_tilted_features", lambda keyframe, config: keyframe)
     return calls
 
 
 def graph_of(*names: str) -> Any:
-    graph: Any = ViewGraph(matching.Config())
-    for name in names:
-        graph.add(keyframe(name))
-    return graph
+    return match(map(keyframe, names), matching.Config())  # pyright: ignore[reportArgumentType]
+
+
+def complete(graph: Any) -> Any:
+    *_, whole = completed(graph, None)
+    return whole
+
+
+def soon(graph: Any, name: str) -> Any:
+    """With a further keyframe that is compared with a few others."""
+    *_, later = matched_soon(graph.with_keyframe(keyframe(name)), None)
+    return later
 
 
 def names_of(graph: Any) -> dict[tuple[str, str], tuple[str, str]]:
@@ -130,12 +138,13 @@ def test_components_are_the_largest_first(compared):
 
 def test_without_a_keyframe_the_graph_is_that_of_the_others(compared):
     graph = graph_of("a1", "a2", "b1", "A1", "a3")
+    made = len(compared)
     rest = graph.without({"a1", "b1"})
-    assert [keyframe.name for keyframe in rest.keyframes] == ["a2", "A1", "a3"]
+    assert rest.names == ["a2", "A1", "a3"] and len(compared) == made  # it is asked by what follows, which can pause
     # a2 and a3 had two firm partners before; now they have one, and tilted features are worth their time.
+    rest = complete(rest)
     assert names_of(rest) == names_of(graph_of("a2", "A1", "a3"))
-    rest.add(keyframe("a4"))
-    assert ("a2", "a4") in names_of(rest)
+    assert ("a2", "a4") in names_of(complete(rest.with_keyframe(keyframe("a4"))))
     assert len(graph.keyframes) == 5 and ("a1", "a2") in names_of(graph)
 
 
@@ -153,18 +162,16 @@ def test_a_removal_that_is_abandoned_leaves_the_graph_as_it_was(compared):
 
 
 def test_pairs_from_elsewhere_stay_when_a_keyframe_comes(compared):
-    graph: Any = ViewGraph(matching.Config())
-    graph.keyframes[:] = [keyframe("a1"), keyframe("a2")]
-    graph.pairs = {(0, 1): "as it was"}
-    graph.add(keyframe("b1"))
+    graph: Any = ViewGraph(matching.Config(), (keyframe("a1"), keyframe("a2")), {(0, 1): "as it was"})
+    graph = complete(graph.with_keyframe(keyframe("b1")))
     assert graph.pairs == {(0, 1): "as it was"}
 
 
 @pytest.mark.parametrize("pairs", [[(0, 1), (1, 2), (2, 3)], [(2, 3), (0, 1), (1, 2)], [(0, 3), (2, 3), (1, 2)]])
 def test_a_chain_is_one_component_in_whatever_order_its_pairs_were_found(pairs):
-    graph = ViewGraph(matching.Config(tilting=tilting.Config(tilts=())))
-    graph.keyframes.extend(["a", "b", "c", "d", "e"])
-    graph.pairs.update(dict.fromkeys(pairs))
+    graph: Any = ViewGraph(
+        matching.Config(tilting=tilting.Config(tilts=())), ("a", "b", "c", "d", "e"), dict.fromkeys(pairs)
+    )
     assert graph.components() == [[0, 1, 2, 3], [4]]
 
 
@@ -180,10 +187,9 @@ def test_cameras_do_not_depend_on_the_order_of_the_photographs():
     config = matching.Config(features=features.Config(num_features=1500))
     found = {}
     for order in ((0, 1, 2), (2, 0, 1)):
-        graph = ViewGraph(config)
-        for index in order:
-            image = frames[index].image
-            graph.add(Keyframe(frames[index], image, features.extract(image, config.features)))
+        images = [frames[index].image for index in order]
+        found_in = [features.extract(image, config.features) for image in images]
+        graph = match(map(Keyframe, [frames[index] for index in order], images, found_in), config)
         registration = register.register(graph.keyframes, graph.pairs, register.Config())
         assert registration is not None and len(registration.cameras) == 3
         found[order] = {graph.keyframes[camera.index].name: camera for camera in registration.cameras}
@@ -199,10 +205,10 @@ def test_a_keyframe_added_soon_is_compared_with_a_few_first_and_in_the_end_with_
     names = [f"a{number}" for number in range(8)]
     graph = graph_of(*names[:7])
     compared.clear()
-    graph.add(keyframe("a7"), soon=True)
+    graph = soon(graph, "a7")
     assert len(compared) == FIRST_COMPARISONS and not tilted(compared)
     assert {i for i, j in graph.pending if j == 7} == {i for i in range(7) if (i, 7) not in graph.pairs}
-    graph.complete()
+    graph = complete(graph)
     assert not graph.pending
     assert names_of(graph) == names_of(graph_of(*names))
 
@@ -210,7 +216,7 @@ def test_a_keyframe_added_soon_is_compared_with_a_few_first_and_in_the_end_with_
 def test_what_shares_most_with_the_partners_of_a_keyframe_is_looked_at_before_the_rest(compared):
     graph = graph_of("a1", "a2", "a3", "a4", "b1", "b2", "b3")
     compared.clear()
-    graph.add(keyframe("a5"), soon=True)
+    graph = soon(graph, "a5")
     # The latest tell nothing, one after the other, until one of the a's is met.
     assert compared[:FIRST_COMPARISONS] == [("a5", "b3"), ("a5", "b2"), ("a5", "b1"), ("a4", "a5")]
     # One partner is too little to be used: then all is compared.
@@ -219,7 +225,7 @@ def test_what_shares_most_with_the_partners_of_a_keyframe_is_looked_at_before_th
 
 def test_what_is_pending_stays_so_without_another_keyframe(compared):
     graph = graph_of(*(f"a{number}" for number in range(7)))
-    graph.add(keyframe("a7"), soon=True)
+    graph = soon(graph, "a7")
     (later,) = {i for i, _ in graph.pending} & {0}
     rest = graph.without({"a6"})
     assert (later, 6) in rest.pending and len(rest.keyframes) == 7
@@ -232,5 +238,5 @@ def test_a_joined_graph_knows_what_either_knew_and_what_is_left_to_compare():
     assert [keyframe.name for keyframe in joined.keyframes] == names[::-1]
     assert joined.pending == {(0, 3)} and set(joined.pairs) == set(itertools.combinations(range(4), 2)) - {(0, 3)}
     assert np.array_equal(joined.pairs[0, 1].points1, graph.pairs[2, 3].points2)  # swapped with their keyframes
-    joined.complete()
+    joined = complete(joined)
     assert len(joined.pairs[0, 3].matches) == len(graph.pairs[0, 3].matches)

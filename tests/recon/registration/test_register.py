@@ -13,6 +13,7 @@ from splatnode.capture.frame import Frame
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features
+from splatnode.recon.matching.match import match
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import bundle, register
 from splatnode.recon.verification import decision
@@ -23,9 +24,9 @@ def test_the_lens_of_a_frame_that_is_left_out_makes_no_focal_length_uncertain():
     place = synthetic.Config(views=3, width=320, height=240)
     blank = np.full((200, 300, 3), 128, np.uint8)
     config, settings = register.Config(), matching.Config()
-    graph = ViewGraph(settings)
-    for frame in [*synthetic.stream(place), Frame(3, "another size", 3, blank, None)]:
-        graph.add(Keyframe(frame, frame.image, features.extract(frame.image, settings.features)))
+    frames = [*synthetic.stream(place), Frame(3, "another size", 3, blank, None)]
+    keyframes = [Keyframe(frame, frame.image, features.extract(frame.image, settings.features)) for frame in frames]
+    graph = match(keyframes, settings)
     registration = register.register(graph.keyframes, graph.pairs, config)
     assert registration is not None and [camera.index for camera in registration.cameras] == [0, 1, 2]
     assert registration.focal_sigma < 0.5 * config.lenses.voted_sigma

@@ -54,10 +54,8 @@ def pair(matches: int = 200, turned: bool = False) -> TwoView:
 
 
 def graph(num_frames: int, pairs: dict[tuple[int, int], TwoView], plain: tuple[int, ...] = ()) -> ViewGraph:
-    made = ViewGraph(matching.Config())
-    made.keyframes = [keyframe(i, PLAIN if i in plain else RICH) for i in range(num_frames)]
-    made.pairs = pairs
-    return made
+    keyframes = tuple(keyframe(i, PLAIN if i in plain else RICH) for i in range(num_frames))
+    return ViewGraph(matching.Config(), keyframes, pairs)
 
 
 def all_pairs(num_frames: int, turned: tuple[tuple[int, int], ...] = ()) -> dict[tuple[int, int], TwoView]:
@@ -207,9 +205,11 @@ def test_frames_that_overlap_and_still_cannot_be_placed():
 
 def test_frames_that_find_no_place_because_of_the_focal_length_that_was_given():
     pairs = {key: replace(view, focal_ratio=1.4) for key, view in all_pairs(4).items()}
-    told = graph(4, pairs)
     lens = Intrinsics(64, 48, 64.0, 64.0, 32.0, 24.0, "given")
-    told.keyframes = [replace(k, frame=replace(k.frame, intrinsics=lens)) for k in told.keyframes]
+    silent = graph(4, pairs)
+    told = replace(
+        silent, keyframes=tuple(replace(k, frame=replace(k.frame, intrinsics=lens)) for k in silent.keyframes)
+    )
     given = refused(decide(told, None, None, Config()), Code.FOCAL_SUSPECT)
     assert "64 pixels" in given.message and "+40 %" in given.message
 

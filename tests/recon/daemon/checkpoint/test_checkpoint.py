@@ -13,31 +13,31 @@ from msgspec.structs import replace
 
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.recon.config import PREVIEW, Config
-from splatnode.recon.daemon.checkpoint import checkpoint, saved_judgement
+from splatnode.recon.daemon.checkpoint import checkpoint, saved_estimate
 from splatnode.recon.daemon.checkpoint.saved import GraphRecord
 from splatnode.recon.daemon.checkpoint.store import MADE_ANEW, Store
-from splatnode.recon.daemon.reconstruction import LiveReconstruction
-from splatnode.recon.pipeline import prepare
+from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.preparation import prepare
 from tests.support.synthetic import photographs
 
 CONFIG = Config(size=160, preview=replace(PREVIEW, iterations=1))
 
 
 @pytest.fixture(scope="module")
-def saved(tmp_path_factory) -> tuple[Path, LiveReconstruction]:
+def saved(tmp_path_factory) -> tuple[Path, IncrementalReconstruction]:
     """A checkpoint with a scene of three keyframes, and what is in it."""
     folder = tmp_path_factory.mktemp("checkpoint")
-    store, made = Store(folder), LiveReconstruction(CONFIG)
+    store, made = Store(folder), IncrementalReconstruction(CONFIG)
     for sequence, frame in enumerate(photographs()[:3]):
         made.add(prepare(store.put(ReceivedFrame("0" * 32, sequence, frame)).frame, CONFIG))
-    made.work_in()
+    made.update()
     checkpoint.save(store, made, final=True)
     store.close()
     return folder, made
 
 
 @pytest.fixture
-def work(saved) -> LiveReconstruction:
+def work(saved) -> IncrementalReconstruction:
     return saved[1]
 
 
@@ -48,27 +48,27 @@ def store(saved, tmp_path):
     opened.close()
 
 
-def test_what_was_judged_and_measured_comes_back_and_is_not_made_anew(store, work, monkeypatch):
-    again = LiveReconstruction(CONFIG)
-    found = checkpoint.restore(store, again)
+def test_what_was_estimated_and_measured_comes_back_and_is_not_made_anew(store, work, monkeypatch):
+    found = checkpoint.restore(store, CONFIG)
     assert (found.keyframes, found.new, found.final) == (3, [], True)
+    again = found.work
 
     def refuse(*_):
-        raise AssertionError("judged thoroughly again")
+        raise AssertionError("estimated thoroughly again")
 
-    monkeypatch.setattr(again, "judge_thoroughly", refuse)
-    before, after = work.judge(), again.judge()
+    monkeypatch.setattr(again, "estimate_thoroughly", refuse)
+    before, after = work.remembered(), again.remembered()
     assert after.verdict == before.verdict and after.evidence == before.evidence and again.proven == work.proven
     for one, other in zip(after.registration.cameras, before.registration.cameras, strict=True):
         assert np.array_equal(one.T_world_camera, other.T_world_camera) and one.lens == other.lens
     assert after.registration.inlier_ratios == before.registration.inlier_ratios
     assert np.array_equal(after.registration.observed_pixels, before.registration.observed_pixels)
-    for name, pointmap in work.pointmaps.items():
+    for name, pointmap in work.known.pointmaps.items():
         known = pointmap.depth > 0
-        assert np.array_equal(again.pointmaps[name].depth > 0, known)
-        assert np.abs(again.pointmaps[name].depth[known] / pointmap.depth[known] - 1).max() < 1e-3
-        assert np.abs(again.pointmaps[name].confidence - pointmap.confidence).max() < 0.01
-        assert np.abs(again.pointmaps[name].normal - pointmap.normal).max() < 0.01
+        assert np.array_equal(again.known.pointmaps[name].depth > 0, known)
+        assert np.abs(again.known.pointmaps[name].depth[known] / pointmap.depth[known] - 1).max() < 1e-3
+        assert np.abs(again.known.pointmaps[name].confidence - pointmap.confidence).max() < 0.01
+        assert np.abs(again.known.pointmaps[name].normal - pointmap.normal).max() < 0.01
     further = photographs()[3]
     again.add(prepare(further, CONFIG))
     assert again.grow() and [view.name for view in again.scene.views] == [*work.names, further.name]
@@ -76,33 +76,33 @@ def test_what_was_judged_and_measured_comes_back_and_is_not_made_anew(store, wor
 
 def test_what_another_version_wrote_is_made_anew(store, caplog):
     store.save("graph", GraphRecord(names=["a.png"], features=[{"unknown": 1}], pairs=[], pending=[]), [])
-    found = checkpoint.restore(store, LiveReconstruction(CONFIG))
+    found = checkpoint.restore(store, CONFIG)
     assert (found.keyframes, len(found.new), found.final) == (3, 3, False) and "made anew" in caplog.text
 
 
 def test_evidence_of_an_older_version_is_weighed_anew_and_no_frame_is_lost(store, work, caplog):
     """Before, the weakest link was the weakest joint, inlier ratios were agreements."""
-    record, arrays = saved_judgement.judgement_message(work.judge(), work.names, work.proven)
+    record, arrays = saved_estimate.estimate_message(work.remembered(), work.proven)
     older = msgspec.to_builtins(record)
     evidence = older["evidence"]
     evidence["joint"], evidence["loose"] = evidence.pop("weakest_link"), evidence.pop("disconnected")
     evidence["agreement"] = evidence.pop("inlier_ratio")
     store.save("judgement", cast(msgspec.Struct, older), arrays)
-    again = LiveReconstruction(CONFIG)
-    found = checkpoint.restore(store, again)
+    found = checkpoint.restore(store, CONFIG)
+    again = found.work
     assert "judgement of the checkpoint is made anew" in caplog.text
     assert found.keyframes == 3 and len(again.scene.views) == 3
     assert again.names + [keyframe.name for keyframe in found.new] == work.names
-    assert again.judge().verdict == work.judge().verdict
+    assert again.estimate_soon().verdict == work.remembered().verdict
 
 
 @pytest.mark.parametrize("lost", MADE_ANEW)
 def test_what_is_missing_is_made_anew(store, lost):
     (store.directory / lost).write_bytes(b"damaged")
-    again = LiveReconstruction(CONFIG)
-    found = checkpoint.restore(store, again)
+    found = checkpoint.restore(store, CONFIG)
+    again = found.work
     assert found.keyframes == 3
     for keyframe in found.new:
         again.add(keyframe)
-    again.work_in()
-    assert len(again.scene.views) == 3 and again.judge().verdict.publishable
+    again.update()
+    assert len(again.scene.views) == 3 and again.remembered().verdict.publishable

@@ -48,7 +48,7 @@ def same(one, other) -> bool:
 
 
 def test_features_and_pairs_come_back_to_the_bit(graph):
-    graph.pending = {(0, 2)}
+    graph = replace(graph, pending=frozenset({(0, 2)}))
     found = graph_from(over_the_disk(*graph_message(graph)))
     features, pairs = found.features, found.pairs
     names = [keyframe.name for keyframe in graph.keyframes]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Mapping
+from dataclasses import fields
 from typing import Any
 
 import msgspec
@@ -12,8 +12,9 @@ import numpy.typing as npt
 
 from splatnode.capture.messaging.wire import Message
 from splatnode.recon.daemon.checkpoint.saved import Numbers, put_together, taken_apart
-from splatnode.recon.estimation import Judgement
+from splatnode.recon.estimation import Estimate
 from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Verdict
@@ -23,7 +24,7 @@ OF_REGISTRATION = ("points", "observed_by", "observed_point", "observed_pixels")
 OF_POINTMAP = ("depth", "confidence", "normal", "T_world_camera", "K")
 
 
-class JudgementRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class EstimateRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Arrays: those of each camera in the order of their fields, then OF_REGISTRATION."""
 
     names: list[str]  # of the keyframes, as the cameras number them
@@ -41,26 +42,17 @@ class PointmapsRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     names: list[str]
 
 
-@dataclass(frozen=True, eq=False)
-class SavedJudgement:
-    names: tuple[str, ...]
-    proven: frozenset[str]
-    judgement: Judgement
-
-
-def judgement_message(
-    judged: Judgement, names: Sequence[str], proven: Collection[str]
-) -> tuple[JudgementRecord, list[npt.NDArray]]:
-    """Of a judgement that has cameras and evidence, on the keyframes `names`. Raises ValueError for another."""
-    registration, evidence = judged.registration, judged.evidence
+def estimate_message(estimate: Estimate, proven: Collection[str]) -> tuple[EstimateRecord, list[npt.NDArray]]:
+    """Of an estimate that has cameras and evidence; its depth is kept by itself. Raises ValueError for another."""
+    registration, evidence = estimate.registration, estimate.evidence
     if registration is None or evidence is None:
-        raise ValueError("only a judgement with cameras and evidence is kept")
+        raise ValueError("only an estimate with cameras and evidence is kept")
     cameras = [taken_apart(camera) for camera in registration.cameras]
     kept = {field.name: getattr(registration, field.name) for field in fields(registration)}
-    record = JudgementRecord(
-        names=list(names),
+    record = EstimateRecord(
+        names=estimate.graph.names,
         proven=sorted(proven),
-        verdict=judged.verdict,
+        verdict=estimate.verdict,
         evidence=msgspec.convert(msgspec.to_builtins(evidence, enc_hook=lambda number: number.item()), Evidence),
         cameras=[numbers for numbers, _ in cameras],
         inlier_ratios=[(int(i), int(j), float(ratio)) for (i, j), ratio in registration.inlier_ratios.items()],
@@ -70,8 +62,8 @@ def judgement_message(
     return record, [*arrays, *(kept[name] for name in OF_REGISTRATION)]
 
 
-def judgement_from(message: Message[JudgementRecord]) -> SavedJudgement:
-    """What `judgement_message` was given. Raises ValueError where another version wrote the message."""
+def estimate_from(message: Message[EstimateRecord], graph: ViewGraph) -> Estimate:
+    """What `estimate_message` was given, of the same keyframes. Raises ValueError where another version wrote it."""
     header, arrays = message.header, iter(message.arrays)
     cameras = tuple(put_together(RegisteredCamera, numbers, arrays) for numbers in header.cameras)
     inlier_ratios = {(i, j): ratio for i, j, ratio in header.inlier_ratios}
@@ -79,10 +71,8 @@ def judgement_from(message: Message[JudgementRecord]) -> SavedJudgement:
     try:
         registration = Registration(**content, **dict(zip(OF_REGISTRATION, arrays, strict=True)))
     except TypeError as error:
-        raise ValueError("a judgement of another version") from error
-    return SavedJudgement(
-        tuple(header.names), frozenset(header.proven), Judgement(registration, header.evidence, header.verdict)
-    )
+        raise ValueError("an estimate of another version") from error
+    return Estimate(graph, registration, header.evidence, header.verdict)
 
 
 def pointmaps_message(pointmaps: Mapping[str, Pointmap]) -> tuple[PointmapsRecord, list[npt.NDArray]]:
@@ -96,7 +86,7 @@ def pointmaps_message(pointmaps: Mapping[str, Pointmap]) -> tuple[PointmapsRecor
 
 
 def pointmaps_from(message: Message[PointmapsRecord], keyframes: Mapping[str, Keyframe]) -> dict[str, Pointmap]:
-    """The point maps of those keyframes that there are. Raises ValueError as `judgement_from`."""
+    """The point maps of those keyframes that there are. Raises ValueError as `estimate_from`."""
     names, arrays = message.header.names, message.arrays
     if len(arrays) != len(OF_POINTMAP) * len(names):
         raise ValueError(f"{len(names)} point maps with {len(arrays)} arrays are of another version")

@@ -1,0 +1,290 @@
+"""A reconstruction whose frames come one at a time: what it knows, and the steps by which it comes to know more.
+
+All that it knows is one frozen record, which each step replaces whole: a step that is abandoned leaves what was known.
+Steps that compute take `pause`, which is called about once a second at least and may raise to abandon the work;
+the others, and `snapshot`, compute nothing.
+"""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.recon.budget import hits
+from splatnode.recon.clock import Clock
+from splatnode.recon.config import Config
+from splatnode.recon.estimation import Estimate, continued, estimate_cameras, estimate_depth
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.frames.screening import Rejected, Screened
+from splatnode.recon.matching.match import completed, matched_soon
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.memory import Key, Memory
+from splatnode.recon.modelling import Shown, begin_scene, refined, shown, snapshot
+from splatnode.recon.optimize import refinement
+from splatnode.recon.preparation import load_prior, prepare
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.scene import growth, warping
+from splatnode.recon.scene.scene import Scene
+
+log = logging.getLogger(__name__)
+
+MAX_CAMERA_SHIFT = (
+    0.1  # in median depths of the scene: where a new estimate moves a camera further, a scene begins anew
+)
+
+Pause = Callable[[], None]
+
+
+def without_pause() -> None:
+    """What is called between the parts of work that nobody interrupts."""
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """All that a growing reconstruction knows."""
+
+    graph: ViewGraph  # of the keyframes that belong to the scene
+    beside: ViewGraph  # what is known of keyframes that were set aside, and of others
+    screened: Screened = field(default_factory=Screened)
+    memory: Memory = field(default_factory=Memory)
+    pointmaps: Mapping[str, Pointmap] = field(default_factory=dict)  # by keyframe, as they were last computed
+    begun: Scene | None = None  # from the last estimate of all frames, not refined
+    show: Shown = field(default_factory=Shown)
+
+    @property
+    def key(self) -> Key:
+        """By which the estimate of these keyframes is remembered."""
+        return tuple(self.graph.names), len(self.screened.rejected)
+
+
+class IncrementalReconstruction:
+    """Keyframes, their cameras and verdict, and the scene that grows with them."""
+
+    def __init__(self, config: Config, known: Known | None = None) -> None:
+        """`known` is what an earlier process knew."""
+        self.config = config
+        self.clock = Clock()
+        self.numbers: Iterator[int] = itertools.count(1)  # of the snapshots
+        self.dropped: list[DroppedFrame] = []
+        self._prior = load_prior(config)
+        empty = ViewGraph(config.matching)
+        self._known = known or Known(empty, empty)
+
+    @property
+    def known(self) -> Known:
+        return self._known
+
+    @property
+    def graph(self) -> ViewGraph:
+        return self._known.graph
+
+    @property
+    def names(self) -> list[str]:
+        """Of the keyframes that belong to the scene, in their order."""
+        return self._known.graph.names
+
+    @property
+    def scene(self) -> Scene | None:
+        """What is shown."""
+        return self._known.show.scene
+
+    @property
+    def begun(self) -> Scene | None:
+        return self._known.begun
+
+    @property
+    def aside(self) -> list[Keyframe]:
+        """Keyframes that are known and do not belong to the scene, in the order in which their frames came."""
+        belonging = set(self.names)
+        found = [keyframe for keyframe in self._known.beside.keyframes if keyframe.name not in belonging]
+        return sorted(found, key=lambda keyframe: keyframe.frame.frame_id)
+
+    @property
+    def proven(self) -> frozenset[str]:
+        """The keyframes that a publishable verdict was last given on thoroughly."""
+        return self._known.memory.proven
+
+    def was_refused(self, names: Collection[str]) -> bool:
+        """Whether a thorough estimate for these keyframes, just these, is known and forbade a scene."""
+        return self._known.memory.was_refused(names)
+
+    def drop(self, frame: DroppedFrame) -> None:
+        """Keeps in mind that there was a frame that was left out."""
+        self.dropped.append(frame)
+
+    def take(self, frame: Frame, pause: Pause = without_pause) -> None:
+        """Adds a frame to the view graph unless it says nothing new. Time counts from the first one.
+
+        A frame that turns out to be blurred beside a sharper one is left out again.
+        """
+        if not self._known.screened.summaries:
+            self.clock = Clock()
+        self.clock.lap("wait")
+        rejected = self.screen(frame)
+        for each in rejected:
+            self.drop(DroppedFrame(each.name, each.reason))
+        self.retract({each.name for each in rejected})
+        self.clock.lap("poses")
+        if frame.name in self._known.screened.summaries:
+            self.add(prepare(frame, self.config), pause)
+
+    def screen(self, frame: Frame) -> list[Rejected]:
+        """The frames that say nothing beside the others, now that there is this one too: it, or earlier ones."""
+        screened, rejected = self._known.screened.with_frame(frame, self.config.screening)
+        self._known = replace(self._known, screened=screened)
+        return rejected
+
+    def add(self, keyframe: Keyframe, pause: Pause = without_pause) -> None:
+        """Adds a keyframe to the view graph, matched with a few others at first."""
+        graph = self.graph.with_keyframe(keyframe)
+        self._known = replace(self._known, graph=graph, screened=self._known.screened.with_known(keyframe.frame))
+        self._keep_matching(matched_soon(graph, self._prior.matcher), pause)
+        newest, num_features = len(self.graph.keyframes) - 1, len(keyframe.features.points)
+        overlapping = len(self.graph.partners(newest))
+        compared = newest - sum(newest in pair for pair in self.graph.pending)
+        log.info("%s: %d features, overlaps %d of %d frames tried", keyframe.name, num_features, overlapping, compared)
+        self.clock.lap("poses")
+
+    def complete(self, pause: Pause = without_pause) -> None:
+        """Matches the pairs that are still pending. What was matched is kept if `pause` raises."""
+        self._keep_matching(completed(self.graph, self._prior.matcher), pause)
+
+    def _keep_matching(self, graphs: Iterable[ViewGraph], pause: Pause) -> None:
+        for graph in graphs:
+            self._known = replace(self._known, graph=graph)
+            pause()
+
+    def retract(self, names: Collection[str]) -> None:
+        """Forgets keyframes, and what the scene has from them alone."""
+        known = self._known
+        self._known = replace(known, screened=known.screened.without(names), beside=known.beside.without(names))
+        self._leave_out(names)
+
+    def set_aside(self, names: Collection[str]) -> None:
+        """Takes keyframes out of the scene as `retract` does, and remembers them and what their pairs say."""
+        self._known = replace(self._known, beside=self.graph.joined(self._known.beside))
+        self._leave_out(names)
+
+    def bring_back(self, names: Collection[str]) -> None:
+        """The keyframes among these that were set aside belong to the scene as before."""
+        others = {keyframe.name for keyframe in self.aside}.difference(names)
+        self._known = replace(self._known, graph=self.graph.joined(self._known.beside.without(others)))
+
+    def _leave_out(self, names: Collection[str]) -> None:
+        if set(self.names).isdisjoint(names):
+            return
+        known, show = self._known, self._known.show
+        if show.scene is not None and not {view.name for view in show.scene.views}.isdisjoint(names):
+            rest = growth.without_views(show.scene, names)
+            show = replace(show, scene=rest if rest.views else None)
+        pointmaps = {name: pointmap for name, pointmap in known.pointmaps.items() if name not in names}
+        self._known = replace(known, graph=known.graph.without(names), begun=None, pointmaps=pointmaps, show=show)
+
+    def remembered(self) -> Estimate | None:
+        """The estimate of just these keyframes, if it was made a moment ago."""
+        return self._known.memory.recall(self._known.key)
+
+    def estimate_thoroughly(self, pause: Pause = without_pause) -> Estimate:
+        """Cameras and verdict from all that there is to know, whatever it takes; remembered while nothing changes."""
+        estimate = self.remembered()
+        if estimate is not None and not estimate.verdict.provisional:
+            return estimate
+        self.clock.lap("wait")
+        self.complete(pause)
+        estimate = estimate_cameras(self.graph, self._known.screened.rejected, self.config, pause)
+        self._remember(estimate)
+        self.clock.lap("poses")
+        return estimate
+
+    def estimate_quickly(self) -> Estimate | None:
+        """What is remembered, or what continues it with cameras for all keyframes; None without either."""
+        estimate = self.remembered()
+        if estimate is not None:
+            return estimate
+        self.clock.lap("wait")
+        known = self._known.memory.newest_publishable(self.names)
+        estimate = None if known is None else continued(known, self.graph, self.config)
+        if estimate is not None:
+            self._remember(estimate)
+        self.clock.lap("poses")
+        return estimate
+
+    def estimate_soon(self, pause: Pause = without_pause) -> Estimate:
+        """As `estimate_quickly`, else as `estimate_thoroughly`."""
+        return self.estimate_quickly() or self.estimate_thoroughly(pause)
+
+    def estimate_with_depth(self, pause: Pause = without_pause) -> Estimate:
+        """A thorough estimate, with point maps made afresh from all keyframes where a scene is allowed."""
+        estimate = self.estimate_thoroughly(pause)
+        pause()
+        estimate = estimate_depth(estimate, self._prior, pause)
+        self.clock.lap("points")
+        return estimate
+
+    def _remember(self, estimate: Estimate) -> None:
+        self._known = replace(self._known, memory=self._known.memory.remember(self._known.key, estimate))
+
+    def update(self, pause: Pause = without_pause) -> None:
+        """Shows a scene of all keyframes as soon as possible: grown from the one that is shown, else begun."""
+        if not self.grow(pause):
+            self.rebuild(pause)
+            self.show(shown(self.begun, self.config))
+        for show in self.refine(self.scene, self.config.preview):
+            self.show(show)
+
+    def grow(self, pause: Pause = without_pause) -> bool:
+        """Adds to the shown scene what new keyframes show; False where it has to be begun anew, or given up."""
+        estimate, scene = self.estimate_soon(pause), self.scene
+        if scene is None or estimate.registration is None or not estimate.verdict.publishable:
+            return False
+        graph, pointmaps = self.graph, self._known.pointmaps
+        placed = warping.registration_in_scene_world(scene, estimate.registration, graph)
+        carried = warping.updated_pointmaps(pointmaps, placed, graph) if placed else {}
+        moved = warping.warped_scene(scene, pointmaps, carried, MAX_CAMERA_SHIFT)
+        if placed is None or moved is None:
+            return False
+        further = self._prior.further_pointmaps(graph, placed, carried)
+        pointmaps = carried | {pointmap.name: pointmap for pointmap in further}
+        grown = growth.grow(moved, pointmaps, graph, placed, self.config.initialisation)
+        self._known = replace(self._known, pointmaps=pointmaps, show=shown(grown, self.config))
+        self.clock.lap("points")
+        return True
+
+    def rebuild(self, pause: Pause = without_pause) -> None:
+        """Begins a scene from all keyframes, which is not shown yet; none where the verdict forbids it."""
+        estimate = self.estimate_with_depth(pause)
+        begun = begin_scene(estimate, self.config)
+        self._known = replace(self._known, pointmaps=estimate.pointmaps or self._known.pointmaps, begun=begun)
+        self.clock.lap("points")
+
+    def refine(self, scene: Scene | None, steps: refinement.Config) -> Iterator[Shown]:
+        """`scene`, if there is one, at every checkpoint of its refinement and at the end. It is not shown yet."""
+        self.clock.lap("wait")
+        for show in refined(scene, self.config, steps):
+            self.clock.lap("optimise")
+            yield show
+            self.clock.lap("wait")
+
+    def show(self, show: Shown) -> None:
+        """Makes this what snapshots show."""
+        self._known = replace(self._known, show=show)
+
+    def snapshot(self, dropped: Collection[DroppedFrame] | None = None, final: bool = False) -> Snapshot:
+        """What was estimated and is shown. `dropped` are the frames to name as left out; None: those that were dropped.
+
+        Raises RuntimeError where these keyframes have no estimate: one of the steps that estimate comes before.
+        """
+        estimate = self.remembered()
+        if estimate is None:
+            raise RuntimeError("a snapshot needs an estimate of the keyframes: call estimate_soon before")
+        left_out = self.dropped if dropped is None else dropped
+        show, seconds, bound = self._known.show, self.clock.booked, ()
+        if final and estimate.verdict.publishable:
+            bound = hits(self.config, self.begun, show.scene, seconds)
+        return snapshot(
+            next(self.numbers), estimate, show, seconds=seconds, dropped=left_out, budget=bound, final=final
+        )

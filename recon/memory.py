@@ -1,0 +1,54 @@
+"""Estimates that were made a moment ago: a keyframe may be tried and taken back, and nothing is estimated twice."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+from splatnode.recon.estimation import Estimate
+
+REMEMBERED = 8  # estimates: a keyframe that is tried with each of several others, and taken back
+REMEMBERED_REFUSED = 100  # sets of keyframes of which nothing came: they need not be tried again
+
+Key = tuple[tuple[str, ...], int]  # the keyframes' names, and how many frames were rejected beside them
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """The latest estimates, by the keyframes that they are about; what was asked for last comes last."""
+
+    recent: tuple[tuple[Key, Estimate], ...] = ()
+    refused: tuple[frozenset[str], ...] = ()  # sets of keyframes for which a thorough estimate forbade a scene
+    proven: frozenset[str] = frozenset()  # keyframes of the last thorough estimate that was publishable
+
+    def recall(self, key: Key) -> Estimate | None:
+        """The estimate for just these keyframes, if it is remembered."""
+        return dict(self.recent).get(key)
+
+    def remember(self, key: Key, estimate: Estimate) -> Memory:
+        """With this estimate as the latest one."""
+        others = [(known, before) for known, before in self.recent if known != key]
+        memory = replace(self, recent=(*others, (key, estimate))[-REMEMBERED:])
+        if estimate.verdict.provisional:
+            return memory
+        names = frozenset(key[0])
+        if estimate.verdict.publishable:
+            return replace(memory, proven=names)
+        refused = [known for known in self.refused if known != names]
+        return replace(memory, refused=(*refused, names)[-REMEMBERED_REFUSED:])
+
+    def was_refused(self, names: Collection[str]) -> bool:
+        """Whether a thorough estimate for these keyframes is known, and forbade a scene."""
+        return frozenset(names) in self.refused
+
+    def newest_publishable(self, among: Collection[str]) -> Estimate | None:
+        """The latest estimate with cameras that may be published whose keyframes are all `among` these."""
+        for (names, _), estimate in reversed(self.recent):
+            if (
+                estimate.registration
+                and estimate.evidence
+                and estimate.verdict.publishable
+                and set(names) <= set(among)
+            ):
+                return estimate
+        return None

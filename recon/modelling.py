@@ -1,0 +1,108 @@
+"""From an estimate to what is shown: the scene begins, is refined and watched meanwhile, and becomes snapshots."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+
+from splatnode.capture.frame import DroppedFrame
+from splatnode.recon.budget import Hit
+from splatnode.recon.config import Config
+from splatnode.recon.estimation import Estimate
+from splatnode.recon.optimize import divergence, refinement
+from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
+from splatnode.recon.result.verdict import Verdict
+from splatnode.recon.scene import growth
+from splatnode.recon.scene.initialisation import initial_scene
+from splatnode.recon.scene.scene import Scene
+from splatnode.recon.verification.likelihood import record
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """A scene as others may see it, or the reason why there is none although the cameras would allow one."""
+
+    scene: Scene | None = None
+    refusal: Verdict | None = None
+
+
+def shown(scene: Scene | None, config: Config) -> Shown:
+    """The scene with as many Gaussians as there may be."""
+    return Shown(None if scene is None else growth.limited(scene, config.most_gaussians))
+
+
+def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
+    """The scene of all cameras that were placed, not optimised yet; None where the verdict forbids one."""
+    if estimate.registration is None or not estimate.verdict.publishable:
+        return None
+    return initial_scene(
+        tuple(estimate.pointmaps.values()),
+        {keyframe.name: keyframe.image for keyframe in estimate.graph.keyframes},
+        estimate.registration.cameras,
+        config.initialisation,
+    )
+
+
+def refined(
+    scene: Scene | None, config: Config, steps: refinement.Config, deadline: float | None = None
+) -> Iterator[Shown]:
+    """The scene, if there is one, at each checkpoint of its refinement and at its end; a refusal where that ruins it.
+
+    `deadline` is a time of `time.monotonic()`.
+    """
+    if scene is None:
+        return
+    before = divergence.misfit(scene)
+    limit = config.most_gaussians
+    for later in refinement.refine(scene, steps, seed=config.seed, deadline=deadline, max_gaussians=limit):
+        refusal = None
+        if later.losses or later.iterations in config.optimize.checkpoints:
+            refusal = divergence.refusal(before, later)
+        if refusal is not None:
+            yield Shown(refusal=refusal)
+            return
+        yield shown(later, config)
+
+
+def snapshot(
+    sequence: int,
+    estimate: Estimate,
+    show: Shown,
+    *,
+    seconds: Mapping[str, float],
+    dropped: Collection[DroppedFrame] = (),
+    budget: Collection[Hit] = (),
+    final: bool = False,
+) -> Snapshot:
+    """What the estimate and the scene are now; `seconds` by stage. Only a publishable verdict has a scene."""
+    verdict = estimate.verdict
+    if verdict.publishable and show.refusal is not None:
+        verdict = show.refusal
+    scene = show.scene if verdict.publishable else None
+    made = Snapshot(
+        sequence=sequence,
+        verdict=verdict,
+        cameras=scene.cameras() if scene else (),
+        gaussians=scene.arrays() if scene else GaussianArrays.empty(),
+        images={view.name: view.image for view in scene.views} if scene else {},
+        dropped=tuple(dropped),
+        iterations=scene.iterations if scene else 0,
+        seconds=dict(seconds),
+        budget=tuple(hit.record() for hit in budget),
+        final=final,
+        served_by=scene.served_by if scene else {},
+        evidence=record(estimate.evidence) if estimate.evidence is not None else None,
+    )
+    log.info(
+        "snapshot %d: %s, %d cameras, %d Gaussians, %d iterations, %.1f s",
+        sequence,
+        verdict.code.value,
+        len(made.cameras),
+        len(made.gaussians),
+        made.iterations,
+        made.seconds["total"],
+    )
+    return made
