@@ -14,7 +14,6 @@ from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features
 from splatnode.recon.matching.match import match
-from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import bundle, register
 from splatnode.recon.verification import decision
 from tests.support.synthetic import photographs, renumbered, view_graph
