@@ -148,19 +148,6 @@ def test_without_a_keyframe_the_graph_is_that_of_the_others(compared):
     assert len(graph.keyframes) == 5 and ("a1", "a2") in names_of(graph)
 
 
-def test_a_removal_that_is_abandoned_leaves_the_graph_as_it_was(compared):
-    graph = graph_of(*(f"{letter}{number}" for number in range(5) for letter in "aA"))
-    before = names_of(graph)
-
-    def pause() -> None:
-        raise InterruptedError
-
-    compared.clear()
-    with pytest.raises(InterruptedError):
-        graph.without({"a0"}, pause)
-    assert not compared and names_of(graph) == before and len(graph.keyframes) == 10
-
-
 def test_pairs_from_elsewhere_stay_when_a_keyframe_comes(compared):
     graph: Any = ViewGraph(matching.Config(), (keyframe("a1"), keyframe("a2")), {(0, 1): "as it was"})
     graph = complete(graph.with_keyframe(keyframe("b1")))
