@@ -10,7 +10,8 @@ from splatnode.capture.frame import DroppedFrame
 from splatnode.recon.budget import Hit
 from splatnode.recon.config import Config
 from splatnode.recon.estimation import Estimate
-from splatnode.recon.optimize import divergence, refinement
+from splatnode.recon.optimize import refinement
+from splatnode.recon.optimize.watch import examine, watch
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.scene import growth
@@ -23,10 +24,10 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A scene as others may see it, or the reason why there is none although the cameras would allow one."""
+    """A scene as others may see it, and the verdict on its refinement where that takes the place of the cameras' one."""
 
     scene: Scene | None = None
-    refusal: Verdict | None = None
+    verdict: Verdict | None = None  # DIVERGED, without a scene, or OVERFIT, with the best one before
 
 
 def shown(scene: Scene | None, config: Config) -> Shown:
@@ -49,20 +50,22 @@ def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
 def refined(
     scene: Scene | None, config: Config, steps: refinement.Config, deadline: float | None = None
 ) -> Iterator[Shown]:
-    """The scene, if there is one, at each checkpoint of its refinement and at its end; a refusal where that ruins it.
+    """The scene, if there is one, at each checkpoint of its refinement and at its end.
 
+    Where it diverges or overfits it ends with a verdict, and with the best scene so far if that is publishable.
     `deadline` is a time of `time.monotonic()`.
     """
     if scene is None:
         return
-    before = divergence.misfit(scene)
+    watching = watch(scene, steps.iterations)
     limit = config.most_gaussians
     for later in refinement.refine(scene, steps, seed=config.seed, deadline=deadline, max_gaussians=limit):
-        refusal = None
+        verdict = None
         if later.losses or later.iterations in config.optimize.checkpoints:
-            refusal = divergence.refusal(before, later)
-        if refusal is not None:
-            yield Shown(refusal=refusal)
+            watching, verdict = examine(watching, later)
+        if verdict is not None:
+            best = shown(watching.best, config).scene if verdict.publishable else None
+            yield Shown(best, verdict)
             return
         yield shown(later, config)
 
@@ -79,8 +82,8 @@ def snapshot(
 ) -> Snapshot:
     """What the estimate and the scene are now; `seconds` by stage. Only a publishable verdict has a scene."""
     verdict = estimate.verdict
-    if verdict.publishable and show.refusal is not None:
-        verdict = show.refusal
+    if verdict.publishable and show.verdict is not None:
+        verdict = show.verdict
     scene = show.scene if verdict.publishable else None
     made = Snapshot(
         sequence=sequence,

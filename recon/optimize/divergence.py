@@ -1,12 +1,15 @@
-"""Whether the refinement ruined a scene: then it is no result, however right its cameras were at the start."""
+"""Whether a refinement diverged: a scene that shows its photographs worse than before is no result."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import numpy.typing as npt
 
+from splatnode.recon.frames import border
 from splatnode.recon.optimize.refinement import PARAMETERS
+from splatnode.recon.optimize.torch_threads import single_torch_thread
 from splatnode.recon.optimize.training_image import training_image
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.result.verdict import Verdict
@@ -14,9 +17,9 @@ from splatnode.recon.scene.scene import Scene, TrainingView
 from splatnode.recon.verification import refusals
 
 WORSE = 1.1  # times the misfit that the scene began with; refinements that work end between .2 and .8 of it
-_LOOKED_AT = 4  # views at most
+_VIEWS = 4  # that are compared, at most
 _SCALE = 0.5  # of the photographs' size
-_DSSIM = 0.2
+_DSSIM = 0.2  # weight of D-SSIM in the loss, as in 3DGS, whatever the refinement's is
 
 
 def refusal(before: float, scene: Scene) -> Verdict | None:
@@ -29,15 +32,20 @@ def refusal(before: float, scene: Scene) -> Verdict | None:
 
 
 def misfit(scene: Scene) -> float:
-    """The mean photometric loss over some views; infinite where the scene has become numbers that none can show."""
+    """The mean photometric loss over some training views, without the black border of undistorted photographs.
+
+    Infinite where the scene has parameters that are not finite, which nothing can render.
+    """
     if not all(bool(getattr(scene.gaussians, name).isfinite().all()) for name in PARAMETERS):
         return math.inf
-    views = scene.views[:: math.ceil(len(scene.views) / _LOOKED_AT)]
-    return sum(_misfit(scene, view) for view in views) / len(views)
+    valid = border.valid_masks([view.image for view in scene.views])
+    compared = list(zip(scene.views, valid, strict=True))[:: math.ceil(len(scene.views) / _VIEWS)]
+    with single_torch_thread():
+        return sum(_misfit(scene, *each) for each in compared) / len(compared)
 
 
-def _misfit(scene: Scene, view: TrainingView) -> float:
-    image = training_image(view, np.ones((view.height, view.width), np.bool_), _SCALE, _DSSIM)
+def _misfit(scene: Scene, view: TrainingView, valid: npt.NDArray[np.bool_]) -> float:
+    image = training_image(view, valid, _SCALE, _DSSIM)
     camera = Camera(view.T_world_camera, image.K, image.width, image.height)
     rgb = render_gaussians(scene.gaussians, camera).rgb
     assert rgb is not None  # it was asked for

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from typing import Annotated
 
@@ -22,6 +21,7 @@ from splatnode.recon.optimize.control import prune
 from splatnode.recon.optimize.control.control import Control, ControlChoice, Step
 from splatnode.recon.optimize.pseudo_views import PseudoView
 from splatnode.recon.optimize.regularise import Regularisation
+from splatnode.recon.optimize.torch_threads import single_torch_thread
 from splatnode.recon.optimize.training_image import TrainingImage, training_image
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.rasterize.render import Render
@@ -73,7 +73,7 @@ def refine(
     `max_gaussians` is how many there may be at the end; it is for the control to see to that.
     The first view stays where it is: it is the world.
     """
-    with _single_torch_thread():
+    with single_torch_thread():
         fit = _Fit(scene, config, seed, max_gaussians)
     order = np.random.default_rng(seed)
     started = time.monotonic()
@@ -86,26 +86,11 @@ def refine(
                 break
             progress = max(progress, (now - started) / max(deadline - started, 1e-9))
         queue = queue or order.permutation(len(scene.views)).tolist()
-        with _single_torch_thread():
+        with single_torch_thread():
             fit.step(queue.pop(), progress)
         if iteration + 1 in config.checkpoints and iteration + 1 < config.iterations:
             yield fit.scene()
     yield replace(fit.scene(), losses=tuple(fit.losses))
-
-
-@contextmanager
-def _single_torch_thread() -> Iterator[None]:
-    """One thread for torch while a step computes, as many as before after it.
-
-    The core has its own threads; torch's would only wait for each other over the little that is left to them. Their
-    number holds for the whole process, so it is never left changed while the generator is suspended.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 class _Fit:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.result.verdict import Code, Verdict
@@ -60,5 +62,20 @@ def _all_placed(evidence: Evidence, exposure_ratio: float) -> Verdict:
         f"All {count} frames were placed; the brightest is exposed {ratio:.1f} times as much as the darkest.",
         "Lock exposure and white balance.",
         tuple(name for name, gain in gains.items() if not 1 / limit < gain < limit),
+        publishable=True,
+    )
+
+
+def overfitted(names: Sequence[str], iterations: int, kept: int, before: float, after: float) -> Verdict:
+    """OVERFIT: the scene after `kept` iterations is published in place of the one after `iterations`.
+
+    `before` and `after` are their misfits between the photographs.
+    """
+    return Verdict(
+        Code.OVERFIT,
+        f"The refinement overfitted the photographs: between them the scene misses what stereo shows by {after:.2g} "
+        f"after {iterations} iterations, and by {before:.2g} after {kept}, which is the scene that is given.",
+        "Take smaller steps (optimize.rates) or fewer (optimize.iterations), or a preset as it is.",
+        tuple(names),
         publishable=True,
     )

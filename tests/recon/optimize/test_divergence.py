@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from splatnode.recon.optimize.divergence import misfit, refusal
@@ -56,8 +57,20 @@ def test_numbers_that_nothing_can_show_are_refused(truth):
 def test_of_many_photographs_some_are_looked_at(truth, monkeypatch):
     looked_at: list[str] = []
     monkeypatch.setattr(
-        "splatnode.recon.optimize.divergence._misfit", lambda scene, view: looked_at.append(view.name) or 1.0
+        "splatnode.recon.optimize.divergence._misfit", lambda scene, view, valid: looked_at.append(view.name) or 1.0
     )
     views = tuple(replace(truth.views[0], name=f"{index}.png") for index in range(30))
     assert refusal(1.0, replace(scattered(truth), views=views)) is None
     assert looked_at == ["0.png", "8.png", "16.png", "24.png"]
+
+
+def test_the_black_border_of_undistorted_photographs_is_not_compared(truth):
+    def bordered(view):
+        image = view.image.copy()
+        image[:2] = 0
+        return replace(view, image=image)
+
+    bright = replace(truth, gaussians=replace(truth.gaussians, sh=truth.gaussians.sh + 3.0))
+    views = tuple(replace(view, image=np.maximum(view.image, 120)) for view in bright.views)
+    plain, rimmed = replace(bright, views=views), replace(bright, views=tuple(map(bordered, views)))
+    assert misfit(rimmed) == pytest.approx(misfit(plain), rel=0.05)
