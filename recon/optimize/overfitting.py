@@ -25,8 +25,8 @@ from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
 
-# Times the best misfit so far. With the presets it rose to 1.14 of it at most; with step sizes ten times as large to 1.9
-# where held-out views lost at most .3 dB, and to 2.3 and 2.4 where they lost more than 1 dB.
+# Times the best misfit so far. With the presets it rose to 1.14 of it at most; with step sizes ten times as large, to
+# 1.9 where held-out views lost at most .3 dB, and to 2.3 and 2.4 where they lost more than 1 dB.
 OVERFITTED = 2.0
 _PSEUDO_VIEWS = 2  # that are compared
 _OFF_PATH = 0.1  # of a pseudo view, at most, in distances of neighbouring cameras
@@ -117,4 +117,6 @@ def _points(view: TrainingView) -> tuple[Array, Array, Array]:
     points = world_points(depth, T_world_camera, K / np.array([[_STEP], [_STEP], [1.0]]))
     image = cv2.resize(view.image, depth.shape[::-1], interpolation=cv2.INTER_AREA)
     normals = pointmap.normal[::_STEP, ::_STEP][kept] @ T_world_camera[:3, :3].T
-    return points[kept], image[kept].astype(np.float32) / np.float32(255.0), normals.astype(np.float32)
+    colours = image[kept].astype(np.float32)
+    colours /= 255.0
+    return points[kept], colours, normals.astype(np.float32)

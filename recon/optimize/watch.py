@@ -9,7 +9,7 @@ from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.scene.scene import Scene
 from splatnode.recon.verification import acceptances
 
-# Iterations of a refinement that is short enough not to be tested for overfitting, which takes as long as 10 of them: no
+# Iterations up to which a refinement is not tested for overfitting, because the test takes as long as 10 of them: no
 # set of photographs lost held-out quality within 200.
 SHORT = 250
 
