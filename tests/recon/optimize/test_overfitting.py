@@ -7,7 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from msgspec.structs import replace as replace_fields
 
+from splatnode.recon.config import Config
+from splatnode.recon.modelling import refined
 from splatnode.recon.optimize import overfitting
 from splatnode.recon.optimize.watch import SHORT, examine, watch
 from splatnode.recon.priors.pointmap import Pointmap
@@ -15,7 +18,7 @@ from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
-from tests.recon.optimize.test_refinement import photographed
+from tests.recon.optimize.test_refinement import photographed, plain
 
 SIZE = 64
 K = torch.tensor([[64.0, 0.0, 32.0], [0.0, 64.0, 32.0], [0.0, 0.0, 1.0]])
@@ -96,3 +99,11 @@ def test_a_scene_that_diverged_is_not_published_and_a_short_refinement_is_not_te
     assert verdict is not None and verdict.code is Code.DIVERGED and not verdict.publishable
     _, verdict = examine(watching, truth)
     assert verdict is None
+
+
+def test_the_refinement_ends_with_the_best_scene_and_the_verdict(truth, monkeypatch):
+    monkeypatch.setattr(overfitting, "OVERFITTED", 0.0)  # whatever comes is too much
+    steps = plain(iterations=SHORT + 1, checkpoints=(2,))
+    (only,) = refined(truth, replace_fields(Config(), optimize=steps), steps)
+    assert only.verdict is not None and only.verdict.code is Code.OVERFIT
+    assert only.scene is not None and torch.equal(only.scene.gaussians.means, truth.gaussians.means)
