@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """A scene as others may see it, and the verdict on its refinement where that takes the place of the cameras' one."""
+    """A scene as others may see it, and the verdict on its refinement where that replaces the one on the cameras."""
 
     scene: Scene | None = None
     verdict: Verdict | None = None  # DIVERGED, without a scene, or OVERFIT, with the best one before
