@@ -1,4 +1,4 @@
-"""Images of a point cloud: each pixel takes the colours of the nearest points, and is white where there are none."""
+"""Point rendering: each pixel blends the colours of the nearest points, and is white where there are none."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float32]
-_STEPS = 2**16  # that distances from a pixel are told apart in: one key sorts faster than two
+_DISTANCE_STEPS = 2**16  # into which distances are quantised, so that pixel and distance sort by one integer key
+_MIN_DEPTH = 1e-6  # z of a point in front of the camera
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,9 +31,9 @@ def render_points(
     width: int,
     height: int,
     *,
-    nearest: int = 8,
-    radius: float = 1.5,
-    same_surface: float = 0.02,
+    nearest: int = 8,  # K
+    radius: float = 1.5,  # pixels
+    same_surface: float = 0.02,  # share of the depth
 ) -> PointRender:
     """The point-rendered image of equation 6.
 
@@ -44,7 +45,7 @@ def render_points(
     to_camera = np.linalg.inv(T_world_camera).astype(np.float32)
     in_camera = points @ to_camera[:3, :3].T + to_camera[:3, 3]
     turned = normals @ to_camera[:3, :3].T
-    in_front = (in_camera[:, 2] > 1e-6) & ((turned * in_camera).sum(1) <= 0)
+    in_front = (in_camera[:, 2] > _MIN_DEPTH) & ((turned * in_camera).sum(1) <= 0)
     index = np.flatnonzero(in_front)
     z = in_camera[index, 2]
     u = in_camera[index, 0] / z * np.float32(K[0, 0]) + np.float32(K[0, 2])
@@ -57,7 +58,7 @@ def render_points(
     np.minimum.at(depth, pixel, z[point])
     front = z[point] <= depth[pixel] * (1 + same_surface)
     pixel, point, distance = pixel[front], point[front], distance[front]
-    order = np.argsort(pixel * _STEPS + (distance * (_STEPS / (radius + 1.0))).astype(np.int64))
+    order = np.argsort(pixel * _DISTANCE_STEPS + (distance * (_DISTANCE_STEPS / (radius + 1.0))).astype(np.int64))
     pixel, point, distance = pixel[order], point[order], distance[order]
     first = np.flatnonzero(np.diff(pixel, prepend=-1))
     rank = np.arange(len(pixel)) - np.repeat(first, np.diff(first, append=len(pixel)))

@@ -1,4 +1,4 @@
-"""Cameras where no photograph was taken, for losses on what the training views leave open."""
+"""Pseudo views: cameras where no photograph was taken, between the training views."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ import torch
 from scipy.linalg import expm, logm
 
 from splatnode.recon.rasterize.gaussian_render import Camera
+
+_SHARES = (0.15, 0.85)  # of the motion between two training views, within which a pseudo view lies
 
 Array = npt.NDArray[np.float64]
 
@@ -84,7 +86,7 @@ def pseudo_views(
     views = []
     for index in range(count):
         start, end = steps[index % len(steps)]
-        share = float(rng.uniform(0.15, 0.85))
+        share = float(rng.uniform(*_SHARES))
         T_world_camera = interpolate(Ts_world_camera[start], Ts_world_camera[end], share)
         distance = float(np.linalg.norm(Ts_world_camera[end][:3, 3] - Ts_world_camera[start][:3, 3]))
         aside = rng.uniform(-off_path, off_path, 2) * distance

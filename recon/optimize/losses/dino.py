@@ -1,4 +1,4 @@
-"""What a place is, as DINOv2 sees it: the paper's semantic features (equation 12), with gradients."""
+"""Image embeddings of DINOv2, the paper's semantic features (equation 12), with gradients."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""How alike two images look: LPIPS where its weights are there, structure over several scales where they are not.
-
-An image to be compared with again and again is `prepared` once. Which one served is its `name`, for the report.
-"""
+"""Perceptual distance of two images: LPIPS where its weights are present, else image gradients over several scales."""
 
 from __future__ import annotations
 
@@ -16,15 +13,20 @@ from torch.nn import functional
 
 from splatnode.recon.networks.lpips import Lpips, load_lpips
 
+_MIN_SIDE = 8  # pixels, of the smallest level of a pyramid
+_FLAT = 1e-3  # mean gradient that is added to the truth's: a flat image divides by it
+
 Distance = Callable[[Tensor], Tensor]  # image (H, W, 3) in [0, 1] -> scalar with gradients
 
 
 class Perceptual(Protocol):
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Which measure it is, for the report."""
+        ...
 
     def prepared(self, truth: Tensor) -> Distance:
-        """The distance from `truth` (H, W, 3) in [0, 1]; 0 for equal images."""
+        """The distance from `truth` (H, W, 3) in [0, 1], whose own features are computed once; 0 for equal images."""
         ...
 
 
@@ -51,7 +53,7 @@ class MultiScaleGradient:
 
     def prepared(self, truth: Tensor) -> Distance:
         expected = [_slopes(level) for level in _pyramid(truth, self.scales)]
-        strength = [sum(slope.abs().mean() for slope in level) + 1e-3 for level in expected]
+        strength = [sum(slope.abs().mean() for slope in level) + _FLAT for level in expected]
 
         def distance(image: Tensor) -> Tensor:
             found = [_slopes(level) for level in _pyramid(image, self.scales)]
@@ -71,9 +73,9 @@ def load_perceptual(weights_dir: Path | None = None) -> Perceptual:
 
 
 def _pyramid(image: Tensor, scales: int) -> list[Tensor]:
-    """[(3, H, W), (3, H/2, W/2), ...], as long as a side has at least 8 pixels."""
+    """[(3, H, W), (3, H/2, W/2), ...], as long as both sides have at least 8 pixels."""
     levels = [image.permute(2, 0, 1)]
-    while len(levels) < scales and min(levels[-1].shape[1:]) >= 16:
+    while len(levels) < scales and min(levels[-1].shape[1:]) >= 2 * _MIN_SIDE:
         levels.append(functional.avg_pool2d(levels[-1], 2))
     return levels
 
