@@ -44,11 +44,6 @@ class Memory:
     def newest_publishable(self, among: Collection[str]) -> Estimate | None:
         """The latest estimate with cameras that may be published whose keyframes are all `among` these."""
         for (names, _), estimate in reversed(self.recent):
-            if (
-                estimate.registration
-                and estimate.evidence
-                and estimate.verdict.publishable
-                and set(names) <= set(among)
-            ):
+            if estimate.publishable and set(names) <= set(among):
                 return estimate
         return None

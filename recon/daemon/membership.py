@@ -67,7 +67,7 @@ def connected(work: IncrementalReconstruction, pause: Pause = without_pause) -> 
 
 
 def prove(work: IncrementalReconstruction, pause: Pause = without_pause) -> None:
-    """Estimates thoroughly what was added for now and what was set aside: together, else one after the other.
+    """Estimates thoroughly what was added provisionally and what was set aside: together, else one after the other.
 
     Keyframes by which the scene fails are set aside. `pause` may raise to abandon the work; what was not estimated by
     then is aside, or as it was.

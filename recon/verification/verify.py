@@ -71,7 +71,7 @@ def verify(
 
 
 def verify_further(graph: ViewGraph, registration: Registration, known: Evidence, config: Config) -> Evidence | None:
-    """Evidence for `registration`, which continues the one that `known` is about: for now, and quick.
+    """Evidence for `registration`, which continues the one that `known` is about: provisional, and quick.
 
     None where a further photograph may be mirrored: a few partners cannot tell that for certain, all evidence must.
 
