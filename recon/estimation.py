@@ -12,7 +12,9 @@ from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior
 from splatnode.recon.registration import continuation
 from splatnode.recon.registration.register import Registration, register
+from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.verdict import Verdict
+from splatnode.recon.verification.claims import claims
 from splatnode.recon.verification.decision import decide, refuse_before_registration
 from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.verify import verify, verify_further
@@ -37,6 +39,13 @@ class Estimate:
     def publishable(self) -> bool:
         """Whether there are cameras, verified, that may be published."""
         return self.verdict.publishable and self.registration is not None and self.evidence is not None
+
+    @property
+    def bounds(self) -> Mapping[str, Bounds]:
+        """Of the errors of each camera, by the name of its keyframe; empty where nothing was verified."""
+        if self.registration is None or self.evidence is None:
+            return {}
+        return claims(self.registration, self.evidence)
 
     @property
     def placed(self) -> set[str]:

@@ -92,18 +92,12 @@ def _by_baseline(cameras: tuple[CameraEstimate, ...], baseline: Baseline) -> tup
     first, second = (known[name] for name in baseline[:2])
     distance = float(np.linalg.norm(first.T_world_camera[:3, 3] - second.T_world_camera[:3, 3]))
     source = f"{baseline.metres:g} m between {baseline.first} and {baseline.second}"
-    sigma = _sigma(cameras, first, second)
-    if distance <= 2.0 * sigma:
+    of_first, of_second = (camera.bounds.centre if camera.bounds else 0.0 for camera in (first, second))
+    bound = float(np.hypot(of_first, of_second))
+    if distance <= bound:
         return None, f"{source} were given, but the photographs do not tell these two cameras apart"
-    certainty = f", known to {100 * sigma / distance:.1g} %" if sigma else ""
+    certainty = f", known to {100 * bound / distance:.1g} %" if bound else ""
     return baseline.metres / distance, source + certainty
-
-
-def _sigma(cameras: tuple[CameraEstimate, ...], first: CameraEstimate, second: CameraEstimate) -> float:
-    """Standard deviation of the distance of two cameras, in the scene's unit; 0 where it was not estimated."""
-    centres = np.stack([camera.T_world_camera[:3, 3] for camera in cameras])
-    spread = float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
-    return spread * float(np.hypot(first.centre_sigma_rel or 0.0, second.centre_sigma_rel or 0.0))
 
 
 def _ratio(snapshot: Snapshot, camera: CameraEstimate, network: MetricDepth) -> float | None:
@@ -122,7 +116,8 @@ def _scaled(snapshot: Snapshot, factor: float) -> Snapshot:
     def moved(camera: CameraEstimate) -> CameraEstimate:
         T_world_camera = camera.T_world_camera.copy()
         T_world_camera[:3, 3] *= factor
-        return replace(camera, T_world_camera=T_world_camera)
+        bounds = camera.bounds and camera.bounds.scaled(factor)
+        return replace(camera, T_world_camera=T_world_camera, bounds=bounds)
 
     gaussians = snapshot.gaussians
     larger = replace(

@@ -42,7 +42,6 @@ def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
     return initial_scene(
         tuple(estimate.pointmaps.values()),
         {keyframe.name: keyframe.image for keyframe in estimate.graph.keyframes},
-        estimate.registration.cameras,
         config.initialisation,
     )
 
@@ -88,7 +87,7 @@ def snapshot(
     made = Snapshot(
         sequence=sequence,
         verdict=verdict,
-        cameras=scene.cameras() if scene else (),
+        cameras=scene.cameras(estimate.bounds) if scene else (),
         gaussians=scene.arrays() if scene else GaussianArrays.empty(),
         images={view.name: view.image for view in scene.views} if scene else {},
         dropped=tuple(dropped),

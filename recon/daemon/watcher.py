@@ -64,9 +64,7 @@ class Watcher:
     def _track(self, tracker: Tracker, image: npt.NDArray[np.uint8], snapshot: Snapshot) -> None:
         height, width = image.shape[:2]
         position, motion = tracker.track(image, preview_intrinsics(snapshot.cameras[-1], width, height))
-        self.tracked = position and CameraEstimate(
-            "live", -1, position.T_world_camera, position.K, width, height, None, None
-        )
+        self.tracked = position and CameraEstimate("live", -1, position.T_world_camera, position.K, width, height)
         if motion is not None and motion.moved and not (self.motion and self.motion.moved):
             event(log, logging.WARNING, "camera_moved", how=motion)
         self.motion = motion

@@ -23,7 +23,7 @@ def write_capture(folder: Path, place: synthetic.Config) -> Split:
     for number, (name, (T_world_camera, K)) in enumerate({**training, **testing}.items()):
         image = synthetic.photograph(place, (T_world_camera, K), noise_seed=number)
         files[name] = encode_png(image)
-        cameras.append(CameraEstimate(name, number, T_world_camera, K, place.width, place.height, None, None))
+        cameras.append(CameraEstimate(name, number, T_world_camera, K, place.width, place.height))
     write_files(folder / "images", files)
     write_file(folder / "cameras.json", encode_cameras(cameras))
     return Split(tuple(training), tuple(testing))

@@ -7,7 +7,7 @@ photograph (JPEG).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Annotated
 
 import cv2
@@ -18,6 +18,7 @@ import numpy.typing as npt
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.messaging.jpeg import from_jpeg, to_jpeg
 from splatnode.capture.messaging.wire import Header, Message, WireError
+from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 
@@ -27,9 +28,19 @@ MAX_CAMERAS = 1000  # of a message: bounds what a hostile one can make a viewer 
 GAUSSIAN_FIELDS = ("means", "quats", "scales", "opacities", "sh", "source_frame")
 
 Finite = Annotated[float, msgspec.Meta(ge=-1e12, le=1e12)]
+Bound = Annotated[float, msgspec.Meta(ge=0.0, le=1e12)]
 Pixels = Annotated[int, msgspec.Meta(ge=1, le=65536)]
 Matrix4 = Annotated[tuple[Finite, ...], msgspec.Meta(min_length=16, max_length=16)]
 Matrix3 = Annotated[tuple[Finite, ...], msgspec.Meta(min_length=9, max_length=9)]
+
+
+class BoundsRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A Bounds."""
+
+    rotation_deg: Bound
+    centre: Bound
+    centre_percent: Bound
+    focal_percent: Bound
 
 
 class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -41,8 +52,7 @@ class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     K: Matrix3  # row by row
     width: Pixels
     height: Pixels
-    rotation_sigma_deg: float | None
-    centre_sigma_rel: float | None
+    bounds: BoundsRecord | None
 
 
 class SceneHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -134,6 +144,14 @@ def thumbnail(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
+def bounds_record(bounds: Bounds | None) -> BoundsRecord | None:
+    return None if bounds is None else BoundsRecord(**asdict(bounds))
+
+
+def bounds_from(record: BoundsRecord | None) -> Bounds | None:
+    return None if record is None else Bounds(**msgspec.structs.asdict(record))
+
+
 def camera_record(camera: CameraEstimate) -> CameraRecord:
     return CameraRecord(
         name=camera.name,
@@ -142,8 +160,7 @@ def camera_record(camera: CameraEstimate) -> CameraRecord:
         K=tuple(camera.K.ravel().tolist()),
         width=camera.width,
         height=camera.height,
-        rotation_sigma_deg=camera.rotation_sigma_deg,
-        centre_sigma_rel=camera.centre_sigma_rel,
+        bounds=bounds_record(camera.bounds),
     )
 
 
@@ -155,8 +172,7 @@ def camera_from(record: CameraRecord) -> CameraEstimate:
         K=np.array(record.K).reshape(3, 3),
         width=record.width,
         height=record.height,
-        rotation_sigma_deg=record.rotation_sigma_deg,
-        centre_sigma_rel=record.centre_sigma_rel,
+        bounds=bounds_from(record.bounds),
     )
 
 

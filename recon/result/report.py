@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import platform
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 
+from splatnode.recon.result.bounds import widest
 from splatnode.recon.result.export.cameras import camera_record
 from splatnode.recon.result.export.formats.ply import ply_bytes
 from splatnode.recon.result.export.prepare import viewer_safe
@@ -21,6 +23,7 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
     """
     gaussians = viewer_safe(snapshot.gaussians)
     verdict = snapshot.verdict
+    worst = widest(camera.bounds for camera in snapshot.cameras if camera.bounds is not None)
     stages = {stage: seconds for stage, seconds in snapshot.seconds.items() if stage != "total"}
     return {
         **snapshot.scale.record(),
@@ -31,6 +34,7 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
             "frames": list(verdict.frames),
             "publishable": verdict.publishable,
         },
+        "bounds": None if worst is None else asdict(worst),
         "evidence": snapshot.evidence,
         "seconds": {**stages, "total": snapshot.seconds.get("total", sum(stages.values()))},
         "peak_rss_mb": peak_rss_mb,

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
+from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.verdict import Verdict
 
@@ -25,8 +26,7 @@ class CameraEstimate:
     K: npt.NDArray[np.float64]  # (3, 3), centre of the top-left pixel at (0.5, 0.5)
     width: int
     height: int
-    rotation_sigma_deg: float | None  # standard deviation after bundle adjustment; None: not estimated
-    centre_sigma_rel: float | None  # the same for the centre, relative to the spread of all centres
+    bounds: Bounds | None = None  # of its errors; None: not estimated
 
 
 @dataclass(frozen=True, eq=False)

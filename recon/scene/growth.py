@@ -41,7 +41,6 @@ def grow(
     begun = initialisation.initial_scene(
         [pointmaps[graph.keyframes[camera.index].name] for camera in cameras],
         {graph.keyframes[index].name: graph.keyframes[index].image for index in shown},
-        cameras,
         initialisation.Config(
             completion=config.completion,
             seeding=config.seeding,

@@ -11,7 +11,6 @@ import torch
 
 from splatnode.recon.frames import border
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.registration.register import RegisteredCamera
 from splatnode.recon.scene import background, completion, pixelwise, seeding
 from splatnode.recon.scene.gaussians import concatenate
 from splatnode.recon.scene.scene import Scene, TrainingView
@@ -34,13 +33,12 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def initial_scene(
     pointmaps: Sequence[Pointmap],
     images: Mapping[str, Image],
-    cameras: Sequence[RegisteredCamera],
     config: Config,
 ) -> Scene:
     """The scene with a training view for each point map, and Gaussians seeded from all of them.
 
-    `images` (h, w, 3) are found by the point maps' names; `cameras` are in the order of the point maps. Pixels of a
-    dark rim, which do not show the scene, seed nothing.
+    `images` (h, w, 3) are found by the point maps' names. Pixels of a dark rim, which do not show the
+    scene, seed nothing.
     """
     pictures = [images[pointmap.name] for pointmap in pointmaps]
     valid = border.valid_masks(pictures)
@@ -52,11 +50,9 @@ def initial_scene(
             image=images[pointmap.name],
             T_world_camera=torch.tensor(pointmap.T_world_camera, dtype=torch.float32),
             K=torch.tensor(pointmap.K, dtype=torch.float32),
-            rotation_sigma_deg=camera.rotation_sigma_deg,
-            centre_sigma_rel=camera.centre_sigma_rel,
             pointmap=pointmap,
         )
-        for pointmap, camera in zip(pointmaps, cameras, strict=True)
+        for pointmap in pointmaps
     )
     if config.pixelwise is not None:
         return Scene(views, pixelwise.pixelwise_gaussians(pointmaps, pictures, config.pixelwise, config.max_gaussians))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
 from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.recon.scene.gaussians import Gaussians
 
@@ -23,8 +25,6 @@ class TrainingView:
     image: npt.NDArray[np.uint8]  # (h, w, 3) RGB at modelled size
     T_world_camera: Tensor  # (4, 4)
     K: Tensor  # (3, 3) at modelled size
-    rotation_sigma_deg: float | None  # of the registration; None: not estimated
-    centre_sigma_rel: float | None  # in units of the spread of the cameras' centres; None: not estimated
     pointmap: Pointmap | None = None  # with the camera as registered; None: there is none
 
     @property
@@ -47,8 +47,8 @@ class Scene:
     num_unlimited: int = 0  # Gaussians that it would have begun with without a limit
     served_by: Mapping[str, str] = field(default_factory=dict)  # by loss that was used: the network or measure in it
 
-    def cameras(self) -> tuple[CameraEstimate, ...]:
-        """The views' cameras as they are published: copies, in float64."""
+    def cameras(self, bounds: Mapping[str, Bounds] = MappingProxyType({})) -> tuple[CameraEstimate, ...]:
+        """The views' cameras as they are published: copies, in float64, with the `bounds` of their errors by name."""
         return tuple(
             CameraEstimate(
                 name=view.name,
@@ -57,8 +57,7 @@ class Scene:
                 K=view.K.double().numpy().copy(),
                 width=view.width,
                 height=view.height,
-                rotation_sigma_deg=view.rotation_sigma_deg,
-                centre_sigma_rel=view.centre_sigma_rel,
+                bounds=bounds.get(view.name),
             )
             for view in self.views
         )

@@ -45,7 +45,7 @@ def make_gaussians() -> GaussianArrays:
 
 
 def estimate(name: str, T_world_camera: np.ndarray) -> CameraEstimate:
-    return CameraEstimate(name, int(name[:2]), T_world_camera, K, WIDTH, HEIGHT, None, None)
+    return CameraEstimate(name, int(name[:2]), T_world_camera, K, WIDTH, HEIGHT)
 
 
 def perfect_snapshot() -> Snapshot:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from splatnode.capture.frame import DroppedFrame
+from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
@@ -31,7 +32,7 @@ def make_camera(frame_id: int, angle: float = 0.3) -> CameraEstimate:
     T_world_camera[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
     T_world_camera[:3, 3] = [frame_id, -0.5, 0.25]
     K = np.array([[400.0, 0, 256], [0, 410, 192], [0, 0, 1]])
-    return CameraEstimate(f"{frame_id:04d}.jpg", frame_id, T_world_camera, K, 512, 384, 0.1, None)
+    return CameraEstimate(f"{frame_id:04d}.jpg", frame_id, T_world_camera, K, 512, 384, Bounds(0.1, 0.02, 2.0, 1.5))
 
 
 def make_snapshot(code: Code = Code.OK, publishable: bool = True) -> Snapshot:

@@ -67,4 +67,4 @@ def maps_of(indices: range) -> dict[str, Pointmap]:
 
 def scene_of(count: int, graph: ViewGraph) -> Scene:
     images = {keyframe.name: keyframe.image for keyframe in graph.keyframes}
-    return initial_scene(list(maps_of(range(count)).values()), images, registration_of(count).cameras, Config())
+    return initial_scene(list(maps_of(range(count)).values()), images, Config())

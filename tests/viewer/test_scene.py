@@ -26,7 +26,7 @@ UP = np.array([0.0, -1.0, 0.0])
 def camera(x: float, y: float = 0.0, z: float = 0.0, *, frame_id: int = 0, target=(0.0, 0.0, 1.0)) -> CameraEstimate:
     """A camera of 100 x 80 pixels that looks at `target`."""
     T_world_camera = look_at(np.array([x, y, z]), np.array(target), UP)
-    return CameraEstimate(f"{frame_id}.png", frame_id, T_world_camera, K, 100, 80, None, None)
+    return CameraEstimate(f"{frame_id}.png", frame_id, T_world_camera, K, 100, 80)
 
 
 def wall(count: int = 41, depth: float = 1.0, half: float = 0.3, source: int = 0) -> GaussianArrays:

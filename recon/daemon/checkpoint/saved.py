@@ -31,16 +31,10 @@ class GraphRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     pending: list[tuple[int, int]]  # that have not been compared
 
 
-class ViewRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    name: str
-    rotation_sigma_deg: float | None
-    centre_sigma_rel: float | None
-
-
 class SceneRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Arrays: Ts_world_camera (C, 4, 4), Ks (C, 3, 3), then those of the Gaussians in the order of their fields."""
 
-    views: list[ViewRecord]
+    views: list[str]  # their names
     iterations: int
     final: bool
 
@@ -78,7 +72,7 @@ def graph_from(message: Message[GraphRecord]) -> SavedGraph:
 
 def scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDArray]]:
     """Header and arrays of the message that holds `scene`; `final`: it is finished."""
-    views = [ViewRecord(view.name, view.rotation_sigma_deg, view.centre_sigma_rel) for view in scene.views]
+    views = [view.name for view in scene.views]
     cameras = [torch.stack([view.T_world_camera for view in scene.views]), torch.stack([v.K for v in scene.views])]
     gaussians = [getattr(scene.gaussians, field.name) for field in fields(Gaussians)]
     return SceneRecord(views, scene.iterations, final), [tensor.numpy() for tensor in (*cameras, *gaussians)]
@@ -87,22 +81,20 @@ def scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDAr
 def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe]) -> Scene | None:
     """The scene that was saved; None where a frame of it is gone. Raises ValueError as `graph_from`."""
     header = message.header
-    if any(view.name not in keyframes for view in header.views):
+    if any(name not in keyframes for name in header.views):
         return None
     if len(message.arrays) != 2 + len(fields(Gaussians)):
         raise ValueError(f"a scene of {len(message.arrays)} arrays is of another version")
     Ts_world_camera, Ks, *gaussians = (torch.from_numpy(np.array(array)) for array in message.arrays)
     views = tuple(
         TrainingView(
-            name=record.name,
-            frame_id=keyframes[record.name].frame.frame_id,
-            image=keyframes[record.name].image,
+            name=name,
+            frame_id=keyframes[name].frame.frame_id,
+            image=keyframes[name].image,
             T_world_camera=T_world_camera,
             K=K,
-            rotation_sigma_deg=record.rotation_sigma_deg,
-            centre_sigma_rel=record.centre_sigma_rel,
         )
-        for record, T_world_camera, K in zip(header.views, Ts_world_camera, Ks, strict=True)
+        for name, T_world_camera, K in zip(header.views, Ts_world_camera, Ks, strict=True)
     )
     return Scene(views, Gaussians(*gaussians), header.iterations)
 

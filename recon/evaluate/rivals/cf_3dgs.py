@@ -123,7 +123,7 @@ def _refined(scene: Scene, config: refinement.Config, iterations: int, seed: int
 
 def _view(frame: FrameWithDepth, T_world_camera: np.ndarray) -> TrainingView:
     T, K = torch.from_numpy(T_world_camera).float(), torch.from_numpy(frame.K).float()
-    return TrainingView(frame.name, frame.frame_id, frame.image, T, K, None, None)
+    return TrainingView(frame.name, frame.frame_id, frame.image, T, K)
 
 
 def _from_depth(frame: FrameWithDepth, T_world_camera: np.ndarray, config: Config) -> Gaussians:

@@ -88,7 +88,7 @@ def view(registered: RegisteredFrame) -> TrainingView:
     image = modelled_image(frame.image, SIZE)
     K = frame.intrinsics.resized(image.shape[1], image.shape[0]).K
     T_world_camera = torch.from_numpy(registered.T_world_camera).float()
-    return TrainingView(frame.name, frame.frame_id, image, T_world_camera, torch.from_numpy(K).float(), None, None)
+    return TrainingView(frame.name, frame.frame_id, image, T_world_camera, torch.from_numpy(K).float())
 
 
 def in_parts_of_extent(config: refinement.Config, scene: Scene) -> refinement.Config:

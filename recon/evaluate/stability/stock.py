@@ -47,6 +47,4 @@ def _camera(registered: RegisteredFrame) -> CameraEstimate:
         registered.intrinsics.K,
         frame.width,
         frame.height,
-        None,
-        None,
     )

@@ -8,13 +8,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 
 import numpy as np
 
+from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate
+
+BOUNDS_MEANING = (
+    "hold for 95 % of all cameras: rotation_deg after the best common rotation, centre (in the file's unit) and "
+    "centre_percent (of the distance to the scene) after the best similarity, focal_percent of the focal length"
+)
 
 
 def camera_record(camera: CameraEstimate) -> dict[str, object]:
@@ -26,7 +33,7 @@ def camera_record(camera: CameraEstimate) -> dict[str, object]:
         "K": camera.K.tolist(),
         "width": camera.width,
         "height": camera.height,
-        "uncertainty": {"rotation_deg": camera.rotation_sigma_deg, "centre_rel": camera.centre_sigma_rel},
+        "bounds": None if camera.bounds is None else asdict(camera.bounds),
     }
 
 
@@ -37,6 +44,7 @@ def encode_cameras(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -
             **scale.record(),
             "axes": "OpenCV: x right, y down, z forward",
             "T_world_camera": "p_world = T_world_camera @ p_camera",
+            "bounds": BOUNDS_MEANING,
             "pixel_origin": "the centre of the top-left pixel is (0.5, 0.5)",
             "cameras": [camera_record(camera) for camera in cameras],
         }
@@ -64,7 +72,7 @@ def _camera_from_record(record: Mapping) -> CameraEstimate:
         raise ValueError(f"T_world_camera must be 4x4 and K 3x3, got {T_world_camera.shape} and {K.shape}")
     if not np.isfinite(T_world_camera).all() or not np.isfinite(K).all():
         raise ValueError("T_world_camera and K must be finite")
-    uncertainty = record.get("uncertainty") or {}
+    bounds = record.get("bounds")
     return CameraEstimate(
         name=str(record["name"]),
         frame_id=int(record["frame_id"]),
@@ -72,6 +80,5 @@ def _camera_from_record(record: Mapping) -> CameraEstimate:
         K=K,
         width=int(record["width"]),
         height=int(record["height"]),
-        rotation_sigma_deg=uncertainty.get("rotation_deg"),
-        centre_sigma_rel=uncertainty.get("centre_rel"),
+        bounds=Bounds(**{name: float(value) for name, value in bounds.items()}) if bounds else None,
     )

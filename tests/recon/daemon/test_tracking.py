@@ -135,7 +135,7 @@ def test_landmarks_lie_on_what_the_gaussians_show():
         source_frame=np.zeros(1, np.int32),
     )
     K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
-    camera = CameraEstimate(frame.name, 0, np.eye(4), K, 320, 240, None, None)
+    camera = CameraEstimate(frame.name, 0, np.eye(4), K, 320, 240)
     verdict = Verdict(Code.OK, "", "", publishable=True)
     snapshot = Snapshot(1, verdict, (camera,), wall, {frame.name: frame.image}, (), 0)
     (found,) = landmarks(snapshot, [keyframe], CONFIG)

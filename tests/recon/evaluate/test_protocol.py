@@ -183,7 +183,7 @@ def test_one_camera_cannot_be_aligned(scene_folder):
 
 
 def test_intrinsics_are_carried_to_an_image_of_another_size():
-    first = CameraEstimate("a", 0, np.eye(4), np.array([[100.0, 0, 50], [0, 100, 30], [0, 0, 1]]), 100, 60, None, None)
+    first = CameraEstimate("a", 0, np.eye(4), np.array([[100.0, 0, 50], [0, 100, 30], [0, 0, 1]]), 100, 60)
     second = replace(first, K=np.array([[110.0, 0, 52], [0, 110, 30], [0, 0, 1]]))
     found = mean_intrinsics([first, second], 200, 120)
     assert np.allclose(found, [[210, 0, 102], [0, 210, 60], [0, 0, 1]])

@@ -60,7 +60,7 @@ def cameras(names: Sequence[str]) -> list[CameraEstimate]:
     K = np.array([[8.0, 0, 4], [0, 8.0, 3], [0, 0, 1]])
     Ts = np.tile(np.eye(4), (len(names), 1, 1))
     Ts[:, 0, 3] = np.arange(len(names))
-    return [CameraEstimate(name, i, T, K, 8, 6, None, None) for i, (name, T) in enumerate(zip(names, Ts, strict=True))]
+    return [CameraEstimate(name, i, T, K, 8, 6) for i, (name, T) in enumerate(zip(names, Ts, strict=True))]
 
 
 def write_colmap(folder: Path, names: Sequence[str]) -> None:

@@ -17,7 +17,7 @@ SEEN = plane_pointmap(np.eye(4), confidence=0.3, frame_id=4)
 
 def view(pointmap=SEEN) -> TrainingView:
     image = np.zeros((*SEEN.depth.shape, 3), np.uint8)
-    return TrainingView(SEEN.name, 4, image, torch.eye(4), torch.from_numpy(SEEN.K).float(), None, None, pointmap)
+    return TrainingView(SEEN.name, 4, image, torch.eye(4), torch.from_numpy(SEEN.K).float(), pointmap)
 
 
 def gaussians(count: int, source_frame: int = SHELL) -> Gaussians:

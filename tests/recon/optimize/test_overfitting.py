@@ -51,7 +51,7 @@ def view(x: float, frame_id: int, gaussians: Gaussians) -> TrainingView:
     normal[..., 2] = -1.0
     matrices = T_world_camera.double().numpy(), K.double().numpy()
     pointmap = Pointmap(f"{frame_id}", frame_id, depth, np.ones_like(depth), normal, *matrices)
-    return TrainingView(f"{frame_id}", frame_id, image, T_world_camera, K, None, None, pointmap)
+    return TrainingView(f"{frame_id}", frame_id, image, T_world_camera, K, pointmap)
 
 
 @pytest.fixture(scope="module")

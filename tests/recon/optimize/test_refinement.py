@@ -47,7 +47,7 @@ def photographed() -> Scene:
     views = []
     for index, (T, K) in enumerate(zip(tiny.Ts_world_camera, tiny.Ks, strict=True)):
         empty = np.zeros((tiny.height, tiny.width, 3), np.uint8)
-        view = TrainingView(f"{index}.png", index, empty, T, K, 0.1, 0.01)
+        view = TrainingView(f"{index}.png", index, empty, T, K)
         image = (255 * render(tiny.gaussians, view)).round().byte().numpy()
         views.append(replace(view, image=image))
     return Scene(tuple(views), tiny.gaussians, iterations=7)

@@ -16,7 +16,7 @@ def test_only_what_shows_the_scene_is_compared(scale):
     shown = np.ones((HEIGHT, WIDTH), bool)
     image[:3], shown[:3] = 0, False
     K = torch.tensor([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
-    compared = training_image(TrainingView("a", 0, image, torch.eye(4), K, None, None), shown, scale, 0.2)
+    compared = training_image(TrainingView("a", 0, image, torch.eye(4), K), shown, scale, 0.2)
     assert (compared.width, compared.height) == (WIDTH * scale, HEIGHT * scale)
     torch.testing.assert_close(compared.K[:2], scale * K[:2])
     grey = torch.full((compared.height, compared.width, 3), 128 / 255, requires_grad=True)

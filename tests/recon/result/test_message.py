@@ -9,6 +9,7 @@ import pytest
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.messaging.jpeg import to_jpeg
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
+from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.message import SceneHeader, from_message, to_message
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
@@ -19,7 +20,13 @@ NUMBERED = Numbering(session="0123456789abcdef" * 2).next() | {"sequence": 7}
 
 def camera(index: int) -> CameraEstimate:
     return CameraEstimate(
-        f"{index}.png", index, RANDOM.normal(size=(4, 4)), np.diag([300.0, 301, 1]), 320, 200, 0.1, None
+        f"{index}.png",
+        index,
+        RANDOM.normal(size=(4, 4)),
+        np.diag([300.0, 301, 1]),
+        320,
+        200,
+        Bounds(0.1, 0.02, 2.0, 1.5),
     )
 
 

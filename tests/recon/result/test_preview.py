@@ -28,7 +28,7 @@ def ball(rgb: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> GaussianArrays:
 
 def snapshot(num_cameras: int) -> Snapshot:
     """Photographs of one grey each, brighter from camera to camera."""
-    cameras = tuple(CameraEstimate(f"{i}.png", i, np.eye(4), K, WIDTH, HEIGHT, None, None) for i in range(num_cameras))
+    cameras = tuple(CameraEstimate(f"{i}.png", i, np.eye(4), K, WIDTH, HEIGHT) for i in range(num_cameras))
     images = {camera.name: np.full((HEIGHT, WIDTH, 3), 20 * camera.frame_id, np.uint8) for camera in cameras}
     verdict = Verdict(Code.OK, "Good.", "", publishable=True)
     return Snapshot(0, verdict, cameras, ball(), images, (), 0)

@@ -12,7 +12,6 @@ from splatnode.capture.process.config import typed
 from splatnode.recon.config import Config
 from splatnode.recon.frames import border
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.registration.register import RegisteredCamera
 from splatnode.recon.scene import background, initialisation, pixelwise
 from splatnode.recon.scene.initialisation import initial_scene
 from splatnode.recon.scene.scene import Scene
@@ -35,22 +34,14 @@ def scene_of(
     pointmaps: tuple[Pointmap, ...], max_gaussians: int | None = None, by_pixel: pixelwise.Config | None = None
 ) -> Scene:
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8)
-    principal = np.array([WIDTH / 2, HEIGHT / 2])
-    cameras = tuple(
-        RegisteredCamera(i, pointmap.T_world_camera, 0, 1.1 * WIDTH, principal, 0.0, 0.1 + i, 0.01)
-        for i, pointmap in enumerate(pointmaps)
-    )
     images = {pointmap.name: noise for pointmap in pointmaps}
     config = initialisation.Config(pixelwise=by_pixel, max_gaussians=max_gaussians)
-    return initial_scene(pointmaps, images, cameras, config)
+    return initial_scene(pointmaps, images, config)
 
 
 def test_a_scene_begins_with_the_registered_cameras_and_a_gaussian_for_what_they_saw():
     scene = begun()
-    assert [(view.name, view.frame_id, view.rotation_sigma_deg) for view in scene.views] == [
-        ("00.png", 0, 0.1),
-        ("01.png", 1, 1.1),
-    ]
+    assert [(view.name, view.frame_id) for view in scene.views] == [("00.png", 0), ("01.png", 1)]
     assert float(scene.views[1].T_world_camera[0, 3]) == pytest.approx(0.3)
     sources = scene.gaussians.source_frame
     # Every pixel of noise from the surer view; from the other what only it sees: 0.3 * 35.2 / 2 = 5.3 of 32 columns.

@@ -75,7 +75,7 @@ def refined_wall(image: np.ndarray) -> int:
     size = image.shape[0]
     pointmap = plane_pointmap(np.eye(4), width=size, height=size)
     T, K = torch.eye(4), torch.from_numpy(pointmap.K).float()
-    view = TrainingView("0.png", 0, image, T, K, 0.1, 0.01)
+    view = TrainingView("0.png", 0, image, T, K)
     scene = Scene((view,), initial_gaussians([pointmap], [image], CONFIG.seeding))
     return len(list(refinement.refine(scene, SHORT, seed=0))[-1].gaussians)
 

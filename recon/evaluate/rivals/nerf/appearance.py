@@ -87,4 +87,4 @@ def _camera(frame: Frame, T_world_camera: Tensor, focal: float) -> CameraEstimat
     pixels = focal * max(width, height)
     K = np.array([[pixels, 0, width / 2], [0, pixels, height / 2], [0, 0, 1.0]])
     T = T_world_camera.double().numpy()
-    return CameraEstimate(frame.name, frame.frame_id, T, K, width, height, None, None)
+    return CameraEstimate(frame.name, frame.frame_id, T, K, width, height)

@@ -26,9 +26,7 @@ def estimated(*degrees: float, turn: float = 0.0) -> list[CameraEstimate]:
     moved[:3, :3], moved[:3, 3] = cv2.Rodrigues(np.array([0.3, -1.0, 0.2]))[0], [4.0, 5.0, 6.0]
     Ts = [moved @ on_arc(value, 6.0) for value in degrees]
     Ts[-1][:3, :3] = Ts[-1][:3, :3] @ cv2.Rodrigues(np.radians([0.0, 0.0, turn]))[0]
-    return [
-        CameraEstimate(f"{value:g}", 0, T, K, WIDTH, HEIGHT, None, None) for value, T in zip(degrees, Ts, strict=True)
-    ]
+    return [CameraEstimate(f"{value:g}", 0, T, K, WIDTH, HEIGHT) for value, T in zip(degrees, Ts, strict=True)]
 
 
 def test_right_cameras_are_right_in_any_frame_and_scale():
