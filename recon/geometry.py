@@ -124,6 +124,10 @@ class Similarity:
         moved[:3, 3] = self.scale * self.rotation @ T_world_camera[:3, 3] + self.translation
         return moved
 
+    def covariance(self, of_points: Array) -> Array:
+        """The covariances (..., 3, 3) of points after the similarity."""
+        return self.scale**2 * self.rotation @ of_points @ self.rotation.T
+
 
 def align_cameras(Ts_source: Array, Ts_target: Array) -> Similarity:
     """The similarity that carries source cameras (C, 4, 4) onto target cameras (C, 4, 4).

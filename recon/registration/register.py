@@ -34,6 +34,8 @@ class RegisteredCamera:
     radial: float  # first radial distortion coefficient
     rotation_sigma_deg: float  # after the best similarity; infinite where nothing is known
     centre_sigma_rel: float  # over the spread of the centres, after the best similarity; infinite likewise
+    # (3, 3) of the centre, after the best similarity, in the frame and the squared unit of the world; NaN likewise
+    centre_covariance: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +149,7 @@ def in_first_camera(found: mapper.Map, keyframes: Sequence[Keyframe], scales: Se
     unit = 1.0 / max(float(np.median(depths)), _MIN_DEPTH)
     rotation0, translation0 = estimate.rotations[order[0]], estimate.translations[order[0]]
     rotation_sigmas, centre_sigmas = uncertainty.camera_sigmas(estimate, covariance, order)
+    covariances = unit**2 * rotation0 @ uncertainty.centre_covariances(estimate, covariance, order) @ rotation0.T
     cameras = []
     for position, i in enumerate(order):
         T_world_camera = np.eye(4)
@@ -163,6 +166,7 @@ def in_first_camera(found: mapper.Map, keyframes: Sequence[Keyframe], scales: Se
                 radial=float(estimate.radials[lens]),
                 rotation_sigma_deg=float(rotation_sigmas[position]),
                 centre_sigma_rel=float(centre_sigmas[position]),
+                centre_covariance=covariances[position],
             )
         )
     principal = np.stack([principal_point(keyframe.frame) for keyframe in keyframes])

@@ -7,6 +7,7 @@ here (an S-transformation: Baarda, 1973): it does not depend on which camera the
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -38,13 +39,45 @@ def camera_sigmas(
     In the order of `registered`; each is of the error's three components together. All are infinite where poses or
     covariance are not finite, single ones where their variance is negative beyond rounding.
     """
+    errors = _errors(problem, covariance, registered)
+    if errors is None:
+        return np.full(len(registered), np.inf), np.full(len(registered), np.inf)
+    rotation_sigmas, centre_sigmas = (sigmas(_variances(by, errors.joint)) for by in (errors.turns, errors.moves))
+    return np.degrees(rotation_sigmas), centre_sigmas / errors.spread
+
+
+def centre_covariances(problem: bundle.Problem, covariance: bundle.Covariance, registered: Sequence[int]) -> Array:
+    """(C, 3, 3) covariances of the centres after the best similarity, in the frame and unit of length of `problem`.
+
+    In the order of `registered`; NaN where poses or covariance are not finite. Each trace is the variance whose root
+    `camera_sigmas` gives over the spread.
+    """
+    errors = _errors(problem, covariance, registered)
+    if errors is None:
+        return np.full((len(registered), 3, 3), np.nan)
+    own = errors.moves.reshape(len(registered), 3, -1)
+    return own @ errors.joint @ own.transpose(0, 2, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Errors:
+    """What the errors of C poses after the best similarity are made of."""
+
+    joint: Array  # (6 C, 6 C) covariance of the poses' parameters
+    turns: Array  # (3 C, 6 C) derivatives of the orientations in the world
+    moves: Array  # (3 C, 6 C) derivatives of the centres
+    spread: float  # of the centres
+
+
+def _errors(problem: bundle.Problem, covariance: bundle.Covariance, registered: Sequence[int]) -> _Errors | None:
+    """None where poses or covariance are not finite."""
     members = list(registered)
     rows = (6 * np.array(members)[:, None] + np.arange(6)).ravel()
     joint = covariance.joint[np.ix_(rows, rows)]
     rotations, translations = problem.rotations[members], problem.translations[members]
     count = len(members)
     if not all(np.isfinite(values).all() for values in (joint, rotations, translations)):
-        return np.full(count, np.inf), np.full(count, np.inf)
+        return None
     turns, moves = _by_pose(rotations, translations)
     centres = np.stack([-R.T @ t for R, t in zip(rotations, translations, strict=True)])
     centred = centres - centres.mean(0)
@@ -54,8 +87,7 @@ def camera_sigmas(
     rotated = np.concatenate([cross_matrix(centre[None])[0] for centre in centred])
     turns = _without(translated) @ turns
     moves = _without(np.column_stack([translated, rotated / spread, centred.ravel() / spread])) @ moves
-    rotation_sigmas, centre_sigmas = (sigmas(_variances(by, joint)) for by in (turns, moves))
-    return np.degrees(rotation_sigmas), centre_sigmas / spread
+    return _Errors(joint, turns, moves, spread)
 
 
 def _by_pose(rotations: Array, translations: Array) -> tuple[Array, Array]:

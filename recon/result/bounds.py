@@ -9,6 +9,17 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Vector = tuple[float, float, float]
+Axes = tuple[Vector, Vector, Vector]
+
+_CHI2_95_OF_3 = 7.815  # 95 % quantile of the chi-squared distribution with 3 degrees of freedom
+_NORMAL_95 = 1.645  # 95 % quantile of the standard normal distribution
+_NEGLIGIBLE = 1e-6  # standard deviation over bound: below, a covariance is rounding and has no shape
+
 
 @dataclass(frozen=True)
 class Bounds:
@@ -18,14 +29,15 @@ class Bounds:
     centre: float  # in the unit of the world: metres where it is metric
     centre_percent: float  # the same, of the distance to the scene: the median depth of its points
     focal_percent: float  # of the focal length
+    axes: Axes  # of the ellipsoid that holds the centre: semi-axes in the world's frame and unit, the longest first
 
     def scaled(self, factor: float) -> Bounds:
         """The same in a world whose unit is `factor` times smaller."""
-        return replace(self, centre=self.centre * factor)
+        return replace(self, centre=self.centre * factor, axes=as_axes(factor * np.array(self.axes)))
 
 
 def widest(bounds: Iterable[Bounds]) -> Bounds | None:
-    """The widest bound of each kind; None without any."""
+    """The widest bound of each kind, with the ellipsoid of the widest centre; None without any."""
     every = list(bounds)
     if not every:
         return None
@@ -34,4 +46,47 @@ def widest(bounds: Iterable[Bounds]) -> Bounds | None:
         centre=max(each.centre for each in every),
         centre_percent=max(each.centre_percent for each in every),
         focal_percent=max(each.focal_percent for each in every),
+        axes=max(every, key=lambda each: each.centre).axes,
     )
+
+
+def ball(radius: float) -> Axes:
+    """The semi-axes of a ball."""
+    return ((radius, 0.0, 0.0), (0.0, radius, 0.0), (0.0, 0.0, radius))
+
+
+def axes_of(covariance: Array, centre: float) -> Axes:
+    """The semi-axes of the ellipsoid of 95 % for a centre whose errors are shorter than `centre` with 95 %.
+
+    `covariance` (3, 3) gives its shape, `centre` its size: the ellipsoid is that of a normal distribution with a
+    multiple of the covariance under which 95 % of the errors are shorter than `centre`. A ball where all directions
+    are alike; in a needle's direction it is longer than `centre`, by 1.4 times at most, for an ellipsoid of three
+    dimensions must be wider to hold as much. A ball, too, where `covariance` is not finite or has no size.
+    """
+    if not (np.isfinite(covariance).all() and np.isfinite(centre)):
+        return ball(centre)
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2.0)
+    variances = values[::-1].clip(0.0)
+    if variances[0] <= (_NEGLIGIBLE * centre) ** 2:
+        return ball(centre)
+    lengths = centre * np.sqrt(_CHI2_95_OF_3 * variances / _squared_length_95(variances))
+    directions = vectors.T[::-1]
+    largest = directions[np.arange(3), np.abs(directions).argmax(1)]
+    return as_axes(lengths[:, None] * directions * np.sign(largest)[:, None])
+
+
+def as_axes(rows: Array) -> Axes:
+    """The rows (3, 3) as axes."""
+    first, second, third = ((float(x), float(y), float(z)) for x, y, z in rows)
+    return first, second, third
+
+
+def _squared_length_95(variances: Array) -> float:
+    """The 95 % quantile of the squared length of a normal vector with `variances` (3,) along its axes.
+
+    As of the scaled chi-squared variable with the same mean and variance (Satterthwaite, 1946), whose quantile is
+    Wilson and Hilferty's (1931): within 3 %.
+    """
+    mean, square = float(variances.sum()), float((variances**2).sum())
+    spread = 2.0 * square / (9.0 * mean**2)  # 2 / (9 degrees of freedom)
+    return mean * (1.0 - spread + _NORMAL_95 * spread**0.5) ** 3

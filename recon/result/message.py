@@ -31,6 +31,7 @@ Finite = Annotated[float, msgspec.Meta(ge=-1e12, le=1e12)]
 Bound = Annotated[float, msgspec.Meta(ge=0.0, le=1e12)]
 Pixels = Annotated[int, msgspec.Meta(ge=1, le=65536)]
 Matrix4 = Annotated[tuple[Finite, ...], msgspec.Meta(min_length=16, max_length=16)]
+Vector3 = tuple[Finite, Finite, Finite]
 Matrix3 = Annotated[tuple[Finite, ...], msgspec.Meta(min_length=9, max_length=9)]
 
 
@@ -41,6 +42,7 @@ class BoundsRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     centre: Bound
     centre_percent: Bound
     focal_percent: Bound
+    axes: tuple[Vector3, Vector3, Vector3]
 
 
 class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

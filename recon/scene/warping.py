@@ -38,7 +38,12 @@ def registration_in_scene_world(scene: Scene, registration: Registration, graph:
     return replace(
         registration,
         cameras=tuple(
-            replace(camera, T_world_camera=similarity.camera(camera.T_world_camera)) for camera in registration.cameras
+            replace(
+                camera,
+                T_world_camera=similarity.camera(camera.T_world_camera),
+                centre_covariance=similarity.covariance(camera.centre_covariance),
+            )
+            for camera in registration.cameras
         ),
         points=similarity(registration.points),
     )

@@ -163,6 +163,13 @@ def test_a_moved_camera_is_rigid_and_sees_the_moved_world_alike():
     np.testing.assert_allclose(similarity(point), moved_point, atol=1e-12)
 
 
+def test_the_covariance_of_moved_points_is_the_moved_covariance():
+    similarity = Similarity(0.4, Rotation.random(random_state=3).as_matrix(), np.array([1.0, 2.0, 3.0]))
+    points = np.random.default_rng(0).normal(size=(2, 50, 3)) * [3.0, 1.0, 0.5]
+    before, after = (np.stack([np.cov(each.T) for each in of]) for of in (points, similarity(points)))
+    np.testing.assert_allclose(similarity.covariance(before), after, atol=1e-12)
+
+
 def test_similarities_are_composed_and_undone():
     first, second = (
         Similarity(scale, Rotation.random(random_state=seed).as_matrix(), np.array([1.0, seed, -2.0]))

@@ -13,7 +13,7 @@ from splatnode.recon.config import Config as ReconConfig
 from splatnode.recon.config import overlaid
 from splatnode.recon.metric import Baseline, Config, MetricDepth, by_network, in_metres
 from splatnode.recon.networks.crop import crop
-from splatnode.recon.result.bounds import Bounds
+from splatnode.recon.result.bounds import Bounds, ball
 from splatnode.recon.result.export import export_scene
 from splatnode.recon.result.export.formats.ply import decode as decode_ply
 from splatnode.recon.result.rendering import render_arrays
@@ -31,7 +31,7 @@ def seen() -> Snapshot:
     apart = first.T_world_camera.copy()
     apart[:3, 3] += [0.5, 0.0, 0.0]
     cameras = tuple(
-        replace(first, name=name, T_world_camera=T, bounds=Bounds(1.0, 0.005, 0.5, 1.0))
+        replace(first, name=name, T_world_camera=T, bounds=Bounds(1.0, 0.005, 0.5, 1.0, ball(0.005)))
         for name, T in (("a.jpg", first.T_world_camera), ("b.jpg", apart))
     )
     wide = replace(known.gaussians, scales=np.full((1, 3), 0.9, np.float32))
@@ -46,7 +46,7 @@ def test_a_known_distance_gives_the_unit(seen):
     metric = in_metres(seen, Config(baseline=Baseline("a.jpg", "b.jpg", 2.0)))
     centres = [camera.T_world_camera[:3, 3] for camera in metric.cameras]
     assert np.linalg.norm(centres[1] - centres[0]) == pytest.approx(2.0)
-    assert metric.cameras[0].bounds == Bounds(1.0, 0.02, 0.5, 1.0)
+    assert metric.cameras[0].bounds == Bounds(1.0, 0.02, 0.5, 1.0, ball(0.02))
     np.testing.assert_allclose(metric.gaussians.means, 4.0 * seen.gaussians.means, rtol=1e-6)
     np.testing.assert_allclose(metric.gaussians.scales, 4.0 * seen.gaussians.scales, rtol=1e-6)
     assert metric.scale.metric and metric.scale.source == "2 m between a.jpg and b.jpg, known to 1 %"
@@ -63,7 +63,7 @@ def test_what_cannot_be_had_is_said_and_the_scene_stays(seen, tmp_path, monkeypa
     assert not lost.scale.metric and "z.jpg is not among" in (lost.scale.source or "")
     np.testing.assert_array_equal(lost.gaussians.means, seen.gaussians.means)
     unsure = replace(
-        seen, cameras=tuple(replace(camera, bounds=Bounds(1.0, 0.5, 50.0, 1.0)) for camera in seen.cameras)
+        seen, cameras=tuple(replace(camera, bounds=Bounds(1.0, 0.5, 50.0, 1.0, ball(0.5))) for camera in seen.cameras)
     )
     told = in_metres(unsure, Config(baseline=Baseline("a.jpg", "b.jpg", 2.0)))
     assert not told.scale.metric and "do not tell these two cameras apart" in (told.scale.source or "")

@@ -32,7 +32,8 @@ def make_camera(frame_id: int, angle: float = 0.3) -> CameraEstimate:
     T_world_camera[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
     T_world_camera[:3, 3] = [frame_id, -0.5, 0.25]
     K = np.array([[400.0, 0, 256], [0, 410, 192], [0, 0, 1]])
-    return CameraEstimate(f"{frame_id:04d}.jpg", frame_id, T_world_camera, K, 512, 384, Bounds(0.1, 0.02, 2.0, 1.5))
+    bounds = Bounds(0.1, 0.02, 2.0, 1.5, ((0.03, 0.0, 0.0), (0.0, 0.0, 0.01), (0.0, 0.005, 0.0)))
+    return CameraEstimate(f"{frame_id:04d}.jpg", frame_id, T_world_camera, K, 512, 384, bounds)
 
 
 def make_snapshot(code: Code = Code.OK, publishable: bool = True) -> Snapshot:

@@ -46,7 +46,7 @@ def registration_of(count: int, world: Similarity | None = None) -> Registration
     principal = np.array([WIDTH / 2, HEIGHT / 2])
     return Registration(
         cameras=tuple(
-            RegisteredCamera(i, world.camera(camera(i)), 0, 1.1 * WIDTH, principal, 0.0, 0.1, 0.01)
+            RegisteredCamera(i, world.camera(camera(i)), 0, 1.1 * WIDTH, principal, 0.0, 0.1, 0.01, 1e-4 * np.eye(3))
             for i in range(count)
         ),
         points=np.array([[0.0, 0.0, 2.0]]) * world.scale @ world.rotation.T + world.translation,

@@ -12,7 +12,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from splatnode.recon.result.bounds import Bounds
+from splatnode.recon.result.bounds import Bounds, as_axes
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.scale import RELATIVE, Scale
@@ -20,7 +20,8 @@ from splatnode.recon.result.snapshot import CameraEstimate
 
 BOUNDS_MEANING = (
     "hold for 95 % of all cameras: rotation_deg after the best common rotation, centre (in the file's unit) and "
-    "centre_percent (of the distance to the scene) after the best similarity, focal_percent of the focal length"
+    "centre_percent (of the distance to the scene) after the best similarity, focal_percent of the focal length; axes "
+    "are the semi-axes of the ellipsoid around the centre, in the file's unit and world"
 )
 
 
@@ -72,7 +73,6 @@ def _camera_from_record(record: Mapping) -> CameraEstimate:
         raise ValueError(f"T_world_camera must be 4x4 and K 3x3, got {T_world_camera.shape} and {K.shape}")
     if not np.isfinite(T_world_camera).all() or not np.isfinite(K).all():
         raise ValueError("T_world_camera and K must be finite")
-    bounds = record.get("bounds")
     return CameraEstimate(
         name=str(record["name"]),
         frame_id=int(record["frame_id"]),
@@ -80,5 +80,13 @@ def _camera_from_record(record: Mapping) -> CameraEstimate:
         K=K,
         width=int(record["width"]),
         height=int(record["height"]),
-        bounds=Bounds(**{name: float(value) for name, value in bounds.items()}) if bounds else None,
+        bounds=_bounds_from_record(record["bounds"]) if record.get("bounds") else None,
     )
+
+
+def _bounds_from_record(record: Mapping) -> Bounds:
+    numbers = {name: float(value) for name, value in record.items() if name != "axes"}
+    axes = np.array(record["axes"], np.float64)
+    if axes.shape != (3, 3) or not np.isfinite([*numbers.values(), *axes.ravel()]).all():
+        raise ValueError("the bounds of a camera must be finite, and their axes 3x3")
+    return Bounds(**numbers, axes=as_axes(axes))

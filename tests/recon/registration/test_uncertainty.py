@@ -9,10 +9,18 @@ import numpy as np
 import pytest
 
 from splatnode.recon.evaluate.camera_errors import umeyama
-from splatnode.recon.registration import bundle, uncertainty
+from splatnode.recon.geometry import Similarity
+from splatnode.recon.registration import bundle, mapper, uncertainty
+from splatnode.recon.registration.register import in_first_camera
+from splatnode.recon.result.bounds import axes_of
 from tests.recon.registration.test_bundle import NOISE_PX, PRIOR, problem
+from tests.support.row_of_views import graph_of
 
 CONFIG = bundle.Config(robust_px=50.0, noise_px=NOISE_PX)  # nearly squares, for which the covariance is exact
+QUIET = bundle.Config(
+    robust_px=50.0, noise_px=0.05, tolerance=1e-9
+)  # errors so small that they are linear in the noise
+FIXED_LENS = bundle.LensPrior(np.log([900.0]), np.zeros(1), np.zeros(1), np.zeros(1))
 ALL = (0, 1, 2, 3)
 
 
@@ -36,6 +44,72 @@ def test_sigmas_are_the_errors_of_repeated_estimates():
         moved.append(np.linalg.norm(aligned - centres(true), axis=1) / spread)
     np.testing.assert_allclose(rotation_sigmas, np.degrees(np.sqrt(np.mean(np.square(turned), 0))), rtol=0.3)
     np.testing.assert_allclose(centre_sigmas, np.sqrt(np.mean(np.square(moved), 0)), rtol=0.3)
+
+
+def test_covariances_of_the_centres_are_those_of_repeated_estimates():
+    true, covariance = far_away(0), bundle.covariance(far_away(0), FIXED_LENS, QUIET)
+    covariances = uncertainty.centre_covariances(true, covariance, ALL)
+    spread = np.sqrt(((centres(true) - centres(true).mean(0)) ** 2).sum(1).mean())
+    _, sigmas = uncertainty.camera_sigmas(true, covariance, ALL)
+    np.testing.assert_allclose(np.sqrt(np.trace(covariances, axis1=1, axis2=2)), sigmas * spread, rtol=1e-9)
+    estimates = [centres(bundle.adjust(far_away(seed), FIXED_LENS, QUIET)) for seed in range(100)]
+    errors = np.stack([umeyama(found, centres(true))(found) for found in estimates]) - centres(true)
+    for of_camera, claimed in zip(errors.transpose(1, 0, 2), covariances, strict=True):
+        found = of_camera.T @ of_camera / len(of_camera)
+        assert np.trace(claimed) == pytest.approx(np.trace(found), rel=0.4)
+        of_errors, of_claim = (np.linalg.eigh(each)[1][:, -1] for each in (found, claimed))
+        assert abs(of_errors @ of_claim) > 0.9
+
+
+def test_ellipsoids_of_cameras_that_know_their_depth_least_lie_along_the_view():
+    """Translations are noisy along z of each camera, and centres so along its view; a similarity takes little out."""
+    generator = np.random.default_rng(0)
+    rotations = np.stack([cv2.Rodrigues(vector)[0] for vector in generator.normal(size=(30, 3))])
+    ring = bundle.without_points(
+        rotations, generator.normal(size=(30, 3)), np.zeros(30, np.int64), np.zeros(1), np.zeros(1), np.zeros((1, 2))
+    )
+    of_pose = np.diag(np.square([0.0, 0.0, 0.0, 0.001, 0.001, 0.01]))
+    covariance = bundle.Covariance(np.kron(np.eye(30), of_pose), np.zeros(1))
+    for rotation, of_centre in zip(rotations, uncertainty.centre_covariances(ring, covariance, range(30)), strict=True):
+        longest, *others = np.array(axes_of(of_centre, 0.02))
+        assert abs(rotation[2] @ longest) > 0.95 * np.linalg.norm(longest)
+        assert np.linalg.norm(longest) > 2.0 * max(np.linalg.norm(other) for other in others)
+
+
+def test_the_covariances_are_in_the_frame_and_unit_of_the_world():
+    """A map that was turned and scaled as a whole is the same registration."""
+    true = far_away(0)
+    turn = Similarity(3.0, cv2.Rodrigues(np.array([0.5, -1.0, 0.8]))[0], np.array([1.0, 2.0, 3.0]))
+    rotations = true.rotations @ turn.rotation.T
+    moved = replace(
+        true,
+        rotations=rotations,
+        translations=-np.einsum("cij,cj->ci", rotations, turn(centres(true))),
+        points=turn(true.points),
+    )
+    keyframes = graph_of(4).keyframes
+    one, other = (
+        in_first_camera(mapper.Map(ALL, of, FIXED_LENS, QUIET, {}, 1.0, 0.3), keyframes, [1.0] * 4)
+        for of in (true, moved)
+    )
+    inside = uncertainty.centre_covariances(true, bundle.covariance(true, FIXED_LENS, QUIET), ALL)
+    unit = np.linalg.norm(one.cameras[1].T_world_camera[:3, 3]) / np.linalg.norm(centres(true)[1] - centres(true)[0])
+    for first, second, own in zip(one.cameras, other.cameras, inside, strict=True):
+        np.testing.assert_allclose(first.centre_covariance, second.centre_covariance, rtol=0.01, atol=1e-9)
+        np.testing.assert_allclose(first.centre_covariance, unit**2 * own, rtol=1e-6)  # the first camera is not turned
+
+
+def far_away(seed: int) -> bundle.Problem:
+    """Cameras that all look along z at a cloud far away, with noisy pixels."""
+    near = problem(seed=seed, noise_px=0.0)
+    away = replace(
+        near,
+        rotations=np.tile(np.eye(3), (4, 1, 1)),
+        translations=-centres(near),
+        points=near.points + [0.0, 0.0, 20.0],
+    )
+    pixels, _ = bundle.project(away)
+    return replace(away, pixels=pixels + np.random.default_rng(seed).normal(size=pixels.shape) * QUIET.noise_px)
 
 
 def test_it_does_not_matter_which_camera_is_held_still():
@@ -99,6 +173,7 @@ def test_a_point_that_is_not_finite_leaves_nothing_known():
     assert np.isnan(covariance.log_focals).all()
     for sigmas in uncertainty.camera_sigmas(broken, covariance, ALL):
         np.testing.assert_array_equal(sigmas, np.full(4, np.inf))
+    assert np.isnan(uncertainty.centre_covariances(broken, covariance, ALL)).all()
 
 
 def test_two_cameras_have_no_shape_to_be_wrong_in():

@@ -10,7 +10,7 @@ from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.messaging.jpeg import to_jpeg
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
 from splatnode.recon.result.bounds import Bounds
-from splatnode.recon.result.message import SceneHeader, from_message, to_message
+from splatnode.recon.result.message import SceneHeader, bounds_record, from_message, to_message
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 
@@ -26,7 +26,7 @@ def camera(index: int) -> CameraEstimate:
         np.diag([300.0, 301, 1]),
         320,
         200,
-        Bounds(0.1, 0.02, 2.0, 1.5),
+        Bounds(0.1, 0.02, 2.0, 1.5, ((0.03, 0.0, 0.0), (0.0, 0.0, 0.01), (0.0, 0.005, 0.0))),
     )
 
 
@@ -74,6 +74,7 @@ def test_a_scene_comes_out_as_it_went_in():
             other.width,
             other.height,
         )
+        assert one.bounds == other.bounds is not None
 
 
 def test_thumbnails_are_small_and_look_like_the_photograph():
@@ -115,6 +116,24 @@ def test_an_unknown_verdict_is_refused():
     header, arrays = to_message(snapshot(), "scene-0001", NUMBERED)
     with pytest.raises(WireError, match="FINE"):
         from_message(Message(msgspec.structs.replace(header, code="FINE"), tuple(arrays)))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"rotation_deg": -1.0},
+        {"centre": float("inf")},
+        {"axes": ((0.0, 0.0, 0.0),) * 2},
+        {"axes": ((0.0, float("nan"), 0.0),) * 3},
+    ],
+)
+def test_bounds_without_meaning_do_not_pass_the_wire(change):
+    header, arrays = to_message(snapshot(), "scene-0001", NUMBERED)
+    bounds = msgspec.structs.replace(bounds_record(snapshot().cameras[0].bounds), **change)
+    broken = msgspec.structs.replace(header.cameras[0], bounds=bounds)
+    parts = encode(msgspec.structs.replace(header, cameras=(broken, *header.cameras[1:])), arrays)
+    with pytest.raises(WireError):
+        decode(parts, SceneHeader)
 
 
 @pytest.mark.parametrize("field", ["T_world_camera", "K"])

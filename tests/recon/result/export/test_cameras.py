@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,16 @@ def test_cameras_read_back_exactly(tmp_path):
         assert np.array_equal(read.K, camera.K)
         assert (read.name, read.frame_id, read.width, read.height) == (camera.name, camera.frame_id, 512, 384)
         assert read.bounds == camera.bounds is not None
+
+
+@pytest.mark.parametrize("axes", [[[0.1, 0.0, 0.0]], [[float("nan"), 0.0, 0.0]] * 3, None])
+def test_axes_that_are_no_ellipsoid_are_a_clear_error(tmp_path, axes):
+    write(make_snapshot(), tmp_path)
+    content = json.loads((tmp_path / "cameras.json").read_text())
+    content["cameras"][0]["bounds"]["axes"] = axes
+    (tmp_path / "cameras.json").write_text(json.dumps(content))
+    with pytest.raises(SceneFileError, match="cameras.json"):
+        read_cameras(tmp_path / "cameras.json")
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"cameras": [{"name": "a"}]}', '{"cameras": [1]}'])

@@ -43,7 +43,8 @@ def test_report_tells_what_happened():
     assert report["scene_bytes"] == len(encode_ply(make_gaussians()))
     assert report["frames_used"] == ["0000.jpg", "0002.jpg"]
     assert report["frames_dropped"] == [{"name": "0001.jpg", "reason": "blurred"}]
-    bounds = {"rotation_deg": 0.1, "centre": 0.02, "centre_percent": 2.0, "focal_percent": 1.5}
+    axes = [[0.03, 0.0, 0.0], [0.0, 0.0, 0.01], [0.0, 0.005, 0.0]]
+    bounds = {"rotation_deg": 0.1, "centre": 0.02, "centre_percent": 2.0, "focal_percent": 1.5, "axes": axes}
     assert report["bounds"] == report["cameras"][0]["bounds"] == bounds
     assert (report["seed"], report["preset"], report["peak_rss_mb"]) == (1, "fast", 100.0)
     assert report["versions"]["numpy"] == np.__version__
