@@ -28,6 +28,7 @@ from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.metric import in_metres
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.size import largest_result_bytes
 from splatnode.recon.result.snapshot import Snapshot
@@ -203,4 +204,6 @@ def _tell(snapshot: Snapshot, out: Path, report: dict[str, object], *, as_json: 
     if verdict.publishable:
         counts = f"{len(snapshot.gaussians)} Gaussians, {len(snapshot.cameras)} cameras"
         print(f"{snapshot.seconds['total']:.1f} s, {counts}")
+        if known := bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale):
+            print(f"cameras: {known}")
     print(f"results: {out}/ ({'scene.ply, cameras.json, preview.png, ' if verdict.publishable else ''}report.json)")

@@ -1,7 +1,8 @@
-"""What stands in the scene beside the Gaussians: frusta, photographs, the path, the tracked camera, the arrow."""
+"""What stands in the scene beside the Gaussians: frusta, photographs, where cameras may be, the path, the arrow."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +22,8 @@ TRACKED_COLOUR: Colour = (0.2, 1.0, 0.3)
 ADVICE_COLOUR: Colour = (1.0, 0.85, 0.1)
 _FRUSTUM = 0.12  # depth of a frustum in parts of the scene's depth, which is 1
 _AT_THE_EYE = 2.0  # times the depth of a frustum
+_MIN_SIZE = 0.002  # of its distance from the eye: a smaller ellipsoid would be a dot in the window
+_CORNERS = 24  # of an ellipse
 _ROOM = 0.5  # of the distance to the nearest other camera: frusta do not run into each other
 
 
@@ -69,6 +72,8 @@ def shapes(
             lines.append(Lines(frustum(camera.T_world_camera, corners), source_colour(index), 2))
             if state.photographs and camera.name in moment.photographs:
                 photographs.append(Photograph(camera.name, corners, moment.photographs[camera.name]))
+    if state.uncertainty:
+        lines += [Lines(ellipsoid(camera, axes), source_colour(index), 1) for index, camera, axes in _seen(others, eye)]
     if state.tracked and tracked is not None and not state.follow:
         corners = image_corners(tracked, tracked.T_world_camera, 1.2 * depth)
         lines.append(Lines(frustum(tracked.T_world_camera, corners), TRACKED_COLOUR, 3))
@@ -109,6 +114,30 @@ def frustum(T_world_camera: Array, corners: Array) -> Array:
     roof = np.stack([np.stack([corners[0], top]), np.stack([corners[1], top])])
     edges = np.stack([np.stack([centre, corners], 1), np.stack([corners, np.roll(corners, -1, 0)], 1)])
     return np.concatenate([*edges, roof])
+
+
+def ellipsoid(camera: CameraEstimate, axes: Array) -> Array:
+    """(3 * 24, 2, 3) the ellipses around the camera's centre in the planes of each two of the semi-axes (3, 3)."""
+    angles = np.linspace(0.0, 2.0 * np.pi, _CORNERS + 1)
+    rings = [
+        np.outer(np.cos(angles), one) + np.outer(np.sin(angles), other)
+        for one, other in zip(axes, np.roll(axes, -1, axis=0), strict=True)
+    ]
+    points = camera.T_world_camera[:3, 3] + np.stack(rings)
+    return np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 3)
+
+
+def _seen(
+    cameras: Sequence[tuple[int, CameraEstimate]], eye: Array | None
+) -> Iterator[tuple[int, CameraEstimate, Array]]:
+    """Those of the numbered cameras whose ellipsoid is more than a dot from the `eye`, with its semi-axes (3, 3)."""
+    for index, camera in cameras:
+        if camera.bounds is None:
+            continue
+        axes = np.array(camera.bounds.axes)
+        away = 0.0 if eye is None else float(np.linalg.norm(camera.T_world_camera[:3, 3] - eye))
+        if np.linalg.norm(axes, axis=1).max() > _MIN_SIZE * away:
+            yield index, camera, axes
 
 
 def path(cameras: tuple[CameraEstimate, ...]) -> Array:

@@ -25,6 +25,7 @@ from splatnode.capture.messaging.state import StateClient
 from splatnode.capture.messaging.wire import WireError
 from splatnode.recon.daemon.status import ReconStatus
 from splatnode.recon.result.export import read_cameras, read_gaussians, viewer_safe
+from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.message import CameraRecord, SceneHeader, camera_from, from_message
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
@@ -160,6 +161,7 @@ def load_result(place: Path, photographs: Path | None = None) -> Moment:
         iterations=report.iterations,
         seconds=report.seconds,
         final=True,
+        scale=StoredResult(scene).scale(),
     )
     return Moment(snapshot, time.monotonic())
 

@@ -39,6 +39,7 @@ class State:
     path: bool = True
     tracked: bool = True
     advice: bool = True
+    uncertainty: bool = True
     help: bool = False
     paused: bool = False
     follow: bool = False  # the viewpoint is that of the live camera
@@ -167,6 +168,7 @@ BINDINGS = (
     Binding("4", "show or hide the path", _toggle("path")),
     Binding("5", "show or hide the tracked camera", _toggle("tracked")),
     Binding("6", "show or hide the advice for the next view", _toggle("advice")),
+    Binding("7", "show or hide where the cameras may be, with 95 %", _toggle("uncertainty")),
     Binding("n", "go to the next camera", _camera(1)),
     Binding("p", "go to the previous camera", _camera(-1)),
     Binding(".", "more of its photograph over the render", _blend(BLEND_STEP)),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from splatnode.recon.result.bounds_in_words import of_camera, of_cameras
+from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.viewer.advice import Advice
 from splatnode.viewer.moment import History, Moment
 from splatnode.viewer.state import State, moment_index
@@ -37,6 +39,15 @@ def count_lines(moment: Moment) -> list[str]:
     if snapshot.iterations:
         lines.append(f"{thousands(snapshot.iterations)} iterations{', finished' if snapshot.final else ''}")
     return lines
+
+
+def bounds_lines(moment: Moment, camera: CameraEstimate | None = None) -> list[str]:
+    """How well `camera` is known, or where there is none, or one without bounds: how well all are at least."""
+    snapshot = moment.snapshot
+    if camera is not None and camera.bounds is not None:
+        return [f"{camera.name}: {of_camera(camera.bounds, snapshot.scale)}"]
+    known = of_cameras(snapshot.cameras, snapshot.scale)
+    return [f"Cameras: {known}"] if known else []
 
 
 def dropped_lines(moment: Moment) -> list[str]:

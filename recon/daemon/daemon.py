@@ -40,6 +40,7 @@ from splatnode.recon.daemon.output import Published
 from splatnode.recon.daemon.status import ReconStatus, State
 from splatnode.recon.daemon.watcher import Watcher
 from splatnode.recon.daemon.worker import Worker
+from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.message import camera_record, to_message
 
@@ -177,6 +178,7 @@ class Daemon:
             final=bool(snapshot and snapshot.final),
             verdict=snapshot.verdict.code.value if snapshot else "",
             message=snapshot.verdict.message if snapshot else "",
+            bounds=bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale) if snapshot else "",
             keyframe_s=worker.keyframe_s,
             refused=intake.refused + self._commands.refused + self._scenes.refused,
             duplicates=intake.duplicates,

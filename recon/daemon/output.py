@@ -12,6 +12,7 @@ from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.metric import in_metres
+from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.write import finish
 
@@ -47,9 +48,11 @@ class Output:
         """Writes the result folder, all of it or nothing; returns whether it was written."""
         recipe, folder = self._config.reconstruction, self._config.out / self._store.scene_id
         try:
-            finish(in_metres(snapshot, recipe.metric), folder, seed=recipe.seed, preset_name="live")
+            measured = in_metres(snapshot, recipe.metric)
+            finish(measured, folder, seed=recipe.seed, preset_name="live")
         except OSError as error:
             self._complain(str(error))
             return False
-        event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians))
+        known = bounds_in_words.of_cameras(measured.cameras, measured.scale)
+        event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians), bounds=known)
         return True

@@ -29,6 +29,7 @@ class ReconStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     final: bool
     verdict: str
     message: str
+    bounds: str  # the widest of the scene's cameras, in words; empty where there are none
     keyframe_s: float | None  # from the last keyframe's arrival until the scene showed it
     refused: int  # malformed messages
     duplicates: int  # keyframes that came again

@@ -23,6 +23,7 @@ from splatnode.recon.daemon.watcher import Finished
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.modelling import Shown
+from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.snapshot import Snapshot
 
 log = logging.getLogger(__name__)
@@ -121,6 +122,7 @@ class Worker:
         event(
             log, logging.INFO, "keyframes", names=",".join(each.keyframe.name for each in arrived),
             verdict=snapshot.verdict.code.value, gaussians=len(snapshot.gaussians), seconds=self.keyframe_s or 0.0,
+            bounds=bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale),
         )  # fmt: skip
         self._output.save(self._work, final=False)
 

@@ -7,15 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from splatnode.recon.result.bounds import Bounds, ball
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.viewer.analysis import analyse
 from splatnode.viewer.canvas import BACKGROUND
+from splatnode.viewer.colours import source_colour
 from splatnode.viewer.paint import blended, caption, paint, paint_gaussians
 from splatnode.viewer.shapes import (
     Lines,
     Photograph,
     Shapes,
     arrow,
+    ellipsoid,
     frustum,
     frustum_depth,
     image_corners,
@@ -134,6 +137,29 @@ def test_the_path_follows_the_frames_and_the_arrow_ends_where_it_points():
     lines = arrow(np.zeros(3), np.array([1.0, 0, 0]), np.array([1.0, 0, 5.0]))
     assert np.allclose(lines[0], [[0, 0, 0], [1, 0, 0]]) and np.allclose(lines[1:, 0], [1, 0, 0])
     assert np.allclose(lines[-1, 1], [1, 0, 1])
+
+
+def test_an_ellipsoid_ends_at_its_semi_axes_and_nowhere_beyond():
+    axes = np.array([[0.0, 0.0, 0.3], [0.1, 0.0, 0.0], [0.0, 0.05, 0.0]])
+    one = camera(0.5, target=(0.5, 0.0, 1.0))
+    ends = ellipsoid(one, axes).reshape(-1, 3) - one.T_world_camera[:3, 3]
+    assert np.allclose(ends.max(0), [0.1, 0.05, 0.3]) and np.allclose(ends.min(0), [-0.1, -0.05, -0.3])
+    np.testing.assert_allclose(((ends / [0.1, 0.05, 0.3]) ** 2).sum(1), 1.0)
+
+
+def test_an_ellipsoid_has_the_colour_of_its_camera_and_is_drawn_where_it_is_more_than_a_dot():
+    sizes = {0: 0.05, 1: 0.001}
+    cameras = [replace(camera(0.5 * i, frame_id=i), bounds=Bounds(0.1, r, r, 1.0, ball(r))) for i, r in sizes.items()]
+    there = moment(wall(), *cameras, camera(1.0, frame_id=2))
+
+    def drawn(**how: object) -> list:
+        state = State(cameras=False, path=False, advice=False, uncertainty=bool(how.pop("uncertainty", True)))
+        return [lines.colour for lines in shapes(there, state, None, **how).lines]
+
+    assert drawn() == [source_colour(0), source_colour(1)]  # nothing is known of the third
+    assert drawn(eye=np.array([0.25, 0.0, -3.0])) == [source_colour(0)]
+    assert drawn(eye=np.array([0.5, 0.0, -0.3])) == [source_colour(0), source_colour(1)]
+    assert drawn(uncertainty=False) == []
 
 
 def test_switches_decide_what_stands_in_the_scene():

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import DroppedFrame
+from splatnode.recon.result.bounds import Bounds, ball
 from splatnode.recon.result.export.prepare import base_rgb
+from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.viewer import words
@@ -149,6 +151,20 @@ def test_the_time_axis_is_thinned_where_it_is_dense_and_never_grows():
         history = remembered(history, moment(wall(5), received_s=second), memory_bytes=4 * size)
         assert len(history) == 4 and history[0].received_s == 0 and history[-1].received_s == second
     assert len(remembered((), moment(wall(5)), memory_bytes=1)) == 1
+
+
+def test_the_camera_that_is_looked_through_is_told_or_else_the_widest_of_all():
+    first = replace(camera(0.0), bounds=Bounds(0.3, 0.01, 1.0, 0.8, ball(0.01)))
+    second = replace(camera(0.5, frame_id=1), bounds=Bounds(0.2, 0.03, 3.0, 0.8, ball(0.03)))
+    there = moment(wall(3), first, second, camera(1.0, frame_id=2), scale=Scale(True, "a ruler"))
+    positions = "of the distance to the scene"
+    assert words.bounds_lines(there, first) == [
+        f"0.png: direction to 0.3 degrees, position to 1 % {positions} (1 cm), focal length to 0.8 % (95 % bounds)"
+    ]
+    best = "focal length to 0.8 % (95 % bounds)"
+    of_all = f"Cameras: directions to 0.3 degrees, positions to 3 % {positions} (3 cm), {best}"
+    assert words.bounds_lines(there) == words.bounds_lines(there, there.snapshot.cameras[2]) == [of_all]
+    assert words.bounds_lines(moment(wall(3), camera(0.0))) == []
 
 
 def test_words_are_plain():

@@ -6,9 +6,11 @@ The images are those at modelled size, expected in images/; the centre of the to
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 
 import numpy as np
 
+from splatnode.recon.result.export.cameras import BOUNDS_MEANING
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.scale import RELATIVE, Scale
@@ -35,7 +37,8 @@ def encode_nerfstudio(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE
             "w": camera.width,
             "h": camera.height,
             "transform_matrix": (camera.T_world_camera @ _OPENCV_FROM_OPENGL).tolist(),
+            "bounds": None if camera.bounds is None else asdict(camera.bounds),
         }
         for camera in cameras
     ]
-    return json_bytes({"camera_model": "OPENCV", **scale.record(), "frames": frames})
+    return json_bytes({"camera_model": "OPENCV", **scale.record(), "bounds": BOUNDS_MEANING, "frames": frames})

@@ -1,0 +1,49 @@
+"""Bounds as a person reads them. Numbers are rounded up, because a bound that was rounded down would not hold."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from splatnode.recon.result.bounds import Bounds, widest
+from splatnode.recon.result.scale import Scale
+from splatnode.recon.result.snapshot import CameraEstimate
+
+_DIGITS = 2  # significant ones
+_ROUNDING = 1e-9  # relative: a number that is over its digits by less is not rounded up
+_LENGTHS = ((1.0, "m"), (0.01, "cm"), (0.001, "mm"))  # metres of a unit and its sign, the largest first
+
+
+def of_camera(bounds: Bounds, scale: Scale) -> str:
+    """The bounds of one camera, with its position in metres where `scale` is metric."""
+    return _parts("direction", "position", bounds, scale)
+
+
+def of_cameras(cameras: Sequence[CameraEstimate], scale: Scale) -> str:
+    """The widest bounds of the cameras; empty where no camera has bounds."""
+    worst = widest(camera.bounds for camera in cameras if camera.bounds is not None)
+    return "" if worst is None else _parts("directions", "positions", worst, scale)
+
+
+def _parts(direction: str, position: str, bounds: Bounds, scale: Scale) -> str:
+    length = f" ({_length(bounds.centre)})" if scale.metric else ""
+    return (
+        f"{direction} to {_rounded_up(bounds.rotation_deg)} degrees, "
+        f"{position} to {_rounded_up(bounds.centre_percent)} % of the distance to the scene{length}, "
+        f"focal length to {_rounded_up(bounds.focal_percent)} % (95 % bounds)"
+    )
+
+
+def _length(metres: float) -> str:
+    unit, sign = next((each for each in _LENGTHS if metres >= each[0]), _LENGTHS[-1])
+    return f"{_rounded_up(metres / unit)} {sign}"
+
+
+def _rounded_up(value: float) -> str:
+    """With two significant digits, the smallest number that is not below `value`; no exponent."""
+    if not (math.isfinite(value) and value > 0):
+        return "0" if value == 0 else "an unknown number of"
+    decimals = _DIGITS - 1 - math.floor(math.log10(value))
+    rounded = math.ceil(value * 10.0**decimals * (1.0 - _ROUNDING)) / 10.0**decimals
+    text = f"{rounded:.{max(decimals, 0)}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
