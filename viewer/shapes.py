@@ -73,7 +73,8 @@ def shapes(
             if state.photographs and camera.name in moment.photographs:
                 photographs.append(Photograph(camera.name, corners, moment.photographs[camera.name]))
     if state.uncertainty:
-        lines += [Lines(ellipsoid(camera, axes), source_colour(index), 1) for index, camera, axes in _seen(others, eye)]
+        for index, camera, axes in _uncertain(snapshot.cameras, eye):
+            lines.append(Lines(ellipsoid(camera, axes), source_colour(index), 1))
     if state.tracked and tracked is not None and not state.follow:
         corners = image_corners(tracked, tracked.T_world_camera, 1.2 * depth)
         lines.append(Lines(frustum(tracked.T_world_camera, corners), TRACKED_COLOUR, 3))
@@ -127,17 +128,21 @@ def ellipsoid(camera: CameraEstimate, axes: Array) -> Array:
     return np.stack([points[:, :-1], points[:, 1:]], axis=2).reshape(-1, 2, 3)
 
 
-def _seen(
-    cameras: Sequence[tuple[int, CameraEstimate]], eye: Array | None
-) -> Iterator[tuple[int, CameraEstimate, Array]]:
-    """Those of the numbered cameras whose ellipsoid is more than a dot from the `eye`, with its semi-axes (3, 3)."""
-    for index, camera in cameras:
+def _uncertain(cameras: Sequence[CameraEstimate], eye: Array | None) -> Iterator[tuple[int, CameraEstimate, Array]]:
+    """The cameras whose ellipsoid is drawn, with their positions in the list and the semi-axes (3, 3).
+
+    Not one that would be a dot from the `eye`, nor one that has the eye within it.
+    """
+    for index, camera in enumerate(cameras):
         if camera.bounds is None:
             continue
         axes = np.array(camera.bounds.axes)
-        away = 0.0 if eye is None else float(np.linalg.norm(camera.T_world_camera[:3, 3] - eye))
-        if np.linalg.norm(axes, axis=1).max() > _MIN_SIZE * away:
-            yield index, camera, axes
+        longest = float(np.linalg.norm(axes, axis=1).max())
+        if eye is not None:
+            away = float(np.linalg.norm(camera.T_world_camera[:3, 3] - eye))
+            if not longest < away < longest / _MIN_SIZE:
+                continue
+        yield index, camera, axes
 
 
 def path(cameras: tuple[CameraEstimate, ...]) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,6 +17,8 @@ from splatnode import command_line
 from splatnode.capture.cameras.folder import Config, stream
 from splatnode.capture.recording import Recorder
 from splatnode.recon import cli
+from splatnode.recon.result.scale import Scale
+from tests.support.exported import make_snapshot
 
 
 @pytest.fixture
@@ -82,6 +85,14 @@ def replayed(photographs, monkeypatch):
         return command_line.main(["replay", "photographs", "--out", "new/out"])
 
     return replay
+
+
+def test_the_terminal_tells_how_well_the_cameras_are_known(replayed, capsys):
+    images = {camera.name: np.zeros((384, 512, 3), np.uint8) for camera in make_snapshot().cameras}
+    found = replace(make_snapshot(), images=images, seconds={"total": 3.5}, scale=Scale(True, "a ruler"))
+    assert replayed(lambda: [found]) == 0
+    known = "directions to 0.1 degrees, positions to 2 % of the distance to the scene (2 cm), focal length to 1.5 %"
+    assert f"\ncameras: {known} (95 % bounds)\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (SystemExit(0), None), (OSError(5, "x"), 74)])

@@ -158,7 +158,8 @@ def test_an_ellipsoid_has_the_colour_of_its_camera_and_is_drawn_where_it_is_more
 
     assert drawn() == [source_colour(0), source_colour(1)]  # nothing is known of the third
     assert drawn(eye=np.array([0.25, 0.0, -3.0])) == [source_colour(0)]
-    assert drawn(eye=np.array([0.5, 0.0, -0.3])) == [source_colour(0), source_colour(1)]
+    assert drawn(eye=np.array([0.5, 0.0, -0.02])) == [source_colour(0), source_colour(1)]  # where frusta are not drawn
+    assert drawn(eye=np.array([-0.03, 0.0, 0.0])) == []  # from within
     assert drawn(uncertainty=False) == []
 
 

@@ -31,9 +31,11 @@ from splatnode.recon.daemon.control import Answer, Retract
 from splatnode.recon.daemon.daemon import Daemon
 from splatnode.recon.daemon.tracking import Config as Tracking
 from splatnode.recon.optimize import refinement
+from splatnode.recon.result.bounds_in_words import of_cameras
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.folder import FolderInUse
 from splatnode.recon.result.message import LiveScene, SceneHeader, from_message
+from splatnode.recon.result.scale import RELATIVE
 from splatnode.recon.result.verdict import Code
 from tests.capture.messaging.test_sockets import wait_for
 from tests.support.synthetic import photographs, places
@@ -140,7 +142,9 @@ def test_keyframes_become_a_scene_that_survives_the_process_and_forgets_what_it_
         peer.wait_for_acknowledgements()
         with pytest.raises(AlreadyRunning):
             Daemon(config, threading.Event())
-        assert heartbeats(config.network)["recon"]["keyframes"] == 4
+        status = heartbeats(config.network)["recon"]
+        assert status["keyframes"] == 4
+        assert status["bounds"] == of_cameras(scene.snapshot.cameras, RELATIVE) != ""
     exported = read_cameras(config.out / "scene-0001" / "cameras.json")
     assert [camera.name for camera in exported] == [frame.name for frame in frames]
 
