@@ -21,7 +21,8 @@ class Features:
     points: npt.NDArray[np.float64]  # (M, 2) pixels of the full-size image, top-left pixel centre at (0.5, 0.5)
     descriptors: npt.NDArray[np.uint8]  # (D, 128) as matching/nearest_neighbours.py quantises them
     point_of: npt.NDArray[np.int64]  # (D,) the point that a descriptor describes
-    tilt: npt.NDArray[np.float64]  # (D,) simulated tilt: the image was this much narrower than the frame; 1 for none
+    # (D,) simulated tilt: by which the image's width was divided; below 1, its height was multiplied by it; 1 for none
+    tilt: npt.NDArray[np.float64]
 
 
 _KEY_POINTS = 64  # features whose places tell any two photographs apart

@@ -16,8 +16,8 @@ from splatnode.recon.matching.nearest_neighbours import quantise
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
 
-_TILT_BLUR = 0.8  # sigma over sqrt(tilt^2 - 1), pixels: against aliasing when the width is divided (Morel and Yu, 2009)
-_NO_BLUR = 0.01  # sigma, pixels, along the height: OpenCV takes 0 for "as along the width"
+_TILT_BLUR = 0.8  # sigma over sqrt(tilt^2 - 1), pixels: against aliasing when a side shrinks (Morel and Yu, 2009)
+_NO_BLUR = 0.01  # sigma, pixels, along the other side: OpenCV takes 0 for "as along the width"
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -37,8 +37,9 @@ def extract(image: Image, config: Config) -> Features:
 def add_tilted(features: Features, image: Image, tilts: Sequence[float], config: Config) -> Features:
     """Adds to the `features` of `image` (H, W, 3) RGB those of the image with its width divided by each of `tilts`.
 
-    Narrowing simulates that a frontal surface is seen from the side. These are the tilts of affine SIFT (Morel and Yu,
-    2009) along one axis only, the one along which people walk. Tilts that `features` has already are left out.
+    Narrowing simulates that a frontal surface is seen from the side; a tilt below 1 multiplies the height instead, as
+    if the surface were seen from above or below. These are tilts of affine SIFT (Morel and Yu, 2009) along the image's
+    axes. Tilts that `features` has already are left out.
     """
     for tilt in tilts:
         if (features.tilt == tilt).any():
@@ -66,9 +67,11 @@ def _detect(image: Image, tilt: float, config: Config) -> tuple[Array, npt.NDArr
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
     scale = float(np.clip(1.0, config.min_longer_side / max(grey.shape), config.max_longer_side / max(grey.shape)))
-    size = max(1, round(width * scale / tilt)), max(1, round(height * scale))
-    if tilt > 1.0:
-        grey = cv2.GaussianBlur(grey, (0, 0), sigmaX=_TILT_BLUR * float(np.sqrt(tilt**2 - 1)), sigmaY=_NO_BLUR)
+    size = max(1, round(width * scale / max(tilt, 1.0))), max(1, round(height * scale * min(tilt, 1.0)))
+    if tilt != 1.0:
+        blur = _TILT_BLUR * float(np.sqrt(max(tilt, 1.0 / tilt) ** 2 - 1))
+        sigma_x, sigma_y = (blur, _NO_BLUR) if tilt > 1.0 else (_NO_BLUR, blur)
+        grey = cv2.GaussianBlur(grey, (0, 0), sigmaX=sigma_x, sigmaY=sigma_y)
     if size != (width, height):
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC)
     sift = cv2.SIFT.create(

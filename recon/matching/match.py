@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -71,7 +71,7 @@ def completed(graph: ViewGraph, matcher: Matcher | None) -> Iterator[ViewGraph]:
         yield graph
     to_tilt = graph.to_tilt()
     for pair in [pair for pair in graph.plain if pair in to_tilt and pair not in graph.tilted]:
-        graph = _matched_tilted(graph, pair, matcher)
+        graph = matched_further(graph, pair, graph.config.tilting.tilts, matcher)
         yield graph
     yield graph.chosen()
 
@@ -99,12 +99,17 @@ def _most_promising(graph: ViewGraph, new: int) -> int:
     return max(score, key=lambda index: (score[index], index))
 
 
-def _matched_tilted(graph: ViewGraph, pair: Pair, matcher: Matcher | None) -> ViewGraph:
-    """With two keyframes matched by their tilted features, which they get first, and by what the matcher proposes."""
+def matched_further(graph: ViewGraph, pair: Pair, tilts: Sequence[float], matcher: Matcher | None = None) -> ViewGraph:
+    """With matches by features of these tilts, which the two keyframes get first, and by what the matcher proposes.
+
+    They are added to what is known of `pair`, a key of `plain`. `ViewGraph.chosen` makes them count.
+    """
     keyframes = list(graph.keyframes)
-    for index in pair:
-        keyframes[index] = _with_tilted_features(keyframes[index], graph.config)
-    found = pair_matching.match_tilted(*_of(keyframes, pair), graph.plain[pair], graph.config.pair_matching)
+    found = graph.tilted.get(pair, graph.plain[pair])
+    if tilts:
+        for index in pair:
+            keyframes[index] = _with_tilted_features(keyframes[index], tilts, graph.config)
+        found = pair_matching.match_tilted(*_of(keyframes, pair), found, tilts, graph.config.pair_matching)
     if matcher is not None:
         for index in pair:
             keyframes[index] = matcher.with_points(keyframes[index])
@@ -116,8 +121,8 @@ def _of(keyframes: list[Keyframe], pair: Pair) -> tuple[Keyframe, Keyframe]:
     return keyframes[pair[0]], keyframes[pair[1]]
 
 
-def _with_tilted_features(keyframe: Keyframe, config: Config) -> Keyframe:
-    found = features.add_tilted(keyframe.features, keyframe.frame.image, config.tilting.tilts, config.features)
+def _with_tilted_features(keyframe: Keyframe, tilts: Sequence[float], config: Config) -> Keyframe:
+    found = features.add_tilted(keyframe.features, keyframe.frame.image, tilts, config.features)
     return replace(keyframe, features=found)
 
 

@@ -41,15 +41,16 @@ def match_plain(keyframe1: Keyframe, keyframe2: Keyframe, config: Config) -> Mat
     return _verified(keyframe1, keyframe2, matches, config)
 
 
-def match_tilted(keyframe1: Keyframe, keyframe2: Keyframe, plain: MatchedPair, config: Config) -> MatchedPair:
-    """Adds matches of features with simulated tilt to those of the `plain` ones.
+def match_tilted(
+    keyframe1: Keyframe, keyframe2: Keyframe, known: MatchedPair, tilts: Sequence[float], config: Config
+) -> MatchedPair:
+    """Adds matches of features with the simulated `tilts` to those that are `known`.
 
     One of the two images is always plain: a surface is seen from the side in one of them, not in both.
     """
-    tilts = {(PLAIN, tilt) for tilt in set(keyframe2.features.tilt) - {PLAIN}}
-    tilts |= {(tilt, PLAIN) for tilt in set(keyframe1.features.tilt) - {PLAIN}}
-    found = [plain.matches]
-    found += [_match(keyframe1.features, keyframe2.features, both, config.nearest_neighbours) for both in sorted(tilts)]
+    both_ways = sorted({(PLAIN, tilt) for tilt in tilts} | {(tilt, PLAIN) for tilt in tilts})
+    found = [known.matches]
+    found += [_match(keyframe1.features, keyframe2.features, both, config.nearest_neighbours) for both in both_ways]
     return _verified(keyframe1, keyframe2, _merged(found), config)
 
 

@@ -11,7 +11,9 @@ from splatnode.recon.matching.pair_matching import MatchedPair
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    tilts: tuple[float, ...] = (1.6,)  # factors by which the image's width is divided; empty: no pair is matched again
+    tilts: tuple[float, ...] = (
+        1.6,
+    )  # by which the image's width is divided; below 1, its height multiplied; none: no pair is matched again
     firm_matches: int = 150  # verified matches that make a pair firm: it needs no tilted features
     enough_firm_pairs: int = 4  # firm pairs of a frame, so that it needs no more
     # log10 of the number of false alarms of a pair's plain matches below which the pair may overlap: of 40 pairs that

@@ -68,19 +68,31 @@ def test_a_tilt_adds_descriptors_to_known_points_and_points(picture):
 
 def test_a_view_from_the_side_is_matched_by_tilted_features(picture):
     """The picture half as wide, as a wall seen from 60 degrees aside is."""
-    config = features.Config(num_features=2000)
     aside = cv2.resize(cv2.GaussianBlur(picture, (0, 0), sigmaX=1.4, sigmaY=0.01), (320, 480))
-    front, side = features.extract(picture, config), features.extract(aside, config)
-    tilted = features.add_tilted(front, picture, (2.0,), config)
+    plain, tilted = num_right(picture, aside, 2.0)
+    assert tilted > 3 * max(plain, 20)
 
-    def num_right(descriptors: np.ndarray, points: np.ndarray) -> int:
-        found = nearest_neighbours.match(descriptors, side.descriptors, nearest_neighbours.Config())
-        there = side.points[found[:, 1]] * [2.0, 1.0]
-        return int((np.linalg.norm(points[found[:, 0]] - there, axis=1) < 3.0).sum())
 
-    chosen = tilted.tilt == 2.0
-    plain = num_right(front.descriptors, front.points)
-    assert num_right(tilted.descriptors[chosen], tilted.points[tilted.point_of[chosen]]) > 3 * max(plain, 20)
+def test_a_view_from_above_is_matched_by_tilts_below_one(picture):
+    """The picture half as high, as a table seen from 60 degrees above its normal is."""
+    above = cv2.resize(cv2.GaussianBlur(picture, (0, 0), sigmaX=0.01, sigmaY=1.4), (640, 240))
+    plain, tilted = num_right(picture, above, 0.5)
+    assert tilted > 3 * max(plain, 20)
+
+
+def num_right(picture: np.ndarray, shrunk: np.ndarray, tilt: float) -> tuple[int, int]:
+    """Right matches of the shrunk picture with plain features of the picture, and with those of this tilt."""
+    config = features.Config(num_features=2000)
+    front, side = features.extract(picture, config), features.extract(shrunk, config)
+    both = features.add_tilted(front, picture, (tilt,), config)
+    there = np.array(picture.shape[1::-1]) / shrunk.shape[1::-1]
+
+    def count(chosen: np.ndarray) -> int:
+        found = nearest_neighbours.match(both.descriptors[chosen], side.descriptors, nearest_neighbours.Config())
+        points = both.points[both.point_of[chosen]][found[:, 0]]
+        return int((np.linalg.norm(points - side.points[found[:, 1]] * there, axis=1) < 3.0).sum())
+
+    return count(both.tilt == 1.0), count(both.tilt == tilt)
 
 
 def test_frames_without_features_are_compared_without_a_pair():
@@ -91,7 +103,7 @@ def test_frames_without_features_are_compared_without_a_pair():
     ]
     plain = pair_matching.match_plain(keyframes[0], keyframes[1], config.pair_matching)
     assert plain.geometry is None and plain.log10_nfa == 0.0 and plain.matches.shape == (0, 2)
-    assert pair_matching.match_tilted(keyframes[0], keyframes[1], plain, config.pair_matching).geometry is None
+    assert pair_matching.match_tilted(keyframes[0], keyframes[1], plain, (1.6,), config.pair_matching).geometry is None
 
 
 def test_the_motion_of_a_resized_copy_is_none():

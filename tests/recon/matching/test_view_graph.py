@@ -50,7 +50,7 @@ def compared(monkeypatch) -> list[tuple[str, ...]]:
         firm = Verified(range(200), (first.name, second.name)) if first.name[0] == second.name[0] else None
         return MatchedPair(NO_MATCHES, firm, hint)
 
-    def match_tilted(first, second, plain, config):
+    def match_tilted(first, second, plain, tilts, config):
         calls.append((first.name, second.name, "tilted"))
         weak = Verified(range(30), (first.name, second.name)) if plain.log10_nfa < 0.0 else None
         return MatchedPair(NO_MATCHES, weak, -20.0 if weak else 0.0)
@@ -58,7 +58,9 @@ def compared(monkeypatch) -> list[tuple[str, ...]]:
     monkeypatch.setattr(pair_matching, "match_plain", compare)
     monkeypatch.setattr(pair_matching, "match_tilted", match_tilted)
     monkeypatch.setattr("splatnode.recon.matching.view_graph.content_key", lambda keyframe: keyframe.name)
-    monkeypatch.setattr("splatnode.recon.matching.match._with_tilted_features", lambda keyframe, config: keyframe)
+    monkeypatch.setattr(
+        "splatnode.recon.matching.match._with_tilted_features", lambda keyframe, tilts, config: keyframe
+    )
     return calls
 
 
