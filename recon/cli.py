@@ -172,6 +172,7 @@ def _config(args: argparse.Namespace) -> Config:
         "budget_s": args.budget_s,
         "max_gaussians": args.max_gaussians,
         "max_mb": args.max_mb,
+        "quick": args.quick or None,
     }
     return overlaid(config, {key: value for key, value in flags.items() if value is not None})
 
@@ -206,4 +207,7 @@ def _tell(snapshot: Snapshot, out: Path, report: dict[str, object], *, as_json: 
         print(f"{snapshot.seconds['total']:.1f} s, {counts}")
         if known := bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale):
             print(f"cameras: {known}")
+    further = snapshot.seconds.get("ladder", 0.0)
+    if further >= 0.1:
+        print(f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches (--quick leaves them out)")
     print(f"results: {out}/ ({'scene.ply, cameras.json, preview.png, ' if verdict.publishable else ''}report.json)")

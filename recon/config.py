@@ -34,15 +34,23 @@ PREVIEW = refinement.Config(
 )
 
 
+class Ladder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is tried before photographs are refused or left out for want of matches."""
+
+    seconds: Annotated[float, Meta(ge=0)] = 4.0  # in which further work begins; what has begun is finished
+
+
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     size: Annotated[int, Meta(ge=64)] = 512  # longer side of the modelled images, pixels
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0  # what generators of random numbers take
+    quick: bool = False  # whether the first answer stands, also where it is no
     prior: PriorChoice = PriorChoice("classical", classical.Config())
     screening: screening.Config = screening.Config()
     matching: matching.Config = matching.Config()
     registration: registration.Config = registration.Config()
     verification: verify.Config = verify.Config()
     decision: decision.Config = decision.Config()
+    ladder: Ladder = Ladder()
     completion: completion.Config = completion.Config()
     seeding: seeding.Config = seeding.Config()
     background: background.Config = background.Config()

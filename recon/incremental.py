@@ -19,6 +19,7 @@ from splatnode.recon.config import Config
 from splatnode.recon.estimation import Estimate, continued, estimate_cameras, estimate_depth
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.frames.screening import Rejected, Screened
+from splatnode.recon.ladder.ladder import climbed
 from splatnode.recon.matching.match import completed, matched_soon
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.memory import Key, Memory
@@ -195,9 +196,12 @@ class IncrementalReconstruction:
             return estimate
         self.clock.lap("wait")
         self.complete(pause)
-        estimate = estimate_cameras(self.graph, self._known.screened.rejected, self.config, pause)
-        self._remember(estimate)
+        rejected = self._known.screened.rejected
+        estimate = estimate_cameras(self.graph, rejected, self.config, pause)
         self.clock.lap("poses")
+        estimate = climbed(estimate, rejected, self.config, pause)
+        self._remember(estimate)
+        self.clock.lap("ladder")
         return estimate
 
     def estimate_quickly(self) -> Estimate | None:

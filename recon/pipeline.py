@@ -17,6 +17,7 @@ from splatnode.recon.config import Config
 from splatnode.recon.estimation import Estimate, estimate_cameras, estimate_depth
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.ladder.ladder import climbed
 from splatnode.recon.matching.match import match
 from splatnode.recon.modelling import begin_scene, refined, shown, snapshot
 from splatnode.recon.preparation import load_prior, prepare
@@ -44,6 +45,8 @@ def estimate_frames(
     graph = match(keyframes, config.matching, prior.matcher)
     estimate = estimate_cameras(graph, rejected, config)
     clock.lap("poses")
+    estimate = climbed(estimate, rejected, config)
+    clock.lap("ladder")
     estimate = estimate_depth(estimate, prior)
     clock.lap("points")
     return estimate, dropped

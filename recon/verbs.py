@@ -38,6 +38,9 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
         help="the best scene within this many seconds from the first photograph on; starting the program, reading "
         "photographs and writing files come on top, and cameras and first points take what they take",
     )
+    parser.add_argument(
+        "--quick", action="store_true", help="refuse at once: try nothing that takes longer before the answer is no"
+    )
     parser.add_argument("--max-gaussians", type=positive, metavar="N", help="and with at most so many Gaussians")
     parser.add_argument("--max-mb", type=megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes")
     parser.add_argument(

@@ -39,6 +39,8 @@ def foundation(config: Config) -> Config:
         screening=config.screening,
         verification=config.verification,
         decision=config.decision,
+        quick=config.quick,
+        ladder=config.ladder,
     )
 
 

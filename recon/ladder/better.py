@@ -1,0 +1,39 @@
+"""Which of two estimates of the same keyframes is better: an accepted answer is extended, never replaced."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.estimation import Estimate
+from splatnode.recon.geometry import align_cameras
+
+MAX_TURN_DEG = 2.0  # of an accepted camera from one estimate to the other, after the best similarity
+
+
+def better(one: Estimate, other: Estimate) -> Estimate:
+    """`other` where it is publishable and has the cameras of `one`, where they were, and more; else `one`.
+
+    Of two refusals `one` stands: it says what is wrong with the photographs, `other` with what was made of them.
+    """
+    if not other.publishable or not one.placed < other.placed:
+        return one
+    return other if _turn_deg(one, other) <= MAX_TURN_DEG else one
+
+
+def _turn_deg(one: Estimate, other: Estimate) -> float:
+    """The largest angle between the cameras that `one` has placed and the same ones in `other`; 0 without any."""
+    if not one.placed:
+        return 0.0
+    source, target = _cameras(one), _cameras(other)
+    Ts, others = (np.stack([cameras[name] for name in sorted(one.placed)]) for cameras in (source, target))
+    turned = align_cameras(Ts, others).rotation @ Ts[:, :3, :3]
+    cosines = (np.einsum("cij,cij->c", turned, others[:, :3, :3]) - 1.0) / 2.0
+    return float(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).max())
+
+
+def _cameras(estimate: Estimate) -> dict[str, npt.NDArray[np.float64]]:
+    """T_world_camera by the keyframe's name."""
+    if estimate.registration is None:
+        return {}
+    return {estimate.graph.names[camera.index]: camera.T_world_camera for camera in estimate.registration.cameras}

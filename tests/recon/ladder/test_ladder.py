@@ -1,0 +1,167 @@
+"""The ladder: rungs are climbed while they are needed and the seconds last, and the better answer is kept."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Iterator
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from splatnode.recon.config import Config, overlaid
+from splatnode.recon.estimation import Estimate
+from splatnode.recon.ladder import ladder
+from splatnode.recon.ladder.better import better
+from splatnode.recon.ladder.ladder import climbed
+from splatnode.recon.ladder.rung import Means, Rung
+from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.result.verdict import Code, Verdict
+from tests.support.row_of_views import graph_of, registration_of
+from tests.support.synthetic import SMALL, places
+
+NAMES = graph_of(4).names
+
+
+def estimate(code: Code, cameras: int) -> Estimate:
+    """With a camera for each of the first keyframes of four."""
+    publishable = code in (Code.OK, Code.OK_PARTIAL)
+    verdict = Verdict(code, "So it is.", "", () if publishable else tuple(NAMES), publishable)
+    evidence: Any = SimpleNamespace()
+    return Estimate(graph_of(4), registration_of(cameras), evidence, verdict)
+
+
+NO_OVERLAP = estimate(Code.NO_OVERLAP, 2)
+
+
+def rung(name: str, parts: int = 1, obstacle: str = "") -> Rung:
+    """Adds so many pieces of work; the seed of its means' configuration counts them all."""
+
+    def climb(means: Means, doubtful: Collection[str]) -> Iterator[Means]:
+        for _ in range(parts):
+            means = replace(means, config=overlaid(means.config, {"seed": means.config.seed + 1}))
+            yield means
+
+    return Rung(name, climb, lambda: obstacle)
+
+
+@pytest.fixture
+def estimated(monkeypatch):
+    """The seeds of what was estimated from; `answers` is what came of it, in order."""
+    seeds: list[int] = []
+
+    def of(*answers: Estimate) -> list[int]:
+        coming = iter(answers)
+
+        def estimate_cameras(graph, rejected, config, pause):
+            seeds.append(config.seed)
+            return next(coming)
+
+        monkeypatch.setattr(ladder, "estimate_cameras", estimate_cameras)
+        return seeds
+
+    return of
+
+
+def climb(first: Estimate, *rungs: Rung, config: Config | None = None) -> Estimate:
+    return climbed(first, (), config or Config(), rungs=rungs)
+
+
+def test_rungs_add_up_until_one_leads_to_an_answer(estimated):
+    answer = estimate(Code.OK, 4)
+    seeds = estimated(NO_OVERLAP, answer)
+    assert climb(NO_OVERLAP, rung("a", 2), rung("b", 3), rung("c")) is answer
+    assert seeds == [2, 5]
+
+
+def test_a_refusal_says_what_was_tried(estimated):
+    estimated(NO_OVERLAP)
+    found = climb(NO_OVERLAP, rung("tilts"), rung("networks", obstacle="no weights"), rung("nothing", 0))
+    assert found.verdict.message == "So it is. Also tried: tilts. Not tried: networks (no weights)."
+    assert found.verdict.code is Code.NO_OVERLAP and not found.publishable
+
+
+@pytest.mark.parametrize(
+    "first",
+    [estimate(Code.OK, 4), estimate(Code.BASELINE_TOO_SMALL, 4), estimate(Code.TOO_FEW_VIEWS, 0)],
+    ids=lambda found: found.verdict.code.value,
+)
+def test_what_no_match_could_help_is_not_touched(first, estimated):
+    assert climb(first, rung("a")) is first and estimated() == []
+
+
+def test_quick_stops_at_the_first_rung(estimated):
+    assert climb(NO_OVERLAP, rung("a"), config=Config(quick=True)) is NO_OVERLAP and estimated() == []
+
+
+def test_the_seconds_end_the_climb_between_pieces_of_work_and_between_rungs(estimated, monkeypatch):
+    seeds = estimated(NO_OVERLAP, NO_OVERLAP)
+    clock = itertools.count(0.0, 1.0)
+    monkeypatch.setattr(ladder.time, "monotonic", lambda: next(clock))
+    found = climb(NO_OVERLAP, rung("long", 100), rung("late"), config=overlaid(Config(), {"ladder": {"seconds": 6.0}}))
+    assert len(seeds) == 1 and 1 < seeds[0] < 6
+    assert found.verdict.message.endswith("Also tried: long.")
+
+
+def test_no_seconds_are_no_ladder(estimated):
+    assert climb(NO_OVERLAP, rung("a"), config=overlaid(Config(), {"ladder": {"seconds": 0}})) is NO_OVERLAP
+
+
+def test_the_better_answer_is_kept(estimated):
+    partial, worse = estimate(Code.OK_PARTIAL, 3), estimate(Code.OK_PARTIAL, 3)
+    refusals = [estimate(Code.AMBIGUOUS, 4), estimate(Code.NO_OVERLAP, 1)]
+    estimated(refusals[0], worse, refusals[1])
+    kept = climb(partial, rung("a"), rung("b"), rung("c"))
+    assert kept.registration is partial.registration and kept.verdict.code is Code.OK_PARTIAL
+    more = estimate(Code.BASELINE_TOO_SMALL, 4)  # "move further to the side" would be the wrong thing to say
+    estimated(more)
+    assert climb(NO_OVERLAP, rung("a")).verdict.code is Code.NO_OVERLAP
+    estimated(estimate(Code.OK_PARTIAL, 4))
+    assert len(climb(partial, rung("a")).placed) == 4
+
+
+def test_an_answer_that_contradicts_the_accepted_one_is_not_better():
+    partial, whole = estimate(Code.OK_PARTIAL, 3), estimate(Code.OK, 4)
+    assert better(partial, whole) is whole
+    assert whole.registration is not None
+    first, *others = whole.registration.cameras
+    for turn_deg, kept in ((1.0, "other"), (10.0, "one")):
+        T_world_camera = first.T_world_camera.copy()
+        T_world_camera[:3, :3] = cv2.Rodrigues(np.array([0.0, np.radians(turn_deg), 0.0]))[0]
+        turned = replace(first, T_world_camera=T_world_camera)
+        other = replace(whole, registration=replace(whole.registration, cameras=(turned, *others)))
+        assert better(partial, other) is (other if kept == "other" else partial)
+
+
+def test_an_accepted_camera_is_not_given_up_for_two_others():
+    others = estimate(Code.OK_PARTIAL, 4)
+    assert others.registration is not None
+    without_first = replace(others, registration=replace(others.registration, cameras=others.registration.cameras[1:]))
+    one = estimate(Code.OK_PARTIAL, 2)
+    assert better(one, without_first) is one and len(without_first.placed) == 3
+
+
+def test_pause_may_abandon_the_climb(estimated):
+    class Abandoned(Exception):
+        pass
+
+    def pause() -> None:
+        raise Abandoned
+
+    estimated(NO_OVERLAP)
+    with pytest.raises(Abandoned):
+        climbed(NO_OVERLAP, (), Config(), pause, [rung("a")])
+
+
+@pytest.mark.parametrize("quick", [False, True])
+def test_photographs_of_three_places_are_refused_with_what_was_tried_unless_quick(quick, monkeypatch, tmp_path):
+    monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
+    frames = places(msgspec.structs.replace(SMALL, views=3), seeds=(0, 1, 2))
+    *_, final = reconstruct(frames, Config(quick=quick))
+    assert final.verdict.code is Code.NO_OVERLAP
+    assert ("stronger tilts" in final.verdict.message) != quick
+    assert (final.seconds["ladder"] > 0.1) != quick
