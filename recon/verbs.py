@@ -100,10 +100,24 @@ def _stability_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rows", type=counts, default=(), metavar="N,N", help="rows of the matrix (default: all)")
     parser.add_argument("--seeds", type=positive, default=4, metavar="N", help="trials of each row (default: 4)")
     parser.add_argument(
-        "--methods", type=names, default=("splatnode",), metavar="A,B,C", help="splatnode, colmap, glomap"
+        "--methods",
+        type=names,
+        metavar="A,B,C",
+        help="splatnode, colmap, glomap (default: splatnode; with --windows all that are installed)",
     )
     parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="trials at a time (default: 1)")
     parser.add_argument("--timeout-s", type=seconds, default=120.0, metavar="S", help="of one trial (default: 120)")
+    parser.add_argument(
+        "--windows", action="store_true", help="instead of the matrix: windows of 3, 6 and 12 consecutive photographs"
+    )
+    parser.add_argument(
+        "--per-kind", type=positive, default=2, metavar="N", help="windows of a scene, count and stride (default: 2)"
+    )
+    parser.add_argument(
+        "--fresh",
+        action="store_true",
+        help="time each window from its photographs on, too, with nothing kept of others",
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="trials that it holds are not run again")
 
 

@@ -30,7 +30,7 @@ _COLOURS = {
     Outcome.FAILED: "#7F7F7F",
 }
 _OUTCOME_LABELS = {
-    Outcome.ACCEPTED: "published,\nright",
+    Outcome.ACCEPTED: "published,\nnot wrong",
     Outcome.FALSE_ACCEPT: "published,\nwrong",
     Outcome.REFUSED: "refused,\nfitting code",
     Outcome.REFUSED_OTHERWISE: "refused,\nother code",

@@ -12,16 +12,19 @@ from splatnode.recon.evaluate.stability.matrix import chosen
 from splatnode.recon.evaluate.stability.methods import by_name
 from splatnode.recon.evaluate.stability.places import load_places
 from splatnode.recon.evaluate.stability.summary import Rate, summarise
+from splatnode.recon.evaluate.stability.windows.command import windows
 
 logger = logging.getLogger(__name__)
 
 
 def stability(args: argparse.Namespace) -> int:
-    """Runs the matrix, writes stability.json and stability.png, and prints the rates."""
+    """Runs the matrix, writes stability.json and stability.png, and prints the rates; or the windows, where asked."""
+    if args.windows:
+        return windows(args)
     plan = Plan(
         rows=chosen(args.rows),
         seeds=tuple(range(args.seeds)),
-        methods=args.methods,
+        methods=args.methods or ("splatnode",),
         jobs=args.jobs,
         timeout_s=args.timeout_s,
     )

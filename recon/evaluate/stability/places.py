@@ -192,7 +192,7 @@ def load_places(scenes: Sequence[Path], out: Path) -> Places:
 
     Raises ValueError where fewer than three scenes have a camera that moved to the side: there would be no mixtures.
     """
-    loaded = [_recorded(folder) for folder in scenes] or [built_in(out, seed) for seed in _BUILT_IN_SEEDS]
+    loaded = loaded_places(scenes, out)
     kinds = {"walked": [], "forward": [], "turned": []}
     for place in loaded:
         kinds[motion(place.Ts_world_camera)].append(place)
@@ -202,6 +202,14 @@ def load_places(scenes: Sequence[Path], out: Path) -> Places:
             "have; give more scenes, or none to use the built-in place"
         )
     return Places(**{kind: tuple(places) for kind, places in kinds.items()})
+
+
+def loaded_places(scenes: Sequence[Path], out: Path) -> list[Place]:
+    """The scenes in their folders; without any, the built-in place in `out`/places.
+
+    Raises ValueError where a scene has too few photographs with true cameras.
+    """
+    return [_recorded(folder) for folder in scenes] or [built_in(out, seed) for seed in _BUILT_IN_SEEDS]
 
 
 def motion(Ts_world_camera: Poses) -> str:

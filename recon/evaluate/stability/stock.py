@@ -29,7 +29,7 @@ def _reconstructed(frames: Iterable[Frame | DroppedFrame], config: Config, mappi
     return Snapshot(
         sequence=1,
         verdict=found,
-        cameras=tuple(map(_camera, registered)) if found.publishable else (),
+        cameras=tuple(map(camera_estimate, registered)) if found.publishable else (),
         gaussians=GaussianArrays.empty(),
         images={},
         dropped=(),
@@ -38,7 +38,8 @@ def _reconstructed(frames: Iterable[Frame | DroppedFrame], config: Config, mappi
     )
 
 
-def _camera(registered: RegisteredFrame) -> CameraEstimate:
+def camera_estimate(registered: RegisteredFrame) -> CameraEstimate:
+    """The camera of a registered frame, for the frame at full size; nothing is claimed of it."""
     frame = registered.frame
     return CameraEstimate(
         frame.name,

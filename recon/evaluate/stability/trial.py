@@ -11,10 +11,14 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing.context import ForkServerContext
 
+from splatnode.recon.clock import Clock
 from splatnode.recon.evaluate.process import call_alone
 from splatnode.recon.evaluate.stability.case import Case, Measured
+from splatnode.recon.evaluate.stability.claim import ROUGH, CameraError
 from splatnode.recon.evaluate.stability.methods import by_name
 from splatnode.recon.evaluate.stability.outcome import Outcome, compare, outcome
+from splatnode.recon.evaluate.stability.own_cameras import cameras_of, evidence_record, registered
+from splatnode.recon.pipeline import estimate_frames
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.verdict import Verdict
@@ -46,6 +50,9 @@ class Trial:
     centre_error_pct: float | None = None
     measured: Mapping[str, float] | None = None  # by the row's probe
     held: bool | None = None  # whether that was within the row's limits
+    errors: tuple[CameraError, ...] = ()  # of the published cameras; of a refusal, of those that were registered
+    registered_right: bool | None = None  # whether the registered cameras are right, published or not; None: no cameras
+    evidence: Mapping[str, object] | None = None  # recon.verification.likelihood.record
     message: str = ""  # the verdict's sentence, or the error
 
 
@@ -54,7 +61,8 @@ class Answer:
     """What the other process leaves."""
 
     verdict: Verdict
-    cameras: tuple[CameraEstimate, ...]
+    cameras: tuple[CameraEstimate, ...]  # those published; of splatnode's refusals, those that were registered
+    evidence: Mapping[str, object] | None
     num_gaussians: int
     seconds: float
     processor_seconds: float
@@ -77,8 +85,8 @@ def run_trial(case: Case, row: int, name: str, seed: int, method: str, timeout_s
         failed = Outcome.FAILED
         return Trial(**head, verdict=FAILED, published=False, right=failed.right, outcome=failed.value, message=answer)
     verdict = answer.verdict
-    score = compare(answer.cameras, case.worlds) if verdict.publishable else None
-    found = outcome(case.demand, verdict.publishable, score is not None and score.right, verdict.code in case.codes)
+    score = compare(answer.cameras, case.worlds, rough=verdict.code.value == ROUGH)
+    found = outcome(case.demand, verdict.publishable, score.right, verdict.code in case.codes)
     return Trial(
         **head,
         verdict=verdict.code.value,
@@ -88,12 +96,15 @@ def run_trial(case: Case, row: int, name: str, seed: int, method: str, timeout_s
         seconds=answer.seconds,
         processor_seconds=answer.processor_seconds,
         peak_rss_mb=answer.peak_rss_mb,
-        num_cameras=len(answer.cameras),
+        num_cameras=len(answer.cameras) if verdict.publishable else 0,
         num_gaussians=answer.num_gaussians,
-        rotation_error_deg=score.rotation_error_deg if score else None,
-        centre_error_pct=score.centre_error_pct if score else None,
+        rotation_error_deg=score.rotation_error_deg if verdict.publishable else None,
+        centre_error_pct=score.centre_error_pct if verdict.publishable else None,
         measured=answer.measured.values if answer.measured else None,
         held=answer.measured.held if answer.measured else None,
+        errors=score.errors,
+        registered_right=score.exact if answer.cameras else None,
+        evidence=answer.evidence,
         message=verdict.message,
     )
 
@@ -122,11 +133,15 @@ def _work(case: Case, method: str) -> Answer:
     snapshot = reconstruct(case.source(), case.config)
     seconds, processor_seconds = time.perf_counter() - started, time.process_time() - worked
     peak = peak_rss_mb()
-    publishable = snapshot.verdict.publishable
-    probe = case.probe if publishable and method == "splatnode" else None
+    probe = case.probe if snapshot.verdict.publishable and method == "splatnode" else None
+    cameras, evidence = snapshot.cameras, snapshot.evidence
+    if method == "splatnode" and not snapshot.verdict.publishable:
+        estimate = registered(estimate_frames(case.source(), case.config, Clock())[0], case.config)
+        cameras, evidence = cameras_of(estimate), evidence_record(estimate)
     return Answer(
         verdict=snapshot.verdict,
-        cameras=snapshot.cameras if publishable else (),
+        cameras=cameras,
+        evidence=evidence,
         num_gaussians=len(snapshot.gaussians),
         seconds=seconds,
         processor_seconds=processor_seconds,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from splatnode.recon.evaluate.stability.case import Demand
 from splatnode.recon.evaluate.stability.outcome import Outcome, compare, outcome
 from splatnode.recon.evaluate.stability.summary import rate, report, summarise
 from splatnode.recon.evaluate.truth import TrueCamera
+from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.support.stability_places import HEIGHT, WIDTH, K, on_arc
 
@@ -37,14 +39,32 @@ def test_right_cameras_are_right_in_any_frame_and_scale():
 
 
 def test_a_camera_turned_too_far_is_wrong():
-    assert compare(estimated(0, 10, 20, turn=1.9), [world(0, 10, 20)]).right
-    wrong = compare(estimated(0, 10, 20, turn=2.1), [world(0, 10, 20)])
-    assert not wrong.right and wrong.rotation_error_deg == pytest.approx(2.1)
+    """By two thirds of the turn: the best common rotation takes the others along."""
+    assert compare(estimated(0, 10, 20, turn=2.9), [world(0, 10, 20)]).exact
+    between = compare(estimated(0, 10, 20, turn=7.0), [world(0, 10, 20)])
+    assert between.right and not between.exact
+    wrong = compare(estimated(0, 10, 20, turn=8.0), [world(0, 10, 20)])
+    assert not wrong.right and wrong.rotation_error_deg == pytest.approx(8.0)
+
+
+def test_a_camera_beyond_its_claim_is_wrong():
+    cameras = estimated(0, 10, 20, turn=1.5)
+    claimed = [replace(camera, bounds=Bounds(0.3, 0.01, 1.0, 1.0)) for camera in cameras]
+    assert compare(cameras, [world(0, 10, 20)]).right and not compare(claimed, [world(0, 10, 20)]).right
+    roughly = [replace(camera, bounds=Bounds(3.0, 0.1, 10.0, 10.0)) for camera in estimated(0, 10, 20, turn=8.0)]
+    assert not compare(roughly, [world(0, 10, 20)]).right
+    assert compare(roughly, [world(0, 10, 20)], rough=True).right
+
+
+def test_a_camera_without_a_finite_place_is_wrong():
+    cameras = estimated(0, 10, 20)
+    cameras[1].T_world_camera[0, 3] = np.nan
+    assert not compare(cameras, [world(0, 10, 20)]).right
 
 
 def test_a_centre_too_far_off_is_wrong():
     cameras = estimated(0, 10, 20, 30)
-    cameras[1].T_world_camera[:3, 3] += 0.05  # of a spread of 1.2
+    cameras[1].T_world_camera[:3, 3] += 0.4  # of a spread of 1.2
     assert not compare(cameras, [world(0, 10, 20, 30)]).right
 
 

@@ -1,0 +1,43 @@
+"""What splatnode registered, published or not: whether a refusal was of right cameras."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from splatnode.recon.config import Config
+from splatnode.recon.estimation import Estimate
+from splatnode.recon.registration.register import register
+from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.verification.likelihood import record
+from splatnode.recon.verification.verify import verify
+
+
+def registered(estimate: Estimate, config: Config) -> Estimate:
+    """The estimate with the cameras and the evidence of a registration, also where the verdict needed none."""
+    if estimate.registration is not None:
+        return estimate
+    registration = register(estimate.graph.keyframes, estimate.graph.pairs, config.registration)
+    return replace(
+        estimate, registration=registration, evidence=verify(estimate.graph, registration, config.verification)
+    )
+
+
+def evidence_record(estimate: Estimate) -> dict[str, object] | None:
+    """The evidence for the registration and what it amounts to; None where there is nothing to verify."""
+    return None if estimate.evidence is None else record(estimate.evidence)
+
+
+def cameras_of(estimate: Estimate) -> tuple[CameraEstimate, ...]:
+    """The registered cameras, for their frames at full size; those that were placed, where a scene may be published."""
+    if estimate.registration is None:
+        return ()
+    bounds, found = estimate.bounds, []
+    for camera in estimate.registration.cameras:
+        frame = estimate.graph.keyframes[camera.index].frame
+        K = np.diag([camera.focal, camera.focal, 1.0])
+        K[:2, 2] = camera.principal
+        of_camera = (camera.T_world_camera, K, frame.width, frame.height, bounds.get(frame.name))
+        found.append(CameraEstimate(frame.name, frame.frame_id, *of_camera))
+    return tuple(each for each in found if not estimate.verdict.publishable or each.name in estimate.placed)

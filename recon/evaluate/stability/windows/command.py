@@ -1,0 +1,73 @@
+"""`splatnode stability --windows`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import logging
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from splatnode.recon.evaluate.stability.methods import NAMES, by_name
+from splatnode.recon.evaluate.stability.places import loaded_places
+from splatnode.recon.evaluate.stability.windows.campaign import FILE, OURS, Plan, run_windows
+from splatnode.recon.evaluate.stability.windows.row import Row
+from splatnode.recon.evaluate.stability.windows.summary import KINDS, by_angle, by_count, by_method, coverage, tally
+
+logger = logging.getLogger(__name__)
+
+
+def windows(args: argparse.Namespace) -> int:
+    """Runs the windows, writes windows.json and its charts, and prints the tables."""
+    methods = args.methods or default_methods()
+    for method in methods:
+        by_name(method)
+    plan = Plan(methods, per_kind=args.per_kind, fresh=args.fresh, timeout_s=args.timeout_s)
+    rows = run_windows(plan, loaded_places(args.scenes, args.out), args.out, shlex.join(["splatnode", *sys.argv[1:]]))
+    drawn = _drawn(args.out, rows)
+    for line in report_lines(rows):
+        print(line)
+    print(f"results: {args.out}/ ({', '.join((FILE, *drawn))})")
+    return 0
+
+
+def default_methods() -> tuple[str, ...]:
+    """All methods that can run here."""
+    return NAMES if importlib.util.find_spec("pycolmap") else (OURS,)
+
+
+def report_lines(rows: Sequence[Row]) -> list[str]:
+    """For people: the windows of each method by angle and by count, then the shares within the 95 % bounds."""
+    head = f"{'':>26} {'sets':>5} {'right':>6} {'part':>5} {'between':>8} {'wrong':>6} {'refused':>8} {'no answer':>10}"
+    lines = [head + f" {'own right':>10} {'published':>10}"]
+    for method, mine in by_method(rows).items():
+        groups = {
+            "all": mine,
+            **{f"{name} degrees": some for name, some in by_angle(mine).items()},
+            **{f"{count} views": some for count, some in by_count(mine).items()},
+        }
+        for name, some in groups.items():
+            t = tally(some)
+            own = t.own_right + t.own_right_part, t.own_right_published + t.own_right_part_published
+            lines.append(
+                f"{method:>10} {name:>15} {t.sets:>5} {t.right:>6} {t.right_part:>5} {t.between:>8} {t.wrong:>6} "
+                f"{t.refused:>8} {t.failed:>10} {own[0]:>10} {own[1]:>10}"
+            )
+    for count, some in by_count([row for row in rows if row.method == OURS]).items():
+        found = coverage(some)
+        shares = [f"{kind} {found.within[kind]:.0%}" for kind in KINDS if found.within[kind] is not None]
+        if shares:
+            lines.append(f"within the 95 % bounds, {count} views ({found.cameras} cameras): {', '.join(shares)}")
+    return lines
+
+
+def _drawn(out: Path, rows: Sequence[Row]) -> list[str]:
+    """The names of the charts that were drawn to `out`."""
+    try:
+        from splatnode.recon.evaluate.stability.windows import charts
+    except ImportError:
+        logger.warning("no charts: matplotlib is not installed. Run: pip install 'splatnode[bench]'")
+        return []
+    return charts.draw(rows, out)

@@ -1,0 +1,116 @@
+"""One window and one method: the answer, compared with the truth."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from splatnode.recon.evaluate.stability.claim import ROUGH, CameraError, all_right, errors_of, whole_errors
+from splatnode.recon.evaluate.stability.windows.window import Window
+from splatnode.recon.evaluate.truth import TrueCamera
+from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.result.verdict import Verdict
+
+FAILED = "FAILED"
+Key = tuple[str, int, int, int, str]
+
+
+class Found(enum.Enum):
+    """What became of a window, by what was published: right is within 2 degrees and 5 % of the centres' spread."""
+
+    RIGHT = "right"  # all photographs are placed
+    RIGHT_PART = "right_part"  # those that are placed
+    BETWEEN = "between"  # not right, and within the claim; without one, within 5 degrees and 10 %
+    WRONG = "wrong"  # a camera is beyond its claim: see claim.CameraError.wrong
+    REFUSED = "refused"
+    FAILED = "failed"  # no answer
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a method says of a window."""
+
+    verdict: Verdict | None  # None: there was no answer, `message` says why
+    cameras: tuple[CameraEstimate, ...] = ()  # where nothing is published, those that were registered all the same
+    seconds: float | None = None
+    fresh_seconds: float | None = None
+    evidence: Mapping[str, object] | None = None
+    message: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One line of windows.json. What was not measured is None."""
+
+    scene: str
+    count: int
+    stride: int
+    start: int
+    names: tuple[str, ...]
+    angle_deg: float  # the largest over the views of the angle to the nearest other one: see window.angle_deg
+    method: str
+    verdict: str  # a code; FAILED where there was no answer
+    published: bool
+    message: str
+    seconds: float | None  # from matched pairs to the verdict, or to the model
+    fresh_seconds: float | None  # from photographs to the same, with nothing kept of other windows
+    cameras: tuple[CameraError, ...]  # those published; of a refusal, those that were registered
+    rotation_deg: float | None  # the largest error of any relative rotation
+    centre_pct: float | None  # RMS error of the centres, in percent of the true ones' spread
+    evidence: Mapping[str, Any] | None  # recon.verification.likelihood.record
+
+    @property
+    def key(self) -> Key:
+        return self.scene, self.count, self.stride, self.start, self.method
+
+    @property
+    def right(self) -> bool:
+        """Whether all cameras are right that there are, published or not."""
+        return all_right(self.cameras)
+
+    @property
+    def whole(self) -> bool:
+        """Whether every photograph has a camera."""
+        return len(self.cameras) == self.count
+
+    @property
+    def found(self) -> Found:
+        if self.verdict == FAILED:
+            return Found.FAILED
+        if not self.published:
+            return Found.REFUSED
+        if not self.cameras or any(camera.wrong(self.verdict == ROUGH) for camera in self.cameras):
+            return Found.WRONG
+        if self.right:
+            return Found.RIGHT if self.whole else Found.RIGHT_PART
+        return Found.BETWEEN
+
+
+def key_of(window: Window, method: str) -> Key:
+    return window.scene, window.count, window.stride, window.start, method
+
+
+def judged(window: Window, method: str, answer: Answer, truth: Mapping[str, TrueCamera]) -> Row:
+    """The answer against the true cameras of all photographs of the window."""
+    whole = whole_errors(answer.cameras, truth)
+    verdict = answer.verdict
+    return Row(
+        scene=window.scene,
+        count=window.count,
+        stride=window.stride,
+        start=window.start,
+        names=window.names,
+        angle_deg=window.angle_deg,
+        method=method,
+        verdict=FAILED if verdict is None else verdict.code.value,
+        published=verdict is not None and verdict.publishable,
+        message=answer.message if verdict is None else verdict.message,
+        seconds=answer.seconds,
+        fresh_seconds=answer.fresh_seconds,
+        cameras=errors_of(answer.cameras, truth),
+        rotation_deg=whole.rotation_pair_deg,
+        centre_pct=whole.centre_pct,
+        evidence=answer.evidence,
+    )
