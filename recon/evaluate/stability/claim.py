@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +26,15 @@ _ROUNDING = 1e-6  # degrees and percent: cameras that are given exactly are foun
 
 
 @dataclass(frozen=True)
+class Claim:
+    """The 95 % bounds of a camera, as recon/result/bounds.py has them; what is not finite is very large."""
+
+    rotation_deg: float
+    centre_percent: float  # of the distance to the scene
+    focal_percent: float
+
+
+@dataclass(frozen=True)
 class CameraError:
     """Of one camera; the worlds are aligned as `camera_errors` says. Centres are None where no true camera moves."""
 
@@ -34,7 +43,7 @@ class CameraError:
     centre_pct: float | None  # of the distance to the scene, which is the unit of the estimated world
     spread_pct: float | None  # of the true centres' RMS distance from their mean
     focal_pct: float
-    bounds: Bounds | None = None  # what was claimed; None: nothing
+    bounds: Claim | None = None  # what was claimed; None: nothing
 
     @property
     def right(self) -> bool:
@@ -100,7 +109,7 @@ def errors_of(cameras: Sequence[CameraEstimate], truth: Mapping[str, TrueCamera]
             centre_pct=_of_distance(float(distance), common) if moves else None,
             spread_pct=100.0 * float(distance) / spread if moves else None,
             focal_pct=_focal_pct(camera, one),
-            bounds=None if camera.bounds is None else _finite(camera.bounds),
+            bounds=None if camera.bounds is None else _claim(camera.bounds),
         )
         for camera, one, rotation, distance in zip(cameras, true, rotations, distances, strict=True)
     )
@@ -134,5 +143,6 @@ def _focal_pct(camera: CameraEstimate, true: TrueCamera) -> float:
     return 100.0 * abs(math.sqrt(K[0, 0] * K[1, 1] / (K_true[0, 0] * K_true[1, 1])) - 1.0)
 
 
-def _finite(bounds: Bounds) -> Bounds:
-    return Bounds(**{name: value if math.isfinite(value) else _HUGE for name, value in asdict(bounds).items()})
+def _claim(bounds: Bounds) -> Claim:
+    values = bounds.rotation_deg, bounds.centre_percent, bounds.focal_percent
+    return Claim(*(value if math.isfinite(value) else _HUGE for value in values))

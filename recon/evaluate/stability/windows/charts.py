@@ -32,6 +32,7 @@ _FOUND = {  # from the bottom of a bar to its top
     Found.FAILED: ("#7F7F7F", "no answer"),
 }
 _COUNT_COLOURS = ("#CC79A7", "#0072B2", "#009E73", "#E69F00")
+_NAMES = {"colmap": "COLMAP", "glomap": "GLOMAP"}
 _CLAIMS = {"rotation": "rotation, degrees", "centre": "centre, % of the distance to the scene"}
 _LEAST = 1e-3  # degrees or percent: what is smaller is drawn here
 _WRONG_BELOW = (
@@ -95,7 +96,8 @@ def _shares(axes: Axes, method: str, rows: Sequence[Row], *, labelled: bool) -> 
     axes.spines[:].set_visible(False)
     right = sum(row.found in (Found.RIGHT, Found.RIGHT_PART) for row in rows)
     wrong = sum(row.found is Found.WRONG for row in rows)
-    axes.set_title(f"{method}: {right} of {len(rows)} right, {wrong} wrong", loc="left", fontsize=9, color=_INK)
+    name = _NAMES.get(method, method)
+    axes.set_title(f"{name}: {right} of {len(rows)} right, {wrong} wrong", loc="left", fontsize=9, color=_INK)
     if labelled:
         axes.set_ylabel("share of the sets", fontsize=7.5, color=_MUTED)
 

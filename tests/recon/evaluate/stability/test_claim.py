@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.recon.evaluate.stability.claim import CameraError, all_right, errors_of
+from splatnode.recon.evaluate.stability.claim import CameraError, Claim, all_right, errors_of
 from splatnode.recon.evaluate.truth import TrueCamera
-from splatnode.recon.result.bounds import Bounds
+from splatnode.recon.result.bounds import Bounds, ball
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.support.stability_places import HEIGHT, WIDTH, K, on_arc
 
-BOUNDS = Bounds(rotation_deg=1.0, centre=0.02, centre_percent=2.0, focal_percent=4.0)
+BOUNDS = Claim(rotation_deg=1.0, centre_percent=2.0, focal_percent=4.0)
 GOOD = CameraError("a", rotation_deg=0.9, centre_pct=1.9, spread_pct=4.0, focal_pct=3.0, bounds=BOUNDS)
 TRUTH = {
     f"{degrees}": TrueCamera(on_arc(degrees, distance=3.0), K, WIDTH, HEIGHT) for degrees in (0, 20, 40, 90, 180, 270)
@@ -70,7 +70,7 @@ def test_wrong_is_beyond_the_claim(changes, rough, wrong):
 
 
 def test_bounds_that_are_not_finite_claim_nothing():
-    infinite = Bounds(float("inf"), float("nan"), float("nan"), float("inf"))
+    infinite = Bounds(float("inf"), float("nan"), float("nan"), float("inf"), ball(float("nan")))
     cameras = [replace(camera, bounds=infinite) for camera in estimated(0, 20, 40)]
     assert not any(error.wrong(rough=False) for error in errors_of(cameras, TRUTH))
     assert all(np.isfinite(bound) for error in errors_of(cameras, TRUTH) for _, bound in error.claimed().values())

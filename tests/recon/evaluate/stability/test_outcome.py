@@ -13,7 +13,7 @@ from splatnode.recon.evaluate.stability.case import Demand
 from splatnode.recon.evaluate.stability.outcome import Outcome, compare, outcome
 from splatnode.recon.evaluate.stability.summary import rate, report, summarise
 from splatnode.recon.evaluate.truth import TrueCamera
-from splatnode.recon.result.bounds import Bounds
+from splatnode.recon.result.bounds import Bounds, ball
 from splatnode.recon.result.snapshot import CameraEstimate
 from tests.support.stability_places import HEIGHT, WIDTH, K, on_arc
 
@@ -49,9 +49,11 @@ def test_a_camera_turned_too_far_is_wrong():
 
 def test_a_camera_beyond_its_claim_is_wrong():
     cameras = estimated(0, 10, 20, turn=1.5)
-    claimed = [replace(camera, bounds=Bounds(0.3, 0.01, 1.0, 1.0)) for camera in cameras]
+    claimed = [replace(camera, bounds=Bounds(0.3, 0.01, 1.0, 1.0, ball(0.01))) for camera in cameras]
     assert compare(cameras, [world(0, 10, 20)]).right and not compare(claimed, [world(0, 10, 20)]).right
-    roughly = [replace(camera, bounds=Bounds(3.0, 0.1, 10.0, 10.0)) for camera in estimated(0, 10, 20, turn=8.0)]
+    roughly = [
+        replace(camera, bounds=Bounds(3.0, 0.1, 10.0, 10.0, ball(0.1))) for camera in estimated(0, 10, 20, turn=8.0)
+    ]
     assert not compare(roughly, [world(0, 10, 20)]).right
     assert compare(roughly, [world(0, 10, 20)], rough=True).right
 

@@ -8,17 +8,16 @@ from dataclasses import replace
 import pytest
 
 from splatnode.command_line import build_parser
-from splatnode.recon.evaluate.stability.claim import CameraError
+from splatnode.recon.evaluate.stability.claim import CameraError, Claim
 from splatnode.recon.evaluate.stability.windows import campaign
 from splatnode.recon.evaluate.stability.windows.campaign import Plan, read_rows, run_windows
 from splatnode.recon.evaluate.stability.windows.command import report_lines
 from splatnode.recon.evaluate.stability.windows.row import Answer, Found, Row
 from splatnode.recon.evaluate.stability.windows.summary import coverage, summarise, tally
-from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.support.stability_places import three_places
 
-BOUNDS = Bounds(rotation_deg=1.0, centre=0.02, centre_percent=2.0, focal_percent=4.0)
+BOUNDS = Claim(rotation_deg=1.0, centre_percent=2.0, focal_percent=4.0)
 
 
 def camera(number: int, **changes) -> CameraError:
@@ -110,7 +109,7 @@ def test_charts(tmp_path):
     assert all((tmp_path / name).stat().st_size > 10_000 for name in ("windows.png", "calibration.png"))
     assert charts.draw(ROWS[7:], tmp_path) == ["windows.png"], "who claims nothing has no calibration"
     titles = [axes.get_title(loc="left") for axes in charts.figure_of_shares(ROWS).axes]
-    assert titles == ["splatnode: 2 of 7 right, 1 wrong", "colmap: 0 of 2 right, 1 wrong"]
+    assert titles == ["splatnode: 2 of 7 right, 1 wrong", "COLMAP: 0 of 2 right, 1 wrong"]
     labels = [text.get_text() for axes in charts.figure_of_claims(ROWS).axes for text in axes.get_legend().get_texts()]
     assert labels == ["3 views: 82% of 11 cameras within", "3 views: 100% of 11 cameras within"]
 
