@@ -16,6 +16,7 @@ from splatnode.recon.evaluate.stability.windows.store import matched
 from splatnode.recon.evaluate.stability.windows.window import Window
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.frames.screening import screen_all
+from splatnode.recon.ladder.ladder import climbed
 from splatnode.recon.matching.match import match
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.preparation import load_prior, prepare
@@ -34,7 +35,7 @@ def answers(place: Place, windows: Sequence[Window], config: Config, fresh: bool
                 known[frame.name] = known.get(frame.name) or prepare(frame, config)
             graph, store = matched(store, [known[frame.name] for frame in kept], prior.matcher)
             started = time.perf_counter()
-            estimate = estimate_cameras(graph, rejected, config)
+            estimate = climbed(estimate_cameras(graph, rejected, config), rejected, config)
             seconds = time.perf_counter() - started
             fresh_seconds = _fresh_seconds(frames, config) if fresh else None
             answer = _answer(registered(estimate, config), seconds, fresh_seconds)
@@ -53,7 +54,7 @@ def from_scratch(frames: Sequence[Frame], config: Config) -> Estimate:
     """Cameras and verdict of the frames, with nothing kept of other windows."""
     kept, _, rejected = screen_all(frames, config.screening)
     graph = match([prepare(frame, config) for frame in kept], config.matching, load_prior(config).matcher)
-    return estimate_cameras(graph, rejected, config)
+    return climbed(estimate_cameras(graph, rejected, config), rejected, config)
 
 
 def _fresh_seconds(frames: Sequence[Frame], config: Config) -> float:
