@@ -173,6 +173,7 @@ def _config(args: argparse.Namespace) -> Config:
         "max_gaussians": args.max_gaussians,
         "max_mb": args.max_mb,
         "quick": args.quick or None,
+        "decision": None if args.require is None else {"require_percent": args.require},
     }
     return overlaid(config, {key: value for key, value in flags.items() if value is not None})
 

@@ -14,14 +14,17 @@ from splatnode.recon.registration import continuation
 from splatnode.recon.registration.register import Registration, register
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.verdict import Verdict
-from splatnode.recon.verification.claims import claims
+from splatnode.recon.verification.claims import claims, shaped
 from splatnode.recon.verification.decision import decide, refuse_before_registration
 from splatnode.recon.verification.evidence import Evidence
+from splatnode.recon.verification.fitted import FITTED
+from splatnode.recon.verification.likelihood import record, weigh
 from splatnode.recon.verification.verify import verify, verify_further
 
 # Points of a further camera that two others see, from which a provisional estimate places it; frames of another place
 # that were taken for this one had up to 20.
 MIN_CONFIRMED_POINTS = 50
+PROVISIONALLY_WIDER = 2.0  # factor of a provisional estimate's bounds, whose sources are quick or taken over
 PROVISIONAL = "For now: all evidence is weighed when no keyframe waits."
 
 
@@ -42,10 +45,25 @@ class Estimate:
 
     @property
     def bounds(self) -> Mapping[str, Bounds]:
-        """Of the errors of each camera, by the name of its keyframe; empty where nothing was verified."""
+        """Of the errors of each camera, by the name of its keyframe; empty where nothing was verified.
+
+        A provisional estimate claims less, so that what is known in the end is not less than was claimed before.
+        """
         if self.registration is None or self.evidence is None:
             return {}
-        return claims(self.registration, self.evidence)
+        names, cameras = self.graph.names, self.registration.cameras
+        covariances = {names[camera.index]: camera.centre_covariance for camera in cameras}
+        found = shaped(claims(self.evidence, FITTED.of(self.evidence).claims), covariances)
+        wider = PROVISIONALLY_WIDER if self.verdict.provisional else 1.0
+        return {name: bounds.widened(wider) for name, bounds in found.items()}
+
+    @property
+    def evidence_record(self) -> dict[str, object] | None:
+        """The evidence and what it amounts to, for reports; None where nothing was verified."""
+        if self.evidence is None:
+            return None
+        numbers = FITTED.of(self.evidence)
+        return record(self.evidence, weigh(self.evidence, numbers.claims, numbers.odds))
 
     @property
     def placed(self) -> set[str]:
@@ -82,10 +100,13 @@ def estimate_depth(estimate: Estimate, prior: Prior, pause: Callable[[], None] =
 def continued(known: Estimate, graph: ViewGraph, config: Config) -> Estimate | None:
     """A provisional estimate for `graph`, which has the keyframes of `known` and others beside them.
 
-    None where the others cannot be placed beyond doubt, or the verdict would not be publishable.
+    None where `known` has two cameras only, the others cannot be placed beyond doubt, or the verdict would not be
+    publishable.
     """
     if known.registration is None or known.evidence is None or not known.verdict.publishable:
         return None
+    if len(known.registration.cameras) <= 2:
+        return None  # what is known of two cameras says nothing about a third one
     position = {name: index for index, name in enumerate(graph.names)}
     names = known.graph.names
     if not position.keys() >= set(names):

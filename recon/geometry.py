@@ -129,6 +129,25 @@ class Similarity:
         return self.scale**2 * self.rotation @ of_points @ self.rotation.T
 
 
+def umeyama(source: Array, target: Array) -> Similarity:
+    """The similarity that carries points `source` (M, 3) onto `target` with the least squared error (Umeyama 1991)."""
+    if source.shape != target.shape or source.ndim != 2 or source.shape[1] != 3 or len(source) < 2:
+        raise ValueError(f"points must both be (M, 3) with M >= 2, got {source.shape} and {target.shape}")
+    source_centred, target_centred = source - source.mean(0), target - target.mean(0)
+    u, singular, vt = np.linalg.svd(target_centred.T @ source_centred)
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = u @ np.diag(signs) @ vt
+    spread = float((source_centred**2).sum())
+    scale = float((singular * signs).sum() / spread) if spread > 0 else 1.0
+    return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
+
+
+def angles_deg(rotations: Array, others: Array) -> Array:
+    """(...,) angles between rotations (..., 3, 3), accurate also where they are tiny."""
+    chord = np.linalg.norm(rotations - others, axis=(-2, -1)) / math.sqrt(8.0)
+    return np.rad2deg(2.0 * np.arcsin(np.minimum(chord, 1.0)))
+
+
 def align_cameras(Ts_source: Array, Ts_target: Array) -> Similarity:
     """The similarity that carries source cameras (C, 4, 4) onto target cameras (C, 4, 4).
 

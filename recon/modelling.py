@@ -17,7 +17,6 @@ from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.scene import growth
 from splatnode.recon.scene.initialisation import initial_scene
 from splatnode.recon.scene.scene import Scene
-from splatnode.recon.verification.likelihood import record
 
 log = logging.getLogger(__name__)
 
@@ -96,7 +95,7 @@ def snapshot(
         budget=tuple(hit.record() for hit in budget),
         final=final,
         served_by=scene.served_by if scene else {},
-        evidence=record(estimate.evidence) if estimate.evidence is not None else None,
+        evidence=estimate.evidence_record,
     )
     log.info(
         "snapshot %d: %s, %d cameras, %d Gaussians, %d iterations, %.1f s",

@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 from pkgutil import iter_modules
 
-from splatnode.capture.process.arguments import add_json, counts, megabytes, names, natural, positive, seconds
+from splatnode.capture.process.arguments import add_json, counts, megabytes, names, natural, percent, positive, seconds
 from splatnode.capture.process.verb import Verb, lazily
 
 _FORMATS_FOLDER = Path(__file__).parent / "result" / "export" / "formats"
@@ -40,6 +40,12 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--quick", action="store_true", help="refuse at once: try nothing that takes longer before the answer is no"
+    )
+    parser.add_argument(
+        "--require",
+        type=percent,
+        metavar="PERCENT",
+        help="refuse what is rougher: positions must be known to so much of the distance to the scene (95 %% bound)",
     )
     parser.add_argument("--max-gaussians", type=positive, metavar="N", help="and with at most so many Gaussians")
     parser.add_argument("--max-mb", type=megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes")
@@ -104,6 +110,12 @@ def _stability_arguments(parser: argparse.ArgumentParser) -> None:
         type=names,
         metavar="A,B,C",
         help="splatnode, colmap, glomap (default: splatnode; with --windows all that are installed)",
+    )
+    parser.add_argument(
+        "--counts", type=counts, default=(3, 6, 12), metavar="N,N,N", help="photographs of a window (default: 3,6,12)"
+    )
+    parser.add_argument(
+        "--given-lens", action="store_true", help="windows of a calibrated camera: splatnode is told the true lens"
     )
     parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="trials at a time (default: 1)")
     parser.add_argument("--timeout-s", type=seconds, default=120.0, metavar="S", help="of one trial (default: 120)")

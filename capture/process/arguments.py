@@ -29,6 +29,11 @@ def megabytes(text: str) -> float:
     return _above_zero(text, "megabytes")
 
 
+def percent(text: str) -> float:
+    """A share in percent, above 0."""
+    return _above_zero(text, "percent")
+
+
 def _above_zero(text: str, unit: str) -> float:
     try:
         number = float(text)

@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from splatnode.recon.estimation import Estimate
 from splatnode.recon.geometry import align_cameras
+from splatnode.recon.result.verdict import Code
 
 MAX_TURN_DEG = 2.0  # of an accepted camera from one estimate to the other, after the best similarity
 
@@ -14,9 +15,10 @@ MAX_TURN_DEG = 2.0  # of an accepted camera from one estimate to the other, afte
 def better(one: Estimate, other: Estimate) -> Estimate:
     """`other` where it is publishable and has the cameras of `one`, where they were, and more; else `one`.
 
+    A rough answer that weak matches lead to is not taken: they may join two places, and rough bounds would hide it.
     Of two refusals `one` stands: it says what is wrong with the photographs, `other` with what was made of them.
     """
-    if not other.publishable or not one.placed < other.placed:
+    if not other.publishable or other.verdict.code is Code.OK_ROUGH or not one.placed < other.placed:
         return one
     return other if _turn_deg(one, other) <= MAX_TURN_DEG else one
 

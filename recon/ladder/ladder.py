@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 
 RUNGS = (learned.RUNG, tilts.RUNG)  # what wins most for its seconds comes first
 LACKING_MATCHES = (Code.NO_OVERLAP, Code.SPLIT, Code.OK_PARTIAL, Code.AMBIGUOUS)
+# Of the others, what more cameras may mend, where some keyframes have none: few leave much open.
+UNCERTAIN = (Code.OK_ROUGH, Code.TOO_ROUGH, Code.FOCAL_SUSPECT, Code.PLANAR_ONLY, Code.BASELINE_TOO_SMALL)
 
 
 def climbed(
@@ -37,7 +39,7 @@ def climbed(
     With `config.quick` it is `estimate`. `config.ladder.seconds` bounds the work that is added: they are looked at
     between pairs and before each rung. A pair and an estimate that have begun are finished. `pause` may raise.
     """
-    if config.quick or estimate.verdict.code not in LACKING_MATCHES:
+    if config.quick or not _lacks_matches(estimate):
         return estimate
     means, until = Means(estimate.graph, config), time.monotonic() + config.ladder.seconds
     tried: list[str] = []
@@ -61,6 +63,11 @@ def climbed(
     return _telling(estimate, {"Also tried": tried, "Not tried": not_tried})
 
 
+def _lacks_matches(estimate: Estimate) -> bool:
+    code = estimate.verdict.code
+    return code in LACKING_MATCHES or (code in UNCERTAIN and bool(without_cameras(estimate)))
+
+
 def _last(climb: Iterator[Means], means: Means, until: float, pause: Callable[[], None]) -> Means:
     """The means after the last piece of work that ends before `until`, a time of `time.monotonic()`, or just after."""
     for further in climb:
@@ -73,10 +80,15 @@ def _last(climb: Iterator[Means], means: Means, until: float, pause: Callable[[]
 
 def doubtful_keyframes(estimate: Estimate) -> frozenset[str]:
     """The names of those without a camera, and of those that the verdict is about; none where all are published."""
+    without = without_cameras(estimate)
+    return without if estimate.verdict.publishable else without.union(estimate.verdict.frames)
+
+
+def without_cameras(estimate: Estimate) -> frozenset[str]:
+    """The names of the keyframes that have no camera."""
     cameras = estimate.registration.cameras if estimate.registration is not None else ()
     names = estimate.graph.names
-    without = frozenset(names).difference(names[camera.index] for camera in cameras)
-    return without if estimate.verdict.publishable else without.union(estimate.verdict.frames)
+    return frozenset(names).difference(names[camera.index] for camera in cameras)
 
 
 def _telling(estimate: Estimate, rungs: Mapping[str, Sequence[str]]) -> Estimate:

@@ -19,6 +19,8 @@ from splatnode.recon.core import library, pointer
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
+_RAYLEIGH_MEDIAN = 1.1774  # median length of a 2D error whose components have sigma 1: sqrt(2 log 2)
+_MIN_NOISE_PX = 0.05  # at REFERENCE_SIDE: no observation is believed to be better
 _POSE, _LENS = 6, 4  # parameters of a pose (rotation vector, translation) and of a lens (log focal, radial, shift x, y)
 _MIN_DEPTH = 1e-9  # in the problem's unit of length, in place of 0
 _BEHIND_PX = 1e3  # the error that the robust cost counts for a point behind its camera
@@ -119,6 +121,16 @@ def robust_cost(problem: Problem, config: Config) -> float:
     """The Cauchy loss of all observations, pixels squared, without the priors."""
     squared = np.minimum(reprojection_errors(problem), _BEHIND_PX) ** 2
     return float(config.robust_px**2 * np.log1p(squared / config.robust_px**2).sum())
+
+
+def noise_px(num_observations: int, num_points: int, median_error: float) -> float:
+    """The standard deviation of one component of an observation's error, pixels at REFERENCE_SIDE as `median_error` is.
+
+    A point has three parameters, which fit part of the noise: residuals are smaller than errors.
+    """
+    num_residuals = 2 * num_observations
+    shrinkage = np.sqrt(num_residuals / max(1, num_residuals - 3 * num_points))
+    return float(max(shrinkage * median_error / _RAYLEIGH_MEDIAN, _MIN_NOISE_PX))
 
 
 def adjust(problem: Problem, prior: LensPrior, config: Config, fixed_camera: int = 0) -> Problem:

@@ -15,8 +15,6 @@ from splatnode.recon.registration.patch_image import PatchImage
 
 Array = npt.NDArray[np.float64]
 
-_RAYLEIGH_MEDIAN = 1.1774  # median length of a 2D error whose components have sigma 1: sqrt(2 log 2)
-_MIN_NOISE_PX = 0.05  # at REFERENCE_SIDE: no observation is believed to be better
 _ROBUST_PER_MEDIAN = 3.0  # scale of the robust loss over the median error
 _TOLERANCES = (3.0, 2.0, 1.0)  # of observations, in one adjustment after the other: multiples of `max_error_px`
 _REFINED_ADJUSTMENTS = 3  # with subpixel observations; each drops outliers, and the next one fits better
@@ -87,10 +85,7 @@ def _loss(problem: MappingProblem, estimate: bundle.Problem, config: Config) -> 
     if len(estimate.points) == 0:
         return bundle.Config(robust_px=scale * config.robust_range_px[1])
     median = float(np.median(_errors(problem, estimate)))
-    # A point has three parameters, which fit part of the noise: residuals are smaller than errors.
-    num_residuals = 2 * len(estimate.pixels)
-    shrinkage = np.sqrt(num_residuals / max(1, num_residuals - 3 * len(estimate.points)))
-    noise_px = max(shrinkage * median / _RAYLEIGH_MEDIAN, _MIN_NOISE_PX)
+    noise_px = bundle.noise_px(len(estimate.pixels), len(estimate.points), median)
     return bundle.Config(
         robust_px=scale * float(np.clip(_ROBUST_PER_MEDIAN * median, *config.robust_range_px)),
         noise_px=scale * noise_px * float(np.sqrt(config.correlated)),

@@ -31,6 +31,16 @@ class Bounds:
     focal_percent: float  # of the focal length
     axes: Axes  # of the ellipsoid that holds the centre: semi-axes in the world's frame and unit, the longest first
 
+    def widened(self, factor: float) -> Bounds:
+        """Every bound `factor` times as wide."""
+        wider = self.scaled(factor)
+        return replace(
+            wider,
+            rotation_deg=factor * self.rotation_deg,
+            centre_percent=factor * self.centre_percent,
+            focal_percent=factor * self.focal_percent,
+        )
+
     def scaled(self, factor: float) -> Bounds:
         """The same in a world whose unit is `factor` times smaller."""
         return replace(self, centre=self.centre * factor, axes=as_axes(factor * np.array(self.axes)))

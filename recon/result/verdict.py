@@ -11,6 +11,8 @@ class Code(enum.Enum):
 
     OK = "OK"
     OK_PARTIAL = "OK_PARTIAL"
+    OK_ROUGH = "OK_ROUGH"
+    TOO_ROUGH = "TOO_ROUGH"
     TOO_FEW_VIEWS = "TOO_FEW_VIEWS"
     NO_OVERLAP = "NO_OVERLAP"
     LOW_TEXTURE = "LOW_TEXTURE"

@@ -4,24 +4,50 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.registration.register import Registration
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.verification.evidence import Evidence
+from splatnode.recon.verification.causes import why_wide
+from splatnode.recon.verification.checks import Case
 
 
-def accepted(graph: ViewGraph, registration: Registration, evidence: Evidence, exposure_ratio: float) -> Verdict:
-    """OK where all frames were placed; else what the others show. From `exposure_ratio` on, a change of light is noted.
+def accepted(case: Case) -> Verdict:
+    """OK where all frames were placed, exactly; else what the others show, or how roughly they are placed."""
+    left_out = _left_out(case)
+    rough = _rough(case)
+    if rough:
+        return Verdict(Code.OK_ROUGH, f"{_placed(case)}, roughly: {rough}.", _sharper(case), left_out, publishable=True)
+    return _partial(case, left_out) if left_out else _all_placed(case)
 
-    The ratio is between the brightest and the darkest exposure.
-    """
-    names = [keyframe.name for keyframe in graph.keyframes]
-    placed = {camera.index for camera in registration.cameras}
-    missing = [i for i in range(len(names)) if i not in placed]
-    if not missing:
-        return _all_placed(evidence, exposure_ratio)
-    left_out = tuple(names[i] for i in missing)
-    summary = f"{len(placed)} of {len(names)} frames were placed"
+
+def _left_out(case: Case) -> tuple[str, ...]:
+    placed = {camera.index for camera in case.registration.cameras}
+    return tuple(name for index, name in enumerate(case.graph.names) if index not in placed)
+
+
+def _placed(case: Case) -> str:
+    placed, count = len(case.registration.cameras), len(case.graph.keyframes)
+    return f"All {count} frames were placed" if placed == count else f"{placed} of {count} frames were placed"
+
+
+def _rough(case: Case) -> str:
+    """What is known less well than an exact scene knows it; empty where nothing is."""
+    if case.exact:
+        return ""
+    worst = case.worst
+    return (
+        f"positions are known to {worst.centre_percent:.2g} % of the distance to the scene "
+        f"({case.travel_percent:.2g} % of how far the camera moved), directions to {worst.rotation_deg:.2g} degrees, "
+        f"the focal length to {worst.focal_percent:.2g} %"
+    )
+
+
+def _sharper(case: Case) -> str:
+    """What would make a rough scene exact: the remedy of the cause that made it rough."""
+    return why_wide(case).advice
+
+
+def _partial(case: Case, left_out: tuple[str, ...]) -> Verdict:
+    graph, summary = case.graph, _placed(case)
+    names, placed = graph.names, {camera.index for camera in case.registration.cameras}
     apart = [part for part in graph.components() if not placed & set(part)]
     if any(len(part) > 1 for part in apart):
         return Verdict(
@@ -33,7 +59,7 @@ def accepted(graph: ViewGraph, registration: Registration, evidence: Evidence, e
             left_out,
             publishable=True,
         )
-    if len(apart) == len(missing) == 1 and len(placed) > 3:
+    if len(apart) == len(left_out) == 1 and len(placed) > 3:
         return Verdict(
             Code.OUTLIER_VIEW,
             f"{summary}; {left_out[0]} shows nothing of what the others show.",
@@ -43,23 +69,23 @@ def accepted(graph: ViewGraph, registration: Registration, evidence: Evidence, e
         )
     return Verdict(
         Code.OK_PARTIAL,
-        f"{summary}; {len(missing)} share too little with them.",
+        f"{summary}; {len(left_out)} share too little with them.",
         f"Add a photograph between the others and {left_out[0]}.",
         left_out,
         publishable=True,
     )
 
 
-def _all_placed(evidence: Evidence, exposure_ratio: float) -> Verdict:
-    count = len(evidence.cameras)
-    gains = {camera.name: camera.gain for camera in evidence.cameras}  # finite, for `undetermined` let them pass
+def _all_placed(case: Case) -> Verdict:
+    exposure_ratio, cameras = case.config.exposure_ratio, case.evidence.cameras
+    gains = {camera.name: camera.gain for camera in cameras}  # finite, for `undetermined` let them pass
     ratio = max(gains.values()) / min(gains.values())
     if ratio <= exposure_ratio:
-        return Verdict(Code.OK, f"All {count} frames were placed.", "", (), publishable=True)
+        return Verdict(Code.OK, f"{_placed(case)}.", "", (), publishable=True)
     limit = exposure_ratio**0.5
     return Verdict(
         Code.EXPOSURE_SHIFT,
-        f"All {count} frames were placed; the brightest is exposed {ratio:.1f} times as much as the darkest.",
+        f"{_placed(case)}; the brightest is exposed {ratio:.1f} times as much as the darkest.",
         "Lock exposure and white balance.",
         tuple(name for name, gain in gains.items() if not 1 / limit < gain < limit),
         publishable=True,

@@ -75,17 +75,12 @@ def _too_few(names: list[str], rejected: Sequence[Rejected], config: Config) -> 
 
 
 def _no_motion(graph: ViewGraph, config: Config) -> Verdict | None:
-    """The camera stood still, or only turned, or all that it saw is a plane."""
+    """The camera stood still, or only turned."""
     still = [pair for pair, view in graph.pairs.items() if _motion_px(graph, pair, view) < config.static_px]
     if len(still) == len(graph.pairs):
         return refuse(refusals.ONLY_COPIES, _names(graph, still))
     turned = _pure_rotations(graph)
-    if len(turned) >= config.turned_share * len(graph.pairs):
-        return _without_parallax(graph, turned)
-    flat = [
-        pair for pair, view in graph.pairs.items() if view.num_homography >= config.planar_share * len(view.matches)
-    ]
-    return refuse(refusals.PLANAR, _names(graph, flat)) if len(flat) == len(graph.pairs) else None
+    return _without_parallax(graph, turned) if len(turned) >= config.turned_share * len(graph.pairs) else None
 
 
 def _doubted_focal(graph: ViewGraph, config: Config) -> Verdict | None:

@@ -5,29 +5,70 @@ A limit is asked so that NaN refuses: "not (value <= limit)", never "value > lim
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.register import Registration
+from splatnode.recon.result.bounds import Bounds, widest
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.verification import refusals
+from splatnode.recon.verification.claims import claims, travel_percent
 from splatnode.recon.verification.config import Config
 from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.lens import FreedLens
+from splatnode.recon.verification.models import Numbers
 from splatnode.recon.verification.refusals import refuse
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
-    """Registered poses, and what there is to decide about them with."""
+class Judged:
+    """What is known of registered poses, and the numbers to judge it by."""
 
-    graph: ViewGraph
-    registration: Registration
     evidence: Evidence
     config: Config
+    numbers: Numbers
+
+    @cached_property
+    def bounds(self) -> Mapping[str, Bounds]:
+        """Of each camera's errors, by its name."""
+        return claims(self.evidence, self.numbers.claims)
+
+    @property
+    def worst(self) -> Bounds:
+        """The widest bound of each kind. Raises ValueError where there is no camera."""
+        found = widest(self.bounds.values())
+        if found is None:
+            raise ValueError("there must be a camera to be judged")
+        return found
+
+    @property
+    def travel_percent(self) -> float:
+        """The widest bound of a centre, of how far the camera moved."""
+        return travel_percent(self.bounds, self.evidence)
+
+    @property
+    def exact(self) -> bool:
+        """Whether what is known is as good as a right answer; else it is rough."""
+        worst, config = self.worst, self.config
+        return (
+            worst.rotation_deg <= config.exact_rotation_deg
+            and worst.focal_percent <= config.exact_focal_percent
+            and self.travel_percent <= config.exact_travel_percent
+        )
+
+    @property
+    def known(self) -> bool:
+        """Whether the bounds are narrow enough for anything to be done with the cameras."""
+        worst, config = self.worst, self.config
+        return (
+            worst.rotation_deg <= config.max_rotation_deg
+            and worst.centre_percent <= config.max_centre_percent
+            and self.travel_percent <= config.max_travel_percent
+        )
 
     @property
     def names(self) -> list[str]:
@@ -35,7 +76,15 @@ class Case:
         return [camera.name for camera in self.evidence.cameras]
 
 
-def given_focal(case: Case) -> Verdict | None:
+@dataclass(frozen=True, eq=False)
+class Case(Judged):
+    """Registered poses, and where they come from."""
+
+    graph: ViewGraph
+    registration: Registration
+
+
+def given_focal(case: Judged) -> Verdict | None:
     """The photographs contradict a focal length that came with them."""
     doubted = [freed for freed in case.evidence.freed if _contradicted(freed, case.config)]
     if not doubted:
@@ -53,7 +102,7 @@ def _contradicted(freed: FreedLens, config: Config) -> bool:
     return not (change <= config.nominal_change or held_back <= config.held_back)
 
 
-def distortion(case: Case) -> Verdict | None:
+def distortion(case: Judged) -> Verdict | None:
     """The lens distorts the picture by more than registration found."""
     found, config = case.evidence.distortion, case.config
     if found.cost_ratio >= config.focal_gain or found.corner_shift <= config.corner_shift:
@@ -61,15 +110,24 @@ def distortion(case: Case) -> Verdict | None:
     return refuse(refusals.DISTORTED, case.names, further=100 * found.corner_shift)
 
 
-def weakest_link(case: Case) -> Verdict | None:
+def moving_plane(case: Judged) -> Verdict | None:
+    """All that fits is one plane, and much does not fit with it: a flat thing that moves before what stands still."""
+    evidence, config = case.evidence, case.config
+    explained = evidence.inlier_ratio > config.moving_inlier_ratio
+    if evidence.flatness < config.moving_flatness or (explained and np.isfinite(evidence.flatness)):
+        return None
+    return refuse(refusals.MOVING, case.names, inliers=100 * evidence.inlier_ratio)
+
+
+def weakest_link(case: Judged) -> Verdict | None:
     """Two groups of frames share almost no points."""
     link = case.evidence.weakest_link
     if link.shared_points >= case.config.min_link_points:
         return None
-    return _apart([case.graph.keyframes[index].name for index in link.smaller_part])
+    return _apart(link.smaller_part)
 
 
-def disconnected(case: Case) -> Verdict | None:
+def disconnected(case: Judged) -> Verdict | None:
     """Only contradicted matches join some frames to most of the others."""
     return _apart(case.evidence.disconnected) if case.evidence.disconnected else None
 
@@ -78,7 +136,7 @@ def _apart(frames: Sequence[str]) -> Verdict:
     return refuse(refusals.APART, frames, count=len(frames))
 
 
-def mirrored_photographs(case: Case) -> Verdict | None:
+def mirrored_photographs(case: Judged) -> Verdict | None:
     """Some photographs match the others better when they are turned left to right."""
     found = case.evidence.reflection
     if found.gain <= case.config.max_reflection:
@@ -86,33 +144,9 @@ def mirrored_photographs(case: Case) -> Verdict | None:
     return refuse(refusals.MIRRORED_PHOTOGRAPHS, found.frames, count=len(found.frames))
 
 
-def viewing_angle(case: Case) -> Verdict | None:
-    """Points are seen from almost the same direction by all frames."""
-    return None if case.evidence.median_angle_deg >= case.config.min_angle_deg else too_close(case)
-
-
-def focal_sigma(case: Case) -> Verdict | None:
-    """The observations leave a focal length open."""
-    sigma = case.evidence.focal_sigma
-    if sigma <= case.config.max_focal_sigma:
+def required(case: Judged) -> Verdict | None:
+    """The centres are known less well than the user requires."""
+    needed = case.config.require_percent
+    if needed is None or case.worst.centre_percent <= needed:
         return None
-    return refuse(refusals.UNCERTAIN_FOCAL, case.names, sigma=100 * sigma)
-
-
-def too_close(case: Case) -> Verdict:
-    """The positions are too uncertain: because the camera turned instead of moving, or moved too little."""
-    evidence, config, pairs = case.evidence, case.config, case.graph.pairs.values()
-    matches = sum(len(view.matches) for view in pairs)
-    turned = sum(view.num_rotation for view in pairs) / max(1, matches)
-    if not turned <= config.explained_by_turning:
-        found = f"a turn explains {100 * turned:.0f} % of all matches"
-        return refuse(refusals.NO_PARALLAX, case.names, found=found)
-    if sum(view.num_homography for view in pairs) > config.explained_by_plane * matches:
-        return refuse(refusals.PLANAR, case.names)
-    return refuse(
-        refusals.TOO_CLOSE,
-        case.names,
-        centre=100 * evidence.centre_rel,
-        rotation_deg=evidence.rotation_deg,
-        angle_deg=evidence.median_angle_deg,
-    )
+    return refuse(refusals.ROUGHER, case.names, found=case.worst.centre_percent, needed=needed)

@@ -7,18 +7,28 @@ import msgspec
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Before registration: frames and their pairs.
-    min_cameras: int = 3  # with fewer, an unknown focal length cannot be told from the motion
+    min_cameras: int = 2
     min_features: int = 150  # of a frame; those with fewer show too little texture
     static_px: float = 1.0  # median motion of a pair's matches at REFERENCE_SIDE; below it the camera stood still
     turned_share: float = 0.8  # of the pairs without parallax, from which on the camera has only turned
-    planar_share: float = 0.9  # of a pair's matches on one plane; a facade with its relief reaches 0.84
     voted_change: float = 0.15  # of log focal, between a given one and the pairs' vote, where nothing could be placed
 
     # After registration: limits that decide by themselves.
     min_link_points: int = 20  # that hold two parts together; mirror images share 3, the loosest right answer 62
     max_reflection: float = 0.4  # gain of a group of frames when mirrored; right answers reach 0.25, mirrored frames 1
-    min_angle_deg: float = 1.5  # median of the points' widest viewing angles
-    max_focal_sigma: float = 0.1  # of log focal; right up to 0.073, wrong from 0.13
+    # A flat thing that moves: facades, and meadows from afar, have 98 % of their points on one plane; a bare facade's
+    # poses explain 85 % of its matches, those of a flat thing that moves 81 %.
+    moving_flatness: float = 0.99
+    moving_inlier_ratio: float = 0.845
+    # Bounds beyond which nothing is known that a robot could use, and a scene is refused.
+    max_rotation_deg: float = 10.0
+    max_centre_percent: float = 15.0  # of the distance to the scene
+    max_travel_percent: float = 50.0  # of how far the camera moved: beyond, its depth is a guess
+    # Bounds within which a scene is exact, which are those of a right answer; beyond, it is rough and says so.
+    exact_rotation_deg: float = 2.0
+    exact_travel_percent: float = 5.0
+    exact_focal_percent: float = 10.0  # which the distance to the scene is uncertain by, too
+    require_percent: float | None = None  # a centre's bound, of the distance to the scene, that the user needs
     min_log_odds: float = 0.0  # of poses that are published: more likely right than not, after all bounds
 
     # Given lenses: doubted when freeing them lowers the cost to `focal_gain` and changes them by more than this.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,26 +25,32 @@ class Spread:
     lets them show.
     """
 
-    rotation_deg: float
-    centre_rel: float  # relative to the spread of the centres
+    rotation_deg: tuple[float, ...]  # of each camera, after the best common rotation
+    centre: tuple[float, ...]  # of each camera, after the best similarity, in the unit of the world
     focal_rel: float
 
 
 def by_regions(fit: refit.Fit) -> Spread:
     """The spread when quarters of the points are left out: columns, rows, corners and depths in turn."""
     whole = refit.adjusted(fit)
-    squared = []
+    rotations, centres, focals = [], [], []
     for groups in _groupings(fit.problem):
         moved = [
-            refit.shift(whole, refit.adjusted(refit.without_points(whole, groups == group))) for group in range(GROUPS)
+            refit.moved(whole, refit.adjusted(refit.without_points(whole, groups == group))) for group in range(GROUPS)
         ]
-        squared.append(
-            np.sum([[m.rotation_deg**2, m.centre_rel**2, m.focal_rel**2] for m in moved], axis=0)
-            * (GROUPS - 1)
-            / GROUPS
-        )
-    rotation, centre, focal = np.sqrt(np.mean(squared, axis=0))
-    return Spread(float(rotation), float(centre), float(focal))
+        rotations.append(_variance([each.rotation_deg for each in moved]))
+        centres.append(_variance([each.centre for each in moved]))
+        focals.append(_variance([np.array([each.focal_rel]) for each in moved]))
+    return Spread(
+        rotation_deg=tuple(np.sqrt(np.mean(rotations, axis=0)).tolist()),
+        centre=tuple(np.sqrt(np.mean(centres, axis=0)).tolist()),
+        focal_rel=float(np.sqrt(np.mean(focals))),
+    )
+
+
+def _variance(changes: Sequence[Array]) -> Array:
+    """(C,) of what leaving out one group after the other changes."""
+    return np.square(changes).sum(0) * (GROUPS - 1) / GROUPS
 
 
 def _groupings(problem: bundle.Problem) -> Iterator[npt.NDArray[np.int64]]:

@@ -5,17 +5,18 @@ from __future__ import annotations
 from splatnode.capture import quality
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.verification import refusals
-from splatnode.recon.verification.checks import Case, too_close
-from splatnode.recon.verification.likelihood import Odds, weigh
+from splatnode.recon.verification.causes import why_wide
+from splatnode.recon.verification.checks import Case
+from splatnode.recon.verification.likelihood import weigh
 from splatnode.recon.verification.refusals import refuse
 
 
 def odds(case: Case) -> Verdict | None:
-    """The evidence speaks against the poses together, or against one of them."""
-    found = weigh(case.evidence)
-    if found.total >= case.config.min_log_odds and not found.doubtful:
+    """The evidence speaks against the poses."""
+    found = weigh(case.evidence, case.numbers.claims, case.numbers.odds)
+    if found.total >= case.config.min_log_odds:
         return None
-    return _wrong_frames(case) or _wrong_poses(case, found)
+    return _wrong_frames(case) or _wrong_poses(case, found.against)
 
 
 def _wrong_frames(case: Case) -> Verdict | None:
@@ -35,20 +36,25 @@ def _wrong_frames(case: Case) -> Verdict | None:
     return None
 
 
-def _wrong_poses(case: Case, found: Odds) -> Verdict:
+def _wrong_poses(case: Case, against: str) -> Verdict:
     """What speaks most against the poses."""
-    names, evidence = case.names, case.evidence
-    if found.total >= case.config.min_log_odds:
-        return refuse(refusals.UNCONFIRMED, found.doubtful, count=len(found.doubtful))
-    if found.against == "plane":
-        return refuse(refusals.MOVING, names, inliers=100 * evidence.inlier_ratio)
-    if found.against == "mirror":
-        return refuse(refusals.MIRRORED_IN_DEPTH, names)
-    if found.against == "inlier_ratio":
-        weakest = min(evidence.cameras, key=lambda camera: camera.inlier_ratio)
-        frames = found.doubtful or (weakest.name,)
-        return refuse(refusals.CONTRADICTING, frames, inliers=100 * evidence.inlier_ratio)
-    return too_close(case)
+    cameras = case.evidence.cameras
+    if against == "mirrored_cost":
+        return refuse(refusals.MIRRORED_IN_DEPTH, case.names)
+    if against == "reflection":
+        mirrored = case.evidence.reflection.frames
+        return refuse(refusals.MIRRORED_PHOTOGRAPHS, mirrored, count=len(mirrored))
+    if against == "flat_patch":
+        smallest = min(cameras, key=lambda camera: camera.coverage)
+        percent = 100 * smallest.coverage
+        return refuse(refusals.FLAT_PATCH, (smallest.name,), name=smallest.name, percent=percent)
+    if against in ("confirmed", "patches"):
+        weakest = min(cameras, key=lambda camera: (camera.confirmed, camera.patches.sigmas))
+        return refuse(refusals.UNCONFIRMED, (weakest.name,), name=weakest.name, points=weakest.confirmed)
+    if against in ("rotation_bound", "travel_bound"):
+        return why_wide(case)
+    weakest = min(cameras, key=lambda camera: camera.inlier_ratio)
+    return refuse(refusals.CONTRADICTING, (weakest.name,), inliers=100 * case.evidence.inlier_ratio)
 
 
 def _through_other_lenses(case: Case) -> list[str]:

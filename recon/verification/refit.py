@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
-from splatnode.recon.geometry import align_cameras
+from splatnode.recon.geometry import align_cameras, angles_deg, umeyama
 from splatnode.recon.registration import bundle, tracks
 from splatnode.recon.registration.register import Registration
 
@@ -20,6 +20,7 @@ FREE_SIGMA = 0.3  # of log focal where nothing is known: one sigma is a factor o
 ROBUST_FACTOR = 3.0  # width of the Cauchy loss over the median error
 ROBUST_PX = (0.4, 1.5)  # least and most width of the Cauchy loss, pixels at REFERENCE_SIDE
 MIN_COST = 1e-12  # pixels squared: a smaller cost counts as this one where ratios are taken; made-up data have none
+MIN_FOR_CENTRES = 3  # cameras whose centres alone fix a similarity; those of two leave a turn about their line open
 MIN_SPREAD = 1e-12  # of centres, as MIN_COST: all in one place
 
 
@@ -99,6 +100,13 @@ def adjusted(start: Fit) -> Fit:
     return replace(start, problem=bundle.adjust(start.problem, start.prior, start.loss))
 
 
+def noise_px(of: Fit) -> float:
+    """The standard deviation of one component of an observation's error, pixels of the lens; never 0."""
+    scale = float(np.median(of.scale))
+    median = float(np.median(bundle.reprojection_errors(of.problem))) / scale
+    return scale * bundle.noise_px(len(of.problem.pixels), len(of.problem.points), median)
+
+
 def without_points(start: Fit, left_out: npt.NDArray[np.bool_]) -> Fit:
     """The same with the points `left_out` (P,) taken away."""
     problem = start.problem
@@ -129,6 +137,31 @@ class Shift:
     rotation_deg: float  # the largest change of a relative rotation
     centre_rel: float  # RMS change of the centres after the best similarity, relative to their spread
     focal_rel: float  # the largest change of a focal length, of its logarithm
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """How far each camera has moved from one fit to another."""
+
+    rotation_deg: Array  # (C,) after the best common rotation
+    centre: Array  # (C,) after the best similarity, in the unit of the first fit
+    focal_rel: float  # as in `Shift`
+
+
+def moved(before: Fit, after: Fit) -> Moved:
+    """Farther than any limit, and finite, where one of the two has come to nothing."""
+    Ts_before, Ts_after = before.Ts_world_camera, after.Ts_world_camera
+    count = len(Ts_before)
+    if not (np.isfinite(Ts_before).all() and np.isfinite(Ts_after).all()):
+        return Moved(np.full(count, LOST.rotation_deg), np.full(count, LOST.centre_rel), LOST.focal_rel)
+    common = align_cameras(Ts_after, Ts_before)
+    centres, target = Ts_after[:, :3, 3], Ts_before[:, :3, 3]
+    onto = umeyama(centres, target) if count >= MIN_FOR_CENTRES else common
+    return Moved(
+        rotation_deg=angles_deg(common.rotation @ Ts_after[:, :3, :3], Ts_before[:, :3, :3]),
+        centre=np.linalg.norm(onto(centres) - target, axis=1),
+        focal_rel=float(np.abs(before.problem.log_focals - after.problem.log_focals).max()),
+    )
 
 
 LOST = Shift(rotation_deg=180.0, centre_rel=1e3, focal_rel=10.0)  # farther than any limit, and finite

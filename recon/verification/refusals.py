@@ -13,7 +13,7 @@ from splatnode.recon.result.verdict import Code, Verdict
 
 @dataclass(frozen=True)
 class Refusal:
-    """One entry: `message` is a template of `str.format`, whose fields the caller of `refuse` names."""
+    """One entry: `message` and `advice` are templates of `str.format`, whose fields the caller of `refuse` names."""
 
     code: Code
     message: str
@@ -22,7 +22,7 @@ class Refusal:
 
 def refuse(refusal: Refusal, frames: Sequence[str], **values: object) -> Verdict:
     """The verdict that there is no scene, about the frames of these names. Raises KeyError for a field left open."""
-    return Verdict(refusal.code, refusal.message.format(**values), refusal.advice, tuple(frames))
+    return Verdict(refusal.code, refusal.message.format(**values), refusal.advice.format(**values), tuple(frames))
 
 
 _STEADIER = "Hold the camera still for each photograph, or give it more light."
@@ -86,8 +86,9 @@ DISTORTED = Refusal(
 )
 UNCERTAIN_FOCAL = Refusal(
     Code.FOCAL_SUSPECT,
-    "The focal length is uncertain by {sigma:.0f} %.",
-    "Give the camera's calibration, or photograph from further to the side instead of only forwards.",
+    "The focal length is known to {focal:.0f} % only, which leaves the positions open to {centre:.0f} % of the "
+    "distance to the scene and the directions to {rotation:.0f} degrees.",
+    "Give the camera's calibration, or add photographs that look at the scene from other directions.",
 )
 MIXED_CAMERAS = Refusal(
     Code.MIXED_CAMERAS,
@@ -106,13 +107,19 @@ CONTRADICTING = Refusal(
 )
 UNCONFIRMED = Refusal(
     Code.AMBIGUOUS,
-    "{count} frames could stand elsewhere: too little of them is confirmed by two others.",
-    "Add photographs between those named and their neighbours.",
+    "{name} could stand elsewhere: only {points} of its points are confirmed by two others.",
+    "Add a photograph between {name} and its neighbours.",
 )
 MOVING = Refusal(
     Code.MOVING_SCENE,
     "One flat thing fits, and the rest does not fit with it ({inliers:.0f} % of the matches): it may have moved.",
     "Wait until nothing moves in the picture, or keep what moves out of it.",
+)
+FLAT_PATCH = Refusal(
+    Code.MOVING_SCENE,
+    "What {name} shares with the others is one flat thing that fills {percent:.0f} % of its picture: it may hang or "
+    "stand elsewhere, as posters, screens and vehicles do.",
+    "Keep it out of the picture, or let more of what stands still into {name}.",
 )
 MIRRORED_IN_DEPTH = Refusal(
     Code.AMBIGUOUS,
@@ -126,9 +133,26 @@ MIRRORED_PHOTOGRAPHS = Refusal(
 )
 TOO_CLOSE = Refusal(
     Code.BASELINE_TOO_SMALL,
-    "The positions are uncertain by {centre:.1f} % of their distances, the directions by {rotation_deg:.1f} degrees; "
-    "points are seen under {angle_deg:.1f} degrees.",
+    "Points are seen under {angle:.1f} degrees only: positions are uncertain by {travel:.0f} % of how far the camera "
+    "moved, directions by {rotation:.1f} degrees.",
     "Move further to the side between photographs: about a tenth of the distance to the scene.",
+)
+FEW_SHARED_POINTS = Refusal(
+    Code.NO_OVERLAP,
+    "{name} shares only {points} points with two others at once: its position is open to {centre:.0f} % of the "
+    "distance to the scene, its direction to {rotation:.0f} degrees.",
+    "Add a photograph between {name} and {partner}.",
+)
+SCATTERED = Refusal(
+    Code.AMBIGUOUS,
+    "Parts of the photographs disagree about {name}: its position is open to {centre:.0f} % of the distance to the "
+    "scene, its direction to {rotation:.0f} degrees.",
+    "Add a photograph beside {name}, and keep out of the picture what moves, shines or repeats.",
+)
+ROUGHER = Refusal(
+    Code.TOO_ROUGH,
+    "Positions are known to {found:.2g} % of the distance to the scene; {needed:g} % were required.",
+    "Add photographs between those that are there, give the camera's calibration, or require less.",
 )
 DIVERGED = Refusal(  # the losses over the photographs that the scene began with and that it ended with
     Code.DIVERGED,

@@ -8,16 +8,18 @@ from dataclasses import replace
 import cv2
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
+from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.inliers import pooled_ratio
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.verification import (
     cycles,
     epipolar_consistency,
+    errors,
     exposure,
     flatness,
-    jackknife,
     lens,
     refit,
     reflection,
@@ -25,10 +27,14 @@ from splatnode.recon.verification import (
     weakest_link,
 )
 from splatnode.recon.verification.epipolar_consistency import Picture
+from splatnode.recon.verification.errors import PoseErrors
 from splatnode.recon.verification.evidence import CameraEvidence, Evidence
 from splatnode.recon.verification.reflection import Reflection
 
-MIN_SIGMA = 1e-9  # degrees, or of the spread of the centres: smaller ones count as this where ratios are taken
+Array = npt.NDArray[np.float64]
+
+OUTSIDE = 0.03  # share of a camera's points on each side that the box of its coverage leaves out: wrong matches
+MIN_MATCHES = 60  # of a pair whose homography says something: fewer are explained by chance
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -41,30 +47,32 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def verify(
     graph: ViewGraph, registration: Registration | None, config: Config, pause: Callable[[], None] = lambda: None
 ) -> Evidence | None:
-    """Numbers for and against `registration`; None where it has fewer than three cameras, which confirm nothing.
+    """Numbers for and against `registration`; None where it has fewer than two cameras.
 
     `pause` is called between the sources of evidence; it may raise to abandon the work.
     """
-    if registration is None or len(registration.cameras) < 3:
+    if registration is None or len(registration.cameras) < 2:
         return None
     fit = refit.fit(graph.keyframes, registration, config.tracks_per_camera)
+    sizes = errors.measure(fit, registration)
+    pause()
     registered = [camera.index for camera in registration.cameras]
     views = pictures(graph, registration, config.epipolar_consistency, registered)
-    cameras = _of_cameras(graph, registration, views, config, views)
+    cameras = _of_cameras(graph, registration, views, config, sizes.cameras)
     pause()
     return Evidence(
         cameras=cameras,
         inlier_ratio=inlier_ratio(graph, registration, None),
-        weakest_link=weakest_link.measure(registration, graph.pairs, views, config.epipolar_consistency),
+        weakest_link=weakest_link.measure(registration, graph.names, graph.pairs, views, config.epipolar_consistency),
         disconnected=_disconnected(graph, registration),
         reflection=_reflection(graph, registration, config.reflection),
         flatness=flatness.share_on_plane(registration.points),
-        spread=jackknife.by_regions(fit),
         mirrored_cost=reversal.mirrored_cost(fit),
         cycles=cycles.measure(graph.keyframes, registration, graph.pairs, config.cycles),
         median_angle_deg=registration.median_angle_deg,
         rms_px=registration.rms_px,
-        focal_sigma=registration.focal_sigma,
+        focal=sizes.focal,
+        travel=errors.travel(registration),
         freed=lens.freed(fit),
         distortion=lens.distortion(fit),
     )
@@ -91,35 +99,29 @@ def verify_further(graph: ViewGraph, registration: Registration, known: Evidence
     dense = config.epipolar_consistency
     partners = (epipolar_consistency.partners(index, names, registration, dense.partners) for index in further)
     views = pictures(graph, registration, dense, further.union(*partners))
-    measured = {camera.name: camera for camera in _of_cameras(graph, registration, views, config, further)}
-    sharper = [
-        (
-            before[names[camera.index]].rotation_sigma_deg / max(camera.rotation_sigma_deg, MIN_SIGMA),
-            before[names[camera.index]].centre_sigma_rel / max(camera.centre_sigma_rel, MIN_SIGMA),
-        )
-        for camera in registration.cameras
-        if names[camera.index] in before
-    ]
-    sharper_rotation, sharper_centre = np.minimum(1.0, np.median(sharper, axis=0))
+    known_errors = {index: before[name].errors for index, name in names.items() if name in before}
+    sizes = errors.continued(registration, known_errors)
+    of_further = {index: sizes[index] for index in further}
+    measured = {camera.name: camera for camera in _of_cameras(graph, registration, views, config, of_further)}
     return replace(
         known,
         cameras=tuple(
             replace(
                 measured.get(names[camera.index]) or before[names[camera.index]],
                 inlier_ratio=inlier_ratio(graph, registration, camera.index),
-                rotation_sigma_deg=float(sharper_rotation * camera.rotation_sigma_deg),
-                centre_sigma_rel=float(sharper_centre * camera.centre_sigma_rel),
+                errors=sizes[camera.index],
             )
             for camera in registration.cameras
         ),
         inlier_ratio=inlier_ratio(graph, registration, None),
-        weakest_link=weakest_link.measure(registration, graph.pairs, views, config.epipolar_consistency),
+        weakest_link=weakest_link.measure(registration, graph.names, graph.pairs, views, config.epipolar_consistency),
         disconnected=_disconnected(graph, registration),
         reflection=reflection.strongest([known.reflection, *reflections]),
         flatness=flatness.share_on_plane(registration.points),
         median_angle_deg=registration.median_angle_deg,
         rms_px=registration.rms_px,
-        focal_sigma=float(np.maximum(known.focal_sigma, registration.focal_sigma)),
+        focal=replace(known.focal, sigma=float(np.maximum(known.focal.sigma, registration.focal_sigma))),
+        travel=errors.travel(registration),
     )
 
 
@@ -128,9 +130,10 @@ def _of_cameras(
     registration: Registration,
     views: Mapping[int, Picture],
     config: Config,
-    asked: Collection[int],
+    sizes: Mapping[int, PoseErrors],
 ) -> tuple[CameraEvidence, ...]:
-    """Of the cameras of the keyframes `asked`."""
+    """Of the cameras that `sizes` has, by keyframe."""
+    by = registration.observed_by
     times_seen = np.bincount(registration.observed_point, minlength=len(registration.points))
     by_third = times_seen[registration.observed_point] >= 3
     confirmed = np.bincount(registration.observed_by[by_third], minlength=len(graph.keyframes))
@@ -141,14 +144,29 @@ def _of_cameras(
             name=graph.keyframes[camera.index].name,
             inlier_ratio=inlier_ratio(graph, registration, camera.index),
             confirmed=int(confirmed[camera.index]),
+            coverage=coverage(graph.keyframes[camera.index], registration.observed_pixels[by == camera.index]),
+            flat_share=flat_share(graph, camera.index),
             gain=gains[camera.index],
             patches=epipolar_consistency.in_partners(camera.index, views, registration, config.epipolar_consistency),
-            rotation_sigma_deg=camera.rotation_sigma_deg,
-            centre_sigma_rel=camera.centre_sigma_rel,
+            errors=sizes[camera.index],
         )
         for camera in registration.cameras
-        if camera.index in asked
+        if camera.index in sizes
     )
+
+
+def coverage(keyframe: Keyframe, pixels: Array) -> float:
+    """The share of the picture in the box that holds all of `pixels` (M, 2), but for a few on each side."""
+    if len(pixels) == 0:
+        return 0.0
+    least, most = np.quantile(pixels, (OUTSIDE, 1.0 - OUTSIDE), axis=0)
+    return float(np.prod((most - least) / (keyframe.frame.width, keyframe.frame.height)))
+
+
+def flat_share(graph: ViewGraph, index: int) -> float:
+    """The largest share of a pair's matches that one homography explains, of the pairs of the keyframe `index`."""
+    of_camera = (pair for key, pair in graph.pairs.items() if index in key and len(pair.matches) >= MIN_MATCHES)
+    return max((pair.num_homography / len(pair.matches) for pair in of_camera), default=0.0)
 
 
 def _reflection(graph: ViewGraph, registration: Registration, config: reflection.Config) -> Reflection:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,22 +22,28 @@ MAX_PAIRS_SCORED = 3  # pairs across the link in which patches are looked for, t
 class WeakestLink:
     """Two places that a few chance matches connect are each right by themselves: only what connects them tells."""
 
-    smaller_part: tuple[int, ...]  # its keyframes, by position
+    smaller_part: tuple[str, ...]  # its keyframes, by name
     shared_points: int  # of the pairs of frames across the link, summed
     matches: int  # of the verified pairs across it
     inliers: float  # of these, how many the poses explain
     patches: epipolar_consistency.Score  # across it
 
+    @property
+    def inlier_ratio(self) -> float:
+        """Of the matches across it; 0 without any."""
+        return float(self.inliers / np.maximum(1, self.matches))  # NaN where one of them is
+
 
 def measure(
     registration: Registration,
+    names: Sequence[str],
     pairs: Mapping[tuple[int, int], TwoView],
     pictures: Mapping[int, epipolar_consistency.Picture],
     config: epipolar_consistency.Config,
 ) -> WeakestLink:
     """What connects the two parts into which the cameras fall without the last edge of the maximum spanning tree.
 
-    Patches across it are looked for in what there is of `pictures`.
+    Patches across it are looked for in what there is of `pictures`. `names` are those of all keyframes.
     """
     indices = [camera.index for camera in registration.cameras]
     shared = shared_points(registration)
@@ -51,7 +57,7 @@ def measure(
     ]
     verified = [key for i, j in across if (key := (min(i, j), max(i, j))) in registration.inlier_ratios]
     return WeakestLink(
-        smaller_part=tuple(sorted(min(one, other, key=len))),
+        smaller_part=tuple(names[index] for index in sorted(min(one, other, key=len))),
         shared_points=int(sum(shared[pair] for pair in across)),
         matches=sum(len(pairs[key].matches) for key in verified),
         inliers=sum(registration.inlier_ratios[key] * len(pairs[key].matches) for key in verified),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.config import Config
-from splatnode.recon.estimation import PROVISIONAL
+from splatnode.recon.estimation import PROVISIONAL, continued
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.incremental import IncrementalReconstruction, Known
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -66,9 +66,19 @@ def test_a_further_keyframe_is_accepted_provisionally_and_then_for_good(graph):
     assert soon.verdict.publishable and soon.verdict.provisional and PROVISIONAL in soon.verdict.message
     assert [camera.name for camera in soon.evidence.cameras] == graph.names
     assert work.proven == set(graph.names[:3])
+    claimed = soon.bounds
     thorough = work.estimate_thoroughly()
+    for name, bounds in thorough.bounds.items():
+        assert bounds.rotation_deg <= claimed[name].rotation_deg
+        assert bounds.centre_percent <= claimed[name].centre_percent
+        assert bounds.focal_percent <= claimed[name].focal_percent
     assert thorough.publishable and not thorough.verdict.provisional and work.proven == set(graph.names)
     assert work.estimate_soon() is thorough
+
+
+def test_two_keyframes_are_no_start_for_a_quick_estimate(graph):
+    pair = holding(first(graph, 2)).estimate_soon()
+    assert len(pair.graph.keyframes) == 2 and continued(pair, first(graph, 3), Config()) is None
 
 
 def test_a_mirrored_photograph_is_not_accepted_provisionally(graph):

@@ -213,13 +213,36 @@ def test_budgets():
     assert all(fall and 0.05 <= float(fall[1]) - float(fall[2]) < 0.15 for fall in falls)
 
 
+def test_windows():
+    summary = raw("windows")["summary"]
+    titles = {"splatnode": "splatnode", "colmap": "COLMAP", "glomap": "GLOMAP"}
+    for method, title in titles.items():
+        found = summary[method]["all"]
+        counts = [found[kind] for kind in ("right", "right_part", "between", "wrong", "refused")]
+        says(f"| {title} | {' | '.join(map(str, counts))} |")
+    says(f"Of {summary['splatnode']['all']['sets']} windows")
+    judged = raw("fit")
+    many, pairs = (judged[kind]["cross_validated"] for kind in ("many", "pair"))
+    windows, by_count = many["windows"], many["windows_by_count"]
+    says(f"it publishes {windows['right_published']} of {windows['right']} such sets (`fit.json`)")
+    says(f"hold for {windows['rotations_within']:.0%} of".replace("%", " %"))
+    says(f"{windows['centres_within']:.0%} of their centres".replace("%", " %"))
+    shares = [
+        f"{by_count[n]['rotations_within']:.0%} and {by_count[n]['centres_within']:.0%}" for n in ("3", "6", "12")
+    ]
+    three, six, twelve = (share.replace("% and", "and").replace("%", " %") for share in shares)
+    says(f"{three} at 3 views, {six} at 6, {twelve} at 12")
+    says(f"in {pairs['windows']['right_published']} of {pairs['windows']['right']} sets")
+    assert pairs["windows"]["beyond"] == 0 and windows["beyond"] == 1
+
+
 def test_trust():
     poses = raw("poses")
     total, rows = poses["summary"], poses["rows"]
-    assert total["published"] == total["right"] and not total["false_accepts"]
     scenes = len({row["scene"] for row in rows})
     says(f"Of {total['sets']} sets of 3, 6 and 12 views from {scenes} real scenes with known cameras")
-    says(f"{total['published']} were published, all of them right within 2° and 1.5 %")
+    says(f"{total['published']} were published, {total['right']} of them right within 2° and 5 %")
+    says(f"and {len(total['false_accepts'])} beyond its claim")
     stages = ("features", "matching", "mapping", "verification")
     seconds = [
         median(sum(row[f"seconds_{stage}"] for stage in stages) for row in rows if row["views"] == views)
@@ -232,18 +255,16 @@ def test_trust():
 
 def test_stability():
     found = raw("stability")
-    trials, (summary,) = found["trials"], found["methods"]
-    assert summary["false_accept"]["count"] == 0
+    trials = [trial for trial in found["trials"] if trial["method"] == "splatnode"]
+    summary = found["methods"][0]
     kinds, seeds = len({trial["name"] for trial in trials}), len({trial["seed"] for trial in trials})
-    says(
-        f"Of {len(trials)} trials of the stability matrix (`stability.json`, "
-        f"{kinds} kinds of trials with {seeds} seeds) none published"
-    )
+    says(f"Of {len(trials)} trials of the stability matrix (`stability.json`, {kinds} kinds of")
+    says(f"trials with {seeds} seeds)")
+    says(f"{summary['false_accept']['count']} published a scene beyond its claim")
     low, high = found["false_accept_interval"]
-    says(f"({low:.0%} to {high:.1%} with 95 % confidence)".replace("%", " %", 2).replace("0 % to", "0 to"))
+    says(f"({low:.1%} to {high:.1%} with 95 % confidence)".replace("%", " %", 2).replace("0.0 % to", "0 to"))
     refused = [trial for trial in trials if trial["outcome"] == "false_refuse"]
     says(f"In {len(refused)} of the {summary['false_refuse']['of']} trials that deserved a scene there was none")
-    says(f"in {sum(trial['verdict'] == 'BASELINE_TOO_SMALL' for trial in refused)} of them because the centres")
 
 
 def test_live():

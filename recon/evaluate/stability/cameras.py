@@ -72,7 +72,8 @@ def two_views(sampler: Sampler) -> Case:
     gap = 1 if sampler.seed % 2 else max(1, (len(place.names) - 1) // 3)
     start = int(sampler.rng.integers(len(place.names) - gap))
     note = f"{gap} apart in the order of capture"
-    return either(place.photos([start, start + gap]), note, Code.TOO_FEW_VIEWS, Code.BASELINE_TOO_SMALL)
+    codes = (Code.TOO_FEW_VIEWS, Code.BASELINE_TOO_SMALL, Code.FOCAL_SUSPECT, Code.NO_OVERLAP, Code.PLANAR_ONLY)
+    return either(place.photos([start, start + gap]), note, *codes)
 
 
 @row(6, "tiny baseline")

@@ -53,6 +53,11 @@ class CameraError:
             and self.spread_pct < RIGHT_SPREAD_PCT
         )
 
+    @property
+    def far(self) -> bool:
+        """Beyond 5 degrees or 10 % of the distance."""
+        return self.rotation_deg > GROSS_ROTATION_DEG or (self.centre_pct or 0.0) > GROSS_CENTRE_PCT
+
     def wrong(self, rough: bool) -> bool:
         """Beyond 2.5 times a bound; or beyond 5 degrees or 10 % of the distance without a word that it is rough.
 
@@ -62,7 +67,7 @@ class CameraError:
             return True
         if self.bounds is None:
             return self.rotation_deg > GROSS_ROTATION_DEG or self.spread_pct > GROSS_CENTRE_PCT
-        if not rough and (self.rotation_deg > GROSS_ROTATION_DEG or self.centre_pct > GROSS_CENTRE_PCT):
+        if not rough and self.far:
             return True
         return any(error > BOUNDS_WIDENED * bound + _ROUNDING for error, bound in self.claimed().values())
 

@@ -10,7 +10,6 @@ from splatnode.recon.config import Config
 from splatnode.recon.estimation import Estimate
 from splatnode.recon.registration.register import register
 from splatnode.recon.result.snapshot import CameraEstimate
-from splatnode.recon.verification.likelihood import record
 from splatnode.recon.verification.verify import verify
 
 
@@ -22,11 +21,6 @@ def registered(estimate: Estimate, config: Config) -> Estimate:
     return replace(
         estimate, registration=registration, evidence=verify(estimate.graph, registration, config.verification)
     )
-
-
-def evidence_record(estimate: Estimate) -> dict[str, object] | None:
-    """The evidence for the registration and what it amounts to; None where there is nothing to verify."""
-    return None if estimate.evidence is None else record(estimate.evidence)
 
 
 def cameras_of(estimate: Estimate) -> tuple[CameraEstimate, ...]:

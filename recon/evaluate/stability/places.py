@@ -14,9 +14,9 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Intrinsics
-from splatnode.recon.evaluate.camera_errors import angles_deg
 from splatnode.recon.evaluate.demo import write_capture
 from splatnode.recon.evaluate.truth import EvaluationScene, TrueCamera, load_scene
+from splatnode.recon.geometry import angles_deg
 
 T = TypeVar("T")
 Image = npt.NDArray[np.uint8]

@@ -17,7 +17,7 @@ from splatnode.recon.evaluate.stability.case import Case, Measured
 from splatnode.recon.evaluate.stability.claim import ROUGH, CameraError
 from splatnode.recon.evaluate.stability.methods import by_name
 from splatnode.recon.evaluate.stability.outcome import Outcome, compare, outcome
-from splatnode.recon.evaluate.stability.own_cameras import cameras_of, evidence_record, registered
+from splatnode.recon.evaluate.stability.own_cameras import cameras_of, registered
 from splatnode.recon.pipeline import estimate_frames
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import CameraEstimate
@@ -137,7 +137,7 @@ def _work(case: Case, method: str) -> Answer:
     cameras, evidence = snapshot.cameras, snapshot.evidence
     if method == "splatnode" and not snapshot.verdict.publishable:
         estimate = registered(estimate_frames(case.source(), case.config, Clock())[0], case.config)
-        cameras, evidence = cameras_of(estimate), evidence_record(estimate)
+        cameras, evidence = cameras_of(estimate), estimate.evidence_record
     return Answer(
         verdict=snapshot.verdict,
         cameras=cameras,

@@ -7,13 +7,11 @@ import pytest
 import torch
 
 from splatnode.recon.evaluate.camera_errors import (
-    angles_deg,
     ate_instantsplat,
     camera_errors,
     centre_error_pct,
-    umeyama,
 )
-from splatnode.recon.geometry import Similarity, exp_se3
+from splatnode.recon.geometry import Similarity, angles_deg, exp_se3, umeyama
 
 
 def motion(seed: int, size: float = 1.0) -> np.ndarray:

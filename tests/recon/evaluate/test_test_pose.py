@@ -7,9 +7,8 @@ import pytest
 import torch
 
 from splatnode.recon.evaluate.appearance import Splats
-from splatnode.recon.evaluate.camera_errors import angles_deg
 from splatnode.recon.evaluate.test_pose import find_test_pose
-from splatnode.recon.geometry import exp_se3
+from splatnode.recon.geometry import angles_deg, exp_se3
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.preview import render_rgb
 from splatnode.recon.result.snapshot import GaussianArrays

@@ -29,7 +29,7 @@ NAMES = graph_of(4).names
 
 def estimate(code: Code, cameras: int) -> Estimate:
     """With a camera for each of the first keyframes of four."""
-    publishable = code in (Code.OK, Code.OK_PARTIAL)
+    publishable = code in (Code.OK, Code.OK_PARTIAL, Code.OK_ROUGH)
     verdict = Verdict(code, "So it is.", "", () if publishable else tuple(NAMES), publishable)
     evidence: Any = SimpleNamespace()
     return Estimate(graph_of(4), registration_of(cameras), evidence, verdict)
@@ -135,6 +135,17 @@ def test_an_answer_that_contradicts_the_accepted_one_is_not_better():
         turned = replace(first, T_world_camera=T_world_camera)
         other = replace(whole, registration=replace(whole.registration, cameras=(turned, *others)))
         assert better(partial, other) is (other if kept == "other" else partial)
+
+
+def test_a_rough_answer_of_weak_matches_is_not_taken(estimated):
+    estimated(estimate(Code.OK_ROUGH, 4))
+    assert climb(NO_OVERLAP, rung("a")).verdict.code is Code.NO_OVERLAP
+
+
+def test_what_a_few_cameras_leave_uncertain_may_be_mended_by_more(estimated):
+    pair, answer = estimate(Code.FOCAL_SUSPECT, 2), estimate(Code.OK, 4)
+    estimated(answer)
+    assert climb(pair, rung("a")) is answer
 
 
 def test_an_accepted_camera_is_not_given_up_for_two_others():

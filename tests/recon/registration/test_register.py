@@ -15,7 +15,6 @@ from splatnode.recon.matching import config as matching
 from splatnode.recon.matching import features
 from splatnode.recon.matching.match import match
 from splatnode.recon.registration import bundle, register
-from splatnode.recon.verification import decision
 from tests.support.synthetic import photographs, renumbered, view_graph
 
 
@@ -33,7 +32,7 @@ def test_the_lens_of_a_frame_that_is_left_out_makes_no_focal_length_uncertain():
 
 @pytest.mark.parametrize("variance", [-1e-6, np.nan, np.inf])
 def test_a_focal_length_without_a_variance_is_infinitely_uncertain(monkeypatch, variance):
-    """The verdict's limit on the focal length's sigma refuses infinity; NaN would pass it."""
+    """The verdict refuses what is not finite."""
     graph = view_graph(photographs()[:3])
     covariance = bundle.covariance
 
@@ -44,7 +43,6 @@ def test_a_focal_length_without_a_variance_is_infinitely_uncertain(monkeypatch, 
     monkeypatch.setattr(bundle, "covariance", broken)
     registration = register.register(graph.keyframes, graph.pairs, register.Config())
     assert registration is not None and registration.focal_sigma == np.inf
-    assert registration.focal_sigma > decision.Config().max_focal_sigma
 
 
 def test_the_robots_own_body_in_the_picture_is_not_what_moves():

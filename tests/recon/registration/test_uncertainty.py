@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.recon.evaluate.camera_errors import umeyama
-from splatnode.recon.geometry import Similarity
+from splatnode.recon.geometry import Similarity, umeyama
 from splatnode.recon.registration import bundle, mapper, uncertainty
 from splatnode.recon.registration.register import in_first_camera
 from splatnode.recon.result.bounds import axes_of

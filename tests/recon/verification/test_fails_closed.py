@@ -16,11 +16,13 @@ from splatnode.recon.result.verdict import Code
 from splatnode.recon.verification import flatness, likelihood, refit, reflection, reversal
 from splatnode.recon.verification.checks import Case
 from splatnode.recon.verification.decision import CHECKS, Config, decide
+from splatnode.recon.verification.errors import Errors
 from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.finiteness import not_finite
+from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.lens import FreedLens
 from splatnode.recon.verification.undetermined import WORDS, undetermined
-from tests.recon.verification.test_decision import all_pairs, evidence, graph, registration
+from tests.recon.verification.test_decision import all_pairs, evidence, graph, registration, unsure
 from tests.recon.verification.test_refit import made_up
 
 ALL = (0, 1, 2)
@@ -54,13 +56,17 @@ def with_number(record: Any, path: Path, value: float) -> Any:
     return replace(record, **{first: with_number(getattr(record, first), tuple(rest), value)})
 
 
+def weighed(seen: Evidence) -> likelihood.Odds:
+    return likelihood.weigh(seen, FITTED.many.claims, FITTED.many.odds)
+
+
 EVERY_NUMBER = tuple(numbers_of(Evidence))
 
 
 def test_the_walk_over_types_finds_the_numbers_wherever_they_are():
     for path in (
         ("cameras", 0, "patches", "share"),
-        ("weakest_link", "smaller_part", 0),
+        ("weakest_link", "shared_points"),
         ("freed", 0, "found"),
         ("rms_px",),
     ):
@@ -83,14 +89,14 @@ def test_every_number_of_the_evidence_that_could_not_be_computed_refuses(path, v
 def test_no_limit_lets_a_number_pass_that_could_not_be_computed(path, monkeypatch):
     """Without the check of all numbers, the odds do not hide NaN, and refuse where they have it."""
     monkeypatch.setattr("splatnode.recon.verification.decision.CHECKS", CHECKS[1:])
-    good, odds = (likelihood.weigh(seen) for seen in (GOOD, with_number(GOOD, path, math.nan)))
-    before, after = ([*each.whole.values(), *each.cameras.values()] for each in (good, odds))
+    good, odds = (weighed(seen) for seen in (GOOD, with_number(GOOD, path, math.nan)))
+    before, after = ([*each.terms.values()] for each in (good, odds))
     if before != after:
         given = decide(graph(3, all_pairs(3)), registration(ALL), with_number(GOOD, path, math.nan), Config())
         assert any(math.isnan(piece) for piece in after) and not given.publishable
 
 
-@pytest.mark.parametrize("limited", ["median_angle_deg", "focal_sigma", "mirrored_cost", "flatness", "inlier_ratio"])
+@pytest.mark.parametrize("limited", ["travel", "mirrored_cost", "flatness", "inlier_ratio"])
 def test_every_limit_refuses_nan_by_itself(limited, monkeypatch):
     monkeypatch.setattr("splatnode.recon.verification.decision.CHECKS", CHECKS[1:])
     given = decide(graph(3, all_pairs(3)), registration(ALL), replace(GOOD, **{limited: math.nan}), Config())
@@ -112,10 +118,10 @@ def test_a_pose_that_is_not_a_number_refuses(field, value):
 def test_the_root_of_a_negative_variance_refuses():
     """Registration says infinity where the covariance of a focal length or of a pose came out negative."""
     found = registration(ALL)
-    unsure = replace(found.cameras[2], rotation_sigma_deg=math.inf, centre_sigma_rel=math.inf)
-    found = replace(found, cameras=(*found.cameras[:2], unsure), focal_sigma=math.inf)
-    of_unsure = replace(GOOD.cameras[2], rotation_sigma_deg=math.inf, centre_sigma_rel=math.inf)
-    seen = replace(GOOD, cameras=(*GOOD.cameras[:2], of_unsure), focal_sigma=math.inf)
+    of_third = replace(found.cameras[2], rotation_sigma_deg=math.inf, centre_sigma_rel=math.inf)
+    found = replace(found, cameras=(*found.cameras[:2], of_third), focal_sigma=math.inf)
+    of_unsure = replace(GOOD.cameras[2], errors=unsure(math.inf, math.inf))
+    seen = replace(GOOD, cameras=(*GOOD.cameras[:2], of_unsure), focal=Errors(math.inf, math.inf, math.inf))
     given = decide(graph(3, all_pairs(3)), found, seen, Config())
     assert given.code == Code.UNDETERMINED and given.frames == ("2.png",)
     assert "how certain the focal length is" in given.message and "how certain each pose is" in given.message
@@ -126,7 +132,7 @@ def test_each_field_of_the_evidence_has_words_for_the_user():
 
 
 def test_what_is_finite_is_let_pass():
-    assert undetermined(Case(graph(3, {}), registration(ALL), GOOD, Config())) is None
+    assert undetermined(Case(GOOD, Config(), FITTED.many, graph(3, {}), registration(ALL))) is None
     assert list(not_finite(GOOD)) == []
 
 
@@ -141,7 +147,8 @@ def test_arrays_and_mappings_are_walked_too():
 @pytest.mark.parametrize("value", NOT_FINITE)
 @pytest.mark.parametrize("path", EVERY_NUMBER, ids=lambda path: ".".join(map(str, path)))
 def test_what_is_not_finite_is_none_in_the_report(path, value):
-    written = json.loads(json.dumps(likelihood.record(with_number(GOOD, path, value)), allow_nan=False))
+    broken = with_number(GOOD, path, value)
+    written = json.loads(json.dumps(likelihood.record(broken, weighed(broken)), allow_nan=False))
     found = written
     for step in path:
         found = found[step]

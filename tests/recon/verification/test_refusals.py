@@ -44,7 +44,8 @@ def test_the_table_has_all_entries_that_are_filled_in_anywhere():
 
 @pytest.mark.parametrize("name", ENTRIES)
 def test_every_caller_names_the_fields_of_the_sentence_and_no_others(name):
-    wanted = {field for _, field, _, _ in Formatter().parse(ENTRIES[name].message) if field is not None}
+    text = ENTRIES[name].message + ENTRIES[name].advice
+    wanted = {field for _, field, _, _ in Formatter().parse(text) if field is not None}
     assert CALLS[name]
     assert all(named == wanted for named in CALLS[name])
 
@@ -57,11 +58,12 @@ def test_every_entry_is_a_code_a_sentence_and_an_advice(name):
 
 
 def test_an_entry_that_is_filled_in_is_a_verdict_without_a_scene():
-    given = refuse(refusals.UNCERTAIN_FOCAL, ["a.png"], sigma=12.4)
-    assert given.code == Code.FOCAL_SUSPECT and given.frames == ("a.png",) and not given.publishable
-    assert given.message == "The focal length is uncertain by 12 %." and given.advice
-    with pytest.raises(KeyError, match="sigma"):
-        refuse(refusals.UNCERTAIN_FOCAL, ["a.png"])
+    given = refuse(refusals.FEW_SHARED_POINTS, ["a.png"], name="a.png", points=3, partner="b.png", centre=9, rotation=2)
+    assert given.code == Code.NO_OVERLAP and given.frames == ("a.png",) and not given.publishable
+    assert given.message.startswith("a.png shares only 3 points with two others at once")
+    assert given.advice == "Add a photograph between a.png and b.png."
+    with pytest.raises(KeyError, match="needed"):
+        refuse(refusals.ROUGHER, ["a.png"], found=1.0)
 
 
 def test_whether_all_was_computed_is_asked_first():

@@ -33,6 +33,7 @@ class Plan:
     per_kind: int = 2  # windows of each scene, count and stride, at most
     counts: tuple[int, ...] = COUNTS
     seed: int = 0  # of the draw of the windows
+    given_lens: bool = False  # splatnode is told the true intrinsics, as of a calibrated camera
     fresh: bool = False  # measures each window's seconds from photographs on, too
     timeout_s: float = 120.0  # of a rival on one window
     config: Config = field(default_factory=Config)
@@ -83,7 +84,7 @@ def read_rows(path: Path) -> list[Row]:
 
 def _answers(place: Place, todo: Sequence[tuple[str, Window]], plan: Plan) -> Iterator[tuple[str, Window, Answer]]:
     mine = [window for method, window in todo if method == OURS]
-    for window, answer in ours.answers(place, mine, plan.config, plan.fresh):
+    for window, answer in ours.answers(place, mine, plan.config, plan.fresh, plan.given_lens):
         yield OURS, window, answer
     others = [(method, window) for method, window in todo if method != OURS]
     if others:
@@ -98,6 +99,7 @@ def _content(rows: Sequence[Row], plan: Plan, command: str) -> bytes:
         "command": command,
         "machine": this_machine(),
         "seed": plan.seed,
+        "given_lens": plan.given_lens,
         "summary": summarise(rows),
         "rows": [{**asdict(row), "right": row.right, "found": row.found.value} for row in rows],
     }

@@ -24,7 +24,14 @@ def windows(args: argparse.Namespace) -> int:
     methods = args.methods or default_methods()
     for method in methods:
         by_name(method)
-    plan = Plan(methods, per_kind=args.per_kind, fresh=args.fresh, timeout_s=args.timeout_s)
+    plan = Plan(
+        methods,
+        per_kind=args.per_kind,
+        counts=args.counts,
+        given_lens=args.given_lens,
+        fresh=args.fresh,
+        timeout_s=args.timeout_s,
+    )
     rows = run_windows(plan, loaded_places(args.scenes, args.out), args.out, shlex.join(["splatnode", *sys.argv[1:]]))
     drawn = _drawn(args.out, rows)
     for line in report_lines(rows):

@@ -6,10 +6,10 @@ import time
 import traceback
 from collections.abc import Iterator, Sequence
 
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.config import Config
 from splatnode.recon.estimation import Estimate, estimate_cameras
-from splatnode.recon.evaluate.stability.own_cameras import cameras_of, evidence_record, registered
+from splatnode.recon.evaluate.stability.own_cameras import cameras_of, registered
 from splatnode.recon.evaluate.stability.places import Place
 from splatnode.recon.evaluate.stability.windows.row import Answer
 from splatnode.recon.evaluate.stability.windows.store import matched
@@ -22,13 +22,18 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.preparation import load_prior, prepare
 
 
-def answers(place: Place, windows: Sequence[Window], config: Config, fresh: bool) -> Iterator[tuple[Window, Answer]]:
-    """One answer a window, in their order. An exception is an answer, too: the others are asked all the same."""
+def answers(
+    place: Place, windows: Sequence[Window], config: Config, fresh: bool, given_lens: bool = False
+) -> Iterator[tuple[Window, Answer]]:
+    """One answer a window, in their order; `given_lens`: the true intrinsics come with the photographs.
+
+    An exception is an answer, too: the others are asked all the same.
+    """
     prior = load_prior(config)
     known: dict[str, Keyframe] = {}
     store = ViewGraph(config.matching)
     for window in windows:
-        frames = frames_of(place, window)
+        frames = frames_of(place, window, given_lens)
         try:
             kept, _, rejected = screen_all(frames, config.screening)
             for frame in kept:
@@ -44,10 +49,22 @@ def answers(place: Place, windows: Sequence[Window], config: Config, fresh: bool
         yield window, answer
 
 
-def frames_of(place: Place, window: Window) -> list[Frame]:
-    """The photographs; their ids are their positions in the scene. Nothing is known about the camera."""
-    positions = [place.names.index(name) for name in window.names]
-    return [Frame(i, place.names[i], i, place.scene.image(place.names[i]), None) for i in positions]
+def frames_of(place: Place, window: Window, given_lens: bool = False) -> list[Frame]:
+    """The photographs; their ids are their positions in the scene.
+
+    Nothing is known about the camera, or with `given_lens` its true intrinsics.
+    """
+    frames = []
+    for name in window.names:
+        index, image = place.names.index(name), place.scene.image(name)
+        intrinsics = _true_intrinsics(place, name, image.shape[1], image.shape[0]) if given_lens else None
+        frames.append(Frame(index, name, index, image, intrinsics))
+    return frames
+
+
+def _true_intrinsics(place: Place, name: str, width: int, height: int) -> Intrinsics:
+    K = place.scene.cameras[name].K_for(width, height)
+    return Intrinsics(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], "given")
 
 
 def from_scratch(frames: Sequence[Frame], config: Config) -> Estimate:
@@ -64,4 +81,4 @@ def _fresh_seconds(frames: Sequence[Frame], config: Config) -> float:
 
 
 def _answer(estimate: Estimate, seconds: float, fresh_seconds: float | None) -> Answer:
-    return Answer(estimate.verdict, cameras_of(estimate), seconds, fresh_seconds, evidence_record(estimate))
+    return Answer(estimate.verdict, cameras_of(estimate), seconds, fresh_seconds, estimate.evidence_record)

@@ -16,7 +16,7 @@ logger = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 
-COUNTS = (3, 6, 12)
+COUNTS = (3, 6, 12)  # of photographs
 STRIDES = (1, 2, 3, 4)
 _PARALLEL = 1e-6  # smallest eigenvalue of the sum over axes of I - d d^T: below, the axes have no nearest point
 

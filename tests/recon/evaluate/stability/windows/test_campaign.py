@@ -77,7 +77,7 @@ def test_what_is_on_the_disk_is_not_run_again(tmp_path, monkeypatch):
     places = three_places(tmp_path).walked[:1]
     asked = []
 
-    def answers(place, windows, config, fresh):
+    def answers(place, windows, config, fresh, given_lens):
         for window in windows:
             asked.append(window)
             refusal = Verdict(Code.NO_OVERLAP, "Nothing.", "")

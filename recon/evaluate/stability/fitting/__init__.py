@@ -1,0 +1,1 @@
+"""The numbers of the verdict, found from raw results (windows.json, stability.json)."""

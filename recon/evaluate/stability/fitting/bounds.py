@@ -1,0 +1,109 @@
+"""The models of the 95 % bounds: a line between the logarithms of what the sources say and of the errors found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import lsq_linear
+
+from splatnode.recon.evaluate.stability.fitting.samples import Sample
+from splatnode.recon.verification.claims import MIN_INLIER_RATIO, BoundModel, ClaimModel
+from splatnode.recon.verification.errors import Errors
+
+Array = npt.NDArray[np.float64]
+
+# Of the errors that are fitted: a little more than the 95 % that are claimed, for further scenes differ.
+QUANTILE = 0.955
+RIDGE = 1e-3  # penalty of squared powers, for each camera: where two sources say the same, both count alike
+NEGLIGIBLE = 1e-6  # a smaller power is 0
+# Errors are not told from these: true cameras are no better known. Degrees, of the distance, of log focal.
+FLOORS = {"rotation": 0.1, "centre": 2e-4, "focal": 2e-3}
+
+
+@dataclass(frozen=True)
+class _Line:
+    """One camera's error and what was said of it."""
+
+    scene: str
+    error: float
+    errors: Errors
+    inlier_ratio: float
+    link: float
+    count: int
+
+
+def fit(samples: Sequence[Sample]) -> ClaimModel:
+    """From registrations that are not grossly wrong, each scene with the square root of its number of cameras."""
+    usable = [sample for sample in samples if not sample.gross]
+    return ClaimModel(
+        rotation=_fitted(_lines(usable, "rotation"), FLOORS["rotation"]),
+        centre=_fitted(_lines(usable, "centre"), FLOORS["centre"], link=True),
+        focal=_fitted(_lines(usable, "focal"), FLOORS["focal"], profile=True),
+    )
+
+
+def _lines(samples: Sequence[Sample], kind: str) -> list[_Line]:
+    lines = []
+    for sample in samples:
+        count, link = len(sample.evidence.cameras), sample.evidence.weakest_link.inlier_ratio
+        for camera in sample.evidence.cameras:
+            found = sample.errors[camera.name]
+            if kind == "rotation":
+                lines.append(
+                    _Line(sample.scene, found.rotation_deg, camera.errors.rotation, camera.inlier_ratio, link, count)
+                )
+            elif kind == "centre":
+                centre = (found.centre_pct or 0.0) / 100.0
+                lines.append(_Line(sample.scene, centre, camera.errors.centre, camera.inlier_ratio, link, count))
+            else:
+                focal = float(np.abs(np.log1p(max(found.focal_pct, -99.0) / 100.0)))
+                lines.append(_Line(sample.scene, focal, sample.evidence.focal, 1.0, 1.0, count))
+    return lines
+
+
+def _fitted(lines: Sequence[_Line], floor: float, profile: bool = False, link: bool = False) -> BoundModel:
+    """The powers, then the quantile of what is left.
+
+    More of a source never narrows a bound, and more explained matches never widen it. The profile counts if `profile`
+    (it bounds rotations and centres from below as it is), the weakest link if `link`.
+    """
+    scenes = np.array([line.scene for line in lines])
+    weights = np.array([1.0 / np.sqrt((scenes == scene).sum()) for scene in scenes])
+    wanted = np.log(np.hypot([line.error for line in lines], floor / 3.0))
+    varies = len({line.count for line in lines}) > 1
+    used = {"sigma": True, "regions": True, "profile": profile, "inlier_ratio": True, "link": link, "count": varies}
+    columns = np.array([_logarithms(line, floor) for line in lines])
+    columns = columns * np.array([float(each) for each in used.values()])
+    design = np.column_stack([np.ones(len(lines)), columns])
+    least = np.array([-np.inf, 0.0, 0.0, 0.0, -np.inf, -np.inf, -np.inf])
+    most = np.array([np.inf, np.inf, np.inf, np.inf, 0.0, 0.0, np.inf])
+    root = np.sqrt(weights)
+    ridge = np.sqrt(RIDGE * weights.sum()) * np.eye(design.shape[1])
+    ridge[0] = 0.0  # of the powers, not of the factor
+    powers = lsq_linear(
+        np.vstack([design * root[:, None], ridge]), np.concatenate([wanted * root, np.zeros(len(ridge))]), (least, most)
+    ).x
+    powers[1:][~np.array(list(used.values()))] = 0.0
+    powers = np.where(np.abs(powers) < NEGLIGIBLE, 0.0, powers)
+    factor = np.exp(powers[0] + _quantile(wanted - design @ powers, weights, QUANTILE))
+    found = dict(zip(used, powers[1:], strict=True))
+    return BoundModel(**{name: float(f"{n:.3g}") for name, n in {"factor": factor, "floor": floor, **found}.items()})
+
+
+def _logarithms(line: _Line, floor: float) -> list[float]:
+    sources = (line.errors.sigma, line.errors.regions, line.errors.profile)
+    shares = (_log_share(line.inlier_ratio), _log_share(line.link))
+    return [*(float(np.log(np.hypot(each, floor))) for each in sources), *shares, float(np.log(line.count))]
+
+
+def _log_share(inlier_ratio: float) -> float:
+    return float(np.log(max(inlier_ratio, MIN_INLIER_RATIO)))
+
+
+def _quantile(values: Array, weights: Array, share: float) -> float:
+    order = np.argsort(values)
+    below = np.cumsum(weights[order]) / weights.sum()
+    return float(values[order][min(int(np.searchsorted(below, share)), len(values) - 1)])

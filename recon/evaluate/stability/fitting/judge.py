@@ -1,0 +1,51 @@
+"""What the verdict would be of a sample under other numbers, by the checks that ask the evidence alone."""
+
+from __future__ import annotations
+
+from splatnode.recon.evaluate.stability.claim import BOUNDS_WIDENED
+from splatnode.recon.evaluate.stability.fitting.samples import Sample
+from splatnode.recon.verification.checks import Judged
+from splatnode.recon.verification.config import Config
+from splatnode.recon.verification.decision import LIMITS
+from splatnode.recon.verification.finiteness import not_finite
+from splatnode.recon.verification.likelihood import weigh
+from splatnode.recon.verification.models import Numbers
+
+
+def judged(sample: Sample, numbers: Numbers) -> Judged:
+    return Judged(sample.evidence, Config(), numbers)
+
+
+def passes_limits(sample: Sample, numbers: Numbers) -> bool:
+    """Whether nothing refuses it but the odds."""
+    case = judged(sample, numbers)
+    if sample.stood_still:
+        return False
+    finite = not any(not_finite(sample.evidence))
+    return finite and all(check(case) is None for check in LIMITS) and case.known
+
+
+def published(sample: Sample, numbers: Numbers) -> bool:
+    odds = weigh(sample.evidence, numbers.claims, numbers.odds)
+    return odds.total >= Config().min_log_odds and passes_limits(sample, numbers)
+
+
+def wrong(sample: Sample, numbers: Numbers) -> bool:
+    """Grossly wrong; or not right, and beyond the claim."""
+    return sample.gross or (not sample.right and beyond_claim(sample, numbers))
+
+
+def beyond_claim(sample: Sample, numbers: Numbers) -> bool:
+    """Beyond 2.5 times a bound; or beyond 5 degrees or 10 % of the distance, and said to be exact."""
+    if not sample.together:
+        return True
+    case = judged(sample, numbers)
+    for name, error in sample.errors.items():
+        bounds = case.bounds[name]
+        if error.centre_pct is None or (case.exact and error.far):
+            return True
+        found = (error.rotation_deg, error.centre_pct, abs(error.focal_pct))
+        claimed = (bounds.rotation_deg, bounds.centre_percent, bounds.focal_percent)
+        if any(one > BOUNDS_WIDENED * other for one, other in zip(found, claimed, strict=True)):
+            return True
+    return False

@@ -1,0 +1,81 @@
+"""The odds: a logistic regression of right against wrong, whose slopes have the sign that their measure must have."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize
+
+from splatnode.recon.evaluate.stability.fitting.judge import passes_limits, wrong
+from splatnode.recon.evaluate.stability.fitting.samples import Sample
+from splatnode.recon.verification.claims import ClaimModel
+from splatnode.recon.verification.likelihood import OddsModel, Term, measures
+from splatnode.recon.verification.models import Numbers
+
+Array = npt.NDArray[np.float64]
+
+# Of the slopes: whether more of a measure speaks for the poses, or against them.
+FOR = (
+    "inlier_ratio",
+    "camera_inlier_ratio",
+    "link_inlier_ratio",
+    "link_points",
+    "coverage",
+    "confirmed",
+    "patches",
+    "mirrored_cost",
+)
+AGAINST = ("flat_patch", "reflection", "directions", "rotation_bound", "travel_bound")
+SIGNS = {**dict.fromkeys(FOR, 1), **dict.fromkeys(AGAINST, -1)}
+WRONG_WEIGHT = 4.0  # of a wrong registration beside a right one: there are fewer, and each counts more
+RIDGE = 0.02  # penalty of squared slopes (in standard deviations), for each registration and slope
+MARGIN = 0.5  # nats by which the best wrong registration stays refused: others are made elsewhere
+
+
+def fit(samples: Sequence[Sample], claim_model: ClaimModel) -> OddsModel:
+    """The prior is such that no wrong registration is published whose scene was left out when it was judged."""
+    claims_alone = Numbers(claim_model, OddsModel(0.0, {}))
+    known = [sample for sample in samples if sample.right or wrong(sample, claims_alone)]
+    table = np.array([[measures(sample.evidence, claim_model)[name] for name in SIGNS] for sample in known])
+    right = np.array([sample.right for sample in known])
+    scenes = np.array([sample.scene for sample in known])
+    limits = np.array([passes_limits(sample, claims_alone) for sample in known])
+    left_out = np.zeros(len(known))
+    for scene in np.unique(scenes):
+        rest = scenes != scene
+        left_out[~rest] = _total(_regression(table[rest], right[rest]), table[~rest])
+    whole = _regression(table, right)
+    doubted = left_out[~right & limits]
+    highest = float(doubted.max()) if len(doubted) else 0.0
+    return OddsModel(float(f"{whole.prior - max(0.0, highest + MARGIN):.3g}"), whole.terms)
+
+
+def _regression(table: Array, right: npt.NDArray[np.bool_]) -> OddsModel:
+    names = list(SIGNS)
+    typical, scale = table[right].mean(0), table.std(0) + 1e-9
+    design = np.column_stack([np.ones(len(table)), (table - typical) / scale])
+    weights = np.where(right, 1.0, WRONG_WEIGHT)
+    target = right.astype(np.float64)
+
+    def loss(slopes: Array) -> tuple[float, Array]:
+        total = design @ slopes
+        penalty = RIDGE * len(table) / len(names)
+        value = float((weights * (np.logaddexp(0.0, total) - target * total)).sum() + penalty * (slopes[1:] ** 2).sum())
+        gradient = design.T @ (weights * (1.0 / (1.0 + np.exp(-total)) - target))
+        gradient[1:] += 2.0 * penalty * slopes[1:]
+        return value, gradient
+
+    limits = [(None, None), *((0.0, None) if SIGNS[name] > 0 else (None, 0.0) for name in names)]
+    found = minimize(loss, np.zeros(1 + len(names)), jac=True, method="L-BFGS-B", bounds=limits).x
+    terms = {
+        name: Term(float(f"{typical[k]:.3g}"), float(f"{found[1 + k] / scale[k]:.3g}")) for k, name in enumerate(names)
+    }
+    return OddsModel(float(found[0]), terms)
+
+
+def _total(model: OddsModel, table: Array) -> Array:
+    """(M,) log odds of rows of measures (M, T), in the order of the terms."""
+    typical = np.array([term.typical for term in model.terms.values()])
+    return model.prior + (table - typical) @ np.array([term.slope for term in model.terms.values()])

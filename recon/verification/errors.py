@@ -1,0 +1,86 @@
+"""How large the errors of cameras may be: what three sources say, each of which is blind to something."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from splatnode.recon.registration.register import Registration
+from splatnode.recon.verification import focal_profile, jackknife, principal_point, refit
+
+MIN_SIGMA = 1e-9  # a smaller one counts as this where ratios are taken
+MIN_TRAVEL = 1e-12  # of the centres, as MIN_SIGMA: all in one place
+
+
+@dataclass(frozen=True)
+class Errors:
+    """The size of one error as each source says it, as one standard error."""
+
+    sigma: float  # the covariance of the bundle adjustment, which takes errors for independent
+    regions: float  # what leaving out regions of the pictures changes (see jackknife.py)
+    profile: float  # what unknown lenses leave open (see focal_profile.py and principal_point.py)
+
+
+@dataclass(frozen=True)
+class PoseErrors:
+    """Of one camera."""
+
+    rotation: Errors  # degrees, after the best common rotation
+    centre: Errors  # after the best similarity; the distance to the scene is 1
+
+
+@dataclass(frozen=True)
+class AllErrors:
+    cameras: Mapping[int, PoseErrors]  # by their keyframes' positions
+    focal: Errors  # of the logarithm of the least certain focal length
+
+
+def measure(fit: refit.Fit, registration: Registration) -> AllErrors:
+    """Of the cameras of `registration`, of which `fit` is a part of the points."""
+    regions, profile, freed = jackknife.by_regions(fit), focal_profile.profile(fit), principal_point.freed(fit)
+    turned, shifted = (profile.rotation_deg, profile.centre)
+    if freed is not None:
+        turned, shifted = np.maximum(turned, freed.rotation_deg), np.maximum(shifted, freed.centre)
+    unit = travel(registration)
+    cameras = {
+        camera.index: PoseErrors(
+            rotation=Errors(camera.rotation_sigma_deg, regions.rotation_deg[i], float(turned[i])),
+            centre=Errors(unit * camera.centre_sigma_rel, regions.centre[i], float(shifted[i])),
+        )
+        for i, camera in enumerate(registration.cameras)
+    }
+    return AllErrors(cameras, Errors(registration.focal_sigma, regions.focal_rel, profile.focal_rel))
+
+
+def travel(registration: Registration) -> float:
+    """RMS distance of the centres from their mean; the distance to the scene is 1."""
+    centres = np.stack([camera.T_world_camera[:3, 3] for camera in registration.cameras])
+    return float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
+
+
+def continued(registration: Registration, known: Mapping[int, PoseErrors]) -> dict[int, PoseErrors]:
+    """Of the cameras of a continuation, quickly, by their keyframes' positions; `known` are those of some of them.
+
+    A continuation aligns no patches, so that its sigmas are too large: they shrink as much as those of the known
+    cameras do. What is known of a camera besides stays. A further camera is taken for the worst of the known ones, and
+    as much worse as its sigma is larger.
+    """
+    unit = travel(registration)
+    rotations = {camera.index: camera.rotation_sigma_deg for camera in registration.cameras}
+    centres = {camera.index: unit * camera.centre_sigma_rel for camera in registration.cameras}
+    of_rotations = _continued(rotations, {index: of.rotation for index, of in known.items()})
+    of_centres = _continued(centres, {index: of.centre for index, of in known.items()})
+    return {index: PoseErrors(of_rotations[index], of_centres[index]) for index in rotations}
+
+
+def _continued(sigmas: Mapping[int, float], known: Mapping[int, Errors]) -> dict[int, Errors]:
+    sharper = min(1.0, float(np.median([of.sigma / max(sigmas[index], MIN_SIGMA) for index, of in known.items()])))
+    largest = Errors(*(max(getattr(of, part) for of in known.values()) for part in ("sigma", "regions", "profile")))
+    found = {}
+    for index, sigma in sigmas.items():
+        worse = max(1.0, sharper * sigma / max(largest.sigma, MIN_SIGMA))
+        was = known.get(index) or Errors(sharper * sigma, worse * largest.regions, worse * largest.profile)
+        found[index] = replace(was, sigma=sharper * sigma)
+    return found

@@ -1,0 +1,33 @@
+"""What unknown principal points leave open: pictures of another size may be crops, with the lens beside their middle.
+
+A picture that was cut out of a larger one fits nearly as well with its lens behind the middle, from a wrong pose. Among
+pictures of one size and one lens that would show; of one that differs from the others it would not. There the principal
+point is set free, and how far that moves the cameras is how wrong they may be.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from splatnode.recon.frames.keyframe import REFERENCE_SIDE
+from splatnode.recon.verification import refit
+
+FREE_SHIFT = 0.1  # sigma of a free principal point, of the longer side: a crop to half the width moves it so far
+
+
+def freed(fit: refit.Fit) -> refit.Moved | None:
+    """How far the cameras move when the lenses of fewer cameras than the commonest one are set free.
+
+    None where all pictures came through one lens, or every other one came calibrated.
+    """
+    count = len(fit.prior.sigmas)
+    seen_through = np.bincount(fit.problem.lens_of_camera, minlength=count)
+    free = (fit.prior.sigmas > 0) & (np.arange(count) != seen_through.argmax())
+    if not free.any():
+        return None
+    whole = refit.adjusted(fit)
+    sides = np.array([fit.scale[fit.problem.lens_of_camera == lens].max(initial=1.0) for lens in range(count)])
+    sigmas = np.where(free, FREE_SHIFT * REFERENCE_SIDE * sides, 0.0)
+    return refit.moved(whole, refit.adjusted(replace(whole, prior=replace(whole.prior, shift_sigmas=sigmas))))

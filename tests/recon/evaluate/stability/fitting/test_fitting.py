@@ -1,0 +1,99 @@
+"""The fitting on registrations made up: it finds what they were made with, and what it writes is what it found."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatnode.recon.evaluate.stability.claim import CameraError
+from splatnode.recon.evaluate.stability.fitting import bounds, odds
+from splatnode.recon.evaluate.stability.fitting.cross_validation import counts, fitted, left_out, without_each_scene
+from splatnode.recon.evaluate.stability.fitting.judge import beyond_claim, published, wrong
+from splatnode.recon.evaluate.stability.fitting.module import source
+from splatnode.recon.evaluate.stability.fitting.samples import Sample, read
+from splatnode.recon.verification.errors import Errors, PoseErrors
+from splatnode.recon.verification.fitted import FITTED
+from splatnode.recon.verification.models import Fitted
+from tests.recon.verification.test_decision import evidence
+
+RANDOM = np.random.default_rng(0)
+SCENES = ("a", "b", "c", "d", "e")
+RESULTS = Path(__file__).parents[4] / "bench" / "results"
+
+
+def sample(scene: str, inlier_ratio: float = 0.95, far_deg: float = 0.0, count: int = 3) -> Sample:
+    """Errors are drawn from what the sources say, which differs from camera to camera; `far_deg` comes on top."""
+    cameras, errors = {}, {}
+    for index in range(count):
+        rotation = float(np.exp(RANDOM.normal(-2.0, 0.7)))
+        centre = float(np.exp(RANDOM.normal(-6.0, 0.7)))
+        said = PoseErrors(Errors(rotation, rotation, 0.0), Errors(centre, centre, 0.0))
+        cameras[index] = {"errors": said, "inlier_ratio": inlier_ratio}
+        found = rotation * abs(RANDOM.normal()) + far_deg, 100 * centre * abs(RANDOM.normal())
+        errors[f"{index}.png"] = CameraError(f"{index}.png", *found, 5 * found[1], abs(RANDOM.normal()))
+    seen = evidence(tuple(range(count)), cameras, inlier_ratio=inlier_ratio)
+    return Sample(scene, count, True, True, False, seen, errors)
+
+
+@pytest.fixture(scope="module")
+def samples() -> list[Sample]:
+    """In each scene twenty right ones, and two that are turned by 20 degrees while half of their matches disagree."""
+    right = [sample(scene, count=count) for scene in SCENES for count in (3, 6) for _ in range(10)]
+    return right + [sample(scene, inlier_ratio=0.5, far_deg=20.0) for scene in SCENES for _ in range(2)]
+
+
+def test_the_bounds_hold_for_as_many_errors_as_they_should(samples):
+    judged = left_out(samples, without_each_scene(samples))
+    found = counts([pair for pair in judged if pair[0].right])
+    assert found.right_published == found.right and found.beyond == 0
+    assert found.rotations_within is not None and 0.9 <= found.rotations_within <= 0.99
+    assert found.centres_within is not None and 0.9 <= found.centres_within <= 0.99
+
+
+def test_a_bound_grows_with_what_the_sources_say(samples):
+    model = bounds.fit(samples).rotation
+    narrow, wide = (model.of(Errors(size, size, 0.0), 3) for size in (0.2, 2.0))
+    assert 4.0 * narrow < wide
+    assert model.of(Errors(0.2, 0.2, 50.0), 3) == 100.0  # what the focal length leaves open, twice
+
+
+def test_wrong_registrations_are_refused_by_numbers_that_did_not_see_their_scene(samples):
+    numbers = without_each_scene(samples)
+    bad = [each for each in samples if each.gross]
+    assert len(bad) == 10 and not any(published(each, numbers[each.scene]) for each in bad)
+    assert all(wrong(each, numbers[each.scene]) for each in bad)
+
+
+def test_a_measure_never_counts_the_wrong_way(samples):
+    found = odds.fit(samples, bounds.fit(samples)).terms
+    assert set(found) == {*odds.FOR, *odds.AGAINST}
+    assert all(found[name].slope >= 0 for name in odds.FOR) and all(found[name].slope <= 0 for name in odds.AGAINST)
+    assert found["inlier_ratio"].slope > 0 or found["camera_inlier_ratio"].slope > 0
+
+
+def test_cameras_of_two_worlds_are_beyond_every_claim(samples):
+    mixed = replace(samples[0], errors=dict(list(samples[0].errors.items())[:2]))
+    assert not mixed.together and beyond_claim(mixed, fitted(samples))
+
+
+def test_the_module_that_is_written_holds_what_was_found(samples):
+    numbers = fitted(samples)
+    namespace: dict[str, object] = {}
+    exec(compile(source(Fitted(numbers, numbers)), "fitted.py", "exec"), namespace)
+    assert namespace["FITTED"] == Fitted(numbers, numbers)
+
+
+def test_no_number_of_the_verdict_was_typed_in():
+    """recon/verification/fitted.py is what the fitting found from the raw results that are kept."""
+    kept = json.loads((RESULTS / "fit.json").read_text())["numbers"]
+    assert kept == json.loads(json.dumps(asdict(FITTED)))
+
+
+def test_other_files_are_refused(tmp_path):
+    (tmp_path / "bench.json").write_text('{"runs": []}')
+    with pytest.raises(ValueError, match=r"bench\.json must be a windows\.json or a stability\.json"):
+        read([tmp_path / "bench.json"])
