@@ -230,7 +230,7 @@ def test_windows():
     shares = [
         f"{by_count[n]['rotations_within']:.0%} and {by_count[n]['centres_within']:.0%}" for n in ("3", "6", "12")
     ]
-    three, six, twelve = (share.replace("% and", "and").replace("%", " %") for share in shares)
+    three, six, twelve = (share.replace("% and", " and").replace("%", " %") for share in shares)
     says(f"{three} at 3 views, {six} at 6, {twelve} at 12")
     says(f"in {pairs['windows']['right_published']} of {pairs['windows']['right']} sets")
     assert pairs["windows"]["beyond"] == 0 and windows["beyond"] == 1
