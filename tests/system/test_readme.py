@@ -267,6 +267,13 @@ def test_stability():
     says(f"In {len(refused)} of the {summary['false_refuse']['of']} trials that deserved a scene there was none")
 
 
+def test_stability_of_the_rivals():
+    found = {method["method"]: method for method in raw("stability_rivals")["methods"]}
+    wrong = [found[name]["false_accept"]["count"] for name in ("splatnode", "colmap", "glomap")]
+    says(f"Of the {found['glomap']['trials']} kinds with one seed, splatnode published {wrong[0]} wrong scenes")
+    says(f"COLMAP {wrong[1]} and GLOMAP {wrong[2]}")
+
+
 def test_live():
     rows = raw("live")["rows"]
     assert [row["scene"] for row in rows] == ["fox", "llff_flower", "tum_fr3_office"]
