@@ -142,6 +142,11 @@ def umeyama(source: Array, target: Array) -> Similarity:
     return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
 
 
+def spread(points: Array) -> float:
+    """RMS distance of points (M, 3) from their mean."""
+    return float(np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean()))
+
+
 def angles_deg(rotations: Array, others: Array) -> Array:
     """(...,) angles between rotations (..., 3, 3), accurate also where they are tiny."""
     chord = np.linalg.norm(rotations - others, axis=(-2, -1)) / math.sqrt(8.0)

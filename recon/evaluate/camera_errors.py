@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.geometry import align_cameras, angles_deg, umeyama
+from splatnode.recon.geometry import align_cameras, angles_deg, spread, umeyama
 
 Array = npt.NDArray[np.float64]
 
@@ -65,10 +65,10 @@ def centre_error_pct(estimated: Array, true: Array) -> float | None:
 
     None where the true camera does not move.
     """
-    spread = math.sqrt(float(((true - true.mean(0)) ** 2).sum(1).mean()))
-    if spread <= 1e-9 * (1.0 + float(np.abs(true).max())):
+    apart = spread(true)
+    if apart <= 1e-9 * (1.0 + float(np.abs(true).max())):
         return None
-    return 100.0 * _rms_after_umeyama(estimated, true) / spread
+    return 100.0 * _rms_after_umeyama(estimated, true) / apart
 
 
 def ate_instantsplat(Ts_estimated: Array, Ts_true: Array) -> float | None:

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.estimation import Estimate
-from splatnode.recon.geometry import align_cameras
+from splatnode.recon.geometry import align_cameras, angles_deg
 from splatnode.recon.result.verdict import Code
 
 MAX_TURN_DEG = 2.0  # of an accepted camera from one estimate to the other, after the best similarity
@@ -29,9 +29,7 @@ def _turn_deg(one: Estimate, other: Estimate) -> float:
         return 0.0
     source, target = _cameras(one), _cameras(other)
     Ts, others = (np.stack([cameras[name] for name in sorted(one.placed)]) for cameras in (source, target))
-    turned = align_cameras(Ts, others).rotation @ Ts[:, :3, :3]
-    cosines = (np.einsum("cij,cij->c", turned, others[:, :3, :3]) - 1.0) / 2.0
-    return float(np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0))).max())
+    return float(angles_deg(align_cameras(Ts, others).rotation @ Ts[:, :3, :3], others[:, :3, :3]).max())
 
 
 def _cameras(estimate: Estimate) -> dict[str, npt.NDArray[np.float64]]:

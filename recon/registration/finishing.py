@@ -28,7 +28,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robust_range_px: tuple[float, float] = (0.15, 1.5)  # limits of the scale of the robust loss, at REFERENCE_SIDE
     # Errors are not independent: what lens, shutter and scene do otherwise than the model moves whole regions alike.
     # So many observations tell as much as one with an error of its own. With this number, errors of real cameras are
-    # as large as their sigmas say (tests/bench/poses.py).
+    # as large as their sigmas say (tests/bench/quality/poses.py).
     correlated: float = 100.0
     radial_sigma: float = 0.02  # of the radial coefficient of a lens that is not calibrated
     shift_sigma: float = 0.004  # of its principal point, as a share of the longer side

@@ -7,7 +7,7 @@ import msgspec
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Before registration: frames and their pairs.
-    min_cameras: int = 2
+    min_cameras: int = 2  # of a scene
     min_features: int = 150  # of a frame; those with fewer show too little texture
     static_px: float = 1.0  # median motion of a pair's matches at REFERENCE_SIDE; below it the camera stood still
     turned_share: float = 0.8  # of the pairs without parallax, from which on the camera has only turned

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from splatnode.recon.geometry import spread
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.verification import focal_profile, jackknife, principal_point, refit
 
 MIN_SIGMA = 1e-9  # a smaller one counts as this where ratios are taken
-MIN_TRAVEL = 1e-12  # of the centres, as MIN_SIGMA: all in one place
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def measure(fit: refit.Fit, registration: Registration) -> AllErrors:
 def travel(registration: Registration) -> float:
     """RMS distance of the centres from their mean; the distance to the scene is 1."""
     centres = np.stack([camera.T_world_camera[:3, 3] for camera in registration.cameras])
-    return float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()))
+    return spread(centres)
 
 
 def continued(registration: Registration, known: Mapping[int, PoseErrors]) -> dict[int, PoseErrors]:

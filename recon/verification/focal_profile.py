@@ -13,14 +13,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.registration import finishing
 from splatnode.recon.verification import refit
 
 Array = npt.NDArray[np.float64]
 
 STEPS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)  # of log focal, either way; the last is a factor of 1.9
 # Rise of the cost, in units of the variance of an observation, that counts as one standard error. Observations err
-# together: as in registration's covariance, a hundred of them tell as much as one with an error of its own.
-ONE_SIGMA = 100.0
+# together: so many of them tell as much as one with an error of its own, as in registration's covariance.
+ONE_SIGMA = finishing.Config().correlated
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,10 @@ from dataclasses import replace
 import numpy as np
 
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE
+from splatnode.recon.registration import lenses
 from splatnode.recon.verification import refit
 
-FREE_SHIFT = 0.1  # sigma of a free principal point, of the longer side: a crop to half the width moves it so far
+FREE_SHIFT = lenses.Config().free_shift_sigma  # of the longer side, as where frames of several sizes are told apart
 
 
 def freed(fit: refit.Fit) -> refit.Moved | None:

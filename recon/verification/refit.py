@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
-from splatnode.recon.geometry import align_cameras, angles_deg, umeyama
+from splatnode.recon.geometry import align_cameras, angles_deg, spread, umeyama
 from splatnode.recon.registration import bundle, tracks
 from splatnode.recon.registration.register import Registration
 
@@ -38,6 +39,11 @@ class Fit:
     def Ts_world_camera(self) -> Array:
         """(C, 4, 4)"""
         return Ts_world_camera(self.problem)
+
+    @cached_property
+    def minimum(self) -> Fit:
+        """This fit adjusted: found once, for several sources of evidence begin there."""
+        return replace(self, problem=bundle.adjust(self.problem, self.prior, self.loss))
 
     @property
     def cost(self) -> float:
@@ -97,7 +103,7 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
 
 
 def adjusted(start: Fit) -> Fit:
-    return replace(start, problem=bundle.adjust(start.problem, start.prior, start.loss))
+    return start.minimum
 
 
 def noise_px(of: Fit) -> float:
@@ -174,13 +180,11 @@ def shift(before: Fit, after: Fit) -> Shift:
         return LOST
     first, second = np.triu_indices(len(Ts_before), 1)
     relative = [Ts[first, :3, :3].transpose(0, 2, 1) @ Ts[second, :3, :3] for Ts in (Ts_before, Ts_after)]
-    chord = np.linalg.norm(relative[0] - relative[1], axis=(1, 2)) / np.sqrt(8.0)
     moved = align_cameras(Ts_after, Ts_before)
     centres = moved(Ts_after[:, :3, 3])
     target = Ts_before[:, :3, 3]
-    spread = np.sqrt(((target - target.mean(0)) ** 2).sum(1).mean())
     return Shift(
-        rotation_deg=float(np.degrees(2.0 * np.arcsin(np.minimum(chord, 1.0))).max()),
-        centre_rel=float(np.sqrt(((centres - target) ** 2).sum(1).mean()) / max(spread, MIN_SPREAD)),
+        rotation_deg=float(angles_deg(*relative).max()),
+        centre_rel=float(np.sqrt(((centres - target) ** 2).sum(1).mean()) / max(spread(target), MIN_SPREAD)),
         focal_rel=float(np.abs(before.problem.log_focals - after.problem.log_focals).max()),
     )

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.evaluate.camera_errors import CameraErrors, angles_deg, camera_errors, umeyama
+from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
 from splatnode.recon.evaluate.truth import TrueCamera
-from splatnode.recon.geometry import Similarity, align_cameras
+from splatnode.recon.geometry import Similarity, align_cameras, angles_deg, spread, umeyama
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.snapshot import CameraEstimate
 
@@ -32,6 +32,11 @@ class Claim:
     rotation_deg: float
     centre_percent: float  # of the distance to the scene
     focal_percent: float
+
+
+def claim_of(bounds: Bounds) -> Claim:
+    values = bounds.rotation_deg, bounds.centre_percent, bounds.focal_percent
+    return Claim(*(value if math.isfinite(value) else _HUGE for value in values))
 
 
 @dataclass(frozen=True)
@@ -103,8 +108,8 @@ def errors_of(cameras: Sequence[CameraEstimate], truth: Mapping[str, TrueCamera]
     Ts_true = np.stack([camera.T_world_camera for camera in true])
     turned = align_cameras(Ts, Ts_true)
     rotations = angles_deg(turned.rotation @ Ts[:, :3, :3], Ts_true[:, :3, :3])
-    spread = math.sqrt(float(((Ts_true[:, :3, 3] - Ts_true[:, :3, 3].mean(0)) ** 2).sum(1).mean()))
-    moves = spread > 1e-9 * (1.0 + float(np.abs(Ts_true[:, :3, 3]).max()))
+    apart = spread(Ts_true[:, :3, 3])
+    moves = apart > 1e-9 * (1.0 + float(np.abs(Ts_true[:, :3, 3]).max()))
     common = turned if len(cameras) == 2 or not moves else umeyama(Ts[:, :3, 3], Ts_true[:, :3, 3])
     distances = np.linalg.norm(common(Ts[:, :3, 3]) - Ts_true[:, :3, 3], axis=1)
     return tuple(
@@ -112,9 +117,9 @@ def errors_of(cameras: Sequence[CameraEstimate], truth: Mapping[str, TrueCamera]
             name=camera.name,
             rotation_deg=float(rotation),
             centre_pct=_of_distance(float(distance), common) if moves else None,
-            spread_pct=100.0 * float(distance) / spread if moves else None,
+            spread_pct=100.0 * float(distance) / apart if moves else None,
             focal_pct=_focal_pct(camera, one),
-            bounds=None if camera.bounds is None else _claim(camera.bounds),
+            bounds=None if camera.bounds is None else claim_of(camera.bounds),
         )
         for camera, one, rotation, distance in zip(cameras, true, rotations, distances, strict=True)
     )
@@ -146,8 +151,3 @@ def _of_distance(distance: float, similarity: Similarity) -> float:
 def _focal_pct(camera: CameraEstimate, true: TrueCamera) -> float:
     K, K_true = camera.K, true.K_for(camera.width, camera.height)
     return 100.0 * abs(math.sqrt(K[0, 0] * K[1, 1] / (K_true[0, 0] * K_true[1, 1])) - 1.0)
-
-
-def _claim(bounds: Bounds) -> Claim:
-    values = bounds.rotation_deg, bounds.centre_percent, bounds.focal_percent
-    return Claim(*(value if math.isfinite(value) else _HUGE for value in values))

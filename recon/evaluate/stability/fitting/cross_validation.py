@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 from splatnode.recon.evaluate.stability.fitting import bounds, odds
-from splatnode.recon.evaluate.stability.fitting.judge import beyond_claim, judged, published
+from splatnode.recon.evaluate.stability.fitting.judge import beyond_claim, claimed, published
 from splatnode.recon.evaluate.stability.fitting.samples import Sample
+from splatnode.recon.evaluate.stability.windows.summary import KINDS, within
 from splatnode.recon.verification.models import Numbers
 
 
@@ -63,18 +64,18 @@ def report(pairs: Sequence[Judgement]) -> dict[str, object]:
 
 def counts(pairs: Sequence[Judgement]) -> Counts:
     out = [(sample, numbers) for sample, numbers in pairs if published(sample, numbers)]
-    within = [shares for sample, numbers in out for shares in _within(sample, numbers)]
-    means = [sum(share[kind] for share in within) / len(within) if within else None for kind in range(3)]
+    errors = [error for sample, numbers in out for error in claimed(sample, numbers)]
+    shares = {kind: within([error.claimed()[kind] for error in errors if error.claimed()]) for kind in KINDS}
     return Counts(
         sets=len(pairs),
         right=sum(sample.right for sample, _ in pairs),
         right_published=sum(sample.right for sample, _ in out),
         published=len(out),
         beyond=sum(beyond_claim(sample, numbers) for sample, numbers in out),
-        cameras=len(within),
-        rotations_within=means[0],
-        centres_within=means[1],
-        focals_within=means[2],
+        cameras=len(errors),
+        rotations_within=shares["rotation"],
+        centres_within=shares["centre"],
+        focals_within=shares["focal"],
     )
 
 
@@ -92,16 +93,3 @@ def named(sample: Sample) -> Mapping[str, object]:
 
 def _beyond(sample: Sample, numbers: Numbers) -> bool:
     return published(sample, numbers) and beyond_claim(sample, numbers)
-
-
-def _within(sample: Sample, numbers: Numbers) -> list[tuple[bool, bool, bool]]:
-    """Of each camera: whether its rotation, centre and focal length are within their bounds."""
-    bounds = judged(sample, numbers).bounds
-    return [
-        (
-            error.rotation_deg <= bounds[name].rotation_deg,
-            (error.centre_pct or 0.0) <= bounds[name].centre_percent,
-            abs(error.focal_pct) <= bounds[name].focal_percent,
-        )
-        for name, error in sample.errors.items()
-    ]

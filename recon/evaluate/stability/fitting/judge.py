@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from splatnode.recon.evaluate.stability.claim import BOUNDS_WIDENED
+from dataclasses import replace
+
+from splatnode.recon.evaluate.stability.claim import CameraError, claim_of
 from splatnode.recon.evaluate.stability.fitting.samples import Sample
 from splatnode.recon.verification.checks import Judged
 from splatnode.recon.verification.config import Config
@@ -37,15 +39,11 @@ def wrong(sample: Sample, numbers: Numbers) -> bool:
 
 def beyond_claim(sample: Sample, numbers: Numbers) -> bool:
     """Beyond 2.5 times a bound; or beyond 5 degrees or 10 % of the distance, and said to be exact."""
-    if not sample.together:
-        return True
-    case = judged(sample, numbers)
-    for name, error in sample.errors.items():
-        bounds = case.bounds[name]
-        if error.centre_pct is None or (case.exact and error.far):
-            return True
-        found = (error.rotation_deg, error.centre_pct, abs(error.focal_pct))
-        claimed = (bounds.rotation_deg, bounds.centre_percent, bounds.focal_percent)
-        if any(one > BOUNDS_WIDENED * other for one, other in zip(found, claimed, strict=True)):
-            return True
-    return False
+    rough = not judged(sample, numbers).exact
+    return not sample.together or any(error.wrong(rough) for error in claimed(sample, numbers))
+
+
+def claimed(sample: Sample, numbers: Numbers) -> tuple[CameraError, ...]:
+    """The errors, each beside the bounds that these numbers give its camera."""
+    bounds = judged(sample, numbers).bounds
+    return tuple(replace(error, bounds=claim_of(bounds[name])) for name, error in sample.errors.items())

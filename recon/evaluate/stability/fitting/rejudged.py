@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from splatnode.recon.evaluate.stability.claim import ROUGH, Claim
-from splatnode.recon.evaluate.stability.fitting.judge import judged, published
+from splatnode.recon.evaluate.stability.claim import ROUGH
+from splatnode.recon.evaluate.stability.fitting.judge import claimed, judged, published
 from splatnode.recon.evaluate.stability.fitting.samples import Sample, of_window
 from splatnode.recon.evaluate.stability.windows.row import Row
 from splatnode.recon.result.verdict import Code
@@ -24,19 +24,8 @@ def _rejudged(row: Row, sample: Sample, by_scene: Mapping[str, Numbers]) -> Row:
     if sample.pair or row.scene not in by_scene:
         return row
     numbers = by_scene[row.scene]
-    case = judged(sample, numbers)
-    cameras = tuple(
-        replace(
-            camera,
-            bounds=Claim(
-                case.bounds[camera.name].rotation_deg,
-                case.bounds[camera.name].centre_percent,
-                case.bounds[camera.name].focal_percent,
-            ),
-        )
-        for camera in row.cameras
-    )
+    exact, cameras = judged(sample, numbers).exact, claimed(sample, numbers)
     if published(sample, numbers):
-        verdict = (Code.OK.value if sample.whole else Code.OK_PARTIAL.value) if case.exact else ROUGH
+        verdict = (Code.OK.value if sample.whole else Code.OK_PARTIAL.value) if exact else ROUGH
         return replace(row, published=True, verdict=verdict, cameras=cameras)
     return replace(row, published=False, verdict=REFUSED if row.published else row.verdict, cameras=cameras)

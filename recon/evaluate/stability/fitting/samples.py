@@ -13,11 +13,10 @@ from typing import Any
 import msgspec
 
 from splatnode.recon.evaluate.stability.claim import CameraError, all_right
-from splatnode.recon.evaluate.stability.windows.row import Row
+from splatnode.recon.evaluate.stability.windows.row import OURS, Row
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.verification.evidence import Evidence
 
-OURS = "splatnode"
 GROSS_SPREAD_PCT = 20.0  # of the true centres' spread
 
 
@@ -87,7 +86,7 @@ def of_window(row: Row) -> Sample:
 
 def _of_trials(trials: list[dict]) -> Iterator[Sample]:
     for trial in trials:
-        if trial["method"] == "splatnode" and trial.get("evidence") is not None:
+        if trial["method"] == OURS and trial.get("evidence") is not None:
             evidence = _evidence(trial["evidence"])
             scene = trial["note"].split(",")[0].split(" and ")[0]
             still, errors = _still(trial["published"], trial["verdict"]), _errors(trial["errors"])

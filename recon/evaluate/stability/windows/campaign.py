@@ -15,14 +15,13 @@ from splatnode.recon.config import Config
 from splatnode.recon.evaluate.records import this_machine
 from splatnode.recon.evaluate.stability.places import Place
 from splatnode.recon.evaluate.stability.windows import ours
-from splatnode.recon.evaluate.stability.windows.row import Answer, Found, Row, judged, key_of
+from splatnode.recon.evaluate.stability.windows.row import OURS, Answer, Found, Row, judged, key_of
 from splatnode.recon.evaluate.stability.windows.summary import summarise
 from splatnode.recon.evaluate.stability.windows.window import COUNTS, Window, moving, windows_of
 from splatnode.recon.result.export.staged import json_bytes, write_file
 
 logger = logging.getLogger(__name__)
 
-OURS = "splatnode"
 FILE = "windows.json"
 WRITE_EVERY_S = 5.0
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 from splatnode.recon.evaluate.stability.methods import NAMES, by_name
 from splatnode.recon.evaluate.stability.places import loaded_places
-from splatnode.recon.evaluate.stability.windows.campaign import FILE, OURS, Plan, run_windows
-from splatnode.recon.evaluate.stability.windows.row import Row
+from splatnode.recon.evaluate.stability.windows.campaign import FILE, Plan, run_windows
+from splatnode.recon.evaluate.stability.windows.row import OURS, Row
 from splatnode.recon.evaluate.stability.windows.summary import KINDS, by_angle, by_count, by_method, coverage, tally
 
 logger = logging.getLogger(__name__)

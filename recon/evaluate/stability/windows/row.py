@@ -13,6 +13,7 @@ from splatnode.recon.evaluate.truth import TrueCamera
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.verdict import Verdict
 
+OURS = "splatnode"  # among the methods
 FAILED = "FAILED"
 Key = tuple[str, int, int, int, str]
 
