@@ -22,8 +22,8 @@ from splatnode.recon.verification.finiteness import not_finite
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.lens import FreedLens
 from splatnode.recon.verification.undetermined import WORDS, undetermined
-from tests.recon.verification.test_decision import all_pairs, evidence, graph, registration, unsure
 from tests.recon.verification.test_refit import made_up
+from tests.support.verdicts import all_pairs, evidence, graph, registration, unsure
 
 ALL = (0, 1, 2)
 GOOD = evidence(ALL, freed=(FreedLens(1000.0, True, 1000.0, 1000.0, 1.0),))

@@ -18,7 +18,7 @@ from splatnode.recon.evaluate.stability.fitting.samples import Sample, read
 from splatnode.recon.verification.errors import Errors, PoseErrors
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.models import Fitted
-from tests.recon.verification.test_decision import evidence
+from tests.support.verdicts import evidence
 
 RANDOM = np.random.default_rng(0)
 SCENES = ("a", "b", "c", "d", "e")

@@ -1,0 +1,164 @@
+"""Why a scene is refused or rough: the cause of wide bounds, and what speaks most against the poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from splatnode.recon.evaluate.stability.fitting.odds import FOR
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.result.verdict import Code
+from splatnode.recon.verification.claims import claims
+from splatnode.recon.verification.decision import Config, decide
+from splatnode.recon.verification.errors import Errors
+from splatnode.recon.verification.fitted import FITTED
+from splatnode.recon.verification.likelihood import OddsModel
+from splatnode.recon.verification.models import Fitted
+from splatnode.recon.verification.reflection import Reflection
+from tests.support.verdicts import (
+    BY_CHANCE,
+    all_pairs,
+    evidence,
+    graph,
+    names,
+    pair,
+    refused,
+    registration,
+    unsure,
+    verdict,
+)
+
+
+def flat(count: int) -> ViewGraph:
+    return graph(count, {key: replace(value, num_homography=195) for key, value in all_pairs(count).items()})
+
+
+def turning(count: int) -> ViewGraph:
+    return graph(count, {key: replace(value, num_rotation=150) for key, value in all_pairs(count).items()})
+
+
+WHATEVER_THE_ODDS = Config(min_log_odds=-100.0)
+OPEN_FOCAL = Errors(0.5, 0.5, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("graph", "what", "code", "said"),
+    [
+        (turning, {}, Code.NO_PARALLAX, "a turn explains 75 % of all matches"),
+        (turning, {"focal": OPEN_FOCAL}, Code.NO_PARALLAX, "a turn explains"),  # it leaves the focal length open, too
+        (flat, {"focal": OPEN_FOCAL}, Code.PLANAR_ONLY, "one plane"),
+        (flat, {"median_angle_deg": 2.0}, Code.BASELINE_TOO_SMALL, "under 2.0 degrees"),  # its focal length is known
+        (lambda n: graph(n, all_pairs(n)), {"focal": OPEN_FOCAL}, Code.FOCAL_SUSPECT, "focal length is known to"),
+        (lambda n: graph(n, all_pairs(n)), {"median_angle_deg": 2.0}, Code.BASELINE_TOO_SMALL, "under 2.0 degrees"),
+        (lambda n: graph(n, all_pairs(n)), {}, Code.AMBIGUOUS, "disagree about 2.png"),
+    ],
+)
+def test_bounds_that_are_too_wide_are_refused_for_their_cause(graph, what, code, said):
+    seen = evidence((0, 1, 2, 3), {2: {"errors": unsure(rotation=20.0)}}, **what)
+    given = refused(decide(graph(4), registration((0, 1, 2, 3)), seen, Config()), code)
+    assert said in given.message
+    assert ("further to the side" in given.advice) == (code == Code.BASELINE_TOO_SMALL)
+
+
+def test_a_camera_that_hangs_on_few_points_is_named_with_its_neighbour():
+    pairs = {**all_pairs(4), (1, 2): pair(300)}
+    seen = evidence((0, 1, 2, 3), {2: {"errors": unsure(centre=0.3), "confirmed": 8}})
+    given = refused(decide(graph(4, pairs), registration((0, 1, 2, 3)), seen, Config()), Code.NO_OVERLAP)
+    assert given.frames == names(2, 1) and "2.png shares only 8 points" in given.message
+    assert given.advice == "Add a photograph between 2.png and 1.png."
+
+
+@pytest.mark.parametrize("errors", [unsure(rotation=20.0), unsure(centre=0.3)])
+def test_what_is_known_of_one_camera_only_roughly_makes_nothing_of_the_others(errors):
+    refused(verdict(4, {2: {"errors": errors}}), Code.AMBIGUOUS)
+
+
+def test_a_rough_scene_is_published_and_says_how_rough_it_is():
+    rough = evidence((0, 1, 2, 3), {2: {"errors": unsure(centre=0.01)}})
+    given = decide(graph(4, all_pairs(4)), registration((0, 1, 2, 3)), rough, WHATEVER_THE_ODDS)
+    assert given.code == Code.OK_ROUGH and given.publishable and given.frames == () and given.advice.endswith(".")
+    assert "All 4 frames were placed, roughly: positions are known to" in given.message
+    assert "% of the distance to the scene" in given.message and "of how far the camera moved" in given.message
+    pairs = {key: value for key, value in all_pairs(5).items() if 3 not in key}
+    left = (0, 1, 2, 4)
+    rough = evidence(left, {2: {"errors": unsure(rotation=2.0)}})
+    given = decide(graph(5, pairs), registration(left), rough, WHATEVER_THE_ODDS)
+    assert given.code == Code.OK_ROUGH and given.frames == names(3) and "4 of 5 frames were placed" in given.message
+
+
+def test_who_requires_more_than_is_known_gets_a_refusal_that_says_what_is_known():
+    rough = {2: {"errors": unsure(centre=0.01)}}
+    seen = evidence((0, 1, 2, 3), rough)
+    positions = max(bounds.centre_percent for bounds in claims(seen, FITTED.many.claims).values())
+    given = decide(
+        graph(4, all_pairs(4)),
+        registration((0, 1, 2, 3)),
+        seen,
+        Config(require_percent=positions + 0.1, min_log_odds=-100.0),
+    )
+    assert given.code == Code.OK_ROUGH
+    given = decide(
+        graph(4, all_pairs(4)),
+        registration((0, 1, 2, 3)),
+        seen,
+        Config(require_percent=positions - 0.1, min_log_odds=-100.0),
+    )
+    assert f"{positions:.2g} % of the distance" in refused(given, Code.TOO_ROUGH).message
+
+
+def test_cameras_that_moved_less_than_their_centres_are_uncertain_show_no_depth():
+    given = refused(verdict(3, travel=0.001, median_angle_deg=0.3), Code.BASELINE_TOO_SMALL)
+    assert "0.3 degrees" in given.message
+
+
+def doubting(measure: str) -> Fitted:
+    """Numbers by which only one measure counts, against the poses where it is worse than in right registrations."""
+    term = replace(FITTED.many.odds.terms[measure], slope=30.0 if measure in FOR else -30.0)
+    numbers = replace(FITTED.many, odds=OddsModel(2.0, {measure: term}))
+    return Fitted(numbers, numbers)
+
+
+@pytest.mark.parametrize(
+    ("measure", "what", "whole", "code", "frames", "said"),
+    [
+        ("inlier_ratio", {2: {"inlier_ratio": 0.45}}, {"inlier_ratio": 0.5}, Code.AMBIGUOUS, (2,), "50 % of their"),
+        ("camera_inlier_ratio", {2: {"inlier_ratio": 0.45}}, {}, Code.AMBIGUOUS, (2,), "of their matches fit"),
+        ("confirmed", {3: {"confirmed": 2}, 1: {"confirmed": 60}}, {}, Code.AMBIGUOUS, (3,), "only 2 of its points"),
+        ("patches", {1: {"patches": BY_CHANCE, "confirmed": 80}}, {}, Code.AMBIGUOUS, (1,), "could stand elsewhere"),
+        (
+            "mirrored_cost",
+            {},
+            {"mirrored_cost": 0.9},
+            Code.AMBIGUOUS,
+            (0, 1, 2, 3),
+            "mirror image of the other in depth",
+        ),
+        ("reflection", {}, {"reflection": Reflection(("1.png",), 0.3)}, Code.AMBIGUOUS, (1,), "the wrong way round"),
+        ("flat_patch", {2: {"coverage": 0.04, "flat_share": 0.99}}, {}, Code.MOVING_SCENE, (2,), "4 % of its picture"),
+        ("travel_bound", {2: {"errors": unsure(centre=0.05)}}, {}, Code.AMBIGUOUS, (2,), "disagree about 2.png"),
+        (
+            "rotation_bound",
+            {2: {"errors": unsure(4.0)}},
+            {"median_angle_deg": 2.0},
+            Code.BASELINE_TOO_SMALL,
+            None,
+            "2.0 d",
+        ),
+    ],
+)
+def test_what_speaks_most_against_the_poses_is_the_reason(measure, what, whole, code, frames, said):
+    seen = evidence((0, 1, 2, 3), what, **whole)
+    at = (graph(4, all_pairs(4)), registration((0, 1, 2, 3)))
+    given = refused(decide(*at, seen, Config(), doubting(measure)), code)
+    assert said in given.message and given.frames == names(*(frames or (0, 1, 2, 3)))
+    assert decide(*at, evidence((0, 1, 2, 3)), Config(), doubting(measure)).code == Code.OK
+
+
+def test_frames_through_another_lens_that_do_not_fit_are_named():
+    mixed = registration((0, 1, 2, 3))
+    mixed = replace(mixed, cameras=tuple(replace(camera, lens=int(camera.index == 1)) for camera in mixed.cameras))
+    uncertain = evidence((0, 1, 2, 3), {1: {"inlier_ratio": 0.3, "patches": BY_CHANCE}})
+    doubted = doubting("camera_inlier_ratio")
+    given = refused(decide(graph(4, all_pairs(4)), mixed, uncertain, Config(), doubted), Code.MIXED_CAMERAS)
+    assert given.frames == names(1)
