@@ -17,6 +17,7 @@ from splatnode.capture.messaging import keys as key_files
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import load_config, read_yaml, typed
 from splatnode.capture.process.logs import use_structured_lines
+from splatnode.capture.process.terminal import say
 from splatnode.capture.reader import Reader, State
 from splatnode.capture.recording import Recorder
 from splatnode.capture.status import heartbeats
@@ -53,7 +54,7 @@ def record(args: argparse.Namespace) -> int:
                     recorder.write(item)
             finally:
                 late = f", {reader.skipped} came while the disk was busy and are missing" if reader.skipped else ""
-                print(f"{recorder.frames} frames in {args.out}{late}")
+                say(f"{recorder.frames} frames in {args.out}{late}")
     return EXIT_GOOD
 
 
@@ -86,9 +87,9 @@ def find(args: argparse.Namespace) -> int:
         return EXIT_GOOD
     for kind, devices in found.items():
         for device in devices:
-            print(f"camera: {{kind: {kind}, device: {json.dumps(device['device'])}}}  # {device['description']}")
+            say(f"camera: {{kind: {kind}, device: {json.dumps(device['device'])}}}  # {device['description']}")
     if not any(found.values()):
-        print("no camera is connected; folders and videos need none: see configs/replay.yaml")
+        say("no camera is connected; folders and videos need none: see configs/replay.yaml")
     return EXIT_GOOD
 
 
@@ -97,12 +98,12 @@ def keys(args: argparse.Namespace) -> int:
     if args.allow:
         name, public = args.allow
         key_files.allow(args.folder, name, public.encode())
-        print(f"{name} may connect")
+        say(f"{name} may connect")
     elif args.server:
         key_files.expect_server(args.folder, args.server.encode())
-        print("this machine connects to that server and to no other")
+        say("this machine connects to that server and to no other")
     else:
-        print(key_files.create_keys(args.folder).decode())
+        say(key_files.create_keys(args.folder).decode())
     return EXIT_GOOD
 
 
@@ -114,7 +115,8 @@ def status(args: argparse.Namespace) -> int:
         print(json.dumps(found))
     else:
         for room, fields in found.items():
-            print("\n".join(_described(room, fields)))
+            for line in _described(room, fields):
+                say(line)
     return EXIT_GOOD if all(found.values()) else EXIT_SILENT
 
 

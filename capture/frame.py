@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
+
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -50,13 +52,14 @@ class Frame:
     """One image of a stream."""
 
     frame_id: int  # position in its stream, from 0
-    name: str  # unique in its stream; for a file, its name
+    name: str  # printable, unique in its stream; for a file, its name as `printable_name` writes it
     stamp_ns: int  # monotonic time of exposure
     image: npt.NDArray[np.uint8]  # (H, W, 3) RGB
     intrinsics: Intrinsics | None  # None: nothing is known about this camera
     encoded: bytes | None = field(default=None, repr=False)  # the JPEG or PNG that `image` was decoded from, if any
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "name", printable(self.name, LONGEST_NAME))
         if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:
             raise ValueError(f"image must be (H, W, 3) uint8, got {self.image.shape} {self.image.dtype}")
 
@@ -88,3 +91,8 @@ class DroppedFrame:
 
     name: str
     reason: str
+
+    def __post_init__(self) -> None:
+        """Both are shown to people, and what a decoder says of a stranger's file is a stranger's text."""
+        object.__setattr__(self, "name", printable(self.name, LONGEST_NAME))
+        object.__setattr__(self, "reason", printable(self.reason, LONGEST_TEXT))

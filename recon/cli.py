@@ -16,6 +16,7 @@ import numpy as np
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.config import read_yaml
+from splatnode.capture.process.terminal import say
 from splatnode.recon.config import Config, overlaid, preset
 from splatnode.recon.evaluate import methods
 from splatnode.recon.evaluate.bench import Entrants, Plan, Scoring, run_bench, run_line
@@ -143,9 +144,9 @@ def bench(args: argparse.Namespace) -> int:
         )
         for row in found.rows:
             if row.final:
-                print(run_line(row))
+                say(run_line(row))
     redraw(found, args.out)
-    print(f"results: {args.out}/ (report.html, report.md, bench.json, bench.csv)")
+    say(f"results: {args.out}/ (report.html, report.md, bench.json, bench.csv)")
     return EXIT_GOOD
 
 
@@ -195,20 +196,20 @@ def _tell(snapshot: Snapshot, out: Path, report: dict[str, object], *, as_json: 
         print(json.dumps(report))
         return
     verdict = snapshot.verdict
-    print(f"{verdict.code.value}: {verdict.message}" + (f" {verdict.advice}" if verdict.advice else ""))
+    say(f"{verdict.code.value}: {verdict.message}" + (f" {verdict.advice}" if verdict.advice else ""))
     for frame in snapshot.dropped:
-        print(f"left out: {frame.name}: {frame.reason}")
+        say(f"left out: {frame.name}: {frame.reason}")
     held_out = report.get("held_out")
     if isinstance(held_out, dict):
-        print(f"held-out views: {held_out['psnr']:.1f} dB PSNR, {held_out['ssim']:.3f} SSIM")
+        say(f"held-out views: {held_out['psnr']:.1f} dB PSNR, {held_out['ssim']:.3f} SSIM")
     for hit in snapshot.budget:
-        print(hit["message"])
+        say(hit["message"])
     if verdict.publishable:
         counts = f"{len(snapshot.gaussians)} Gaussians, {len(snapshot.cameras)} cameras"
-        print(f"{snapshot.seconds['total']:.1f} s, {counts}")
+        say(f"{snapshot.seconds['total']:.1f} s, {counts}")
         if known := bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale):
-            print(f"cameras: {known}")
+            say(f"cameras: {known}")
     further = snapshot.seconds.get("ladder", 0.0)
     if further >= 0.1:
-        print(f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches (--quick leaves them out)")
-    print(f"results: {out}/ ({'scene.ply, cameras.json, preview.png, ' if verdict.publishable else ''}report.json)")
+        say(f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches (--quick leaves them out)")
+    say(f"results: {out}/ ({'scene.ply, cameras.json, preview.png, ' if verdict.publishable else ''}report.json)")

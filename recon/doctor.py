@@ -16,6 +16,7 @@ from pathlib import Path
 from splatnode.capture.cameras import v4l2
 from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.network import Network, runtime_directory
+from splatnode.capture.process.terminal import say
 from splatnode.recon import core
 from splatnode.recon.core.compile import find_compiler
 
@@ -57,7 +58,7 @@ def doctor(args: argparse.Namespace) -> int:
         print(json.dumps([asdict(finding) for finding in found], indent=1))
     else:
         for finding in found:
-            print(f"{finding.state:9}{finding.name:14}{finding.detail}")
+            say(f"{finding.state:9}{finding.name:14}{finding.detail}")
     return 2 if any(finding.state == "missing" for finding in found) else 0
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import errno
-import io
 import logging
 import os
 import signal
@@ -17,11 +16,15 @@ import sys
 import threading
 import traceback
 from collections.abc import Sequence
+from typing import NoReturn
 
 import splatnode.capture.verbs
 import splatnode.recon.verbs
 import splatnode.viewer.verbs
+from splatnode.capture.process.logs import use_plain_lines
+from splatnode.capture.process.printable import printable, printable_lines
 from splatnode.capture.process.stop_signals import on_first
+from splatnode.capture.process.terminal import shown_as_text
 
 # libgomp's threads spin while they wait. On a robot's busy processor that doubles the time of torch's operations.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -35,14 +38,17 @@ VERBS = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the verb that `argv` names and returns the exit code. Raises SystemExit for usage errors and SIGTERM."""
+    with shown_as_text():
+        return _run(argv)
+
+
+def _run(argv: Sequence[str] | None) -> int:
     parser = build_parser()
     args = parser.parse_args(argv)
     if args.verb is None:
         parser.print_help(sys.stderr)
         return 2
-    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors="backslashreplace")  # a name that a terminal cannot show costs no result
-    logging.basicConfig(format="%(message)s", stream=sys.stderr)
+    use_plain_lines()
     logging.getLogger("splatnode").setLevel(logging.INFO)
     stopping = threading.Event()
 
@@ -59,14 +65,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         if stopping.is_set():  # a package that was being imported makes an ImportError of the exit
             return 0
         if args.debug:
-            traceback.print_exc()
+            print(printable_lines(traceback.format_exc()), file=sys.stderr)
         code = exit_code(error)
         print(f"splatnode: {explain(error, code)}", file=sys.stderr)
         return code
 
 
+class _Parser(argparse.ArgumentParser):
+    """One whose complaints repeat an argument as text that only shows."""
+
+    def error(self, message: str) -> NoReturn:
+        super().error(printable_lines(message))
+
+
 def build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="splatnode",
         description="Photographs in, camera poses and a 3D Gaussian scene out, on a CPU.",
         allow_abbrev=False,
@@ -98,16 +111,24 @@ def exit_code(error: BaseException) -> int:
 
 
 def explain(error: BaseException, code: int) -> str:
-    """One line, or the error's own text where that has more."""
+    """One line, or the error's own text where that has more, its further lines set in."""
+    return printable_lines(_explained(error, code))
+
+
+def _explained(error: BaseException, code: int) -> str:
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
     if isinstance(error, OSError) and error.strerror:
-        return f"{error.strerror}: {error.filename}" if error.filename is not None else error.strerror
+        return error.strerror if error.filename is None else f"{error.strerror}: {_file(error.filename)}"
     if isinstance(error, ModuleNotFoundError):
         return f"{error}. ./run in place of splatnode installs what it needs; or run: pip install 'splatnode[bench]'"
     if code == 70:
         return f"internal error: {type(error).__name__}: {error} (--debug shows where; splatnode doctor may tell why)"
     return str(error)
+
+
+def _file(name: str | bytes | int) -> str:
+    return printable(os.fsdecode(name) if isinstance(name, bytes) else name)
 
 
 def _os_exit_code(error: OSError) -> int:

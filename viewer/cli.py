@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import sys
 from pathlib import Path
 
 import cv2
 
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import read_yaml, typed
+from splatnode.capture.process.terminal import say
 from splatnode.recon.result.rendering import use_threads
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.pictures import keep_picture, write_movie, write_series
@@ -38,7 +38,7 @@ def view(args: argparse.Namespace) -> int:
         raise ValueError("--export needs a finished result and a file that ends with .mp4")
     width, height = args.size or _PICTURE
     if args.export is not None and finished is not None:
-        print(write_movie(finished, args.export, width, height, args.pictures))
+        say(write_movie(finished, args.export, width, height, args.pictures))
         return EXIT_GOOD
     window = None if args.headless else _window()
     if window is None and not args.headless:
@@ -52,17 +52,13 @@ def view(args: argparse.Namespace) -> int:
         session, size = Session(source, State()), args.size or window.size
         show(session, software=window.software, screenshots=folder, opened=background, size=size)
     elif finished is not None:
-        print(write_series(finished, folder, width, height, args.pictures))
+        say(write_series(finished, folder, width, height, args.pictures))
     else:
         source = _source(finished, network)
         _give_way()
         with contextlib.closing(source):
-            keep_picture(source, folder, width, height, until_final=args.until_final, say=_say)
+            keep_picture(source, folder, width, height, until_final=args.until_final, say=say)
     return EXIT_GOOD
-
-
-def _say(line: str) -> None:
-    print(line, flush=True)
 
 
 def _finished(args: argparse.Namespace) -> Moment | None:
@@ -89,11 +85,11 @@ def _is_configuration(what: Path) -> bool:
 def _window() -> Probe | None:
     """What a window would be like here; None where what it needs is not installed. Says so where there is none."""
     if not open3d_installed():
-        print(_NO_OPEN3D, file=sys.stderr)
+        say(_NO_OPEN3D, error=True)
         return None
     probe = probe_window()
     if not probe.window:
-        print(f"splatnode: no window: {probe.detail}. Writing pictures instead, as with --headless", file=sys.stderr)
+        say(f"splatnode: no window: {probe.detail}. Writing pictures instead, as with --headless", error=True)
     return probe
 
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
+from splatnode.capture.process.printable import printable
 from splatnode.recon.result.verdict import Code
 from splatnode.viewer import words
 from splatnode.viewer.session import Session
@@ -109,7 +110,7 @@ class Panel:
         self._cameras.selected_index = 1 + names.index(chosen) if chosen in names else 0
 
     def _set(self, name: str, lines: list[str]) -> None:
-        text = "\n".join(textwrap.fill(line, _LINE) for line in lines)
+        text = "\n".join(textwrap.fill(printable(line), _LINE) for line in lines)
         label = self._labels[name]
         if label.text != text:
             label.text = text

@@ -14,6 +14,7 @@ from splatnode.capture import recording
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.image_file import MAX_PIXELS, SUFFIXES, UnusableImage, decode_image
 from splatnode.capture.pace import FramesPerSecond, Pace, paced
+from splatnode.capture.process.printable import printable, printable_name
 
 DEFAULT_STEP_NS = 100_000_000  # between two loops of a single photograph, which has no rate
 # Photographs that cannot be decoded here; they are reported as dropped.
@@ -101,10 +102,9 @@ def frame_name(path: Path) -> str:
     """The file's name as text of one line: bytes that are no UTF-8, and control characters, are written as escapes.
 
     Names go into messages, JSON and lists of cameras, where a stray byte or a line break would end the reconstruction.
-    So would two frames of one name: a backslash is escaped too.
+    So would two frames of one name: files whose names differ have names that differ.
     """
-    escaped = (c if c.isprintable() and c != "\\" else c.encode("unicode_escape").decode() for c in path.name)
-    return "".join(escaped)
+    return printable_name(path.name)
 
 
 def image_paths(folder: Path) -> list[Path]:
@@ -125,24 +125,28 @@ def names_in(folder: Path) -> list[str]:
     """What `Config.names` can choose from, in order. Raises as `stream` does."""
     if recording.is_recording(folder):
         return recording.read(folder).names
-    return [path.name for path in chosen_images(folder)]
+    return [frame_name(path) for path in chosen_images(folder)]
 
 
 def chosen_images(folder: Path, names: tuple[str, ...] = ()) -> list[Path]:
-    """The photographs of `folder` called `names` (with or without suffix), or all. Raises where one is missing."""
+    """The photographs of `folder` called `names`, or all. Raises where one is missing.
+
+    A photograph is called by its file's name, with or without suffix, and by the name of its frame.
+    """
     paths = image_paths(folder)
     if not paths:
-        inside = sorted(child.name for child in folder.iterdir() if child.is_dir() and image_paths(child))
+        inside = sorted(frame_name(child) for child in folder.iterdir() if child.is_dir() and image_paths(child))
         advice = f"give one of its folders: {', '.join(inside)}" if inside else "give a folder of JPEGs or PNGs"
         raise ValueError(f"no photographs in {str(folder)!r}; {advice}")
     foreign = sorted({path.suffix.lower() for path in paths})
     if FOREIGN_SUFFIXES.issuperset(foreign):
         raise ValueError(f"{str(folder)!r} holds only {', '.join(foreign)} files; convert them to JPEG or PNG")
-    missing = [name for name in names if not any(name in (path.name, path.stem) for path in paths)]
+    called = {path: {path.name, path.stem, frame_name(path)} for path in paths}
+    missing = [printable(name) for name in names if not any(name in own for own in called.values())]
     if missing:
-        present = ", ".join(path.name for path in paths[:5]) + (", ..." if len(paths) > 5 else "")
+        present = ", ".join(frame_name(path) for path in paths[:5]) + (", ..." if len(paths) > 5 else "")
         raise ValueError(f"no photograph named {', '.join(missing)} in {str(folder)!r}; it holds {present}")
-    return [path for path in paths if not names or path.name in names or path.stem in names]
+    return [path for path in paths if not names or not called[path].isdisjoint(names)]
 
 
 def natural_order(path: Path) -> tuple:

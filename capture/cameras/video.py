@@ -12,6 +12,9 @@ import numpy as np
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.pace import Pace, paced
+from splatnode.capture.process.printable import LONGEST_NAME, printable_name
+
+_LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes behind it
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -55,5 +58,5 @@ def _frame(image: np.ndarray, frame_id: int, index: int, rate: float, config: Co
     """Stamps are counted, not read: containers with edited time lines give stamps that go back."""
     rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
     intrinsics = config.intrinsics.resized(rgb.shape[1], rgb.shape[0]) if config.intrinsics else None
-    name = f"{config.file.stem}_{index:06d}.png"
+    name = f"{printable_name(config.file.stem, _LONGEST_STEM)}_{index:06d}.png"
     return Frame(frame_id, name, round(index / rate * 1e9), rgb, intrinsics)

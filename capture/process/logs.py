@@ -1,43 +1,85 @@
-"""Structured lines on stderr: `event=keyframe name=0042.png waiting=1`. The journal gets their priorities too."""
+"""Structured lines on stderr: `event=keyframe name=0042.png waiting=1`. The journal gets their priorities too.
+
+A record that `event` makes carries its fields to the formatter; a line is put together once, there, from values of one
+word or in quotes. No text in a record is read again, so none can pass for an event, a field, a line or a priority.
+"""
 
 from __future__ import annotations
 
 import logging
 import os
 import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from splatnode.capture.process.printable import escaped, printable_lines
+from splatnode.capture.process.terminal import beneath
 
 _PRIORITIES = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
+_LONGEST_VALUE = 4000  # characters; a status tells of 1000, and lists of names are longer
+_LONGEST_TRACEBACK = 20_000
 
 
 def use_structured_lines() -> None:
     """From now on every record of every room is one line of key=value."""
-    handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(_Formatter(journal="JOURNAL_STREAM" in os.environ))
+    handler = logging.StreamHandler(beneath(sys.stderr))
+    handler.setFormatter(StructuredLines(journal="JOURNAL_STREAM" in os.environ))
     logging.getLogger().handlers = [handler]
+    logging.captureWarnings(True)
+
+
+def use_plain_lines() -> None:
+    """From now on every record is its message alone, as a person reads it on a terminal."""
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(PlainLines())
+    logging.basicConfig(handlers=[handler])
 
 
 def event(log: logging.Logger, level: int, what: str, **fields: object) -> None:
-    """Logs that `what` happened."""
-    log.log(level, "%s", " ".join(f"{key}={_value(value)}" for key, value in {"event": what, **fields}.items()))
+    """Logs that `what` happened; `what` and the names of the fields are the program's own words."""
+    log.log(level, _Event(what, fields))
 
 
-class _Formatter(logging.Formatter):
+@dataclass(frozen=True)
+class _Event:
+    what: str
+    fields: Mapping[str, object]
+
+    def __str__(self) -> str:
+        return " ".join(f"{key}={_value(value)}" for key, value in {"event": self.what, **self.fields}.items())
+
+
+class StructuredLines(logging.Formatter):
     def __init__(self, journal: bool) -> None:
         super().__init__()
         self._journal = journal  # which adds the time, the process and the priority by itself
 
     def format(self, record: logging.LogRecord) -> str:
-        message = record.getMessage()
-        text = message if message.startswith("event=") else f"event=log message={_value(message)}"
+        what = record.msg if isinstance(record.msg, _Event) else _Event("log", {"message": record.getMessage()})
+        text = str(what)
         if record.exc_info:
-            text += f" exception={_value(self.formatException(record.exc_info))}"
+            text += f" exception={_quoted(self.formatException(record.exc_info)[-_LONGEST_TRACEBACK:])}"
         if self._journal:
             return f"<{_PRIORITIES.get(record.levelno, 6)}>logger={record.name} {text}"
         return f"time={_value(self.formatTime(record))} level={record.levelname.lower()} logger={record.name} {text}"
 
 
+class PlainLines(logging.Formatter):
+    """The message; lines after its first one are set in, so that none passes for a message of its own."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        return printable_lines(super().format(record))
+
+
 def _value(value: object) -> str:
     """One word, or a quoted text on one line."""
     text = f"{value:.4g}" if isinstance(value, float) else str(value)
+    if len(text) > _LONGEST_VALUE:
+        text = text[: _LONGEST_VALUE - 1] + "…"
     plain = text and not any(letter.isspace() or letter in "\"'=" or not letter.isprintable() for letter in text)
-    return text if plain else '"' + text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n") + '"'
+    return text if plain else _quoted(text)
+
+
+def _quoted(text: str) -> str:
+    marked = text.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped(marked)}"'

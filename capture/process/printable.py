@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 LONGEST_NAME = 255  # characters, as of a file
 LONGEST_TEXT = 1000  # characters of a message
 
@@ -13,13 +15,39 @@ def printable(text: object, longest: int = LONGEST_TEXT) -> str:
     direction \\u202e, a byte of a file's name that is no UTF-8 \\udcff. What is printable already comes back as it is;
     of more than `longest` characters the end is left out.
     """
-    escaped = "".join(letter if letter.isprintable() else _escape(letter) for letter in str(text)[: longest + 1])
-    return escaped if len(escaped) <= longest else escaped[: longest - 1] + "…"
+    shown = escaped(str(text)[: longest + 1])
+    return shown if len(shown) <= longest else shown[: longest - 1] + "…"
 
 
 def is_printable(text: str, longest: int = LONGEST_TEXT) -> bool:
     """Whether `printable` gives `text` back as it is."""
     return len(text) <= longest and text.isprintable()
+
+
+def printable_lines(text: object) -> str:
+    """`text` of several lines, each printable; those after the first are set in by two spaces.
+
+    So a line that a stranger's line break began is told from one of the program's own.
+    """
+    lines = str(text).rstrip("\n").split("\n")
+    return "\n  ".join(escaped(line) for line in lines)
+
+
+def printable_name(raw: str, longest: int = LONGEST_NAME) -> str:
+    """The name `raw` of a file as `printable` shows it; two names that differ stay two.
+
+    So a backslash is escaped, too, and of a name that is too long the end is replaced by a digest of the whole.
+    """
+    name = escaped(raw.replace("\\", "\\\\"))
+    if len(name) <= longest:
+        return name
+    digest = hashlib.blake2b(raw.encode(errors="surrogatepass"), digest_size=8).hexdigest()
+    return f"{name[: longest - len(digest) - 1]}~{digest}"
+
+
+def escaped(text: str) -> str:
+    """`text` with what is not printable as escapes, however long it is."""
+    return "".join(letter if letter.isprintable() else _escape(letter) for letter in text)
 
 
 def _escape(letter: str) -> str:

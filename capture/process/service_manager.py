@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
+import re
 import socket
 import time
+
+from splatnode.capture.process.printable import printable
 
 WATCHDOG_SHARE = 0.25  # of the watchdog's time between two signs of life; sd_watchdog_enabled(3) asks for half at most
 
@@ -14,7 +17,8 @@ class ServiceManager:
 
     def __init__(self) -> None:
         self._address = os.environ.get("NOTIFY_SOCKET", "")
-        timeout_s = int(os.environ.get("WATCHDOG_USEC", "0")) / 1e6
+        usec = os.environ.get("WATCHDOG_USEC", "")
+        timeout_s = int(usec) / 1e6 if re.fullmatch("[0-9]{1,18}", usec) else 0.0
         self._every_s = WATCHDOG_SHARE * timeout_s if timeout_s else 1.0
         self._next = 0.0
         self._is_ready = False
@@ -29,7 +33,7 @@ class ServiceManager:
         """`status` is shown by systemctl status."""
         if time.monotonic() >= self._next:
             self._next = time.monotonic() + self._every_s
-            self._notify(f"WATCHDOG=1\nSTATUS={status}")
+            self._notify(f"WATCHDOG=1\nSTATUS={printable(status)}")  # a line break would begin another assignment
 
     def stopping(self) -> None:
         self._notify("STOPPING=1")

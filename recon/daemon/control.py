@@ -9,6 +9,7 @@ import msgspec
 from splatnode.capture.messaging.commands import ask
 from splatnode.capture.messaging.services import RECON_CONTROL
 from splatnode.capture.process.config import load_config
+from splatnode.capture.process.terminal import say
 from splatnode.recon.daemon.config import Config
 
 EXIT_GOOD, EXIT_UNKNOWN_NAME = 0, 2
@@ -29,5 +30,5 @@ def retract(args: argparse.Namespace) -> int:
     """Asks the daemon to remove a keyframe; returns 2 where there is none of that name."""
     config = load_config(args.config, Config) if args.config else Config()
     answer = ask(RECON_CONTROL, config.network, Retract(args.name), Answer)
-    print(answer.message)
+    say(answer.message)
     return EXIT_GOOD if answer.done else EXIT_UNKNOWN_NAME

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import SUFFIXES
 from splatnode.recon.result.export import read_cameras
@@ -61,14 +62,16 @@ def load_scene(folder: Path) -> EvaluationScene:
     """
     place = scene_folder(folder)
     data = place / _CHOSEN if (place / _CHOSEN).is_dir() else place
-    paths = {path.name: path for path in sorted((data / "images").glob("*")) if path.suffix.lower() in SUFFIXES}
+    paths = {frame_name(path): path for path in sorted((data / "images").glob("*")) if path.suffix.lower() in SUFFIXES}
     if not paths:
         raise FileNotFoundError(f"{data / 'images'} must hold the scene's images; there are none")
     readers = {"cameras.json": _cameras_json, "transforms.json": _transforms_json, "sparse/0": _colmap}
     for source, read in readers.items():
         if (data / source).exists():
             cameras = read(data / source)
-            return EvaluationScene(place.name, paths, {name: cameras[name] for name in paths if name in cameras})
+            return EvaluationScene(
+                place.name, paths, {name: cameras[path.name] for name, path in paths.items() if path.name in cameras}
+            )
     raise FileNotFoundError(f"{data} must hold the true cameras as one of {', '.join(readers)}; there is none")
 
 

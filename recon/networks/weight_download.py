@@ -5,12 +5,12 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-import sys
 import urllib.error
 import urllib.request
 from pathlib import Path
 from typing import BinaryIO
 
+from splatnode.capture.process.terminal import progress
 from splatnode.recon.networks.weight_catalogue import Weights
 from splatnode.recon.networks.weight_folder import WeightsError
 
@@ -83,15 +83,12 @@ def _download(weights: Weights, part: Path) -> None:
 
 
 def _copy(source: BinaryIO, file: BinaryIO, name: str, done: int, total: int | None) -> None:
-    on_terminal = sys.stderr.isatty()
     for chunk in iter(lambda: source.read(_CHUNK), b""):
         file.write(chunk)
         done += len(chunk)
-        if on_terminal:
-            of = f" of {total / 1e6:.1f}" if total else ""
-            print(f"\r{name}: {done / 1e6:.1f}{of} MB", end="", file=sys.stderr)
-    if on_terminal:
-        print(file=sys.stderr)
+        of = f" of {total / 1e6:.1f}" if total else ""
+        progress(f"{name}: {done / 1e6:.1f}{of} MB")
+    progress("")
 
 
 def _sha256(file: Path) -> str:

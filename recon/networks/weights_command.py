@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from collections.abc import Iterator, Sequence
 
+from splatnode.capture.process.terminal import say
 from splatnode.recon.networks.weight_catalogue import CATALOGUE, Weights
 from splatnode.recon.networks.weight_download import complaint, fetch
 from splatnode.recon.networks.weight_folder import WeightsError, find, folder, located
@@ -46,7 +46,8 @@ def command(args: argparse.Namespace) -> int:
             if args.json:
                 print(json.dumps(entry))
             else:
-                print(f"{entry['name']}: {entry['what']}\n    {entry['licence']}; {entry['found'] or 'not here'}")
+                say(f"{entry['name']}: {entry['what']}")
+                say(f"    {entry['licence']}; {entry['found'] or 'not here'}")
         return 0
     if args.action == "fetch" and not args.names:
         raise WeightsError(f"say which to fetch: {', '.join(weights.name for weights in CATALOGUE)}")
@@ -54,14 +55,14 @@ def command(args: argparse.Namespace) -> int:
     for weights in chosen:
         try:
             if args.action == "fetch":
-                print(f"{weights.name}: {weights.licence}", file=sys.stderr)
-                print(fetch(weights, folder(), args.source))
+                say(f"{weights.name}: {weights.licence}", error=True)
+                say(fetch(weights, folder(), args.source))
             else:
                 wrong = complaint(weights, find(weights.path))
                 failed |= bool(wrong)
                 unknown = "" if weights.sha256 else " (its publisher gives no digest: checked when loaded)"
-                print(f"{weights.name}: {wrong or 'as published' + unknown}")
+                say(f"{weights.name}: {wrong or 'as published' + unknown}")
         except WeightsError as error:
             failed = True
-            print(f"{weights.name}: {error}", file=sys.stderr)
+            say(f"{weights.name}: {error}", error=True)
     return _UNAVAILABLE if failed else 0

@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 
 import cv2
 import numpy as np
@@ -19,7 +18,6 @@ from splatnode.capture.messaging.keyframes import KeyframeClient
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
 from splatnode.capture.preview import PreviewHeader, decode_preview
-from splatnode.capture.process.logs import _Formatter, event
 from splatnode.capture.status import CaptureStatus
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT
@@ -188,16 +186,3 @@ def test_a_disk_that_may_not_hold_the_spool_is_told_at_the_start(tmp_path, start
     assert "further keyframes (spool.max_mb) may take" in status.why
     process.terminate()
     assert process.stderr.read().count("event=disk_space") == 1
-
-
-def test_lines_can_be_taken_apart(caplog):
-    import logging
-
-    log = logging.getLogger("capture.test")
-    with caplog.at_level(logging.INFO):
-        event(log, logging.INFO, "keyframe", name="a b.png", share=0.123456, why='say "x"\n', waiting=0, empty="")
-    line = _Formatter(journal=True).format(caplog.records[0])
-    assert line == (
-        '<6>logger=capture.test event=keyframe name="a b.png" share=0.1235 why="say \\"x\\"\\n" waiting=0 empty=""'
-    )
-    assert time.strftime("%Y-") in _Formatter(journal=False).format(caplog.records[0])

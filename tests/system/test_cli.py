@@ -50,7 +50,10 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
     loaded, heavy = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).splitlines()
     assert loaded.split() == [
         "splatnode.capture.process.arguments",
+        "splatnode.capture.process.logs",
+        "splatnode.capture.process.printable",
         "splatnode.capture.process.stop_signals",
+        "splatnode.capture.process.terminal",
         "splatnode.capture.process.verb",
         "splatnode.capture.verbs",
         "splatnode.command_line",

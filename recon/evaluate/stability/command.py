@@ -7,6 +7,7 @@ import logging
 import shlex
 import sys
 
+from splatnode.capture.process.terminal import say
 from splatnode.recon.evaluate.stability.campaign import Plan, run_campaign
 from splatnode.recon.evaluate.stability.matrix import chosen
 from splatnode.recon.evaluate.stability.methods import by_name
@@ -42,14 +43,14 @@ def stability(args: argparse.Namespace) -> int:
         if trial["outcome"] in ("false_accept", "false_refuse", "failed"):
             which = f"row {trial['row']} {trial['name']}, seed {trial['seed']}, {trial['method']}"
             reason = trial["message"].strip().splitlines()[-1]
-            print(f"{trial['outcome']}: {which}: {trial['verdict']}; {trial['note']}; {reason}")
+            say(f"{trial['outcome']}: {which}: {trial['verdict']}; {trial['note']}; {reason}")
     for method in dict.fromkeys(trial["method"] for trial in trials):
         summary = summarise(trials, method)
-        print(
+        say(
             f"{method}: {summary.trials} trials, false accepts {_rate_text(summary.false_accept)}, "
             f"false refusals {_rate_text(summary.false_refuse)}, other codes {_rate_text(summary.other_code)}"
         )
-    print(f"results: {args.out}/ (stability.json, stability.png)")
+    say(f"results: {args.out}/ (stability.json, stability.png)")
     return 0
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 
+from splatnode.capture.process.terminal import say
 from splatnode.recon.result.export.convert import export_scene
 
 
 def export(args: argparse.Namespace) -> int:
-    print(export_scene(args.scene, args.to, args.out))
+    say(export_scene(args.scene, args.to, args.out))
     return 0

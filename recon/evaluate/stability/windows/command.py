@@ -10,6 +10,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from splatnode.capture.process.terminal import say
 from splatnode.recon.evaluate.stability.methods import NAMES, by_name
 from splatnode.recon.evaluate.stability.places import loaded_places
 from splatnode.recon.evaluate.stability.windows.campaign import FILE, Plan, run_windows
@@ -35,8 +36,8 @@ def windows(args: argparse.Namespace) -> int:
     rows = run_windows(plan, loaded_places(args.scenes, args.out), args.out, shlex.join(["splatnode", *sys.argv[1:]]))
     drawn = _drawn(args.out, rows)
     for line in report_lines(rows):
-        print(line)
-    print(f"results: {args.out}/ ({', '.join((FILE, *drawn))})")
+        say(line)
+    say(f"results: {args.out}/ ({', '.join((FILE, *drawn))})")
     return 0
 
 

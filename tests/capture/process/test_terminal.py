@@ -1,0 +1,93 @@
+"""What is printed only shows, whoever wrote it."""
+
+from __future__ import annotations
+
+import ast
+import io
+import json
+import subprocess
+import sys
+
+import pytest
+
+from splatnode.capture.process.terminal import beneath, progress, shown_as_text
+from tests.conftest import ROOT
+from tests.support.hostile import TEXTS, unprintable
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
+def test_what_is_printed_only_shows(monkeypatch, text):
+    out, err = io.StringIO(), io.StringIO()
+    monkeypatch.setattr(sys, "stdout", out)
+    monkeypatch.setattr(sys, "stderr", err)
+    with shown_as_text():
+        print("left out:", text)
+        print(text, file=sys.stderr)
+    assert not unprintable(out.getvalue() + err.getvalue())
+    assert not any(line.startswith("<") and line[1:2].isdigit() for line in err.getvalue().split("\n"))
+    assert sys.stdout is out and sys.stderr is err
+
+
+def test_plain_text_and_json_stay_as_they_are(monkeypatch):
+    out = io.StringIO()
+    monkeypatch.setattr(sys, "stdout", out)
+    said = json.dumps({"name": "Küche\n\x1b", "a": [1, "<0>"]}, indent=1)
+    with shown_as_text():
+        print(said)
+        print("Küche ±0.5 °, 日本", "<a>", "x <0>")
+    assert out.getvalue() == f"{said}\nKüche ±0.5 °, 日本 <a> x <0>\n"
+
+
+def test_progress_is_for_a_terminal_and_goes_back_to_the_begin_of_its_line(monkeypatch):
+    for stream, expected in ((Terminal(), "\ra\\x1b: 1 MB\n"), (io.StringIO(), "")):
+        monkeypatch.setattr(sys, "stderr", stream)
+        with shown_as_text():
+            progress("a\x1b: 1 MB")
+            progress("")
+            assert not sys.stderr.isatty() and beneath(sys.stderr) is stream
+        assert stream.getvalue() == expected
+
+
+def test_a_process_without_standard_output_prints_nothing(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    with shown_as_text():
+        print("nobody hears")
+        progress("")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["\x1b[2J"],
+        ["view", "a", "b\n<0>forged", "\x1b]0;t\x07"],
+        ["replay", "no\x1b[31m folder\n<0>", "--out", "x"],
+        ["export", "\u202escene\x07.ply", "--to", "spz"],
+        ["replay", "x", "--size", "\x1b[2J"],
+        ["weights", "fetch", "\x1b[2J\n<0>x"],
+    ],
+)
+def test_a_complaint_about_an_argument_only_shows(arguments):
+    done = subprocess.run(
+        [sys.executable, "-m", "splatnode", *arguments], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2 and not unprintable(done.stdout + done.stderr)
+    assert not any(line.startswith("<0>") for line in done.stderr.splitlines())
+
+
+def test_verbs_print_by_this_module_alone():
+    """What is no line of text is JSON, which has no character that is not ASCII."""
+    programs = {"terminal.py", "compile.py", "probe.py"}  # the last two run by themselves
+    files = [path for room in ("capture", "recon", "viewer") for path in (ROOT / room).rglob("*.py")]
+    printed = [
+        f"{path}: {ast.unparse(node)}"
+        for path in files
+        if path.name not in programs
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and ast.unparse(node.func) == "print"
+    ]
+    assert printed and all(": print(json.dumps(" in each for each in printed)
