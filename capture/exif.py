@@ -35,15 +35,16 @@ def read_tags(tiff: bytes) -> Tags:
     if order is None:
         return {}
     try:
-        tags = _read_directory(tiff, struct.unpack_from(order + "I", tiff, 4)[0], order)
+        tags = read_directory(tiff, struct.unpack_from(order + "I", tiff, 4)[0], order)
         if (part := first(tags, EXIF_IFD)) is not None:
-            tags |= _read_directory(tiff, int(part), order)
+            tags |= read_directory(tiff, int(part), order)
     except struct.error:  # an offset points outside
         return {}
     return tags
 
 
-def _read_directory(tiff: bytes, offset: int, order: str) -> dict[int, tuple[float, ...]]:
+def read_directory(tiff: bytes, offset: int, order: str) -> dict[int, tuple[float, ...]]:
+    """The numeric tags of the directory at `offset`, in the byte order `order` of struct. Raises struct.error."""
     tags: dict[int, tuple[float, ...]] = {}
     (entries,) = struct.unpack_from(order + "H", tiff, offset)
     for entry in range(offset + 2, offset + 2 + 12 * entries, 12):

@@ -18,7 +18,7 @@ import cv2
 import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image
+from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_image_file
 from splatnode.capture.process.durable import sync_folder
 
 log = logging.getLogger(__name__)
@@ -132,7 +132,7 @@ class Recording:
         if isinstance(line, _DroppedLine):
             return DroppedFrame(line.name, line.reason)
         try:
-            content = (self.folder / line.file).read_bytes()
+            content = read_image_file(self.folder / line.file, max_pixels)
             image, _ = decode_image(content, max_pixels)
         except UnusableImage as error:
             return DroppedFrame(line.name, str(error))

@@ -12,7 +12,7 @@ import msgspec
 
 from splatnode.capture import recording
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.image_file import MAX_PIXELS, SUFFIXES, UnusableImage, decode_image
+from splatnode.capture.image_file import MAX_PIXELS, SUFFIXES, MaxPixels, UnusableImage, decode_image, read_image_file
 from splatnode.capture.pace import FramesPerSecond, Pace, paced
 from splatnode.capture.process.printable import printable, printable_name
 
@@ -25,7 +25,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     folder: Path
     names: tuple[str, ...] = ()  # the files to take, with or without suffix; none: all
     intrinsics: Intrinsics | None = None  # of all images of its aspect ratio, instead of what their EXIF tells
-    max_pixels: int = MAX_PIXELS  # larger images are left out
+    max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
     frames_per_second: FramesPerSecond = 10.0  # of the stamps, unless they were recorded
     pace: Pace = "fastest"
     loops: Annotated[int, msgspec.Meta(ge=1)] = 1  # times that it is shown, each with names of its own
@@ -75,7 +75,7 @@ def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]
             continue
         name = frame_name(path)
         try:
-            data = path.read_bytes()
+            data = read_image_file(path, config.max_pixels)
             image, intrinsics = decode_image(data, config.max_pixels)
         except UnusableImage as error:
             yield DroppedFrame(name, str(error))

@@ -12,7 +12,14 @@ import msgspec
 
 from splatnode.capture.cameras.folder import foreign_file, frame_name, image_paths
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_header
+from splatnode.capture.image_file import (
+    MAX_PIXELS,
+    MaxPixels,
+    UnusableImage,
+    decode_image,
+    read_header,
+    read_image_file,
+)
 from splatnode.capture.unavailable import CameraUnavailable
 
 _TEMPORARY_SUFFIXES = {".tmp", ".part", ".partial", ".crdownload", ".filepart"}
@@ -24,7 +31,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     poll_s: Annotated[float, msgspec.Meta(gt=0)] = 0.2
     settle_s: Annotated[float, msgspec.Meta(ge=0)] = 0.4  # a file is whole when it has not changed for so long
     give_up_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0  # a file that is not whole by then is left out
-    max_pixels: int = MAX_PIXELS  # larger images are left out
+    max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
     intrinsics: Intrinsics | None = None  # of all images, instead of what their EXIF tells
 
 
@@ -78,16 +85,15 @@ def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> 
             return None
         if now - before.since < config.settle_s:
             return None
-        data = path.read_bytes()
+        data = read_image_file(path, config.max_pixels)
+        read_header(data)
     except FileNotFoundError:
         seen.pop(path.name, None)
         return None
     except OSError as error:
         return DroppedFrame(name, f"cannot be read: {error.strerror}")
-    try:
-        read_header(data)
     except UnusableImage as error:
-        waited = now - before.first
+        waited = now - seen[path.name].first
         return None if waited < config.give_up_s else DroppedFrame(name, f"{error}, after {waited:.0f} s")
     return _decoded(name, data, config, frame_id)
 

@@ -141,7 +141,7 @@ def test_damaged_exif_is_ignored(tmp_path):
 def test_zero_over_zero_in_a_pointer_or_a_size_is_no_number():
     nothing_over_nothing = tiff({0x8769: (0, 0)}, {})
     assert 0x8769 in read_tags(nothing_over_nothing)
-    with pytest.raises(UnusableImage, match="no image directory"):
+    with pytest.raises(UnusableImage, match="ImageWidth"):
         read_header(tiff({0x0100: (0, 0), 0x0101: 48}, {}))
 
 

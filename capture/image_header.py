@@ -1,0 +1,216 @@
+"""Bytes of an image file -> its one size, its EXIF part, and the bytes that a decoder gets.
+
+A decoder takes memory for the size that it finds, and where a file states two, it may find the other one. So the
+structure of every format is walked to its end here: a file whose size is stated twice, or where a decoder could look
+for it at another place, is refused; and what a picture needs no decoder for (texts, profiles, animations of a PNG) is
+left out of what the decoder gets.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from splatnode.capture import exif
+
+MAX_SIDE = 65_535  # pixels; JPEG cannot state more
+_MAX_PARTS = 1_000_000  # segments or chunks of a file; PNG has one in 8 KB at most, as a rule
+
+
+class UnusableImage(Exception):
+    """The bytes hold no image that can be used; the message says why."""
+
+
+@dataclass(frozen=True)
+class ImageHeader:
+    width: int  # as stored, before the EXIF orientation is applied
+    height: int
+    exif: bytes = field(default=b"", repr=False)  # a TIFF structure
+    decodable: bytes = field(default=b"", repr=False)  # the file, without what a decoder does not need
+
+
+def read_header(data: bytes) -> ImageHeader:
+    """Size and EXIF of a JPEG, PNG, WebP, TIFF or BMP file that is structurally complete. Raises UnusableImage.
+
+    No side is 0 or above MAX_SIDE.
+    """
+    if not data:
+        raise UnusableImage("empty file")
+    readers: dict[bytes, Callable[[bytes], ImageHeader]] = {
+        b"\xff\xd8\xff": _jpeg_header,
+        b"\x89PNG\r\n\x1a\n": _png_header,
+        b"RIFF": _webp_header,
+        b"II*\0": _tiff_header,
+        b"MM\0*": _tiff_header,
+        b"BM": _bmp_header,
+    }
+    for magic, reader in readers.items():
+        if data.startswith(magic):
+            try:
+                header = reader(data)
+            except struct.error as error:  # the structure points beyond the end
+                raise UnusableImage("truncated: the file ends early") from error
+            if not 1 <= min(header.width, header.height) <= max(header.width, header.height) <= MAX_SIDE:
+                size = f"{header.width} x {header.height}"
+                raise UnusableImage(f"{size}: each side must have 1 to {MAX_SIDE} pixels; resize or cut it")
+            return header
+    raise UnusableImage(f"not an image: no JPEG, PNG, WebP, TIFF or BMP begins with {data[:4].hex(' ')}")
+
+
+_JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # in entropy-coded data, FF 00 and FF D0..D7 are no markers
+_JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # start of frame: every coding process
+_JPEG_TABLES = {0xC4, 0xCC, 0xDB, 0xDD}  # Huffman, arithmetic, quantisation, restart interval
+_JPEG_SCAN, _JPEG_END, _JPEG_APP1 = 0xDA, 0xD9, 0xE1
+_JPEG_REMARKS = {*range(0xE0, 0xF0), 0xFE}  # for applications, and comments
+_MAX_SCANS = 100  # each is a pass over the whole image; encoders write up to about ten
+
+
+def _jpeg_header(data: bytes) -> ImageHeader:
+    """Walks all segments to the end-of-image marker (ITU-T T.81, annex B), which a truncated file lacks.
+
+    Markers that would let a decoder continue elsewhere (a second start, those without a length) have no use in a file.
+    """
+    size, tiff, position, parts, scans = None, b"", 2, 0, 0
+    while match := _JPEG_MARKER.search(data, position):
+        marker, parts = match.group()[1], parts + 1
+        if marker == _JPEG_END:
+            if size is None:
+                raise UnusableImage("damaged: a JPEG without an image")
+            return ImageHeader(*size, exif=tiff, decodable=data)
+        (length,) = struct.unpack_from(">H", data, match.end())
+        segment = data[match.end() + 2 : match.end() + length]
+        if marker in _JPEG_FRAMES:
+            if size is not None:
+                raise UnusableImage("damaged: the JPEG states its size twice")
+            height, width = struct.unpack_from(">HH", segment, 1)
+            size = width, height
+        elif marker == _JPEG_SCAN:
+            scans += 1
+        elif marker == _JPEG_APP1 and segment.startswith(b"Exif\0\0"):
+            tiff = tiff or segment[6:]
+        elif marker not in _JPEG_TABLES | _JPEG_REMARKS:
+            raise UnusableImage(f"damaged: no JPEG file has a marker {marker:#x}")
+        if length < 2 or parts > _MAX_PARTS or scans > _MAX_SCANS:
+            raise UnusableImage(f"damaged: a JPEG of up to {_MAX_SCANS} scans and {_MAX_PARTS} segments was expected")
+        position = match.end() + length
+    raise UnusableImage("truncated: the JPEG has no end-of-image marker")
+
+
+_PNG_START = 8
+_PNG_NEEDED = {b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"eXIf", b"IEND"}  # eXIf: the orientation
+
+
+def _png_header(data: bytes) -> ImageHeader:
+    """Chunks (PNG, third edition): IHDR comes first and once. Texts and profiles are left out: they are compressed."""
+    tiff, position, kept = b"", _PNG_START, [data[:_PNG_START]]
+    width, height = struct.unpack_from(">II", data, _PNG_START + 8)
+    for part in range(_MAX_PARTS):
+        length, kind = struct.unpack_from(">I4s", data, position)
+        if (kind == b"IHDR") != (part == 0) or (part == 0 and length != 13):
+            raise UnusableImage("damaged: a PNG must state its size once, at its beginning")
+        if kind in _PNG_NEEDED and not (kind == b"eXIf" and tiff):
+            kept.append(data[position : position + 12 + length])
+        if kind == b"IEND":
+            return ImageHeader(width, height, tiff, decodable=b"".join(kept))
+        if kind == b"eXIf":
+            tiff = tiff or data[position + 8 : position + 8 + length]
+        position += 12 + length
+    raise UnusableImage(f"damaged: a PNG of at most {_MAX_PARTS} chunks was expected")
+
+
+def _webp_header(data: bytes) -> ImageHeader:
+    """RIFF chunks (RFC 9649): VP8X, or the only VP8 or VP8L, comes first; with VP8X, the image has the same size."""
+    riff_size, form = struct.unpack_from("<I4s", data, 4)
+    if form != b"WEBP":
+        raise UnusableImage("not an image: a RIFF file that is not WebP")
+    if riff_size + 8 > len(data):
+        raise UnusableImage("truncated: the file ends early")
+    size, tiff, position, parts = None, b"", 12, 0
+    while position + 8 <= riff_size + 8:
+        kind, length = struct.unpack_from("<4sI", data, position)
+        body = data[position + 8 : position + 8 + length]
+        stated = _webp_size(kind, body)
+        if position == 12:
+            size = stated
+        elif kind == b"VP8X" or stated not in (None, size):
+            raise UnusableImage(f"damaged: the WebP states its size twice, {size} and {stated}")
+        if kind == b"EXIF":
+            tiff = tiff or body.removeprefix(b"Exif\0\0")
+        position, parts = position + 8 + length + length % 2, parts + 1
+        if size is None or parts > _MAX_PARTS:
+            raise UnusableImage(f"damaged: a WebP must begin with its size and have at most {_MAX_PARTS} chunks")
+    if size is None:
+        raise UnusableImage("damaged: a WebP without an image")
+    return ImageHeader(*size, exif=tiff, decodable=data[: riff_size + 8])
+
+
+def _webp_size(kind: bytes, body: bytes) -> tuple[int, int] | None:
+    """Width and height, where a chunk of this kind states them."""
+    if kind == b"VP8X":
+        if len(body) < 10:
+            raise UnusableImage("truncated: the file ends early")
+        return 1 + int.from_bytes(body[4:7], "little"), 1 + int.from_bytes(body[7:10], "little")
+    if kind == b"VP8L":
+        bits = int.from_bytes(body[1:5], "little")
+        return 1 + (bits & 0x3FFF), 1 + (bits >> 14 & 0x3FFF)
+    if kind == b"VP8 ":
+        width, height = struct.unpack_from("<HH", body, 6)
+        return width & 0x3FFF, height & 0x3FFF
+    return None
+
+
+_TIFF_SIZES = {  # name -> tag and largest value
+    "ImageWidth": (exif.IMAGE_WIDTH, MAX_SIDE),
+    "ImageLength": (exif.IMAGE_LENGTH, MAX_SIDE),
+    "BitsPerSample": (258, 16),
+    "SamplesPerPixel": (277, 4),
+    "RowsPerStrip": (278, 2**32 - 1),
+    "TileWidth": (322, 2**32 - 1),
+    "TileLength": (323, 2**32 - 1),
+}
+_TIFF_DEPTHS = {32997, 32998}  # of volumes, by which libtiff multiplies sizes
+_TIFF_WHOLE = {1, 3, 4}  # types BYTE, SHORT and LONG
+_MAX_TILE = 1 << 22  # pixels of a tile or a strip, unless the image has more
+
+
+def _tiff_header(data: bytes) -> ImageHeader:
+    """The first directory (TIFF 6.0): no tag twice, and no tile or strip that is larger than its image."""
+    order = "<" if data.startswith(b"II") else ">"
+    (offset,) = struct.unpack_from(order + "I", data, 4)
+    (entries,) = struct.unpack_from(order + "H", data, offset)
+    rows = [struct.unpack_from(order + "HHI", data, offset + 2 + 12 * entry) for entry in range(entries)]
+    kinds = {tag: (kind, count) for tag, kind, count in rows}
+    if len(kinds) < entries or _TIFF_DEPTHS & kinds.keys():
+        raise UnusableImage("damaged: the TIFF has a tag twice, or is of a volume")
+    values = exif.read_directory(data, offset, order)
+    sizes: dict[str, int] = {}
+    for name, (tag, most) in _TIFF_SIZES.items():
+        if tag not in kinds:
+            continue
+        kind, count = kinds[tag]
+        given = values.get(tag, ())
+        if kind not in _TIFF_WHOLE or (count > 1 and name != "BitsPerSample") or not given or max(given) > most:
+            raise UnusableImage(f"the TIFF's {name} must be a whole number of at most {most}, is {given[:4]}")
+        sizes[name] = int(max(given))
+    if not {"ImageWidth", "ImageLength"} <= sizes.keys():
+        raise UnusableImage("truncated: the TIFF has no image directory")
+    width, height = sizes["ImageWidth"], sizes["ImageLength"]
+    strip_rows = sizes.get("RowsPerStrip", 2**32 - 1)
+    strip = width * (height if strip_rows == 2**32 - 1 else strip_rows)  # that number: all rows in one strip
+    tile = sizes.get("TileWidth", 1) * sizes.get("TileLength", 1)
+    if max(strip, tile) > max(_MAX_TILE, width * height):
+        raise UnusableImage(f"damaged: the TIFF of {width} x {height} has a part of {max(strip, tile)} pixels")
+    return ImageHeader(width, height, exif=data, decodable=data)
+
+
+_BMP_OLD_SIZE, _BMP_LEAST_SIZE = 12, 36  # bytes of the second header: OS/2 1.x, and what OpenCV reads
+
+
+def _bmp_header(data: bytes) -> ImageHeader:
+    (header_size,) = struct.unpack_from("<I", data, 14)
+    if header_size != _BMP_OLD_SIZE and header_size < _BMP_LEAST_SIZE:
+        raise UnusableImage(f"damaged: no BMP has a header of {header_size} bytes")
+    width, height = struct.unpack_from("<HH" if header_size == _BMP_OLD_SIZE else "<ii", data, 18)
+    return ImageHeader(abs(width), abs(height), decodable=data)

@@ -1,0 +1,29 @@
+"""Files that a stranger may have put there: regular ones only, and never more bytes than the reader can use."""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+
+def read_bounded(path: Path, most: int, refusal: type[Exception], source: str = "") -> bytes:
+    """The content of `path`, as long as it was when it was opened, if that is at most `most` bytes.
+
+    A pipe or a device, which could be read for ever, is no file; nor is it opened, which some devices take for a
+    command. Raises a `refusal` that begins with `source`, or OSError where the bytes cannot be had.
+    """
+    where = f"{source}: " if source else ""
+    _must_be_regular(os.stat(path), refusal, where)
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        found = os.fstat(file.fileno())  # of what was opened, whatever was there before
+        _must_be_regular(found, refusal, where)
+        if found.st_size > most:
+            raise refusal(f"{where}the file has {found.st_size} bytes; at most {most} are read")
+        return file.read(found.st_size)
+
+
+def _must_be_regular(found: os.stat_result, refusal: type[Exception], where: str) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        kind = "folder" if stat.S_ISDIR(found.st_mode) else "pipe or a device"
+        raise refusal(f"{where}must be a file, is a {kind}")
