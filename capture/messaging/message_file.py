@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from splatnode.capture.messaging.wire import Part
 from splatnode.capture.process.durable import write_whole
+from splatnode.capture.process.private import read_own
+
+LARGEST = 4 << 30  # bytes of a body, unless the reader knows better
 
 _HEAD = struct.Struct("<8sIQI")  # magic, parts, bytes of the body, its CRC-32
 _MAGIC = b"SPLSPOOL"
@@ -29,19 +32,28 @@ def write_message(path: Path, parts: Sequence[Part]) -> None:
     write_whole(path, [_HEAD.pack(_MAGIC, len(parts), size_in_file(parts), checksum), *body])
 
 
-def read_message(path: Path) -> list[Part]:
-    """The parts as they were written. Raises OSError, and ValueError where the disk has lost them."""
-    content = memoryview(path.read_bytes())
+class MessageFileError(ValueError):
+    """The file is no message that was written here, or the disk has lost a part of it; the text names it."""
+
+
+def read_message(path: Path, most_bytes: int = LARGEST) -> list[Part]:
+    """The parts as they were written. Raises OSError, MessageFileError; StrayFile for a link, a pipe, a larger file."""
+    content = memoryview(read_own(path, most_bytes + _HEAD.size))
     if len(content) < _HEAD.size:
-        raise ValueError(f"{path} is no stored message")
+        raise MessageFileError(f"{path} is no stored message")
     magic, count, size, checksum = _HEAD.unpack_from(content)
     body = content[_HEAD.size :]
     if magic != _MAGIC or len(body) != size or zlib.crc32(body) != checksum:
-        raise ValueError(f"{path} is damaged")
-    parts: list[Part] = []
-    position = 0
+        raise MessageFileError(f"{path} is damaged")
+    return list(_parts(body, count, path))
+
+
+def _parts(body: memoryview, count: int, path: Path) -> Iterator[memoryview]:
     for _ in range(count):
-        (length,) = _SIZE.unpack_from(body, position)
-        parts.append(body[position + _SIZE.size : position + _SIZE.size + length])
-        position += _SIZE.size + length
-    return parts
+        length = _SIZE.unpack_from(body)[0] if len(body) >= _SIZE.size else 0
+        if not 0 <= length <= len(body) - _SIZE.size:
+            raise MessageFileError(f"{path} is damaged: its {count} parts are larger than the file")
+        yield body[_SIZE.size : _SIZE.size + length]
+        body = body[_SIZE.size + length :]
+    if len(body):
+        raise MessageFileError(f"{path} is damaged: its {count} parts are smaller than the file")

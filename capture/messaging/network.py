@@ -13,7 +13,6 @@ import errno
 import logging
 import os
 import resource
-import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,6 +26,7 @@ from splatnode.capture.messaging import wire
 from splatnode.capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
 from splatnode.capture.messaging.services import Service
 from splatnode.capture.process.lock import Held, exclusive
+from splatnode.capture.process.private import NotPrivate, private_folder
 
 log = logging.getLogger(__name__)
 
@@ -202,13 +202,10 @@ def _raise_file_limit() -> None:
 def runtime_directory(network: Network) -> Path:
     """The private folder of sockets and locks, made where it is absent. Raises NetworkError where it is not private."""
     directory = network.directory or _default_directory()
-    directory.mkdir(mode=0o700, parents=True, exist_ok=True)
-    found = directory.stat()
-    if found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o077:
-        raise NetworkError(
-            f"{directory} must belong to this user and to nobody else (mode 0700), got mode "
-            f"{stat.S_IMODE(found.st_mode):04o} of user {found.st_uid}. Run: chmod 700 {directory}"
-        )
+    try:
+        private_folder(directory, "network.directory (or $XDG_RUNTIME_DIR), for each process,", ours=False)
+    except NotPrivate as error:
+        raise NetworkError(str(error)) from error
     return directory
 
 

@@ -9,16 +9,19 @@ from __future__ import annotations
 import contextlib
 import errno
 import logging
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
 import msgspec
 
-from splatnode.capture.messaging.message_file import read_message, size_in_file, write_message
+from splatnode.capture.messaging.message_file import MessageFileError, read_message, size_in_file, write_message
 from splatnode.capture.messaging.wire import Part
 from splatnode.capture.process.disk_space import shortage
+from splatnode.capture.process.durable import remove_leftovers
 from splatnode.capture.process.lock import exclusive
+from splatnode.capture.process.private import StrayFile, own_files, private_folder
 from splatnode.capture.process.state_directory import state_directory
 
 log = logging.getLogger(__name__)
@@ -28,6 +31,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     directory: Path | None = None  # None: state_directory() of capture/process
     max_frames: Annotated[int, msgspec.Meta(ge=1)] = 200
     max_mb: Annotated[int, msgspec.Meta(ge=1)] = 1024
+
+
+_FILE = re.compile(r"[0-9]{12,18}-[0-9a-f]{32}-[0-9]{1,18}\.frame")  # number, session, sequence
 
 
 class SpoolFull(RuntimeError):
@@ -45,19 +51,19 @@ class Spool:
     """Survives its process: what was put in is there until it is removed. One process at a time uses a directory."""
 
     def __init__(self, config: Config) -> None:
-        """Takes over what lies in the directory; what is damaged is put aside. Raises OSError, Held."""
+        """Takes over what lies in the directory; what is damaged is put aside. Raises OSError, Held, NotPrivate."""
         self.config = config
         self.directory = spool_directory(config)
-        self.directory.mkdir(mode=0o700, parents=True, exist_ok=True)
+        private_folder(self.directory, "spool.directory (or $XDG_STATE_HOME)", ours=True)
         self._resources = contextlib.ExitStack()
-        self._resources.enter_context(exclusive(self.directory.with_suffix(".lock")))
+        self._resources.enter_context(exclusive(self.directory / "lock"))
         self._files: dict[Key, Path] = {}  # oldest first
         self._bytes: dict[Key, int] = {}
-        for leftover in self.directory.glob(".*.tmp"):
-            leftover.unlink()
-        for path in sorted(self.directory.glob("*.frame")):
+        remove_leftovers(self.directory)
+        found = own_files(self.directory, _FILE, ".frame")
+        for path in found:
             self._take_over(path)
-        self._number = max((int(path.stem.split("-")[0]) for path in self._files.values()), default=-1) + 1
+        self._number = max((_number(path) for path in found), default=-1) + 1
 
     def close(self) -> None:
         """Lets another process use the directory."""
@@ -98,7 +104,7 @@ class Spool:
 
     def get(self, key: Key) -> list[Part]:
         """The parts as they were put in. Raises OSError or ValueError where the disk has lost them."""
-        return read_message(self._files[key])
+        return read_message(self._files[key], self.config.max_mb << 20)
 
     def remove(self, key: Key) -> None:
         """Removes an acknowledged message. Nothing happens where it is gone already."""
@@ -122,16 +128,25 @@ class Spool:
             )
 
     def _take_over(self, path: Path) -> None:
+        _, session, sequence = path.stem.split("-")
+        key = Key(session, int(sequence))
+        if key in self._files:  # the older one is sent
+            log.warning("left alone a copy of a keyframe: %s", path)
+            return
         try:
-            _, session, sequence = path.stem.split("-")
-            key = Key(session, int(sequence))
-            read_message(path)
-        except (OSError, ValueError) as error:
+            read_message(path, self.config.max_mb << 20)
+        except StrayFile as error:
+            log.warning("left alone: %s (spool.max_mb)", error)
+        except (OSError, MessageFileError) as error:
             log.error("put aside a damaged keyframe: %s", error)
             with contextlib.suppress(OSError):
                 path.rename(path.with_suffix(".damaged"))
         else:
             self._files[key], self._bytes[key] = path, path.stat().st_size
+
+
+def _number(path: Path) -> int:
+    return int(path.name.split("-")[0])
 
 
 def spool_directory(config: Config) -> Path:

@@ -1,18 +1,25 @@
-"""Files that are whole or not there, also after a power cut."""
+"""Files of this user alone that are whole or not there, also after a power cut."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import stat
+import uuid
 from collections.abc import Iterable
 from pathlib import Path
 
+from splatnode.capture.process.private import create_own
+
 
 def write_whole(path: Path, content: Iterable[bytes | memoryview]) -> None:
-    """Writes `path` under a temporary name, through to the disk, then renames it. Raises OSError, nothing left."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    """Writes `path` under a temporary name, through to the disk, then renames it. Raises OSError, nothing left.
+
+    Only this user can read it. A process that is killed may leave the temporary file, `.NAME.*.tmp`.
+    """
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
-        with temporary.open("wb") as file:
+        with open(create_own(temporary), "wb") as file:
             file.writelines(content)
             file.flush()
             os.fsync(file.fileno())
@@ -22,6 +29,14 @@ def write_whole(path: Path, content: Iterable[bytes | memoryview]) -> None:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Removes what killed processes left of files that they were writing. For the one process that writes there."""
+    for leftover in folder.glob(".*.tmp"):
+        with contextlib.suppress(OSError):  # where it cannot be removed, it is in nobody's way
+            if stat.S_ISREG(leftover.lstat().st_mode):
+                leftover.unlink()
 
 
 def sync_folder(folder: Path) -> None:

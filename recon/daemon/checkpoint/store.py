@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
 import threading
 from collections import deque
 from collections.abc import Iterator
@@ -28,7 +29,9 @@ from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.message_file import read_message, write_message
 from splatnode.capture.messaging.wire import Limits, Message, WireError, decode, encode
+from splatnode.capture.process.durable import remove_leftovers
 from splatnode.capture.process.lock import Held, exclusive
+from splatnode.capture.process.private import own_files, private_folder
 
 log = logging.getLogger(__name__)
 
@@ -37,6 +40,8 @@ MADE_ANEW = ("graph", "judgement", "scene", "pointmaps")
 REMEMBERED = 1000  # removed frames that are recognised if their sender missed the acknowledgement
 REMEMBERED_DROPPED = 100  # names and reasons
 FILE = "{:012d}.frame"
+_FILE = re.compile(r"[0-9]{12,18}\.frame")
+_INSTEAD = "--checkpoint (or $XDG_STATE_HOME)"
 LIMITS = Limits(header_bytes=64 << 20, arrays=1 << 20, total_bytes=4 << 30)  # of what this process wrote itself
 
 
@@ -75,10 +80,14 @@ class Store:
     """Reads and writes a checkpoint, from any thread. One process at a time uses a directory."""
 
     def __init__(self, directory: Path) -> None:
-        """Raises CheckpointError where another process uses it, or where it is of another version or damaged."""
+        """Raises CheckpointError where another process uses it, or where it is of another version or damaged.
+
+        Raises NotPrivate where another user could read or change it, and OSError.
+        """
         self.directory = directory
         self._frames = directory / "frames"
-        self._frames.mkdir(mode=0o700, parents=True, exist_ok=True)
+        private_folder(directory, _INSTEAD, ours=(directory / "ledger").is_file() or self._frames.is_dir())
+        private_folder(self._frames, _INSTEAD, ours=True)
         self._resources = contextlib.ExitStack()
         try:
             self._resources.enter_context(exclusive(directory / "lock"))
@@ -86,8 +95,8 @@ class Store:
             raise CheckpointError(
                 f"another process uses the checkpoint in {directory}; stop it, or give another --checkpoint"
             ) from error
-        for leftover in (*directory.glob(".*.tmp"), *self._frames.glob(".*.tmp")):
-            leftover.unlink()
+        remove_leftovers(directory)
+        remove_leftovers(self._frames)
         self.ledger = self._read_ledger()
         self._keys: dict[int, tuple[str, int]] = {}
         self._names: dict[str, int] = {}
@@ -122,10 +131,10 @@ class Store:
             yield self._found.popleft()
 
     def _read_frames(self) -> Iterator[StoredFrame]:
-        """The stored frames; a damaged one is renamed and logged."""
-        for path in sorted(self._frames.glob("*.frame")):
+        """The stored frames; a damaged one is renamed and logged, one that is there already left alone."""
+        for path in own_files(self._frames, _FILE, ".frame"):
+            number = int(path.stem)
             try:
-                number = int(path.stem)
                 self._next = max(self._next, number + 1)
                 if number < self.ledger.first:
                     path.unlink()
@@ -134,6 +143,9 @@ class Store:
             except (OSError, ValueError) as error:
                 log.error("a keyframe is lost on the disk, put aside: %s", error)
                 path.rename(path.with_suffix(".damaged"))
+                continue
+            if stored.key in self._keys.values() or stored.frame.name in self._names:
+                log.warning("left alone a copy of keyframe %s: %s", stored.frame.name, path)
                 continue
             self._remember(stored)
             yield stored

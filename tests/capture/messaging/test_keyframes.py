@@ -24,6 +24,7 @@ from splatnode.capture.messaging.wire import WireError, encode
 from splatnode.capture.process.lock import Held
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 from tests.conftest import ROOT
+from tests.support.strays import STRAYS
 
 INTRINSICS = Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0, "calibration", (0.1, -0.2))
 KEY = Key("0" * 32, 0)
@@ -221,7 +222,7 @@ def test_a_full_disk_is_a_full_spool_and_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr("splatnode.capture.process.durable.os.fsync", no_space)
     with pytest.raises(SpoolFull, match="No space left"):
         spool.put(KEY, [b"a"])
-    assert len(spool) == 0 and not list(spool.directory.iterdir())
+    assert len(spool) == 0 and [path.name for path in spool.directory.iterdir()] == ["lock"]
 
 
 def test_damaged_files_are_put_aside(tmp_path):
@@ -240,7 +241,8 @@ def test_damaged_files_are_put_aside(tmp_path):
     again = open_spool(tmp_path)
     assert [key.sequence for key in again] == [1]
     assert [bytes(part) for part in again.get(KEY._replace(sequence=1))] == [b"content", b"of the message"]
-    assert len(list(spool.directory.glob("*.damaged"))) == 4 and not (spool.directory / ".half.tmp").exists()
+    assert len(list(spool.directory.glob("*.damaged"))) == 3 and not (spool.directory / ".half.tmp").exists()
+    assert (spool.directory / "stranger.frame").read_bytes() == b"?"  # it is not ours
 
 
 def test_a_frame_that_the_disk_loses_does_not_block_the_others(tmp_path):
@@ -263,3 +265,43 @@ def test_where_the_spool_is(tmp_path, monkeypatch):
     with pytest.raises(Held, match=f"held by process {os.getpid()}"):
         Spool(Config())
     holder.close()
+
+
+@pytest.mark.parametrize("make", STRAYS.values(), ids=STRAYS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "copy of 000000000000-{session}-5.frame",
+        "000000000003-{session}-3.frame",
+        "000000000003-{session}-x.frame",
+        "{many}-{session}-3.frame",
+        "x-y.frame",
+        ".x.tmp",
+        ".frame",
+        "\udcff\n.frame",
+    ],
+)
+def test_what_is_no_file_of_the_spool_is_left_alone(tmp_path, make, name):
+    spool = open_spool(tmp_path)
+    spool.put(KEY, [b"content"])
+    spool.close()
+    stray = spool.directory / name.format(session=KEY.session, many="9" * 60)
+    make(stray)
+    again = open_spool(tmp_path)
+    assert list(again) == [KEY] and os.path.lexists(stray)
+    again.put(KEY._replace(sequence=9), [b"more"])
+    assert [key.sequence for key in again] == [KEY.sequence, 9]
+    again.close()
+
+
+def test_a_copy_and_a_file_larger_than_the_bound_are_left_alone(tmp_path, caplog):
+    spool = open_spool(tmp_path)
+    spool.put(KEY, [b"content"])
+    (path,) = spool.directory.glob("*.frame")
+    spool.close()
+    path.with_name(f"000000000004{path.name[12:]}").write_bytes(path.read_bytes())
+    with path.with_name(f"000000000007-{KEY.session}-7.frame").open("wb") as file:
+        file.truncate(10 << 30)
+    again = open_spool(tmp_path)
+    assert list(again) == [KEY] and len(list(spool.directory.glob("*.frame"))) == 3
+    assert "a copy of a keyframe" in caplog.text and "spool.max_mb" in caplog.text

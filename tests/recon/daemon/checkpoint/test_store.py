@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.recon.daemon.checkpoint import store as store_module
 from splatnode.recon.daemon.checkpoint.store import REMEMBERED_DROPPED, CheckpointError, Ledger, Store
+from tests.support.strays import STRAYS
 
 SESSION = "0123456789abcdef" * 2
 LENS = Intrinsics(8, 6, 7.0, 7.1, 4.0, 3.0, "calibration", (0.1, 0.0))
@@ -179,3 +181,62 @@ def test_what_can_be_made_anew_is_missing_rather_than_wrong(open_store, caplog):
     path.write_bytes(path.read_bytes()[:-1])
     assert store.load("graph", Ledger) is None and "made anew" in caplog.text
     assert store.load("scene", Ledger) is None
+
+
+@pytest.mark.parametrize("make", STRAYS.values(), ids=STRAYS)
+@pytest.mark.parametrize("name", ["frames/{}", "{}"])
+@pytest.mark.parametrize(
+    "stray", ["copy of 000000000005.frame", "000000000005.frame", "9" * 60 + ".frame", ".x.tmp", "-1.frame", "٣.frame"]
+)
+def test_what_is_no_file_of_the_checkpoint_is_left_alone(open_store, make, name, stray):
+    store = open_store()
+    store.put(received(0))
+    path = store.directory / name.format(stray)
+    make(path)
+    store = open_store()
+    assert [stored.frame.name for stored in store.frames()] == ["0.png"] and os.path.lexists(path)
+    for sequence in range(1, 5):
+        store.put(received(sequence))
+    assert len(list(open_store().frames())) == 5
+
+
+@pytest.mark.parametrize("make", STRAYS.values(), ids=STRAYS)
+@pytest.mark.parametrize("name", ["graph", "scene", "judgement", "pointmaps"])
+def test_what_lies_where_a_file_belongs_that_can_be_made_anew_is_no_file(open_store, make, name):
+    store = open_store()
+    make(store.directory / name)
+    assert open_store().load(name, Ledger) is None
+
+
+@pytest.mark.parametrize("make", STRAYS.values(), ids=STRAYS)
+def test_what_lies_where_the_ledger_belongs_is_told(open_store, make):
+    make(open_store().directory / "ledger")
+    with pytest.raises(CheckpointError, match="Move the folder away"):
+        open_store()
+
+
+def test_a_copy_of_a_keyframe_is_left_alone(open_store, caplog):
+    store = open_store()
+    store.put(received(0))
+    copy = store.directory / "frames" / "000000000007.frame"
+    copy.write_bytes((store.directory / "frames" / "000000000000.frame").read_bytes())
+    store = open_store()
+    assert [stored.number for stored in store.frames()] == [0] and copy.exists() and "a copy of" in caplog.text
+    assert store.put(received(1)).number == 8
+
+
+def test_a_checkpoint_is_private_whatever_the_umask_and_one_that_was_open_is_closed(open_store):
+    before = os.umask(0)
+    try:
+        store = open_store()
+        store.put(received(0))
+        store.begin_place(1)
+        store.put(received(1))
+    finally:
+        os.umask(before)
+    everything = [store.directory, *store.directory.rglob("*")]
+    assert len(everything) > 3 and not any(path.lstat().st_mode & 0o077 for path in everything)
+    for path in everything:
+        path.chmod(0o755 if path.is_dir() else 0o644)
+    store = open_store()
+    assert store.directory.lstat().st_mode & 0o777 == (store.directory / "frames").lstat().st_mode & 0o777 == 0o700

@@ -1,0 +1,185 @@
+"""Folders of one user alone, and files in them that nobody else can have put there, whatever the umask.
+
+What is checked is what was opened: a name may lead elsewhere a moment later, a descriptor does not. Root is trusted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import re
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+from splatnode.capture.process.logs import event
+from splatnode.capture.process.printable import printable
+
+log = logging.getLogger(__name__)
+
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+_FILE = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC
+_OTHERS, _OTHERS_WRITE = 0o077, 0o022
+_NAMED = 5  # stray files
+
+
+class NotPrivate(PermissionError):
+    """Another user could read or replace what is kept there; the text says what to do."""
+
+
+class StrayFile(ValueError):
+    """What lies there is no file of this user, or larger than any that is written there."""
+
+
+def private_folder(folder: Path, instead: str, *, ours: bool) -> None:
+    """Makes `folder`, and what is missing above it, for this user alone.
+
+    Where it is there and others may read it, it is closed to them if it is `ours` by its name, and refused if it is
+    any folder that somebody named. Raises OSError, and NotPrivate, which names what to set `instead`.
+    """
+    with _opened_folder(folder, instead) as descriptor:
+        found = os.fstat(descriptor)
+        if found.st_uid != os.geteuid():
+            raise NotPrivate(
+                f"{_shown(folder)} belongs to user {found.st_uid}, who could read and replace what is kept there. "
+                f"Set {instead} to a folder of your own"
+            )
+        if ours and found.st_mode & _OTHERS and not found.st_mode & stat.S_IWOTH:
+            os.fchmod(descriptor, 0o700)
+        mode = stat.S_IMODE(os.fstat(descriptor).st_mode)
+        if mode & _OTHERS:
+            raise NotPrivate(
+                f"{_shown(folder)} must be private (mode 0700), got mode {mode:04o}. If nobody else has put anything "
+                f"there, run: chmod 700 {_shown(folder)}. Or set {instead} to a folder that is not there yet"
+            )
+
+
+def check_only_ours(folder: Path) -> None:
+    """Raises NotPrivate where another user could change what lies in `folder`, OSError where it is none."""
+    with _open(os.path.realpath(folder), _FOLDER) as descriptor:
+        _check_owner(os.fstat(descriptor), folder)
+
+
+def read_own(path: Path, most_bytes: int, *, only_ours: bool = False) -> bytes:
+    """The content of a file of this user. Raises OSError, and StrayFile for what is none, or is larger.
+
+    `only_ours`: raises NotPrivate where another user could change it.
+    """
+    if not stat.S_ISREG(os.lstat(path).st_mode):  # before it is opened: a device may begin to work
+        raise StrayFile(f"{_shown(path)} is no regular file")
+    with open(os.open(path, os.O_RDONLY | _FILE), "rb", buffering=0) as file:
+        found = os.fstat(file.fileno())
+        if not stat.S_ISREG(found.st_mode) or found.st_uid not in (0, os.geteuid()):
+            raise StrayFile(f"{_shown(path)} is no file of this user")
+        if found.st_size > most_bytes:
+            raise StrayFile(f"{_shown(path)} has {found.st_size} bytes; at most {most_bytes} are read")
+        if only_ours:
+            _check_owner(found, path)
+        return _read(file.fileno(), found.st_size)
+
+
+def create_own(path: Path) -> int:
+    """The descriptor of a new file that only this user can read. Raises OSError where anything has that name."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | _FILE, 0o600)
+    try:
+        os.fchmod(descriptor, 0o600)  # a umask may have taken even that
+    except BaseException:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def own_files(folder: Path, name: re.Pattern[str], ending: str) -> list[Path]:
+    """The regular files of this user in `folder` called as `name` says, in the order of the numbers they begin with.
+
+    What else ends with `ending` (a copy, a folder, a link, a pipe) is left alone, and said.
+    """
+    ours, strays = [], []
+    with os.scandir(folder) as entries:
+        for entry in entries:
+            if not entry.name.endswith(ending):
+                continue
+            found = entry.stat(follow_symlinks=False)
+            is_ours = stat.S_ISREG(found.st_mode) and found.st_uid in (0, os.geteuid())
+            (ours if is_ours and name.fullmatch(entry.name) else strays).append(entry.name)
+    if strays:
+        named = ", ".join(printable(each, 100) for each in sorted(strays)[:_NAMED])
+        event(log, logging.WARNING, "left_alone", folder=folder, files=len(strays), such_as=named)
+    return [folder / each for each in sorted(ours, key=_number_and_name)]
+
+
+def _number_and_name(name: str) -> tuple[int, str]:
+    digits = re.match("[0-9]*", name)
+    return int(digits[0]) if digits and digits[0] else 0, name
+
+
+def _check_owner(found: os.stat_result, path: Path) -> None:
+    if found.st_uid not in (0, os.geteuid()) or found.st_mode & _OTHERS_WRITE:
+        raise NotPrivate(
+            f"{_shown(path)} can be changed by others (mode {stat.S_IMODE(found.st_mode):04o} of user {found.st_uid}). "
+            f"Look what lies there, then run: chown {os.geteuid()} {_shown(path)}; chmod go-w {_shown(path)}"
+        )
+
+
+@contextlib.contextmanager
+def _opened_folder(folder: Path, instead: str) -> Iterator[int]:
+    """A descriptor of the folder, which is made where it is missing."""
+    _check_way(Path.cwd() / folder, instead)
+    missing = [each for each in (folder, *folder.parents) if not os.path.lexists(each)]
+    for each in reversed(missing):
+        with contextlib.suppress(FileExistsError):  # another process has just made it
+            _make(each)
+    with _open(os.path.realpath(folder), _FOLDER) as descriptor:
+        yield descriptor
+
+
+def _make(folder: Path) -> None:
+    folder.mkdir(mode=0o700)
+    with _open(folder, os.O_PATH | _FOLDER) as descriptor:
+        if os.fstat(descriptor).st_mode & 0o700 != 0o700:  # a umask has taken the owner's own rights
+            os.chmod(f"/proc/self/fd/{descriptor}", 0o700)
+
+
+@contextlib.contextmanager
+def _open(path: Path | str, flags: int) -> Iterator[int]:
+    descriptor = os.open(path, flags)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
+
+
+def _check_way(folder: Path, instead: str) -> None:
+    """Raises NotPrivate where another user could make the way to `folder` lead elsewhere."""
+    for each in (*reversed(folder.parents), folder):
+        try:
+            found = os.lstat(each)
+        except (FileNotFoundError, NotADirectoryError):
+            return
+        if stat.S_ISLNK(found.st_mode):
+            if found.st_uid not in (0, os.geteuid()):
+                raise NotPrivate(
+                    f"{_shown(each)} is a link of user {found.st_uid}, who could let it lead anywhere. "
+                    f"Set {instead} to a folder of your own"
+                )
+            target = Path(os.path.realpath(each.parent), os.readlink(each))
+            if target.exists():  # and is no circle
+                _check_way(target, instead)
+        elif found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX and each != folder:
+            raise NotPrivate(
+                f"every user may rename what lies in {_shown(each)}. Run: chmod o-w {_shown(each)}, or set {instead} "
+                "to a folder elsewhere"
+            )
+
+
+def _read(descriptor: int, size: int) -> bytes:
+    pieces = []
+    while size > 0 and (piece := os.read(descriptor, min(size, 1 << 30))):
+        pieces.append(piece)
+        size -= len(piece)
+    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+
+
+def _shown(path: Path) -> str:
+    return printable(path)
