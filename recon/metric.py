@@ -23,6 +23,7 @@ Map = npt.NDArray[np.float32]
 _VIEWS = 6  # that the network is asked about
 _OPAQUE = 0.9
 _ENOUGH = 0.1  # of a view's pixels
+_MAX_METRES = 1_000_000  # of a baseline
 _MOST_SPREAD = 0.3  # between views: beyond, the network does not know this place
 
 
@@ -39,10 +40,12 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     network: bool = False  # ask Depth Anything V2 Metric Indoor Small, where its weights are
 
     def __post_init__(self) -> None:
-        if self.baseline is not None and not (self.baseline.metres > 0 and self.baseline.first != self.baseline.second):
+        if self.baseline is None:
+            return
+        if not 1 / _MAX_METRES <= self.baseline.metres <= _MAX_METRES or self.baseline.first == self.baseline.second:
             raise ValueError(
-                "a baseline must be two different photographs and a positive distance in metres, got "
-                f"{', '.join(map(str, self.baseline))}"
+                "a baseline must be two different photographs and a positive distance in metres, up to "
+                f"{_MAX_METRES}, got {', '.join(map(str, self.baseline))}"
             )
 
 

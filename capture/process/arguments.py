@@ -6,12 +6,18 @@ import argparse
 import math
 from collections.abc import Callable
 
+from splatnode.capture.process.config_text import MAX_NUMBER
+from splatnode.capture.process.printable import printable
+
+_MAX_DIGITS = 20
+
 
 def _whole_number(least: int) -> Callable[[str], int]:
     def convert(text: str) -> int:
-        if not text.strip().isdecimal() or int(text) < least:
-            raise argparse.ArgumentTypeError(f"must be a whole number, {least} or more; got {text!r}")
-        return int(text)
+        number = int(text) if text.strip().isdecimal() and len(text) <= _MAX_DIGITS else -1
+        if not least <= number <= MAX_NUMBER:
+            raise argparse.ArgumentTypeError(f"must be a whole number from {least} to {MAX_NUMBER}; got {_shown(text)}")
+        return number
 
     return convert
 
@@ -39,8 +45,8 @@ def _above_zero(text: str, unit: str) -> float:
         number = float(text)
     except ValueError:
         number = math.nan
-    if not 0 < number < math.inf:
-        raise argparse.ArgumentTypeError(f"must be a number of {unit} above 0; got {text!r}")
+    if not 0 < number <= MAX_NUMBER:
+        raise argparse.ArgumentTypeError(f"must be a number of {unit} above 0, up to {MAX_NUMBER}; got {_shown(text)}")
     return number
 
 
@@ -48,15 +54,15 @@ def names(text: str) -> tuple[str, ...]:
     """Values with commas between them: a,b,c."""
     names = tuple(name.strip() for name in text.split(","))
     if not all(names):
-        raise argparse.ArgumentTypeError(f"must be values with commas between them; got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be values with commas between them; got {_shown(text)}")
     return names
 
 
 def size(text: str) -> tuple[int, int]:
     """WIDTHxHEIGHT in pixels."""
-    sides = [int(side) for side in text.split("x") if side.isdecimal()]
+    sides = [int(side) for side in text.split("x") if side.isdecimal() and len(side) <= _MAX_DIGITS]
     if len(sides) != 2 or not 16 <= min(sides) <= max(sides) <= 4096:
-        raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT, from 16 to 4096 pixels; got {text!r}")
+        raise argparse.ArgumentTypeError(f"must be WIDTHxHEIGHT, from 16 to 4096 pixels; got {_shown(text)}")
     return sides[0], sides[1]
 
 
@@ -67,3 +73,7 @@ def counts(text: str) -> tuple[int, ...]:
 
 def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object for programs")
+
+
+def _shown(text: str) -> str:
+    return repr(printable(text, 100))

@@ -8,7 +8,6 @@ whose type is a Mapping of Plugins holds several by name, which is also their ki
 from __future__ import annotations
 
 import dataclasses
-import re
 import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -19,13 +18,13 @@ from types import ModuleType
 from typing import Any, ClassVar, TypeVar
 
 import msgspec
-import yaml
+
+from splatnode.capture.process.bounded_file import read_bounded
+from splatnode.capture.process.config_text import MAX_BYTES, MAX_DEPTH, ConfigError, parse_yaml
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import printable
 
 T = TypeVar("T")
-
-
-class ConfigError(ValueError):
-    """A configuration that cannot be used; the message names the key, what was expected and what came."""
 
 
 @dataclass(frozen=True)
@@ -71,11 +70,12 @@ def load_config(path: Path, schema: type[T], changes: Sequence[str] = ()) -> T:
 def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file; empty for an empty file. Raises ConfigError."""
     try:
-        content = _parse_yaml(path.read_text(encoding="utf-8"))
+        text = read_bounded(path, MAX_BYTES, ConfigError, str(path)).decode()
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}; give a YAML file") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not YAML: {error}") from error
+    content = parse_yaml(text, str(path))
     if content is not None and not isinstance(content, dict):
         raise ConfigError(f"{path}: expected keys and values, got {type(content).__name__}")
     return content or {}
@@ -86,13 +86,11 @@ def parse_changes(changes: Sequence[str]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for change in changes:
         key, equals, value = change.partition("=")
-        if not (key and equals):
-            raise ConfigError(f"expected KEY=VALUE such as camera.loops=2, got {change!r}")
-        try:
-            leaf: Any = _parse_yaml(value)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{key}: {value!r} is not a YAML value: {error}") from error
-        for name in reversed(key.replace("-", "_").split(".")):
+        names = key.replace("-", "_").split(".")
+        if not (key and equals and len(names) <= MAX_DEPTH):
+            raise ConfigError(f"expected KEY=VALUE such as camera.loops=2, got {printable(change)!r}")
+        leaf = parse_yaml(value, printable(key))
+        for name in reversed(names):
             leaf = {name: leaf}
         tree = merged(tree, leaf)
     return tree
@@ -109,12 +107,15 @@ def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any
 
 def typed(raw: Mapping[str, Any], schema: type[T], where: str = "") -> T:
     """`raw` as a `schema` (Struct or dataclass); `where` is the key under which it stands. Raises ConfigError."""
-    try:
-        return msgspec.convert(_checked(raw, schema, where), schema, dec_hook=_decode)
-    except msgspec.ValidationError as error:
-        message, _, path = str(error).partition(" - at `$")
-        key = _join(where, path.rstrip("`").lstrip("."))
-        raise ConfigError(f"{key or 'configuration'}: {message[0].lower()}{message[1:].replace('`', '')}") from error
+    with foreign(ConfigError, where):
+        try:
+            return msgspec.convert(_checked(raw, schema, where), schema, dec_hook=_decode)
+        except msgspec.ValidationError as error:
+            message, _, path = str(error).partition(" - at `$")
+            key = _join(where, path.rstrip("`").lstrip("."))
+            raise ConfigError(
+                f"{key or 'configuration'}: {message[0].lower()}{message[1:].replace('`', '')}"
+            ) from error
 
 
 def _checked(raw: Any, schema: Any, where: str) -> Any:
@@ -131,7 +132,7 @@ def _checked(raw: Any, schema: Any, where: str) -> Any:
     types = typing.get_type_hints(schema)
     unknown = [str(key) for key in raw if key not in types]
     if unknown:
-        raise ConfigError(f"{_join(where, unknown[0])}: unknown key; allowed here: {', '.join(types)}")
+        raise ConfigError(f"{_join(where, printable(unknown[0]))}: unknown key; allowed here: {', '.join(types)}")
     missing = [name for name in _required(schema) if name not in raw]
     if missing:
         raise ConfigError(f"{_join(where, missing[0])}: missing; it has no default")
@@ -145,7 +146,9 @@ def _of_kind(kind: object, raw: Any) -> Any:
 def _plugin(raw: Mapping[str, Any], schema: type[Plugin], where: str) -> Plugin:
     kind = raw.get("kind", schema.usual)
     if not schema.is_kind(kind):
-        raise ConfigError(f"{_join(where, 'kind')}: expected one of {', '.join(schema.kinds())}, got {kind!r}")
+        raise ConfigError(
+            f"{_join(where, 'kind')}: expected one of {', '.join(schema.kinds())}, got {printable(repr(kind), 100)}"
+        )
     module = import_module(f"{schema.package}.{kind}")
     rest = {key: value for key, value in raw.items() if key != "kind"}
     return schema(kind, typed(rest, module.Config, where))
@@ -180,16 +183,3 @@ def _decode(kind: type, value: Any) -> Any:
 
 def _join(where: str, key: str) -> str:
     return f"{where}.{key}" if where and key and not key.startswith("[") else where + key
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML 1.1 as PyYAML reads it, but 1e-3 is a number, as it is in YAML 1.2."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?[0-9]+(\.[0-9]*)?[eE][-+]?[0-9]+$"), list("-+0123456789")
-)
-
-
-def _parse_yaml(text: str) -> Any:
-    return yaml.load(text, Loader=_Loader)  # a SafeLoader

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -122,6 +123,9 @@ def test_a_refused_result_has_no_metres(seen):
 def test_the_configuration_says_what_a_baseline_is():
     config = overlaid(ReconConfig(), {"metric": {"baseline": ["a.jpg", "b.jpg", 0.5]}})
     assert config.metric.baseline == ("a.jpg", "b.jpg", 0.5) and config.metric.baseline.metres == 0.5
-    for wrong in (["a.jpg", "a.jpg", 0.5], ["a.jpg", "b.jpg", -1]):
+    for wrong in (
+        ["a.jpg", "a.jpg", 0.5],
+        *(["a.jpg", "b.jpg", metres] for metres in (-1, 0, math.nan, math.inf, 1e7)),
+    ):
         with pytest.raises(ConfigError, match="two different photographs and a positive distance"):
             overlaid(ReconConfig(), {"metric": {"baseline": wrong}})
