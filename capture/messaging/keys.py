@@ -8,12 +8,13 @@ Processes on one machine share the folder; its own key is always let in. A key i
 from __future__ import annotations
 
 import logging
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import zmq
+
+from splatnode.capture.process.durable import remove_leftovers, write_whole
 
 log = logging.getLogger(__name__)
 
@@ -36,18 +37,11 @@ def create_keys(folder: Path) -> bytes:
     """A new pair in `folder`, whose public key is returned. Raises KeyFileError where there is one already."""
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     (folder / ALLOWED).mkdir(mode=0o700, exist_ok=True)
+    if (folder / SECRET).exists():
+        raise KeyFileError(f"{folder / SECRET} is there already; remove it to replace this machine's keys")
     public, secret = zmq.curve_keypair()
-    try:
-        descriptor = os.open(folder / SECRET, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    except FileExistsError as error:
-        raise KeyFileError(f"{folder / SECRET} is there already; remove it to replace this machine's keys") from error
-    try:
-        with open(descriptor, "wb") as file:
-            file.write(secret + b"\n")
-        (folder / PUBLIC).write_bytes(public + b"\n")
-    except OSError:  # half a pair would be in the way of the next try
-        (folder / SECRET).unlink()
-        raise
+    _write_key(folder / PUBLIC, public)
+    _write_key(folder / SECRET, secret)  # last: where it is, the pair is
     return public
 
 
@@ -56,12 +50,12 @@ def allow(folder: Path, name: str, public: bytes) -> None:
     if not re.fullmatch(r"[\w.-]{1,64}", name) or name.startswith("."):
         raise ValueError(f"a machine's name has letters, digits, - and _, got {name!r}")
     (folder / ALLOWED).mkdir(mode=0o700, parents=True, exist_ok=True)
-    (folder / ALLOWED / f"{name}.key").write_bytes(checked_key(public, name) + b"\n")
+    _write_key(folder / ALLOWED / f"{name}.key", checked_key(public, name))
 
 
 def expect_server(folder: Path, public: bytes) -> None:
     """Connects to services of the machine with this key, and to no other."""
-    (folder / SERVER).write_bytes(checked_key(public, SERVER) + b"\n")
+    _write_key(folder / SERVER, checked_key(public, SERVER))
 
 
 def read_keys(folder: Path) -> Keys:
@@ -79,6 +73,11 @@ def checked_key(text: bytes, where: object) -> bytes:
     if not _Z85.fullmatch(key):
         raise KeyFileError(f"{where}: expected a key of 40 characters, got {len(key)} bytes. Run: splatnode keys")
     return key
+
+
+def _write_key(path: Path, key: bytes) -> None:
+    remove_leftovers(path.parent)
+    write_whole(path, [key + b"\n"])
 
 
 def _read_key(path: Path) -> bytes:

@@ -15,7 +15,6 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import msgspec
 
@@ -41,6 +40,7 @@ from splatnode.recon.daemon.status import ReconStatus, State
 from splatnode.recon.daemon.watcher import Watcher
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.result import bounds_in_words
+from splatnode.recon.result.export.staged import completed
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.message import camera_record, to_message
 
@@ -81,7 +81,8 @@ class Daemon:
             self._store = Store(config.checkpoint or state_directory() / "recon")
             self._resources.callback(self._store.close)
             self._resources.enter_context(result_folder(config.out))
-            remove_leftovers(config.out)
+            for folder in config.out.glob("scene-*"):
+                completed(folder, [folder / "colmap"])
         self._disk_space = DiskSpace(config, self._store)
         self._inbox = Inbox()
         self._newest = _Newest()
@@ -157,7 +158,10 @@ class Daemon:
         if command.name not in self._store.names:
             known = ", ".join(sorted(self._store.names)) or "none yet"
             return Answer(False, f"no keyframe {command.name!r}; there are: {known}")
-        self._store.forget(command.name, "retracted")
+        try:
+            self._store.forget(command.name, "retracted")
+        except OSError as error:
+            return Answer(False, f"{command.name} cannot be removed ({error.strerror}): make room on the disk")
         self._inbox.put(LeftOut(command.name), self._stopping)
         event(log, logging.INFO, "retracted", frame=command.name)
         return Answer(True, f"{command.name} is removed; the scene is built anew without it")
@@ -213,10 +217,3 @@ class _Newest:
         with self._lock:
             shown, self._shown = self._shown, None
             return shown
-
-
-def remove_leftovers(out: Path) -> None:
-    """Removes temporary files of exports that a killed process had begun."""
-    for leftover in (*out.glob("scene-*/.*.tmp"), *out.glob("scene-*/colmap/.*.tmp")):
-        event(log, logging.INFO, "removed_leftover", file=leftover)
-        leftover.unlink(missing_ok=True)

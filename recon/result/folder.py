@@ -10,7 +10,7 @@ from pathlib import Path
 from splatnode.capture.process.disk_space import shortage
 from splatnode.capture.process.folders import claimed
 from splatnode.capture.process.lock import Held
-from splatnode.recon.result.export.staged import ResultWriteError, explanation
+from splatnode.recon.result.export.staged import ResultWriteError, completed, explanation
 
 
 class FolderInUse(Held):
@@ -26,11 +26,12 @@ def result_folder(out: Path, needed_bytes: int = 0) -> Iterator[None]:
     """Holds the folder `out` for this process. Folders that it made and that are empty are removed at the end.
 
     Raises ResultWriteError where nothing can be written into it or fewer than `needed_bytes` are free, and FolderInUse
-    where another process holds it: all before the work and not after it.
+    where another process holds it: all before the work and not after it. What a killed process had begun is finished.
     """
     with contextlib.ExitStack() as resources:
         try:
             resources.enter_context(claimed(out))
+            completed(out, (path for path in out.iterdir() if path.is_dir() and not path.is_symlink()))
             why = shortage(out, needed_bytes, "the result")
         except Held as error:
             raise FolderInUse(out, error.pid) from error

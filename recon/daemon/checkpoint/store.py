@@ -136,10 +136,10 @@ class Store:
             number = int(path.stem)
             try:
                 self._next = max(self._next, number + 1)
-                if number < self.ledger.first:
-                    path.unlink()
+                stored = _stored(number, read_message(path)) if number >= self.ledger.first else None
+                if stored is None or stored.key in self.ledger.gone:  # its removal did not come to its end
+                    self._remove(number)
                     continue
-                stored = _stored(number, read_message(path))
             except (OSError, ValueError) as error:
                 log.error("a keyframe is lost on the disk, put aside: %s", error)
                 path.rename(path.with_suffix(".damaged"))
@@ -161,7 +161,9 @@ class Store:
                 self._leave_out({}, key, (frame.name, frame.reason))
                 return None
             number = self._next
-            name = frame.name if frame.name not in self._names else f"{number:06d}-{frame.name}"
+            # What is saved of a frame that was dropped may still be on the disk: no other gets its name.
+            taken = frame.name in self._names or any(frame.name == name for name, _ in self.ledger.dropped)
+            name = f"{number:06d}-{frame.name}" if taken else frame.name
             header = FrameRecord(VERSION, *key, name, frame.stamp_ns, frame.intrinsics)
             write_message(self._frames / FILE.format(number), encode(header, [frame.image]))
             stored = StoredFrame(number, key, Frame(number, name, frame.stamp_ns, frame.image, frame.intrinsics))
@@ -177,15 +179,15 @@ class Store:
                 self._leave_out({number: name}, self._keys[number], (name, reason))
 
     def begin_place(self, first: int) -> None:
-        """Begins another place with frame `first`; the frames before it and their scene are removed."""
+        """Begins another place with frame `first`; the frames before it and their scene are removed. Raises OSError."""
         with self._writing:
+            for name in MADE_ANEW:  # first: what a death leaves of the place before can be made anew, of this one not
+                (self.directory / name).unlink(missing_ok=True)
             before = {number: name for name, number in self._names.items() if number < first}
             gone = (*self.ledger.gone, *(self._keys[number] for number in before))
             place = self.ledger.place + 1
             self._write(Ledger(VERSION, place, first, self._next, gone[-REMEMBERED:]))
             self._unlink(before)
-            for name in MADE_ANEW:
-                (self.directory / name).unlink(missing_ok=True)
 
     def save(self, name: str, header: msgspec.Struct, arrays: list[Any]) -> None:
         """Writes one of the files that can be computed again. Raises OSError."""
@@ -215,8 +217,15 @@ class Store:
 
     def _unlink(self, frames: dict[int, str]) -> None:
         for number, name in frames.items():
-            (self._frames / FILE.format(number)).unlink(missing_ok=True)
+            self._remove(number)
             del self._names[name], self._keys[number]
+
+    def _remove(self, number: int) -> None:
+        """The ledger says already that the frame is gone: where the disk keeps the file, the next start removes it."""
+        try:
+            (self._frames / FILE.format(number)).unlink(missing_ok=True)
+        except OSError as error:
+            log.warning("frame %d is gone, but its file cannot be removed now: %s", number, error.strerror)
 
     def _remember(self, stored: StoredFrame) -> None:
         self._names[stored.frame.name] = stored.number

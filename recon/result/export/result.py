@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 from collections.abc import Mapping
@@ -39,8 +38,8 @@ def write_result(
         "verdict": snapshot.verdict.code.value,
         "files": {name: {"bytes": len(data), "sha256": _sha256(data)} for name, data in files.items()},
     }
-    write_files(out_dir, files | {MANIFEST: json_bytes(manifest)})
-    _remove_superseded(out_dir, previous, set(files))
+    superseded = {name: digest for name, digest in previous.items() if name not in files and name != MANIFEST}
+    write_files(out_dir, files | {MANIFEST: json_bytes(manifest)}, superseded)
     return out_dir / MANIFEST
 
 
@@ -65,17 +64,6 @@ def _read_manifest(out_dir: Path) -> dict[str, str]:
         return {str(name): str(entry["sha256"]) for name, entry in files.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}
-
-
-def _remove_superseded(out_dir: Path, previous: Mapping[str, str], current: set[str]) -> None:
-    for name, digest in previous.items():
-        path = out_dir / name
-        inside = path.resolve().is_relative_to(out_dir.resolve())  # a manifest is input, too
-        if name not in current and inside and path.is_file() and _sha256(path.read_bytes()) == digest:
-            path.unlink()
-            with contextlib.suppress(OSError):  # others' files may be beside it
-                if path.parent != out_dir:
-                    path.parent.rmdir()
 
 
 def _sha256(data: bytes) -> str:

@@ -1,56 +1,73 @@
-"""Files that appear together or not at all: written under temporary names, then renamed."""
+"""Files that appear together or not at all: written under temporary names, then renamed.
+
+What several files take to become one result is written down before the first is renamed: a process that is killed
+between two renames, or whose disk fails there, leaves a note beside them, from which `completed` finishes the work.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
+import hashlib
 import json
 import os
+import re
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+
+import msgspec
 
 from splatnode.capture.process.durable import sync_folder
 from splatnode.capture.process.folders import made
 
+_MARK = "[0-9a-f]{12}"
+_TEMPORARY, _NOTE = re.compile(rf"\..+\.{_MARK}\.tmp"), re.compile(rf"\.{_MARK}\.renaming")
+_LARGEST_NOTE = 1 << 20
+
 
 class ResultWriteError(OSError):
-    """A result could not be written; nothing that was there before has been changed. `errno` tells why."""
+    """A result could not be written; nothing that was there before has been changed. `errno` tells why.
+
+    But where a disk takes all files and then refuses to rename one of them, the text says that what was begun will be
+    finished.
+    """
 
 
-def write_files(folder: Path, contents: Mapping[str, bytes]) -> None:
+class _Note(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is to be done in a folder once all new files are on the disk, in this order."""
+
+    files: list[str]  # that are renamed to these names
+    superseded: dict[str, str]  # files that are removed, by their SHA-256: one that changed meanwhile is its owner's
+
+
+@dataclass(frozen=True)
+class _Staged:
+    """A file on its way: on the disk under a temporary name, which is locked as long as its writer lives."""
+
+    name: str
+    target: Path  # what a link names is written, as if it were opened
+    temporary: Path
+    linked: bool  # whether `target` is elsewhere than its name says
+
+
+def write_files(folder: Path, contents: Mapping[str, bytes], superseded: Mapping[str, str] | None = None) -> None:
     """Writes `contents` (by path relative to `folder`), which are renamed in their order once all are on the disk.
 
-    Raises ResultWriteError when one cannot be written (no space, no permission); the temporary files are gone then and
-    every file that was there before is as it was.
+    Files of `superseded` (SHA-256 by path) are removed then, if they are unchanged and inside `folder`. Raises
+    ResultWriteError when one cannot be written (no space, no permission); the temporary files are gone then and every
+    file that was there before is as it was.
     """
-    with contextlib.ExitStack() as folders:  # those that it makes and that stay empty are removed at the end
-        _write_files(folder, contents, folders)
-
-
-def _write_files(folder: Path, contents: Mapping[str, bytes], folders: contextlib.ExitStack) -> None:
-    mark = f".{uuid.uuid4().hex[:12]}.tmp"
-    temporary: dict[Path, Path] = {}
-    try:
-        for name, content in contents.items():
-            target = Path(os.path.realpath(folder / name))  # what a link names is written, as if it were opened
-            if target.is_dir():
-                raise IsADirectoryError(errno.EISDIR, f"{name} is a folder")
-            if target.exists() and not target.is_file():  # root could replace /dev/null
-                raise FileExistsError(errno.EEXIST, f"{name} is a device or a pipe, not a file")
-            temporary[target] = target.with_name(f".{target.name}{mark}")
-            folders.enter_context(made(target.parent))
-            _write_through(temporary[target], content)
-        for target, source in temporary.items():
-            os.replace(source, target)
-        for parent in {target.parent for target in temporary}:
-            sync_folder(parent)
-    except OSError as error:
-        raise ResultWriteError(error.errno, explanation(error, folder, contents)) from error
-    finally:
-        for source in temporary.values():
-            with contextlib.suppress(OSError):
-                source.unlink(missing_ok=True)
+    with contextlib.ExitStack() as resources:  # folders that it makes and that stay empty are removed at the end
+        try:
+            completed(folder, {(folder / name).parent for name in contents})
+            _write_files(folder, contents, superseded or {}, resources)
+        except ResultWriteError:
+            raise
+        except OSError as error:
+            raise ResultWriteError(error.errno, explanation(error, folder, contents)) from error
 
 
 def write_file(path: Path, content: bytes) -> None:
@@ -58,16 +75,24 @@ def write_file(path: Path, content: bytes) -> None:
     write_files(path.parent, {path.name: content})
 
 
+def completed(folder: Path, parents: Iterable[Path] = ()) -> None:
+    """Finishes what a killed process had begun in `folder`: the result is the new one then, or the one before.
+
+    Temporary files in it and in `parents` are removed; what a living process writes is left alone. Raises OSError.
+    """
+    for path in _entries(folder, _NOTE):
+        with _held(path) as free:
+            if free:
+                _follow(path)
+    for path in (path for each in {folder, *parents} for path in _entries(each, _TEMPORARY)):
+        with contextlib.suppress(OSError), _held(path) as free:  # another user's is none of ours
+            if free:
+                path.unlink(missing_ok=True)
+
+
 def json_bytes(value: object) -> bytes:
     """`value` as a JSON file. Raises ValueError for NaN and infinities, which JSON does not have."""
     return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode()
-
-
-def _write_through(path: Path, content: bytes) -> None:
-    with path.open("xb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
 
 
 def explanation(error: OSError, folder: Path, contents: Mapping[str, bytes] | None = None) -> str:
@@ -83,3 +108,148 @@ def explanation(error: OSError, folder: Path, contents: Mapping[str, bytes] | No
     }.get(error.errno or 0, "Choose another folder")
     what = f" {len(contents)} files ({megabytes:.1f} MB)" if len(contents) > 1 else ""
     return f"cannot write{what} to {folder}: {error.strerror or error}. {advice}"
+
+
+def _write_files(
+    folder: Path, contents: Mapping[str, bytes], superseded: Mapping[str, str], resources: contextlib.ExitStack
+) -> None:
+    mark = uuid.uuid4().hex[:12]
+    note, noted = folder / f".{mark}.renaming", len(contents) + len(superseded) > 1
+    staged = [_placed(folder, name, mark) for name in contents]
+    temporary = [each.temporary for each in staged]
+    try:
+        for each, content in zip(staged, contents.values(), strict=True):
+            resources.enter_context(made(each.target.parent))
+            _write_through(each.temporary, content, resources)
+        if noted:
+            temporary += [_temporary(note, mark), note]
+            here = [each.name for each in staged if not each.linked]
+            _write_through(_temporary(note, mark), msgspec.json.encode(_Note(here, dict(superseded))), resources)
+            _sync_parents(staged)
+            os.replace(_temporary(note, mark), note)
+            sync_folder(folder)
+            temporary = []
+        try:
+            _finish(folder, staged, superseded)
+            note.unlink(missing_ok=True)
+        except OSError as error:
+            if noted:
+                raise ResultWriteError(error.errno, _unfinished(error, folder)) from error
+            raise
+    finally:
+        for leftover in temporary:
+            with contextlib.suppress(OSError):
+                leftover.unlink(missing_ok=True)
+
+
+def _unfinished(error: OSError, folder: Path) -> str:
+    why = error.strerror or error
+    return f"cannot rename all files in {folder}: {why}. Run the command again: what writes there next finishes it"
+
+
+def _placed(folder: Path, name: str, mark: str) -> _Staged:
+    target = Path(os.path.realpath(folder / name))
+    if target.is_dir():
+        raise IsADirectoryError(errno.EISDIR, f"{name} is a folder")
+    if target.exists() and not target.is_file():  # root could replace /dev/null
+        raise FileExistsError(errno.EEXIST, f"{name} is a device or a pipe, not a file")
+    return _Staged(name, target, _temporary(target, mark), linked=target != Path(os.path.realpath(folder), name))
+
+
+def _temporary(target: Path, mark: str) -> Path:
+    return target.with_name(f".{target.name}.{mark}.tmp")
+
+
+def _write_through(path: Path, content: bytes, resources: contextlib.ExitStack) -> None:
+    """Leaves the file open and locked, which tells others that its writer lives."""
+    file = resources.enter_context(path.open("xb", buffering=0))
+    with contextlib.suppress(OSError):  # a file system without locks
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    rest = memoryview(content)
+    while rest:
+        rest = rest[file.write(rest) :]
+    os.fsync(file.fileno())
+
+
+def _finish(folder: Path, staged: list[_Staged], superseded: Mapping[str, str]) -> None:
+    for each in staged:
+        os.replace(each.temporary, each.target)
+    _sync_parents(staged)
+    for name, digest in superseded.items():
+        _remove(folder, name, digest)
+
+
+def _sync_parents(staged: list[_Staged]) -> None:
+    for parent in {each.target.parent for each in staged}:
+        sync_folder(parent)
+
+
+def _follow(path: Path) -> None:
+    """Does what is left to do of a note. It says nothing of files outside its folder: it may be a stranger's."""
+    folder, mark, note = path.parent, path.name.split(".")[1], _read_note(path)
+    for name in filter(lambda name: _is_inside(folder, name), note.files):
+        with contextlib.suppress(FileNotFoundError):  # it has its name already
+            os.replace(_temporary(folder / name, mark), folder / name)
+            sync_folder((folder / name).parent)
+    for name, digest in note.superseded.items():
+        _remove(folder, name, digest)
+    path.unlink(missing_ok=True)
+
+
+def _remove(folder: Path, name: str, digest: str) -> None:
+    path = folder / name
+    if not _is_inside(folder, name) or path.is_symlink() or not path.is_file():
+        return
+    if hashlib.sha256(path.read_bytes()).hexdigest() == digest:
+        path.unlink()
+        with contextlib.suppress(OSError):  # others' files may be beside it
+            if path.parent != folder:
+                path.parent.rmdir()
+
+
+def _is_inside(folder: Path, name: str) -> bool:
+    """Whether `name` is that of a file in `folder` or in a folder in it, by no link."""
+    parent = os.path.dirname(os.path.normpath(name))
+    outside = os.path.isabs(name) or parent.startswith("..") or os.path.basename(name) in ("", ".", "..")
+    return not outside and os.path.realpath(folder / parent) == os.path.normpath(
+        os.path.realpath(folder) + "/" + parent
+    )
+
+
+def _read_note(path: Path) -> _Note:
+    """An empty one where it cannot be read: no process leaves half a note."""
+    with path.open("rb") as file:
+        try:
+            return msgspec.json.decode(file.read(_LARGEST_NOTE), type=_Note)
+        except msgspec.DecodeError:
+            return _Note([], {})
+
+
+@contextlib.contextmanager
+def _held(path: Path) -> Iterator[bool]:
+    """Holds a file that no living process holds; False where one does, or where the file has gone."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError:
+        yield False
+        return
+    try:
+        yield _locked(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _locked(descriptor: int) -> bool:
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _entries(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
+    """The folder's entries with such names; none where there is no such folder or it cannot be listed."""
+    try:
+        return [folder / name for name in os.listdir(folder) if pattern.fullmatch(name)]
+    except OSError:
+        return []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import hashlib
 import json
 import os
@@ -77,11 +78,11 @@ def test_full_disk_leaves_the_earlier_result_and_no_temporary_file(tmp_path, mon
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     real = staged_module._write_through
 
-    def full(path: Path, content: bytes) -> None:
+    def full(path: Path, content: bytes, *rest: object) -> None:
         if failing in path.name:
             path.write_bytes(content[: len(content) // 2])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        real(path, content)
+        real(path, content, *rest)
 
     monkeypatch.setattr(staged_module, "_write_through", full)
     changed = replace(make_snapshot(), gaussians=make_gaussians(seed=9))
@@ -122,3 +123,57 @@ def test_file_in_place_of_the_folder_is_a_clear_error(tmp_path):
     with pytest.raises(ResultWriteError, match="cannot write"):
         write(make_snapshot(), tmp_path / "out")
     assert (tmp_path / "out").read_text() == "a file"
+
+
+MINE = hashlib.sha256(b"mine").hexdigest()
+
+
+def interrupted(folder, contents: dict[str, bytes], note: str | None) -> None:
+    """What a process that was killed between renames leaves: temporary files, and the note of what is to be done."""
+    for name, content in contents.items():
+        target = folder / name
+        target.with_name(f".{target.name}.0123456789ab.tmp").write_bytes(content)
+    if note is not None:
+        (folder / ".0123456789ab.renaming").write_text(note)
+
+
+def test_what_a_killed_process_had_begun_is_finished_or_taken_back(tmp_path):
+    write(make_snapshot(), tmp_path)
+    digest = hashlib.sha256((tmp_path / "transforms.json").read_bytes()).hexdigest()
+    note = {"files": ["scene.ply", "report.json"], "superseded": {"transforms.json": digest}}
+    interrupted(tmp_path, {"report.json": b"new"}, json.dumps(note))  # scene.ply has its name already
+    staged_module.completed(tmp_path)
+    assert (tmp_path / "report.json").read_bytes() == b"new" and not (tmp_path / "transforms.json").exists()
+    interrupted(tmp_path, {"report.json": b"newer"}, None)
+    staged_module.completed(tmp_path)
+    assert (tmp_path / "report.json").read_bytes() == b"new" and not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize(
+    "note",
+    ["", "{", '{"files": 3}', '{"files": ["../outside"], "superseded": {}}', '{"files": ["link/x"], "superseded": {}}']
+    + [json.dumps({"files": [], "superseded": {name: MINE}}) for name in ("../outside", "own")],
+)
+def test_a_strangers_note_touches_nothing_outside_its_folder(tmp_path, note):
+    outside, folder = tmp_path / "outside", tmp_path / "out"
+    outside.write_text("mine")
+    (tmp_path / "elsewhere").mkdir()
+    folder.mkdir()
+    (folder / "link").symlink_to(tmp_path / "elsewhere")
+    (folder / "own").symlink_to(outside)
+    (tmp_path / ".outside.0123456789ab.tmp").write_text("theirs")
+    (tmp_path / "elsewhere" / ".x.0123456789ab.tmp").write_text("theirs")
+    interrupted(folder, {}, note)
+    staged_module.completed(folder)
+    assert outside.read_text() == "mine" and not (tmp_path / "elsewhere" / "x").exists()
+    assert {path.name for path in folder.iterdir()} == {"link", "own"}
+
+
+def test_a_living_writers_files_and_a_pipe_of_such_a_name_are_left_alone(tmp_path):
+    os.mkfifo(tmp_path / ".pipe.0123456789ab.tmp")
+    with (tmp_path / ".scene.ply.ba9876543210.tmp").open("wb") as living:
+        fcntl.flock(living, fcntl.LOCK_EX)
+        write_file(tmp_path / "scene.ply", b"mine")
+        assert (tmp_path / ".scene.ply.ba9876543210.tmp").exists()
+    write_file(tmp_path / "scene.ply", b"again")
+    assert not (tmp_path / ".scene.ply.ba9876543210.tmp").exists()
