@@ -8,6 +8,7 @@ Processes on one machine share the folder; its own key is always let in. A key i
 from __future__ import annotations
 
 import logging
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +16,15 @@ from pathlib import Path
 import zmq
 
 from splatnode.capture.process.durable import remove_leftovers, write_whole
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.private import NotPrivate, StrayFile, check_only_ours, read_own
 
 log = logging.getLogger(__name__)
 
 SECRET, PUBLIC, SERVER, ALLOWED = "secret.key", "public.key", "server.key", "allowed"
+_KEY_BYTES = 40
+_LARGEST = 1000  # bytes of a key's file
+_MOST_SAID = 100  # refused keys and connections
 _Z85 = re.compile(rb"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 
 
@@ -34,10 +40,14 @@ class Keys:
 
 
 def create_keys(folder: Path) -> bytes:
-    """A new pair in `folder`, whose public key is returned. Raises KeyFileError where there is one already."""
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    (folder / ALLOWED).mkdir(mode=0o700, exist_ok=True)
-    if (folder / SECRET).exists():
+    """A new pair in `folder`, whose public key is returned; a secret key that was cut short is replaced, and said.
+
+    Raises KeyFileError where there is a secret key already, NotPrivate where others could change what is there.
+    """
+    _make(folder)
+    if _is_cut(folder / SECRET):
+        log.warning("the secret key in %s was cut short: this is a new pair, whose public key others need", folder)
+    elif os.path.lexists(folder / SECRET):
         raise KeyFileError(f"{folder / SECRET} is there already; remove it to replace this machine's keys")
     public, secret = zmq.curve_keypair()
     _write_key(folder / PUBLIC, public)
@@ -46,33 +56,55 @@ def create_keys(folder: Path) -> bytes:
 
 
 def allow(folder: Path, name: str, public: bytes) -> None:
-    """Lets the machine `name` connect, at once: the list is read at each handshake."""
+    """Lets the machine `name` connect, at once: the list is read at each handshake. Raises ValueError, NotPrivate."""
     if not re.fullmatch(r"[\w.-]{1,64}", name) or name.startswith("."):
         raise ValueError(f"a machine's name has letters, digits, - and _, got {name!r}")
-    (folder / ALLOWED).mkdir(mode=0o700, parents=True, exist_ok=True)
+    _make(folder)
     _write_key(folder / ALLOWED / f"{name}.key", checked_key(public, name))
 
 
 def expect_server(folder: Path, public: bytes) -> None:
     """Connects to services of the machine with this key, and to no other."""
+    check_only_ours(folder)
     _write_key(folder / SERVER, checked_key(public, SERVER))
 
 
 def read_keys(folder: Path) -> Keys:
-    """Raises KeyFileError where a key is missing, damaged, or the secret is readable by others."""
-    secret_file = folder / SECRET
-    secret = _read_key(secret_file)
-    if secret_file.stat().st_mode & 0o077:
-        raise KeyFileError(f"{secret_file} can be read by other users. Run: chmod 600 {secret_file}")
-    public = _read_key(folder / PUBLIC)
-    return Keys(public, secret, _read_key(folder / SERVER) if (folder / SERVER).exists() else public)
+    """Raises KeyFileError where a key is missing, damaged, or others could read the secret or change any of them."""
+    try:
+        secret = _read_key(folder / SECRET)
+        check_only_ours(folder)
+        if (folder / SECRET).lstat().st_mode & 0o077:
+            raise KeyFileError(f"{folder / SECRET} can be read by other users. Run: chmod 600 {folder / SECRET}")
+        with foreign(KeyFileError, folder / SECRET):
+            public = zmq.curve_public(secret)
+        server = _read_key(folder / SERVER) if os.path.lexists(folder / SERVER) else public
+    except NotPrivate as error:
+        raise KeyFileError(str(error)) from error
+    return Keys(public, secret, server)
 
 
 def checked_key(text: bytes, where: object) -> bytes:
+    """The key in `text`. Raises KeyFileError, which names `where` it came from."""
     key = text.strip()
     if not _Z85.fullmatch(key):
         raise KeyFileError(f"{where}: expected a key of 40 characters, got {len(key)} bytes. Run: splatnode keys")
     return key
+
+
+def _make(folder: Path) -> None:
+    """The folder, and that of the allowed keys. Raises NotPrivate, OSError."""
+    for each in (folder, folder / ALLOWED):
+        each.mkdir(mode=0o700, parents=True, exist_ok=True)
+        check_only_ours(each)
+
+
+def _is_cut(path: Path) -> bool:
+    """Whether it is a file of less than a key, as a full disk or a power cut may have left it."""
+    try:
+        return len(read_own(path, _LARGEST).strip()) < _KEY_BYTES
+    except (FileNotFoundError, StrayFile):
+        return False
 
 
 def _write_key(path: Path, key: bytes) -> None:
@@ -81,10 +113,13 @@ def _write_key(path: Path, key: bytes) -> None:
 
 
 def _read_key(path: Path) -> bytes:
+    """Raises KeyFileError, and NotPrivate where others could change it."""
     try:
-        return checked_key(path.read_bytes(), path)
+        return checked_key(read_own(path, _LARGEST, only_ours=True), path)
     except FileNotFoundError as error:
         raise KeyFileError(f"no key {path}. Run: splatnode keys {path.parent}") from error
+    except StrayFile as error:
+        raise KeyFileError(str(error)) from error
 
 
 class AllowList:
@@ -93,16 +128,33 @@ class AllowList:
     def __init__(self, folder: Path, own: bytes) -> None:
         self.folder = folder
         self.own = own
+        self._said: set[str] = set()
 
     def callback(self, domain: str, key: bytes) -> bool:
         try:
             allowed = key == self.own or key in self._listed()
         except OSError as error:
-            log.error("cannot read whom to let in, so nobody is: %s", error)
+            self._say(logging.ERROR, f"cannot read whom to let in, so nobody is: {error}")
             return False
         if not allowed:
-            log.warning("refused a connection: key %s is not in %s", key.decode("ascii", "replace"), self.folder)
+            self._say(logging.WARNING, f"refused a connection: key {key.decode('ascii', 'replace')} is not allowed")
         return allowed
 
     def _listed(self) -> set[bytes]:
-        return {path.read_bytes().strip() for path in self.folder.glob("*.key")}
+        """The keys that only this user can have put there; the others are said. Raises NotPrivate, OSError."""
+        for each in (self.folder.parent, self.folder):
+            check_only_ours(each)
+        found = set()
+        for path in self.folder.glob("*.key"):
+            try:
+                found.add(_read_key(path))
+            except (KeyFileError, NotPrivate) as error:
+                self._say(logging.ERROR, f"a key is not accepted: {error}")
+        return found
+
+    def _say(self, level: int, text: str) -> None:
+        """Once: a stranger who tries again and again does not fill the journal."""
+        if text not in self._said and len(self._said) < _MOST_SAID:
+            self._said.add(text)
+            more = "; nothing further is said of connections" if len(self._said) == _MOST_SAID else ""
+            log.log(level, "%s%s (allowed are those in %s)", text, more, self.folder)

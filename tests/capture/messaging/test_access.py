@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import socket
 import subprocess
 import sys
 
 import msgspec
 import pytest
+import zmq
 
 from splatnode.capture.messaging import keys
 from splatnode.capture.messaging.broadcast import Publisher, Subscriber
@@ -19,6 +21,7 @@ from splatnode.capture.messaging.state import StateClient, StateServer
 from splatnode.capture.messaging.wire import Numbering
 from tests.capture.messaging.test_sockets import Note, heard, ipc, tcp, wait_for
 from tests.conftest import ROOT
+from tests.support.strays import STRAYS
 
 SERVES = """
 import pathlib, resource, sys
@@ -129,6 +132,93 @@ def test_keys_are_private_and_not_overwritten(tmp_path):
     (tmp_path / "secret.key").chmod(0o644)
     with pytest.raises(keys.KeyFileError, match="chmod 600"):
         keys.read_keys(tmp_path)
+
+
+@pytest.mark.parametrize("left", [b"", b"\n", b"abc"])
+def test_a_secret_key_that_was_cut_short_is_replaced_and_said(tmp_path, caplog, left):
+    keys.create_keys(tmp_path)
+    (tmp_path / keys.SECRET).write_bytes(left)
+    with pytest.raises(keys.KeyFileError, match="splatnode keys"):
+        keys.read_keys(tmp_path)
+    public = keys.create_keys(tmp_path)
+    assert "was cut short" in caplog.text and keys.read_keys(tmp_path).public == public
+    with pytest.raises(keys.KeyFileError, match="there already"):
+        keys.create_keys(tmp_path)
+
+
+@pytest.mark.parametrize("make", STRAYS.values(), ids=STRAYS)
+def test_what_is_no_key_file_is_not_waited_for(tmp_path, make):
+    public = keys.create_keys(tmp_path)
+    make(tmp_path / keys.ALLOWED / "laptop.key")
+    allowed = keys.AllowList(tmp_path / keys.ALLOWED, public)
+    assert allowed.callback("", public) and not allowed.callback("", b"x" * 40)
+    (tmp_path / keys.SECRET).unlink()
+    make(tmp_path / keys.SECRET)
+    for act in (keys.read_keys, keys.create_keys):
+        with pytest.raises(keys.KeyFileError):
+            act(tmp_path)
+
+
+def loosened(folder, what):
+    """Puts a key that is allowed into `folder`, and lets others change `what` of it."""
+    public = keys.create_keys(folder)
+    other = zmq.curve_keypair()[0]
+    keys.allow(folder, "laptop", other)
+    path = folder / what
+    path.chmod(path.stat().st_mode | 0o022)
+    return public, other
+
+
+@pytest.mark.parametrize("what", [".", "allowed", "allowed/laptop.key"])
+def test_a_key_that_others_may_have_put_there_is_not_accepted_and_that_is_said_once(tmp_path, caplog, what):
+    public, other = loosened(tmp_path / "keys", what)
+    allowed = keys.AllowList(tmp_path / "keys" / keys.ALLOWED, public)
+    for _ in range(3):
+        assert allowed.callback("", public) and not allowed.callback("", other)
+    assert caplog.text.count("chmod go-w") == 1
+    (tmp_path / "keys" / what).chmod((tmp_path / "keys" / what).stat().st_mode & ~0o022)
+    assert allowed.callback("", other)  # the modes are looked at at each handshake
+
+
+@pytest.mark.parametrize("what", [".", "secret.key", "server.key"])
+def test_keys_that_others_may_change_are_not_used(tmp_path, what):
+    folder = tmp_path / "keys"
+    keys.expect_server(folder, keys.create_keys(folder))
+    (folder / what).chmod((folder / what).stat().st_mode | 0o022)
+    with pytest.raises(keys.KeyFileError, match="chmod"):
+        keys.read_keys(folder)
+
+
+def test_a_stranger_who_tries_again_and_again_does_not_fill_the_journal(tmp_path, caplog):
+    allowed = keys.AllowList(tmp_path / keys.ALLOWED, keys.create_keys(tmp_path))
+    for number in range(500):
+        for _ in range(3):
+            assert not allowed.callback("", b"%040d" % number)
+    assert len(caplog.records) == 100 and "nothing further" in caplog.records[-1].getMessage()
+
+
+def test_a_secret_of_the_right_letters_that_is_no_number_is_refused(tmp_path):
+    keys.create_keys(tmp_path)
+    (tmp_path / keys.SECRET).write_bytes(b"#" * 40)
+    with pytest.raises(keys.KeyFileError, match="secret.key"):
+        keys.read_keys(tmp_path)
+
+
+def test_the_public_key_is_that_of_the_secret_one(tmp_path):
+    public = keys.create_keys(tmp_path)
+    (tmp_path / keys.PUBLIC).unlink()
+    assert keys.read_keys(tmp_path).public == public
+
+
+@pytest.mark.parametrize("umask", [0, 0o077], ids=oct)
+def test_keys_are_private_whatever_the_umask(tmp_path, umask):
+    before = os.umask(umask)
+    try:
+        keys.allow(tmp_path / "a", "laptop", keys.create_keys(tmp_path / "a"))
+    finally:
+        os.umask(before)
+    everything = [tmp_path / "a", *(tmp_path / "a").rglob("*")]
+    assert len(everything) == 5 and not any(path.lstat().st_mode & 0o077 for path in everything)
 
 
 def test_keys_that_the_disk_did_not_take_are_not_in_the_way_of_the_next(tmp_path):
