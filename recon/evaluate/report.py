@@ -7,7 +7,9 @@ import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from urllib.parse import quote
 
+from splatnode.capture.process.printable import escaped
 from splatnode.recon.evaluate.protocol import Row
 from splatnode.recon.evaluate.records import Bench, bench_files
 from splatnode.recon.evaluate.renders import PHOTOGRAPH, kept
@@ -63,18 +65,23 @@ def _introduction(bench: Bench) -> str:
 
 
 def _markdown(bench: Bench, found: Sequence[Table]) -> str:
-    lines = ["# Benchmark", "", f"Command: `{bench.command}`", "", _introduction(bench)]
+    lines = ["# Benchmark", "", f"Command: `{escaped(bench.command)}`", "", escaped(_introduction(bench))]
     for table in found:
-        rows = (table.head, ["---"] * len(table.head), *table.body)
+        head, *body = ([_cell(cell) for cell in row] for row in (table.head, *table.body))
+        rows = (head, ["---"] * len(head), *body)
         lines += ["", f"## {table.title}", "", *(f"| {' | '.join(row)} |" for row in rows)]
     return "\n".join(lines) + "\n"
+
+
+def _cell(raw: str) -> str:
+    return escaped(raw).replace("|", "\\|").replace("<", "&lt;")
 
 
 def _html(bench: Bench, found: Sequence[Table], out_dir: Path) -> str:
     charts = [path.name for path in sorted(out_dir.glob("*.png"))]
     parts = [
-        f"<h1>Benchmark</h1><p><code>{html.escape(bench.command)}</code></p><p>{html.escape(_introduction(bench))}</p>",
-        *(f'<p><img src="{name}" alt="{name}"></p>' for name in charts),
+        f"<h1>Benchmark</h1><p><code>{_text(bench.command)}</code></p><p>{_text(_introduction(bench))}</p>",
+        *(f'<p><img src="{_source(name)}" alt="{_text(name)}"></p>' for name in charts),
         *(_html_table(table) for table in found),
         *_galleries([row for row in bench.rows if row.final], out_dir),
     ]
@@ -84,10 +91,10 @@ def _html(bench: Bench, found: Sequence[Table], out_dir: Path) -> str:
 
 def _html_table(table: Table) -> str:
     def line(cells: Sequence[str], tag: str) -> str:
-        return f"<tr>{''.join(f'<{tag}>{html.escape(cell)}</{tag}>' for cell in cells)}</tr>"
+        return f"<tr>{''.join(f'<{tag}>{_text(cell)}</{tag}>' for cell in cells)}</tr>"
 
     body = "".join(line(row, "td") for row in table.body)
-    return f"<h2>{html.escape(table.title)}</h2><table>{line(table.head, 'th')}{body}</table>"
+    return f"<h2>{_text(table.title)}</h2><table>{line(table.head, 'th')}{body}</table>"
 
 
 def _galleries(ends: Sequence[Row], out_dir: Path) -> list[str]:
@@ -101,11 +108,21 @@ def _galleries(ends: Sequence[Row], out_dir: Path) -> list[str]:
                 caption = f"{row.method}, seed {row.seed}: {number(row.psnr, 2)} dB over all views"
                 shown.setdefault(view, [photograph]).append(_figure(path, caption, out_dir))
         if shown:
-            parts.append(f"<h2>{html.escape(scene)}, {views} views</h2>")
+            parts.append(f"<h2>{_text(scene)}, {views} views</h2>")
             parts += [f"<div>{''.join(figures)}</div>" for figures in shown.values()]
     return parts
 
 
 def _figure(path: Path, caption: str, out_dir: Path) -> str:
-    source = html.escape(os.path.relpath(path, out_dir).replace(os.sep, "/"))
-    return f'<figure><img src="{source}" loading="lazy"><figcaption>{html.escape(caption)}</figcaption></figure>'
+    source = _source(os.path.relpath(path, out_dir).replace(os.sep, "/"))
+    return f'<figure><img src="{source}" loading="lazy"><figcaption>{_text(caption)}</figcaption></figure>'
+
+
+def _text(raw: str) -> str:
+    """What somebody named, as a page shows it: neither markup nor a character that does more than show."""
+    return html.escape(escaped(raw))
+
+
+def _source(path: str) -> str:
+    """A file's name as an address relative to the page; no byte of it is markup, a scheme or a question."""
+    return quote(os.fsencode(path))

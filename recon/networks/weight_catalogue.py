@@ -8,7 +8,7 @@ from pathlib import Path
 
 @dataclass(frozen=True)
 class Weights:
-    """One file. `sha256` is None where its publisher gives none: it is then checked when it is loaded."""
+    """One file. `sha256` is None where its publisher gives none: it is then not downloaded, and checked when loaded."""
 
     path: str  # inside the folder of weights
     what: str  # network it is, and what it gives

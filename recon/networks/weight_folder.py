@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from stat import S_ISLNK, S_IWOTH
 
 from splatnode.capture.process.state_directory import home
 
@@ -22,10 +23,26 @@ def folder() -> Path:
 
 
 def located(path: str) -> Path | None:
-    """The file `path` in `folder()`, or beside a checkout of the project where developers keep them; else None."""
-    developers = Path(__file__).resolve().parents[3] / "shared" / "weights"
-    places = [folder()] if "SPLATNODE_WEIGHTS" in os.environ else [folder(), developers]
-    return next((place / path for place in places if (place / path).is_file()), None)
+    """The file `path` in `folder()`, or beside a checkout of the project where developers keep them; else None.
+
+    A checkout may lie in a folder into which everybody writes, such as /tmp: what somebody else put beside it is not
+    looked at.
+    """
+    if (folder() / path).is_file():
+        return folder() / path
+    checkout = Path(__file__).resolve().parents[2]
+    beside = checkout.parent / "shared" / "weights" / path
+    if "SPLATNODE_WEIGHTS" in os.environ or not beside.is_file():
+        return None
+    return beside if _are_of_whoever_wrote_the_code(checkout, beside) else None
+
+
+def _are_of_whoever_wrote_the_code(checkout: Path, weights: Path) -> bool:
+    """Whether nobody else can have put them there: the file, and the folders above it that are beside the checkout."""
+    trusted = {0, os.geteuid(), checkout.stat().st_uid}
+    ways = [weights, *weights.parents]
+    found = [stat for each in ways[: ways.index(checkout.parent)] for stat in (each.lstat(), each.stat())]
+    return all(each.st_uid in trusted and (S_ISLNK(each.st_mode) or not each.st_mode & S_IWOTH) for each in found)
 
 
 def find(path: str) -> Path:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import http.server
+import os
 import threading
 from collections.abc import Iterator
 from dataclasses import replace
@@ -11,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from splatnode.recon.networks import weight_folder
 from splatnode.recon.networks.weight_catalogue import CATALOGUE, Weights
 from splatnode.recon.networks.weight_download import complaint, fetch
 from splatnode.recon.networks.weight_folder import WeightsError, find, folder
@@ -20,9 +23,10 @@ GOOD = Weights("net/tiny.pth", "a test", "CC0", "", hashlib.sha256(CONTENT).hexd
 
 
 class _Server(http.server.BaseHTTPRequestHandler):
-    """Serves CONTENT, with ranges; /cut ends the connection half way."""
+    """Serves CONTENT, with ranges; /cut ends the connection half way, /more and /endless send more than that."""
 
     ranges: list[str] = []  # noqa: RUF012  the class is the server's only place for state
+    sent: list[int] = []  # noqa: RUF012
 
     def do_GET(self) -> None:
         start = 0
@@ -30,8 +34,16 @@ class _Server(http.server.BaseHTTPRequestHandler):
             self.ranges.append(wanted)
             start = int(wanted.removeprefix("bytes=").removesuffix("-"))
         self.send_response(206 if start else 200)
-        self.send_header("Content-Length", str(len(CONTENT) - start))
+        more = 100 * len(CONTENT) if self.path in ("/more", "/endless") else 0
+        if self.path != "/endless":
+            self.send_header("Content-Length", str(len(CONTENT) - start + more))
         self.end_headers()
+        if more:
+            with contextlib.suppress(ConnectionError):  # the reader has had enough
+                for _ in range(101):
+                    self.wfile.write(CONTENT)
+                    self.sent.append(len(CONTENT))
+            return
         end = len(CONTENT) // 2 if self.path == "/cut" else len(CONTENT)
         self.wfile.write(CONTENT[start:end])
 
@@ -59,6 +71,80 @@ def test_a_download_goes_on_where_it_stopped(server, tmp_path):
     assert path.read_bytes() == CONTENT and not path.with_name("tiny.pth.part").exists()
     _Server.ranges.clear()
     assert fetch(replace(GOOD, url=f"{server}/whole"), tmp_path) == path  # it is there: nothing is asked for
+
+
+@pytest.mark.parametrize("begun", [0, 1000, len(CONTENT) - 1])
+@pytest.mark.parametrize("path", ["more", "endless"])
+def test_a_download_takes_no_more_than_the_size_that_is_known(server, tmp_path, begun, path):
+    part = tmp_path / "net" / "tiny.pth.part"
+    part.parent.mkdir()
+    part.write_bytes(CONTENT[:begun])
+    _Server.sent.clear()
+    with pytest.raises(WeightsError, match=f"more than the {len(CONTENT)} bytes of tiny; nothing was kept"):
+        fetch(replace(GOOD, url=f"{server}/{path}"), tmp_path)
+    assert list(part.parent.iterdir()) == [] and len(_Server.sent) < 20
+
+
+@pytest.mark.parametrize("begun", [CONTENT + b"x", CONTENT[::-1] * 3])
+def test_a_beginning_that_is_longer_than_the_file_is_thrown_away(server, tmp_path, begun):
+    (tmp_path / "net").mkdir()
+    (tmp_path / "net" / "tiny.pth.part").write_bytes(begun)
+    assert fetch(replace(GOOD, url=f"{server}/whole"), tmp_path).read_bytes() == CONTENT
+
+
+def test_what_lies_where_the_download_begins_is_not_followed(server, tmp_path):
+    (tmp_path / "net").mkdir()
+    (tmp_path / "mine").write_bytes(b"mine")
+    (tmp_path / "net" / "tiny.pth.part").symlink_to(tmp_path / "mine")
+    assert fetch(replace(GOOD, url=f"{server}/whole"), tmp_path).read_bytes() == CONTENT
+    assert (tmp_path / "mine").read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("unknown", [{"sha256": None}, {"num_bytes": None}])
+def test_what_has_no_digest_is_not_downloaded(server, tmp_path, unknown):
+    _Server.ranges.clear()
+    with pytest.raises(WeightsError, match="no digest.*--from FOLDER"):
+        fetch(replace(GOOD, url=f"{server}/whole", **unknown), tmp_path)
+    (tmp_path / "stick").mkdir()
+    (tmp_path / "stick" / "tiny.pth").write_bytes(CONTENT)
+    assert fetch(replace(GOOD, **unknown), tmp_path, tmp_path / "stick").read_bytes() == CONTENT
+
+
+def test_every_download_of_the_catalogue_is_bounded_and_has_a_digest_or_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("urllib.request.urlopen", lambda *_, **__: pytest.fail("nothing may be asked for"))
+    for entry in CATALOGUE:
+        if entry.url and (entry.sha256 is None or entry.num_bytes is None):
+            with pytest.raises(WeightsError, match="no digest"):
+                fetch(entry, tmp_path)
+
+
+def test_weights_are_not_put_where_others_could_change_them(server, tmp_path):
+    (tmp_path / "net").mkdir()
+    (tmp_path / "net").chmod(0o777)
+    with pytest.raises(WeightsError, match=r"chmod go-w.*\$SPLATNODE_WEIGHTS"):
+        fetch(replace(GOOD, url=f"{server}/whole"), tmp_path)
+
+
+@pytest.mark.parametrize("what", [".", "weights", "weights/net", "weights/net/tiny.pth"])
+@pytest.mark.parametrize("change", [lambda path: path.chmod(0o777), lambda path: os.chown(path, 64321, 64321)])
+def test_a_checkout_beside_a_folder_that_others_can_change_does_not_look_there(tmp_path, monkeypatch, what, change):
+    module = tmp_path / "checkout" / "recon" / "networks" / "weight_folder.py"
+    module.parent.mkdir(parents=True)
+    module.write_text("")
+    file = tmp_path / "shared" / "weights" / "net" / "tiny.pth"
+    file.parent.mkdir(parents=True)
+    file.write_bytes(CONTENT)
+    monkeypatch.setattr(weight_folder, "__file__", str(module))
+    monkeypatch.delenv("SPLATNODE_WEIGHTS", raising=False)
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    assert weight_folder.located("net/tiny.pth") == file
+    try:
+        change(tmp_path / "shared" / what)
+    except PermissionError:
+        pytest.skip("needs root, which can be two users")
+    assert weight_folder.located("net/tiny.pth") is None
+    monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path / "shared" / "weights"))
+    assert weight_folder.located("net/tiny.pth") == file  # whoever names it means it
 
 
 def test_a_file_with_another_digest_is_not_kept(server, tmp_path):
