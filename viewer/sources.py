@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import threading
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import cv2
 import msgspec
@@ -17,14 +16,18 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
-from splatnode.capture.image_file import UnusableImage, decode_image
+from splatnode.capture.image_file import UnusableImage, decode_image, read_image_file
 from splatnode.capture.messaging.broadcast import Subscriber
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_SCENE, RECON_STATUS
 from splatnode.capture.messaging.state import StateClient
 from splatnode.capture.messaging.wire import WireError
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import is_printable
 from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.result.export import read_cameras, read_gaussians, viewer_safe
+from splatnode.recon.result.camera_check import camera_problem
+from splatnode.recon.result.export import SceneFileError, read_cameras, read_gaussians, viewer_safe
+from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.message import CameraRecord, SceneHeader, camera_from, from_message
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
@@ -34,6 +37,7 @@ from splatnode.viewer.moment import Moment
 log = logging.getLogger(__name__)
 
 _POLL_S = 0.25
+_LONGEST_SENTENCE = 10_000  # characters, of a report
 _PHOTOGRAPH_SIDE = 640  # pixels: a blend with the render in a window needs no more
 
 
@@ -174,9 +178,7 @@ def _safe(snapshot: Snapshot) -> Snapshot:
 
 def is_camera(camera: CameraEstimate) -> bool:
     """Whether it can be looked through: a rigid motion and positive focal lengths."""
-    rotation = camera.T_world_camera[:3, :3]
-    rigid = np.abs(rotation @ rotation.T - np.eye(3)).max() < 1e-2 and np.linalg.det(rotation) > 0
-    return bool(rigid and camera.K[0, 0] > 0 and camera.K[1, 1] > 0)
+    return not camera_problem(camera.T_world_camera, camera.K, camera.width, camera.height)
 
 
 class _Report(msgspec.Struct, frozen=True):
@@ -184,19 +186,30 @@ class _Report(msgspec.Struct, frozen=True):
 
     verdict: Verdict
     frames_dropped: tuple[DroppedFrame, ...] = ()
-    iterations: int = 0
-    seconds: dict[str, float] = {}
+    iterations: Annotated[int, msgspec.Meta(ge=0, lt=1 << 31)] = 0
+    seconds: dict[str, Annotated[float, msgspec.Meta(ge=0, le=1e9)]] = {}
     photographs: str | None = None
+
+    def texts(self) -> list[str]:
+        """All that it says, which is shown."""
+        verdict = self.verdict
+        dropped = [text for frame in self.frames_dropped for text in (frame.name, frame.reason)]
+        return [verdict.message, verdict.advice, *verdict.frames, *dropped, *self.seconds, self.photographs or ""]
 
 
 def _report(path: Path) -> _Report | None:
-    """None where there is none. Raises ValueError where it is something else."""
+    """None where there is none. Raises SceneFileError where it is something else, OSError."""
     if not path.is_file():
         return None
-    try:
-        return msgspec.convert(json.loads(path.read_bytes()), _Report)
-    except (ValueError, msgspec.ValidationError) as error:
-        raise ValueError(f"{path} is not a report of splatnode, or is damaged: {error}") from error
+    with foreign(SceneFileError, str(path)):
+        try:
+            report = msgspec.json.decode(read_json_file(path), type=_Report)
+        except msgspec.MsgspecError as error:
+            raise SceneFileError(f"{path} is not a report of splatnode, or is damaged: {error}") from error
+        if not all(is_printable(text, _LONGEST_SENTENCE) for text in report.texts()):
+            longest = f"at most {_LONGEST_SENTENCE} characters"
+            raise SceneFileError(f"{path} is not a report of splatnode: its texts must be printable, of {longest}")
+        return report
 
 
 def _photographs(cameras: tuple[CameraEstimate, ...], folders: list[Path]) -> dict[str, npt.NDArray[np.uint8]]:
@@ -207,8 +220,8 @@ def _photographs(cameras: tuple[CameraEstimate, ...], folders: list[Path]) -> di
             if not path.is_file():
                 continue
             try:
-                found[camera.name] = _small(decode_image(path.read_bytes())[0])
-            except UnusableImage as error:
+                found[camera.name] = _small(decode_image(read_image_file(path))[0])
+            except (UnusableImage, OSError) as error:
                 log.warning("%s is shown without its photograph: %s", camera.name, error)
             break
     return found

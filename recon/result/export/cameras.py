@@ -6,17 +6,27 @@ whether the world's unit is the metre.
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
+from typing import Annotated, TypeAlias
 
+import msgspec
 import numpy as np
 
-from splatnode.recon.result.bounds import Bounds, as_axes
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import LONGEST_TEXT, is_printable, printable
+from splatnode.recon.result.bounds import Bounds
+from splatnode.recon.result.camera_check import MAX_COORDINATE, camera_problem
 from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.export.limits import MAX_CAMERAS, MAX_JSON_BYTES
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate
+
+Number = Annotated[float, msgspec.Meta(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
+Row3: TypeAlias = tuple[Number, Number, Number]
+Row4: TypeAlias = tuple[Number, Number, Number, Number]
+Text = Annotated[str, msgspec.Meta(max_length=LONGEST_TEXT)]
 
 BOUNDS_MEANING = (
     "hold for 95 % of all cameras: rotation_deg after the best common rotation, centre (in the file's unit) and "
@@ -52,41 +62,67 @@ def encode_cameras(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -
     )
 
 
+class _Bounds(msgspec.Struct, frozen=True):
+    rotation_deg: Number
+    centre: Number
+    centre_percent: Number
+    focal_percent: Number
+    axes: tuple[Row3, Row3, Row3]
+
+
+class _Camera(msgspec.Struct, frozen=True):
+    name: Text
+    frame_id: Annotated[int, msgspec.Meta(ge=-1, lt=1 << 31)]
+    T_world_camera: tuple[Row4, Row4, Row4, Row4]
+    K: tuple[Row3, Row3, Row3]
+    width: int
+    height: int
+    bounds: _Bounds | None = None
+
+
+class _File(msgspec.Struct, frozen=True):
+    cameras: Annotated[tuple[_Camera, ...], msgspec.Meta(max_length=MAX_CAMERAS)]
+    scale: Text | None = None
+    scale_source: Text | None = None
+
+
 def decode_cameras(data: bytes, name: str = "cameras.json") -> tuple[CameraEstimate, ...]:
-    """Reads cameras.json. Raises SceneFileError, which names the file as `name`, where it is something else."""
+    """Reads cameras.json: at most MAX_CAMERAS cameras of different names, each a rigid motion and a pinhole.
+
+    Raises SceneFileError, which names the file as `name`, where it is something else.
+    """
+    with foreign(SceneFileError, name):
+        cameras = tuple(_camera(record, name) for record in _parsed(data, name).cameras)
+        if len({camera.name for camera in cameras}) < len(cameras):
+            raise SceneFileError(f"{name} has two cameras of one name")
+        return cameras
+
+
+def decode_scale(data: bytes, name: str = "cameras.json") -> Scale:
+    """The scale that a cameras.json of ours states. Raises SceneFileError."""
+    with foreign(SceneFileError, name):
+        parsed = _parsed(data, name)
+        return Scale(parsed.scale == "metric", parsed.scale_source)
+
+
+def _parsed(data: bytes, name: str) -> _File:
+    if len(data) > MAX_JSON_BYTES:
+        raise SceneFileError(f"{name} has {len(data)} bytes; at most {MAX_JSON_BYTES} are read")
     try:
-        return tuple(_camera_from_record(record) for record in json.loads(data)["cameras"])
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise SceneFileError(f"{name} is not a cameras.json of splatnode, or is damaged: {error!r}") from error
+        parsed = msgspec.json.decode(data, type=_File)
+    except msgspec.MsgspecError as error:
+        raise SceneFileError(f"{name} is not a cameras.json of splatnode, or is damaged: {error}") from error
+    if not is_printable(parsed.scale_source or ""):
+        raise SceneFileError(f"{name}: scale_source must be printable text")
+    return parsed
 
 
-def decode_scale(data: bytes) -> Scale:
-    """The scale that a cameras.json of ours states."""
-    record = json.loads(data)
-    return Scale(record.get("scale") == "metric", record.get("scale_source"))
-
-
-def _camera_from_record(record: Mapping) -> CameraEstimate:
-    T_world_camera = np.array(record["T_world_camera"], np.float64)
-    K = np.array(record["K"], np.float64)
-    if T_world_camera.shape != (4, 4) or K.shape != (3, 3):
-        raise ValueError(f"T_world_camera must be 4x4 and K 3x3, got {T_world_camera.shape} and {K.shape}")
-    if not np.isfinite(T_world_camera).all() or not np.isfinite(K).all():
-        raise ValueError("T_world_camera and K must be finite")
-    return CameraEstimate(
-        name=str(record["name"]),
-        frame_id=int(record["frame_id"]),
-        T_world_camera=T_world_camera,
-        K=K,
-        width=int(record["width"]),
-        height=int(record["height"]),
-        bounds=_bounds_from_record(record["bounds"]) if record.get("bounds") else None,
-    )
-
-
-def _bounds_from_record(record: Mapping) -> Bounds:
-    numbers = {name: float(value) for name, value in record.items() if name != "axes"}
-    axes = np.array(record["axes"], np.float64)
-    if axes.shape != (3, 3) or not np.isfinite([*numbers.values(), *axes.ravel()]).all():
-        raise ValueError("the bounds of a camera must be finite, and their axes 3x3")
-    return Bounds(**numbers, axes=as_axes(axes))
+def _camera(record: _Camera, name: str) -> CameraEstimate:
+    T_world_camera, K = np.array(record.T_world_camera), np.array(record.K)
+    problem = camera_problem(T_world_camera, K, record.width, record.height)
+    if not is_printable(record.name) or record.name in ("", ".", "..") or "/" in record.name:
+        problem = "a name must be that of a file, in printable letters"
+    if problem:
+        raise SceneFileError(f"{name}, camera {printable(record.name, 100)!r}: {problem}")
+    bounds = record.bounds and Bounds(**msgspec.structs.asdict(record.bounds))
+    return CameraEstimate(record.name, record.frame_id, T_world_camera, K, record.width, record.height, bounds)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.result.camera_check import MAX_COORDINATE
 from splatnode.recon.result.snapshot import GaussianArrays
 
 SH_C0 = 0.5 / np.sqrt(np.pi)  # the constant basis function; splatnode.recon.scene.gaussians has it too, but needs torch
@@ -23,6 +24,7 @@ def viewer_safe(gaussians: GaussianArrays) -> GaussianArrays:
     finite = np.isfinite(gaussians.opacities)
     for values in (gaussians.means, gaussians.quats, gaussians.scales, gaussians.sh):
         finite &= np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+    finite &= (np.abs(gaussians.means) <= MAX_COORDINATE).all(axis=1)
     if not finite.any():
         return take(gaussians, finite)
     middle = np.median(gaussians.means[finite], axis=0)

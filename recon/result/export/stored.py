@@ -8,9 +8,11 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 
+from splatnode.capture.process.foreign import foreign
 from splatnode.recon.result.export import formats
 from splatnode.recon.result.export.cameras import decode_cameras, decode_scale
 from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.export.limits import read_json_file, read_scene_file
 from splatnode.recon.result.export.prepare import viewer_safe
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
@@ -40,7 +42,7 @@ class StoredResult:
 
     def scale(self) -> Scale:
         """The unit of the lengths, as cameras.json states it; relative where there is no such file."""
-        return decode_scale(self._cameras.read_bytes()) if self._cameras.is_file() else RELATIVE
+        return decode_scale(read_json_file(self._cameras), self._cameras.name) if self._cameras.is_file() else RELATIVE
 
     @property
     def _cameras(self) -> Path:
@@ -55,16 +57,17 @@ def read_gaussians(path: Path) -> GaussianArrays:
     decode = _decoders().get(path.suffix.lower())
     if decode is None:
         raise SceneFileError(f"{path.name} must end with {', '.join(_decoders())}")
-    gaussians = decode(path.read_bytes(), path.name)
-    safe = viewer_safe(gaussians)
-    if len(gaussians) and not len(safe):
-        raise SceneFileError(f"{path.name} holds {len(gaussians)} Gaussians, none of them with finite values")
-    return safe
+    with foreign(SceneFileError, path.name):
+        gaussians = decode(read_scene_file(path), path.name)
+        safe = viewer_safe(gaussians)
+        if len(gaussians) and not len(safe):
+            raise SceneFileError(f"{path.name} holds {len(gaussians)} Gaussians, none of them with finite values")
+        return safe
 
 
 def read_cameras(path: Path) -> tuple[CameraEstimate, ...]:
     """The cameras of a cameras.json. Raises SceneFileError, OSError."""
-    return decode_cameras(path.read_bytes(), path.name)
+    return decode_cameras(read_json_file(path), path.name)
 
 
 def _decoders() -> dict[str, Callable[[bytes, str], GaussianArrays]]:

@@ -21,6 +21,8 @@ MARGIN = 200_000_000  # bytes beyond a stated bound, as issue 19 has it
 @dataclass(frozen=True)
 class Reading:
     name: str
+    trick: str
+    size: int  # bytes of the file
     taken: int  # bytes of memory at its peak, beyond what the process had before
     outcome: str  # what the reader returned, or "TYPE: message" of what it raised
 
@@ -34,10 +36,9 @@ def readings(corpus: str, reader: str) -> list[Reading]:
     environment = {**os.environ, "OPENCV_LOG_LEVEL": "SILENT"}
     run = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=600)
     lines = [json.loads(line) for line in run.stdout.splitlines() if line.startswith("{")]
-    done = [Reading(**line) for line in lines if len(line) > 1]
     last = lines[-1]["name"] if lines else "none"
-    assert run.returncode == 0, f"ended with {run.returncode} at {last}: {run.stderr[-1000:]}"
-    return done
+    assert run.returncode == 0 and lines, f"ended with {run.returncode} at {last}: {run.stderr[-1000:]}"
+    return [Reading(**line) for line in lines if len(line) > 1]
 
 
 def _read_all(corpus: str, reader: str) -> None:
@@ -51,7 +52,10 @@ def _read_all(corpus: str, reader: str) -> None:
             outcome = read(file)
         except Exception as error:
             outcome = f"{type(error).__name__}: {error}"
-        print(json.dumps(asdict(Reading(file.name, _memory("VmHWM") - before, outcome))), flush=True)
+        print(
+            json.dumps(asdict(Reading(file.name, file.trick, len(file.data), _memory("VmHWM") - before, outcome))),
+            flush=True,
+        )
 
 
 def _named(name: str) -> Callable:

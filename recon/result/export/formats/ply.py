@@ -11,6 +11,7 @@ import re
 import numpy as np
 
 from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.export.limits import check_count
 from splatnode.recon.result.export.prepare import unknown_source
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.scale import RELATIVE, Scale
@@ -19,6 +20,7 @@ from splatnode.recon.result.snapshot import GaussianArrays
 DEFAULT_NAME = "scene.ply"
 
 _LONGEST_HEADER = 65536
+_MOST_DIGITS = 20  # of a count
 _LONGER_HEADER = 8  # bytes by which a header with a large number exceeds one with a single digit
 _NORMAL = ("nx", "ny", "nz")  # part of the layout, always zero and never read
 _TYPES = {
@@ -76,9 +78,11 @@ def decode(data: bytes, name: str = "scene.ply") -> GaussianArrays:
         raise SceneFileError(
             f"{name} is a PLY file but not a Gaussian scene: it lacks the properties {', '.join(missing)}"
         )
-    num_rest = sum(field.startswith("f_rest_") for field in dtype.names or ())
-    if num_rest not in (0, 9, 24, 45):
-        raise SceneFileError(f"{name} must have 0, 9, 24 or 45 properties f_rest_*, has {num_rest}")
+    rests = {field for field in dtype.names or () if field.startswith("f_rest_")}
+    num_rest = len(rests)
+    if num_rest not in (0, 9, 24, 45) or rests != {f"f_rest_{i}" for i in range(num_rest)}:
+        raise SceneFileError(f"{name} must have 0, 9, 24 or 45 properties f_rest_0, f_rest_1 ..., has {num_rest}")
+    check_count(num_gaussians, 1 + num_rest // 3, name)
     if len(data) - start < num_gaussians * dtype.itemsize:
         raise SceneFileError(
             f"{name} is truncated: its header promises {num_gaussians} Gaussians of {dtype.itemsize} bytes, "
@@ -87,7 +91,8 @@ def decode(data: bytes, name: str = "scene.ply") -> GaussianArrays:
     rows = np.frombuffer(data, dtype, num_gaussians, start)
 
     def columns(*names: str) -> np.ndarray:
-        return np.stack([rows[field] for field in names], 1).astype(np.float32)
+        with np.errstate(over="ignore"):  # what is infinite as a float32 is left out later
+            return np.stack([rows[field].astype(np.float32) for field in names], 1)
 
     rest = columns(*(f"f_rest_{i}" for i in range(num_rest))) if num_rest else np.zeros((num_gaussians, 0), np.float32)
     rest = rest.reshape(num_gaussians, 3, num_rest // 3).transpose(0, 2, 1)
@@ -129,7 +134,9 @@ def _parse_header(data: bytes, name: str) -> tuple[int, np.dtype, int]:
         match line.split():
             case ["format", kind, _] if kind != "binary_little_endian":
                 raise SceneFileError(f"{name} must be a binary little-endian PLY file, is {kind}")
-            case ["element", element, count] if count.isdigit():
+            case ["element", element, count] if count.isdecimal():
+                if len(count) > _MOST_DIGITS:
+                    raise SceneFileError(f"{name} is damaged: a count in its header has {len(count)} digits")
                 elements.append((element, int(count)))
             case ["property", kind, field] if kind in _TYPES and len(elements) == 1:
                 properties.append((field, _TYPES[kind]))

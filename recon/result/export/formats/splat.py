@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.export.limits import check_count
 from splatnode.recon.result.export.prepare import SH_C0, base_rgb, take, unknown_source
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import GaussianArrays
@@ -42,6 +43,7 @@ def decode(data: bytes, name: str = "scene.splat") -> GaussianArrays:
             f"{name} is truncated or not a .splat file: its size must be a multiple of {_ROW.itemsize} bytes, is "
             f"{len(data)}; it starts with {data[:4]!r}"
         )
+    check_count(len(data) // _ROW.itemsize, 1, name)
     rows = np.frombuffer(data, _ROW)
     quats = (rows["quat"].astype(np.float32) - 128.0) / 128.0
     length = np.linalg.norm(quats, axis=1, keepdims=True)

@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from splatnode.recon.result.export.axes import least_turned
 from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.export.limits import check_count
 from splatnode.recon.result.export.prepare import take, unknown_source
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import GaussianArrays
@@ -30,7 +31,8 @@ DEFAULT_NAME = "scene.spz"
 _MAGIC, _VERSION = 0x5053474E, 2
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractional bits, flags, reserved
 _FLAG_EXTENSIONS = 0x2  # records follow that a reader may ignore
-_MOST_GAUSSIANS = 10_000_000  # bounds what a hostile header can make us allocate
+_LEAST_BYTES = 4  # of the compressed file for a Gaussian; scenes have 10 and more
+_FEW_GAUSSIANS = 100_000  # that a file of any size may hold
 _STEPS_IN_EXTENT = 12.5  # at least, of centres in a typical Gaussian's extent
 _OPACITY_STEP, _COLOUR_STEP = 4, 2  # of what a byte could tell
 _COLOUR_SCALE = 0.15  # smaller than the basis function's 0.28: colours may leave [0, 1] before SH brings them back
@@ -75,6 +77,11 @@ def decode(data: bytes, name: str = "scene.spz") -> GaussianArrays:
     stream = zlib.decompressobj(16 + zlib.MAX_WBITS)
     version, num_gaussians, degree, bits, flags = _parse_header(_inflate(stream, data, _HEADER.size, name), name)
     num_bases = _NUM_BASES[degree]
+    check_count(num_gaussians, num_bases, name)
+    if num_gaussians > _FEW_GAUSSIANS + len(data) // _LEAST_BYTES:
+        raise SceneFileError(
+            f"{name} is damaged: {len(data)} bytes cannot hold the {num_gaussians} Gaussians it promises"
+        )
     widths = (9, 1, 3, 3, 4 if version == 3 else 3, 3 * (num_bases - 1))
     size = num_gaussians * sum(widths)
     body = _inflate(stream, stream.unconsumed_tail, size, name)
@@ -118,8 +125,8 @@ def _parse_header(header: bytes, name: str) -> tuple[int, int, int, int, int]:
         raise SceneFileError(f"{name} is .spz version {version}; versions 2 and 3 can be read. Save it as version 3")
     if degree not in _NUM_BASES:
         raise SceneFileError(f"{name} has spherical harmonics of degree {degree}; 0 to 3 can be read")
-    if bits > 23 or count > _MOST_GAUSSIANS:
-        raise SceneFileError(f"{name} has an impossible header: {count} Gaussians, {bits} fractional bits")
+    if bits > 23:
+        raise SceneFileError(f"{name} has an impossible header: {bits} fractional bits")
     return version, count, degree, bits, flags
 
 

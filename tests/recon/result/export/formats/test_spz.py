@@ -149,7 +149,10 @@ def recompressed(change):
         (recompressed(lambda raw: b"GSPN" + raw[4:]), "signature"),
         (recompressed(lambda raw: raw[:4] + b"\4" + raw[5:]), "version 4"),
         (recompressed(lambda raw: raw[:12] + b"\7" + raw[13:]), "degree 7"),
-        (recompressed(lambda raw: raw[:8] + b"\xff\xff\xff\xff" + raw[12:]), "impossible header"),
+        (
+            recompressed(lambda raw: raw[:8] + b"\xff\xff\xff\xff" + raw[12:]),
+            "promises 4294967295 Gaussians; at most 10000000 with 4 coefficients",
+        ),
     ],
 )
 def test_damaged_or_foreign_spz_is_a_clear_error(damage, message):
