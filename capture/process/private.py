@@ -41,10 +41,7 @@ def private_folder(folder: Path, instead: str, *, ours: bool) -> None:
     with _opened_folder(folder, instead) as descriptor:
         found = os.fstat(descriptor)
         if found.st_uid != os.geteuid():
-            raise NotPrivate(
-                f"{_shown(folder)} belongs to user {found.st_uid}, who could read and replace what is kept there. "
-                f"Set {instead} to a folder of your own"
-            )
+            raise NotPrivate(_of_another(folder, found, instead))
         if ours and found.st_mode & _OTHERS and not found.st_mode & stat.S_IWOTH:
             os.fchmod(descriptor, 0o700)
         mode = stat.S_IMODE(os.fstat(descriptor).st_mode)
@@ -166,11 +163,20 @@ def _check_way(folder: Path, instead: str) -> None:
             target = Path(os.path.realpath(each.parent), os.readlink(each))
             if target.exists():  # and is no circle
                 _check_way(target, instead)
+        elif not stat.S_ISDIR(found.st_mode) and found.st_uid not in (0, os.geteuid()):
+            raise NotPrivate(_of_another(each, found, instead))
         elif found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX and each != folder:
             raise NotPrivate(
                 f"every user may rename what lies in {_shown(each)}. Run: chmod o-w {_shown(each)}, or set {instead} "
                 "to a folder elsewhere"
             )
+
+
+def _of_another(path: Path, found: os.stat_result, instead: str) -> str:
+    return (
+        f"{_shown(path)} belongs to user {found.st_uid}, who could read and replace what is kept there. "
+        f"Set {instead} to a folder of your own"
+    )
 
 
 def _read(descriptor: int, size: int) -> bytes:

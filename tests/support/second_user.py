@@ -5,42 +5,37 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.conftest import ROOT
-
 OTHER = 64321  # a user whom no machine has
 
 
-def needs_second_user() -> None:
+BECOMES = f"""
+import os, socket, stat, sys  # before: the other user may not be able to read where they lie
+os.setgroups([])
+os.setresgid({OTHER}, {OTHER}, {OTHER})
+os.setresuid({OTHER}, {OTHER}, {OTHER})
+os.umask(0)
+"""
+
+
+@pytest.fixture
+def shared_tmp() -> Iterator[Path]:
+    """A folder as /tmp is: everybody may put something there. Skips where this process cannot be two users."""
     if os.geteuid() != 0:
         pytest.skip("needs root, which can be two users")
+    with tempfile.TemporaryDirectory() as folder:
+        os.chmod(folder, 0o1777)
+        if as_other("print(os.getuid(), os.access(sys.argv[1], os.W_OK))", folder).stdout != f"{OTHER} True\n":
+            pytest.skip("needs root, which can be two users")
+        yield Path(folder)
 
 
 def as_other(program: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-    """Runs the Python program as the other user, whose umask takes nothing."""
-    return subprocess.run(
-        [sys.executable, "-c", program, *map(str, arguments)],
-        cwd="/",
-        env=os.environ | {"PYTHONPATH": str(ROOT), "PYTHONDONTWRITEBYTECODE": "1"},
-        user=OTHER,
-        group=OTHER,
-        extra_groups=[],
-        umask=0,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
-
-
-def open_to_all(folder: Path) -> Path:
-    """`folder`, as everybody's /tmp is; pytest's folders above it can be passed through."""
-    folder.mkdir()
-    folder.chmod(0o1777)
-    for each in folder.parents:
-        if each.stat().st_uid == os.geteuid() and not each.stat().st_mode & 0o001:
-            each.chmod(each.stat().st_mode | 0o011)
-    return folder
+    """Runs the program, which has os, socket, stat and sys, as the other user, whose umask takes nothing."""
+    command = [sys.executable, "-c", BECOMES + program, *map(str, arguments)]
+    return subprocess.run(command, cwd="/", capture_output=True, text=True, check=False, timeout=60)
