@@ -87,7 +87,9 @@ def find(args: argparse.Namespace) -> int:
         return EXIT_GOOD
     for kind, devices in found.items():
         for device in devices:
-            say(f"camera: {{kind: {kind}, device: {json.dumps(device['device'])}}}  # {device['description']}")
+            say(
+                f"camera: {{kind: {kind}, device: {json.dumps(device['device'], ensure_ascii=False)}}}  # {device['description']}"
+            )
     if not any(found.values()):
         say("no camera is connected; folders and videos need none: see configs/replay.yaml")
     return EXIT_GOOD

@@ -20,6 +20,7 @@ import msgspec
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_image_file
 from splatnode.capture.process.durable import sync_folder
+from splatnode.capture.process.printable import LONGEST_NAME, is_printable, marked_name
 
 log = logging.getLogger(__name__)
 
@@ -143,6 +144,11 @@ class Recording:
         return Frame(frame_id, line.name, line.stamp_ns, image, line.intrinsics, encoded=content)
 
 
+def _shown(name: str) -> str:
+    """The recorded name, which is printable if it is ours; another one is changed, into one that no other becomes."""
+    return name if name and is_printable(name, LONGEST_NAME) else marked_name(name)
+
+
 def is_recording(folder: Path) -> bool:
     return (folder / INDEX).is_file()
 
@@ -159,7 +165,7 @@ def read(folder: Path) -> Recording:
             raise ValueError(f"{folder / INDEX}, line {number}: {error}") from error
         if isinstance(line, _Line) and Path(line.file).name != line.file:
             raise ValueError(f"{folder / INDEX}, line {number}: {line.file!r} is not a file of this folder")
-        lines.append(line)
+        lines.append(msgspec.structs.replace(line, name=_shown(line.name)))
     if not lines:
         raise ValueError(f"the recording {str(folder)!r} is empty")
     return Recording(folder, tuple(lines))

@@ -39,10 +39,13 @@ def printable_name(raw: str, longest: int = LONGEST_NAME) -> str:
     So a backslash is escaped, too, and of a name that is too long the end is replaced by a digest of the whole.
     """
     name = escaped(raw.replace("\\", "\\\\"))
-    if len(name) <= longest:
-        return name
+    return name if len(name) <= longest else marked_name(raw, longest)
+
+
+def marked_name(raw: str, longest: int = LONGEST_NAME) -> str:
+    """The beginning of `raw` as `printable` shows it, and a digest of the whole: no other name becomes this one."""
     digest = hashlib.blake2b(raw.encode(errors="surrogatepass"), digest_size=8).hexdigest()
-    return f"{name[: longest - len(digest) - 1]}~{digest}"
+    return f"{escaped(raw)[: longest - len(digest) - 1]}~{digest}"
 
 
 def escaped(text: str) -> str:
