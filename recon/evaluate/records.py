@@ -13,6 +13,7 @@ from typing import Any
 
 import msgspec
 
+from splatnode.recon.evaluate.json_file import read_json
 from splatnode.recon.evaluate.protocol import Row, Settings
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.report import versions
@@ -34,11 +35,8 @@ def run_of(row: Row) -> tuple[str, int, str, int]:
 
 
 def read_bench(path: Path) -> Bench:
-    """Raises FileNotFoundError, or ValueError where the file holds something else."""
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=Bench)
-    except msgspec.DecodeError as error:
-        raise ValueError(f"{path} must be the bench.json of a benchmark: {error}") from error
+    """Raises FileNotFoundError, or EvaluationFileError where the file holds something else."""
+    return read_json(path, Bench, "the bench.json of a benchmark")
 
 
 def merged(benches: Sequence[Bench]) -> Bench:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from splatnode.recon.evaluate.json_file import read_json
 from splatnode.recon.evaluate.truth import scene_folder
 
 _PAPER_FRAMES, _PAPER_TEST = 24, 12
@@ -27,12 +27,14 @@ def load_split(folder: Path, names: Sequence[str], views: int) -> Split:
     """
     place = scene_folder(folder)
     listed = place.parent / "splits.json"
-    splits = json.loads(listed.read_text()) if listed.is_file() else {}
+    splits: dict[str, dict[str, list[str]]] = {}
+    if listed.is_file():
+        splits = read_json(listed, dict[str, dict[str, list[str]]], "lists of photographs by scene and split")
     if place.name not in splits:
         return paper_split(names, views)
     split = splits[place.name]
-    if f"train{views}" not in split:
-        raise ValueError(f"{listed} must list train{views} for {place.name}, has {sorted(split)}")
+    if not {f"train{views}", "test"} <= split.keys():
+        raise ValueError(f"{listed} must list train{views} and test for {place.name}, has {sorted(split)}")
     return Split(tuple(split[f"train{views}"]), tuple(split["test"]))
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import msgspec
+
+from splatnode.recon.evaluate.json_file import read_json
 from splatnode.recon.evaluate.records import this_machine
 from splatnode.recon.evaluate.stability.case import Row
 from splatnode.recon.evaluate.stability.places import Places, Sampler
@@ -91,16 +93,21 @@ def _run(row: Row, seed: int, method: str, places: Places, timeout_s: float) -> 
     return run_trial(case, row.number, row.name, seed, method, timeout_s)
 
 
+class _Trials(msgspec.Struct, frozen=True):
+    scenes: list[str]
+    trials: list[dict]
+
+
 def _resumed(path: Path, scenes: Sequence[str]) -> list[dict]:
     if not path.exists():
         return []
-    content = json.loads(path.read_text())
-    if content["scenes"] != list(scenes):
+    content = read_json(path, _Trials, "the stability.json of a campaign")
+    if content.scenes != list(scenes):
         raise ValueError(
-            f"{path} is of the scenes {', '.join(content['scenes'])}, now there are {', '.join(scenes)}; "
+            f"{path} is of the scenes {', '.join(content.scenes)}, now there are {', '.join(scenes)}; "
             "give another folder with --out DIR, or the same scenes"
         )
-    return content["trials"]
+    return content.trials
 
 
 def _key(trial: Mapping) -> Key:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch, Rectangle
 
+from splatnode.recon.evaluate.json_file import read_json
 from splatnode.recon.evaluate.stability.case import Demand
 from splatnode.recon.evaluate.stability.outcome import Outcome
 from splatnode.recon.result.export.staged import write_file
@@ -43,8 +43,8 @@ _CELL, _LINE, _NAMES, _TABLE = 0.86, 0.17, 2.3, 2.1  # inches
 
 def draw(stability_json: Path, out: Path) -> Path:
     """Writes stability.png to `out`. Raises ValueError where there is no trial to draw."""
-    content = json.loads(stability_json.read_text())
-    if not content["trials"]:
+    content = read_json(stability_json, dict, "the stability.json of a campaign")
+    if not content.get("trials"):
         raise ValueError(f"{stability_json} must have a trial to draw, it has none")
     buffer = io.BytesIO()
     figure_of(content).savefig(buffer, format="png", facecolor="white")

@@ -44,7 +44,7 @@ def test_more_views_than_there_are_is_a_clear_error():
 def test_listed_split_wins_over_the_paper_s(tmp_path):
     (tmp_path / "splits.json").write_text(json.dumps({"garden": {"train3": NAMES[:3], "test": NAMES[3:5]}}))
     assert load_split(tmp_path / "garden", NAMES, 3) == Split(NAMES[:3], NAMES[3:5])
-    with pytest.raises(ValueError, match="must list train6 for garden, has"):
+    with pytest.raises(ValueError, match="must list train6 and test for garden, has"):
         load_split(tmp_path / "garden", NAMES, 6)
     assert load_split(tmp_path / "elsewhere", NAMES, 2) == paper_split(NAMES, 2)
 

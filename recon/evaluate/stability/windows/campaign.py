@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 from collections.abc import Iterator, Sequence
@@ -12,6 +11,7 @@ from pathlib import Path
 import msgspec
 
 from splatnode.recon.config import Config
+from splatnode.recon.evaluate.json_file import read_json
 from splatnode.recon.evaluate.records import this_machine
 from splatnode.recon.evaluate.stability.places import Place
 from splatnode.recon.evaluate.stability.windows import ours
@@ -71,14 +71,15 @@ def _is_done(row: Row, plan: Plan) -> bool:
     return row.found is not Found.FAILED and (row.fresh_seconds is not None or not plan.fresh)
 
 
+class _Rows(msgspec.Struct, frozen=True):
+    rows: list[Row]
+
+
 def read_rows(path: Path) -> list[Row]:
-    """The rows of a windows.json; none where there is no such file. Raises ValueError where it holds something else."""
+    """The rows of a windows.json; none where there is no such file. Raises EvaluationFileError for another file."""
     if not path.exists():
         return []
-    try:
-        return msgspec.convert(json.loads(path.read_bytes())["rows"], list[Row])
-    except (msgspec.ValidationError, KeyError) as error:
-        raise ValueError(f"{path} must be the windows.json of this version: {error}") from error
+    return read_json(path, _Rows, "the windows.json of this version").rows
 
 
 def _answers(place: Place, todo: Sequence[tuple[str, Window]], plan: Plan) -> Iterator[tuple[str, Window, Answer]]:

@@ -1,0 +1,166 @@
+"""True cameras from the files in which data sets have them: cameras.json, transforms.json, COLMAP's models."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import LONGEST_TEXT, printable
+from splatnode.recon.evaluate.colmap_model import read_model
+from splatnode.recon.evaluate.json_file import EvaluationFileError, read_json
+from splatnode.recon.result.camera_check import camera_problem
+from splatnode.recon.result.export import read_cameras
+from splatnode.recon.result.export.cameras import Number, Row3, Row4
+from splatnode.recon.result.export.quaternions import matrices_from_quats
+
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+Array: TypeAlias = npt.NDArray[np.float64]
+Text = Annotated[str, msgspec.Meta(min_length=1, max_length=LONGEST_TEXT)]
+
+
+@dataclass(frozen=True, eq=False)
+class TrueCamera:
+    T_world_camera: npt.NDArray[np.float64]  # (4, 4)
+    K: npt.NDArray[np.float64]  # (3, 3) for an image `width` x `height`
+    width: int
+    height: int
+
+    def K_for(self, width: int, height: int) -> npt.NDArray[np.float64]:
+        """K of the image resized to `width` x `height`."""
+        return self.K * np.array([width / self.width, height / self.height, 1.0])[:, None]
+
+
+class _Photograph(msgspec.Struct, frozen=True):
+    """Of a recorded data set's cameras.json. Some have photographs whose camera nobody knows."""
+
+    name: Text
+    R: tuple[Row3, Row3, Row3] | None = None  # of T_camera_world
+    t: Row3 | None = None
+    K: tuple[Row3, Row3, Row3] | None = None
+    width: int = 0
+    height: int = 0
+
+
+class _CamerasJson(msgspec.Struct, frozen=True):
+    cameras: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET  # ours
+    images: tuple[_Photograph, ...] | None = None
+
+
+class _Lens(msgspec.Struct, frozen=True):
+    """What transforms.json says of all photographs, or of one."""
+
+    w: Number | None = None
+    h: Number | None = None
+    fl_x: Number | None = None
+    fl_y: Number | None = None
+    cx: Number | None = None
+    cy: Number | None = None
+    k1: Number | None = None
+    k2: Number | None = None
+    k3: Number | None = None
+    k4: Number | None = None
+    p1: Number | None = None
+    p2: Number | None = None
+
+
+class _View(_Lens, frozen=True, kw_only=True):
+    file_path: Text
+    transform_matrix: tuple[Row4, Row4, Row4, Row4] | None = None
+
+
+class _TransformsJson(_Lens, frozen=True, kw_only=True):
+    frames: tuple[_View, ...]
+
+
+def read_true_cameras(path: Path) -> dict[str, TrueCamera]:
+    """By the name of the photograph, without its folder; `path` is cameras.json, transforms.json or a model's folder.
+
+    Raises EvaluationFileError or SceneFileError, which name the file, where it is something else, or where a camera is
+    no rigid motion or no pinhole; OSError.
+    """
+    readers = {"cameras.json": _cameras_json, "transforms.json": _transforms_json}
+    with foreign(EvaluationFileError, str(path)):
+        cameras: dict[str, TrueCamera] = {}
+        for name, camera in readers.get(path.name, _colmap)(path):
+            problem = camera_problem(camera.T_world_camera, camera.K, camera.width, camera.height)
+            problem = problem or ("there are two cameras of this name" if name in cameras else "")
+            if problem:
+                raise EvaluationFileError(f"{path}, {printable(name, 100)}: {problem}")
+            cameras[name] = camera
+        return cameras
+
+
+def _cameras_json(path: Path) -> Iterable[tuple[str, TrueCamera]]:
+    content = read_json(path, _CamerasJson, "the cameras of a scene")
+    if content.cameras is not msgspec.UNSET:
+        for camera in read_cameras(path):
+            yield camera.name, TrueCamera(camera.T_world_camera, camera.K, camera.width, camera.height)
+        return
+    if content.images is None:
+        raise EvaluationFileError(f"{path} must have a list 'cameras' or 'images'")
+    for image in content.images:
+        if image.R is None:
+            continue
+        if image.t is None or image.K is None:
+            raise EvaluationFileError(f"{path} must give R, t and K for {printable(image.name)}")
+        yield (
+            image.name,
+            _turned(
+                f"{path}, {printable(image.name, 100)}",
+                np.array(image.R),
+                image.t,
+                np.array(image.K),
+                image.width,
+                image.height,
+            ),
+        )
+
+
+def _transforms_json(path: Path) -> Iterable[tuple[str, TrueCamera]]:
+    content = read_json(path, _TransformsJson, "a transforms.json of nerfstudio")
+    for view in content.frames:
+        told = {key: getattr(view, key) for key in _Lens.__struct_fields__}
+        values = {key: getattr(content, key) if value is None else value for key, value in told.items()}
+        shown = printable(view.file_path)
+        missing = [key for key in ("w", "h", "fl_x") if values[key] is None]
+        missing += ["transform_matrix"] if view.transform_matrix is None else []
+        if missing:
+            raise EvaluationFileError(f"{path} must give {', '.join(missing)} for {shown}")
+        distortion = {key: values[key] for key in _DISTORTION if values[key]}
+        if distortion:
+            raise EvaluationFileError(f"{path} must be of undistorted images, {shown} has {distortion}")
+        width, height, fx = int(values["w"]), int(values["h"]), values["fl_x"]
+        fy = fx if values["fl_y"] is None else values["fl_y"]
+        cx, cy = (half if values[key] is None else values[key] for key, half in (("cx", width / 2), ("cy", height / 2)))
+        K = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        T_world_camera = np.array(view.transform_matrix) @ _OPENGL
+        yield Path(view.file_path).name, TrueCamera(T_world_camera, K, width, height)
+
+
+def _colmap(path: Path) -> Iterable[tuple[str, TrueCamera]]:
+    for image in read_model(path):
+        lens = image.camera
+        K = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
+        with np.errstate(invalid="ignore"):  # a quaternion of zeros is no rotation, which is found below
+            rotation = matrices_from_quats(image.quat)
+        where = f"{path}, {printable(image.name, 100)}"
+        yield Path(image.name).name, _turned(where, rotation, image.translation, K, lens.width, lens.height)
+
+
+def _turned(where: str, rotation: Array, translation: Iterable[float], K: Array, width: int, height: int) -> TrueCamera:
+    """From the rotation and the translation of T_camera_world."""
+    T_camera_world = np.eye(4)
+    T_camera_world[:3, :3], T_camera_world[:3, 3] = rotation, tuple(translation)
+    problem = camera_problem(T_camera_world, K, width, height)
+    if problem:
+        raise EvaluationFileError(f"{where}: {problem.replace('T_world_camera', 'T_camera_world')}")
+    return TrueCamera(np.linalg.inv(T_camera_world).astype(np.float64), K, width, height)
