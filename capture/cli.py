@@ -87,9 +87,8 @@ def find(args: argparse.Namespace) -> int:
         return EXIT_GOOD
     for kind, devices in found.items():
         for device in devices:
-            say(
-                f"camera: {{kind: {kind}, device: {json.dumps(device['device'], ensure_ascii=False)}}}  # {device['description']}"
-            )
+            name = json.dumps(device["device"], ensure_ascii=False)  # with the escapes of `say` it is YAML's text, too
+            say(f"camera: {{kind: {kind}, device: {name}}}  # {device['description']}")
     if not any(found.values()):
         say("no camera is connected; folders and videos need none: see configs/replay.yaml")
     return EXIT_GOOD
