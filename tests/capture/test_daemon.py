@@ -180,7 +180,7 @@ def test_a_full_spool_is_said_once_and_stops_nothing(tmp_path, start, photograph
 
 
 def test_a_disk_that_may_not_hold_the_spool_is_told_at_the_start(tmp_path, start):
-    process = start(", loops: 1000", spool=f"max_mb: {2**40}, ")
+    process = start(", loops: 1000", spool=f"max_mb: {2**31 - 1}, ")
     with Subscriber(CAPTURE_STATUS, network(tmp_path), CaptureStatus) as heartbeats:
         status = wait_for(lambda: (beat := heartbeats.latest(0.1)) and beat.header)
     assert "further keyframes (spool.max_mb) may take" in status.why

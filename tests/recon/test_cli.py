@@ -37,7 +37,6 @@ def photographs(tmp_path):
         (["--out", "new", "--baseline", "a.png", "c.png", "0.5"], 2, "'c.png' is not there; there are: a.png, b.png"),
         (["--out", "new", "--baseline", "a.png", "b.png", "far"], 2, "a distance in metres, got 'far'"),
         (["--out", "new/../photographs"], 2, "must not be the folder of the photographs"),
-        (["--out", "new", "--seed", str(2**63)], 2, "seed: expected int <="),
         (["--out", "photographs/a.png"], 73, "choose another folder"),
         (["--out", "photographs/a.png/below"], 73, "choose another folder"),
     ],
@@ -49,12 +48,6 @@ def test_what_cannot_end_well_is_not_begun(photographs, monkeypatch, capsys, arg
     assert said in capsys.readouterr().err
     assert {path.name for path in photographs.parent.iterdir()} == {"photographs"}
     assert {path.name for path in photographs.iterdir()} == {"a.png", "b.png"}
-
-
-def test_a_seed_that_cannot_be_used_is_told_before_the_capture_is_made(tmp_path, capsys):
-    assert command_line.main(["demo", "--seed", str(2**63), "--out", str(tmp_path / "out")]) == 2
-    assert "seed: expected int <=" in capsys.readouterr().err
-    assert not any(tmp_path.iterdir())
 
 
 def test_so_many_views_of_a_recording_go_by_the_names_that_its_frames_had(photographs, capsys):

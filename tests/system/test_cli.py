@@ -50,6 +50,8 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
     loaded, heavy = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).splitlines()
     assert loaded.split() == [
         "splatnode.capture.process.arguments",
+        "splatnode.capture.process.config_text",
+        "splatnode.capture.process.foreign",
         "splatnode.capture.process.logs",
         "splatnode.capture.process.printable",
         "splatnode.capture.process.stop_signals",
@@ -175,8 +177,10 @@ def test_a_stop_that_an_import_turns_into_its_own_error_is_a_stop(monkeypatch, c
     "argv, said",
     [
         (["replay", "photos"], "--out"),
-        (["replay", "photos", "--out", "o", "--views", "0"], "must be a whole number, 1 or more"),
-        (["replay", "photos", "--out", "o", "--size", "big"], "must be a whole number, 1 or more"),
+        (["replay", "photos", "--out", "o", "--views", "0"], "must be a whole number from 1 to"),
+        (["replay", "photos", "--out", "o", "--seed", str(2**63)], "must be a whole number from 0 to"),
+        (["demo", "--out", "o", "--seed", str(2**63)], "must be a whole number from 0 to"),
+        (["replay", "photos", "--out", "o", "--size", "big"], "must be a whole number from 1 to"),
         (["replay", "photos", "--out", "o", "--budget-s", "nan"], "must be a number of seconds above 0"),
         (["replay", "photos", "--out", "o", "--max-mb", "0"], "must be a number of megabytes above 0"),
         (["replay", "photos", "--out", "o", "--views", "3", "--frames", "a,b,c"], "not allowed with"),
