@@ -20,7 +20,7 @@ from splatnode.capture.process.logs import use_structured_lines
 from splatnode.capture.process.terminal import say
 from splatnode.capture.reader import Reader, State
 from splatnode.capture.recording import Recorder
-from splatnode.capture.status import heartbeats
+from splatnode.capture.status import heartbeats, say_seen
 
 log = logging.getLogger(__name__)
 
@@ -109,7 +109,7 @@ def keys(args: argparse.Namespace) -> int:
 
 
 def status(args: argparse.Namespace) -> int:
-    """Waits for a heartbeat of each process and prints its fields; returns 75 where one is silent."""
+    """Waits for a heartbeat of each process and prints it; 75 where one is silent. `--seen`: what it tells is known."""
     network = typed(read_yaml(args.config).get("network") or {}, Network, "network") if args.config else Network()
     found = heartbeats(network)
     if args.json:
@@ -118,6 +118,9 @@ def status(args: argparse.Namespace) -> int:
         for room, fields in found.items():
             for line in _described(room, fields):
                 say(line)
+    if args.seen:
+        for room, answer in say_seen(network, [room for room, fields in found.items() if fields]).items():
+            say(f"{room}: {answer}")
     return EXIT_GOOD if all(found.values()) else EXIT_SILENT
 
 
@@ -126,6 +129,13 @@ def _described(room: str, fields: dict[str, object] | None) -> list[str]:
         return [f"{room}: silent; is splatnode {room} running, with the same network?"]
     lines = [f"{room}: {fields.get('state', 'running')}"]
     for key, value in fields.items():
-        if key not in NOT_PRINTED and value not in ("", None):
-            lines.append(f"  {key.replace('_', ' '):20}{f'{value:.1f}' if isinstance(value, float) else value}")
+        if key not in NOT_PRINTED and value not in ("", None, []):
+            shown = "; ".join(map(_shown, value)) if isinstance(value, list) else _shown(value)
+            lines.append(f"  {key.replace('_', ' '):20}{shown}")
     return lines
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, dict) and {"name", "reason"} <= value.keys():  # a keyframe that was set aside
+        return f"{value['name']}: {value['reason']}"
+    return f"{value:.1f}" if isinstance(value, float) else str(value)

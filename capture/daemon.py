@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
 from contextlib import ExitStack
@@ -12,28 +13,34 @@ import cv2
 from splatnode.capture.config import CaptureConfig, is_live, open_stream
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging.broadcast import Publisher
+from splatnode.capture.messaging.commands import Answer, CommandServer, Seen
 from splatnode.capture.messaging.keyframes import KeyframeServer
-from splatnode.capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
+from splatnode.capture.messaging.services import CAPTURE_CONTROL, CAPTURE_PREVIEW, CAPTURE_STATUS
 from splatnode.capture.messaging.spool import Spool, SpoolFull
 from splatnode.capture.messaging.wire import Numbering, WireError
 from splatnode.capture.preview import encode_preview
+from splatnode.capture.process.after_ready import after_ready
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.memory import keep_freed, resident_mb
+from splatnode.capture.process.printable import printable
+from splatnode.capture.process.problems import Problems, is_said
 from splatnode.capture.process.service_manager import ServiceManager
 from splatnode.capture.reader import Reader, State
 from splatnode.capture.selection import Decision, Selector
-from splatnode.capture.status import HEARTBEAT_S, CaptureStatus
+from splatnode.capture.status import HEARTBEAT_S, NAMED, CaptureStatus
 
 log = logging.getLogger(__name__)
 
 POLL_S = 0.05  # longest wait for a frame, and so for the answer to a request that comes meanwhile
+SOUND_S = 1.0  # a recording that has not failed by then can be read
 PREVIEW_JITTER = 0.1  # share of the time between previews by which a frame may come too early
 
 
 def capture(config: CaptureConfig) -> None:
-    """Runs until a recording has ended and its keyframes are acknowledged; with a live camera, until a signal comes.
+    """Runs until a recording has ended and its keyframes are answered; with a live camera, until a signal comes.
 
-    Raises CameraUnavailable, AlreadyRunning, NetworkError, OSError. SystemExit and KeyboardInterrupt end it cleanly.
+    Raises what opening the camera, the network and the spool raises; once it is ready, CameraUnavailable or Failed.
+    SystemExit and KeyboardInterrupt end it cleanly.
     """
     keep_freed()
     cv2.setNumThreads(1)  # small images: threads would cost more than they give, and the processor is recon's
@@ -47,18 +54,16 @@ def capture(config: CaptureConfig) -> None:
         event(log, logging.INFO, "started", camera=camera.kind, waiting=server.queued)
         if why := server.spool.shortage():
             event(log, logging.WARNING, "disk_space", problem=why)
-        if not is_live(camera):
-            manager.ready()  # its first frame may be long in coming; a live camera's proves that it is there
+        sound_s = math.inf if is_live(camera) else time.monotonic() + SOUND_S  # a live camera proves it by a frame
         while not (reader.state is State.FINISHED and server.queued == 0):
-            item = reader.next(POLL_S)
-            if isinstance(item, Frame):
-                session.take(item, reader.state)
-                manager.ready()
-            elif isinstance(item, DroppedFrame):
-                session.drop(item)
-            server.serve(0)
-            session.beat(reader)
-            manager.alive(f"{reader.state.value}: {session.frames} frames, {session.keyframes} keyframes")
+            with after_ready(manager):
+                item = reader.next(POLL_S)
+                if item is not None or time.monotonic() > sound_s:
+                    manager.ready()
+                session.handle(item, reader.state)
+                session.serve()
+                session.beat(reader)
+                manager.alive(f"{reader.state.value}: {session.frames} frames, {session.keyframes} keyframes")
         event(log, logging.INFO, "finished", frames=session.frames, keyframes=session.keyframes)
 
 
@@ -72,6 +77,8 @@ class _Session:
         self._spool_full = ""
         self._server = server
         self._selector = Selector(config.selection, config.quality)
+        self._problems = Problems()
+        self._commands = resources.enter_context(CommandServer(CAPTURE_CONTROL, config.network, Seen))
         self._previews = resources.enter_context(Publisher(CAPTURE_PREVIEW, config.network))
         self._heartbeats = resources.enter_context(Publisher(CAPTURE_STATUS, config.network))
         self._preview_numbers = Numbering(server.numbering.session)
@@ -79,6 +86,25 @@ class _Session:
         self._next_preview_ns = 0
         self._started = self._next_beat = time.monotonic()
         self._rate = _Rate()
+
+    def handle(self, item: Frame | DroppedFrame | None, state: State) -> None:
+        """Takes or drops what came, if something did. Whatever a frame's content makes fail costs that frame alone."""
+        if item is None:
+            return
+        try:
+            if isinstance(item, Frame):
+                self.take(item, state)
+            else:
+                self.drop(item)
+        except Exception as error:
+            why = f"{item.name}: {type(error).__name__}: {error}"
+            if is_said(self._problems.add("frames that could not be handled", why)):
+                log.exception("%s could not be handled", item.name)
+
+    def serve(self) -> None:
+        """Answers recon's requests, and whoever has seen the problems."""
+        self._server.serve(0)
+        self._commands.serve(0, self._answer)
 
     def take(self, frame: Frame, state: State) -> None:
         """Sends a frame: as a keyframe where it adds something to those before, and as a preview in any case."""
@@ -103,10 +129,11 @@ class _Session:
         if time.monotonic() < self._next_beat:
             return
         self._next_beat = time.monotonic() + HEARTBEAT_S
+        quarantine = self._server.spool.quarantine
         status = CaptureStatus(
             **self._heartbeat_numbers.next(),
             state=reader.state.value,
-            why=reader.why or self._spool_full or self._server.spool.shortage(),
+            why=printable(reader.why or self._spool_full or self._shortage()),
             camera=self.config.camera.kind,
             pid=os.getpid(),
             uptime_s=time.monotonic() - self._started,
@@ -117,15 +144,38 @@ class _Session:
             dropped=self.dropped,
             skipped=reader.skipped,
             not_taken=self.not_taken,
-            last_decision=self.last_decision,
+            last_decision=printable(self.last_decision),
             waiting=self._server.queued,
             waiting_mb=self._server.spool.size_bytes / 2**20,
             acknowledged=self._server.acknowledged,
             recon_connected=self._server.connected,
-            refused_messages=self._server.refused,
+            refused_messages=self._server.refused + self._commands.refused,
+            set_aside=len(quarantine),
+            newest_set_aside=quarantine.newest(NAMED),
             rss_mb=resident_mb(),
+            problem=self._problem(),
         )
         self._heartbeats.send(status)
+
+    def _problem(self) -> str:
+        server, quarantine = self._server, self._server.spool.quarantine
+        newest = "".join(f"{each.name}: {each.reason}" for each in quarantine.newest(1))
+        self._problems.count("requests that were refused", server.refused, server.why_refused)
+        self._problems.count("commands that were refused", self._commands.refused, self._commands.why_refused)
+        told = [f"{quarantine.unseen} keyframes were set aside, the last: {newest}"] if quarantine.unseen else []
+        told += [f"{server.turned_away} further recons ask for keyframes; stop them"] if server.turned_away else []
+        return printable("; ".join((*told, *filter(None, [str(self._problems)]))))
+
+    def _answer(self, _: Seen) -> Answer:
+        self._problems.seen()
+        self._server.spool.quarantine.seen()
+        return Answer(True, "the problems are not told again")
+
+    def _shortage(self) -> str:
+        try:
+            return self._server.spool.shortage()
+        except OSError as error:
+            return f"the spool's disk does not tell its size: {error.strerror}"
 
     def _offer(self, frame: Frame, decision: Decision) -> None:
         if not self._deliver(frame):
@@ -138,7 +188,12 @@ class _Session:
         """Puts a frame into the spool; False where there is no room, which is logged once until there is room again."""
         try:
             self._server.offer(item)
-        except (SpoolFull, WireError) as error:
+        except WireError as error:
+            self.not_taken += 1
+            if is_said(self._problems.add("keyframes too large to be sent", error)):
+                event(log, logging.ERROR, "too_large", why=error)
+            return False
+        except (SpoolFull, OSError) as error:
             self.not_taken += 1
             if not self._spool_full:
                 event(log, logging.ERROR, "spool_full", why=error)

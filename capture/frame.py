@@ -11,6 +11,13 @@ import numpy.typing as npt
 
 from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
 
+LARGEST_NUMBER = 2**62  # of ids and stamps
+LARGEST_SIDE = 65_535  # pixels, as of a JPEG
+LARGEST_IMAGE = 1 << 30  # pixels
+MOST_COEFFICIENTS = 14  # of OpenCV's lens model
+SOURCES = ("exif", "given", "calibration", "estimated")
+_SMALLEST_FOCAL, _LARGEST_LENS = 1e-6, 1e9  # pixels, and the coefficients' size
+
 
 @dataclass(frozen=True)
 class Intrinsics:
@@ -34,6 +41,17 @@ class Intrinsics:
         lens = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if min(self.width, self.height, self.fx, self.fy) <= 0 or not all(map(math.isfinite, lens)):
             raise ValueError(f"intrinsics must be finite, sizes and focal lengths above 0; got {self}")
+        if max(self.width, self.height) > LARGEST_SIDE:
+            raise ValueError(f"intrinsics must be of at most {LARGEST_SIDE} pixels a side; got {self}")
+        if min(self.fx, self.fy) < _SMALLEST_FOCAL or max(map(abs, lens)) > _LARGEST_LENS:
+            raise ValueError(f"intrinsics must be within {_SMALLEST_FOCAL:g} and {_LARGEST_LENS:g}; got {self}")
+        if len(self.distortion) > MOST_COEFFICIENTS:
+            raise ValueError(
+                "distortion must be OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]], "
+                f"got {len(self.distortion)} numbers. Calibrate with cv2.calibrateCamera."
+            )
+        if self.source not in SOURCES:
+            raise ValueError(f"the source of intrinsics must be one of {', '.join(SOURCES)}, got {self.source[:40]!a}")
 
     @property
     def K(self) -> npt.NDArray[np.float64]:  # (3, 3)
@@ -49,7 +67,7 @@ class Intrinsics:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One image of a stream."""
+    """One image of a stream, within bounds that hold for all that is made of it: `framed` where they may not hold."""
 
     frame_id: int  # position in its stream, from 0
     name: str  # printable, unique in its stream; for a file, its name as `printable_name` writes it
@@ -62,6 +80,15 @@ class Frame:
         object.__setattr__(self, "name", printable(self.name, LONGEST_NAME))
         if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:
             raise ValueError(f"image must be (H, W, 3) uint8, got {self.image.shape} {self.image.dtype}")
+        if not 1 <= self.width <= LARGEST_SIDE or not 1 <= self.height <= LARGEST_SIDE:
+            raise ValueError(f"image must have 1 to {LARGEST_SIDE} pixels a side, got {self.width} x {self.height}")
+        if self.width * self.height > LARGEST_IMAGE:
+            raise ValueError(f"image must have at most {LARGEST_IMAGE} pixels, got {self.width} x {self.height}")
+        if not self.name:
+            raise ValueError("a frame must have a name")
+        for what, number in (("frame_id", self.frame_id), ("stamp_ns", self.stamp_ns)):
+            if not 0 <= number <= LARGEST_NUMBER:
+                raise ValueError(f"{what} must be 0 to 2**62, got {number}")
 
     @property
     def height(self) -> int:
@@ -96,3 +123,23 @@ class DroppedFrame:
         """Both are shown to people, and what a decoder says of a stranger's file is a stranger's text."""
         object.__setattr__(self, "name", printable(self.name, LONGEST_NAME))
         object.__setattr__(self, "reason", printable(self.reason, LONGEST_TEXT))
+
+
+def framed(
+    frame_id: int,
+    name: str,
+    stamp_ns: int,
+    image: npt.NDArray[np.uint8],
+    intrinsics: Intrinsics | None,
+    encoded: bytes | None = None,
+) -> Frame | DroppedFrame:
+    """What a camera or a file gave as a Frame; left out, with the reason, where it keeps a Frame's bounds not."""
+    try:
+        return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded)
+    except ValueError as error:
+        return DroppedFrame(name, f"it cannot be a frame: {error}")
+
+
+def renamed(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame | DroppedFrame:
+    """The same image as another frame, which may be beyond a Frame's bounds."""
+    return framed(frame_id, name, stamp_ns, frame.image, frame.intrinsics, frame.encoded)

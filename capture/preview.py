@@ -10,7 +10,9 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, reduced
 from splatnode.capture.messaging.jpeg import from_jpeg, to_jpeg
+from splatnode.capture.messaging.values import Name, Sequential, Text
 from splatnode.capture.messaging.wire import Header, Message, Numbering, WireError
+from splatnode.capture.process.printable import printable
 
 _LARGEST_SIDE = 4096  # of what is decoded: a JPEG of a few bytes may ask for gigabytes
 
@@ -26,11 +28,11 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class PreviewHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The only array is a JPEG file."""
 
-    name: str
-    stamp_ns: int
-    state: str  # of the camera: reader.State
+    name: Name
+    stamp_ns: Sequential
+    state: Name  # of the camera: reader.State
     taken: bool  # it became a keyframe
-    reason: str  # why, or why not
+    reason: Text  # why, or why not
 
 
 def encode_preview(
@@ -38,7 +40,7 @@ def encode_preview(
 ) -> tuple[PreviewHeader, list[npt.NDArray[np.uint8]]]:
     jpeg = to_jpeg(reduced(frame.image, config.longer_side), config.jpeg_quality)
     header = PreviewHeader(
-        **numbering.next(), name=frame.name, stamp_ns=frame.stamp_ns, state=state, taken=taken, reason=reason
+        **numbering.next(), name=frame.name, stamp_ns=frame.stamp_ns, state=state, taken=taken, reason=printable(reason)
     )
     return header, [jpeg]
 

@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import msgspec
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_image_file
 from splatnode.capture.process.durable import sync_folder
 from splatnode.capture.process.printable import LONGEST_NAME, is_printable, marked_name
@@ -141,7 +141,7 @@ class Recording:
             return DroppedFrame(line.name, f"cannot be read: {error.strerror}")
         if hashlib.sha256(content).hexdigest() != line.sha256:
             return DroppedFrame(line.name, f"{line.file} is not the file that was recorded")
-        return Frame(frame_id, line.name, line.stamp_ns, image, line.intrinsics, encoded=content)
+        return framed(frame_id, line.name, line.stamp_ns, image, line.intrinsics, encoded=content)
 
 
 def _shown(name: str) -> str:

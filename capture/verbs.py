@@ -31,6 +31,7 @@ def _keys_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _status_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="FILE", help="where it says how to reach the processes: network")
+    parser.add_argument("--seen", action="store_true", help="the problems that are told need not be told again")
     add_json(parser)
 
 

@@ -21,11 +21,10 @@ from splatnode.capture.messaging.broadcast import Subscriber
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_SCENE, RECON_STATUS
 from splatnode.capture.messaging.state import StateClient
-from splatnode.capture.messaging.wire import WireError
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import is_printable
+from splatnode.capture.process.problems import Problems, is_said
 from splatnode.recon.daemon.status import ReconStatus
-from splatnode.recon.result.camera_check import camera_problem
 from splatnode.recon.result.export import SceneFileError, read_cameras, read_gaussians, viewer_safe
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.stored import StoredResult
@@ -80,6 +79,7 @@ class Live:
         """Raises what opening the network raises: NetworkError, KeyFileError."""
         self._client = StateClient(RECON_SCENE, network, SceneHeader)
         self._heartbeats = Subscriber(RECON_STATUS, network, ReconStatus)
+        self._refusals = Problems()
         self._newest: Moment | None = None
         self._tracked: CameraEstimate | None = None
         self._lock = threading.Lock()
@@ -119,16 +119,16 @@ class Live:
                 heartbeat = self._heartbeats.latest(0)
                 if heartbeat is not None and heartbeat.header.tracked != last:
                     last = heartbeat.header.tracked
-                    tracked = last and camera_from(last)
-                    self._tracked = tracked if tracked and is_camera(tracked) else None
+                    self._tracked = last and camera_from(last)
                 if message is None:
                     continue
                 try:
                     live = from_message(message)
-                except WireError as error:
-                    log.warning("a scene of the node was refused: %s", error)
+                    moment = Moment(_safe(live.snapshot), time.monotonic(), live.scene_id)
+                except Exception as error:  # of one scene; the next one may do
+                    if is_said(self._refusals.add("scenes that were refused", error)):
+                        log.warning("a scene of the node was refused: %s", error)
                     continue
-                moment = Moment(_safe(live.snapshot), time.monotonic(), live.scene_id)
                 with self._lock:
                     self._newest = moment
         except Exception as error:
@@ -172,13 +172,7 @@ def load_result(place: Path, photographs: Path | None = None) -> Moment:
 
 def _safe(snapshot: Snapshot) -> Snapshot:
     """What comes over the network is input: Gaussians that cannot be drawn are left out."""
-    cameras = tuple(camera for camera in snapshot.cameras if is_camera(camera))
-    return replace(snapshot, gaussians=viewer_safe(snapshot.gaussians), cameras=cameras)
-
-
-def is_camera(camera: CameraEstimate) -> bool:
-    """Whether it can be looked through: a rigid motion and positive focal lengths."""
-    return not camera_problem(camera.T_world_camera, camera.K, camera.width, camera.height)
+    return replace(snapshot, gaussians=viewer_safe(snapshot.gaussians))
 
 
 class _Report(msgspec.Struct, frozen=True):

@@ -16,7 +16,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.pace import FramesPerSecond
 from splatnode.capture.process.logs import event
 from splatnode.capture.unavailable import CameraUnavailable
@@ -41,7 +41,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     silence_s: Annotated[float, msgspec.Meta(gt=0)] = 4.0  # without a frame, the camera counts as lost
 
 
-def stream(config: Config) -> Iterator[Frame]:
+def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     """Frames as they come, with the calibration that the camera carries. Raises CameraUnavailable, also when unplugged.
 
     Whether there is a camera is asked first: opening one that is not there takes 11 seconds to fail.
@@ -80,7 +80,7 @@ def find() -> list[dict[str, str]]:
     ]
 
 
-def read(dai: ModuleType, queue: Any, config: Config, hold: Callable[[], None]) -> Iterator[Frame]:
+def read(dai: ModuleType, queue: Any, config: Config, hold: Callable[[], None]) -> Iterator[Frame | DroppedFrame]:
     """The frames of a running pipeline's `queue`; `hold` is called once the camera has settled."""
     settled, held, frame_id = time.monotonic() + config.settle_s, not config.lock, 0
     while True:
@@ -98,16 +98,17 @@ def read(dai: ModuleType, queue: Any, config: Config, hold: Callable[[], None]) 
             exposure_us = message.getExposureTime() / timedelta(microseconds=1)
             event(log, logging.INFO, "locked", exposure_us=exposure_us, iso=message.getSensitivity())
             continue  # it was exposed before
-        yield to_frame(message, frame_id)
-        frame_id += 1
+        item = to_frame(message, frame_id)
+        frame_id += isinstance(item, Frame)
+        yield item
 
 
-def to_frame(message: Any, frame_id: int) -> Frame:
+def to_frame(message: Any, frame_id: int) -> Frame | DroppedFrame:
     """An ImgFrame as a Frame: its stamp is of the host's monotonic clock, synchronised by DepthAI."""
     stamp_ns = message.getTimestamp() // timedelta(microseconds=1) * 1000
     image = cv2.cvtColor(message.getCvFrame(), cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
     intrinsics = _intrinsics(message.getTransformation(), image.shape[1], image.shape[0])
-    return Frame(frame_id, f"{stamp_ns / 1e9:.6f}", stamp_ns, image, intrinsics)
+    return framed(frame_id, f"{stamp_ns / 1e9:.6f}", stamp_ns, image, intrinsics)
 
 
 def holding(dai: ModuleType, config: Config) -> Any:

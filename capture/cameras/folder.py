@@ -11,7 +11,7 @@ from typing import Annotated
 import msgspec
 
 from splatnode.capture import recording
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed, renamed
 from splatnode.capture.image_file import MAX_PIXELS, SUFFIXES, MaxPixels, UnusableImage, decode_image, read_image_file
 from splatnode.capture.pace import FramesPerSecond, Pace, paced
 from splatnode.capture.process.printable import printable, printable_name
@@ -54,12 +54,7 @@ def _looped(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: int) -> I
             if isinstance(item, Frame):
                 step = item.stamp_ns - last.stamp_ns if last else step
                 last = item
-                yield replace(
-                    item,
-                    frame_id=first_id + item.frame_id,
-                    name=prefix + item.name,
-                    stamp_ns=first_ns + item.stamp_ns,
-                )
+                yield renamed(item, first_id + item.frame_id, prefix + item.name, first_ns + item.stamp_ns)
             else:
                 yield replace(item, name=prefix + item.name)
         if last is None:
@@ -86,8 +81,9 @@ def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]
             if config.intrinsics is not None and _same_aspect(config.intrinsics, width, height):
                 intrinsics = config.intrinsics.resized(width, height)
             stamp_ns = round(frame_id / config.frames_per_second * 1e9)
-            yield Frame(frame_id, name, stamp_ns, image, intrinsics, encoded=data)
-            frame_id += 1
+            item = framed(frame_id, name, stamp_ns, image, intrinsics, encoded=data)
+            frame_id += isinstance(item, Frame)
+            yield item
 
 
 def foreign_file(path: Path) -> DroppedFrame | None:

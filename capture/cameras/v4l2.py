@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.image_file import UnusableImage, decode_image
 from splatnode.capture.pace import FramesPerSecond
 from splatnode.capture.unavailable import CameraUnavailable
@@ -100,7 +100,7 @@ def _frame(raw: RawFrame, chosen: Format, frame_id: int, intrinsics: Intrinsics 
     if intrinsics is not None:
         intrinsics = intrinsics.resized(image.shape[1], image.shape[0])
     encoded = raw.data if chosen.pixels == "MJPG" else None
-    return Frame(frame_id, name, raw.stamp_ns, image, intrinsics, encoded=encoded)
+    return framed(frame_id, name, raw.stamp_ns, image, intrinsics, encoded=encoded)
 
 
 def _decode(data: bytes, chosen: Format) -> npt.NDArray[np.uint8]:

@@ -10,7 +10,7 @@ import cv2
 import msgspec
 import numpy as np
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.pace import Pace, paced
 from splatnode.capture.process.printable import LONGEST_NAME, printable_name
 
@@ -34,7 +34,7 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     return paced(_frames(config), config.pace)
 
 
-def _frames(config: Config) -> Iterator[Frame]:
+def _frames(config: Config) -> Iterator[Frame | DroppedFrame]:
     video = cv2.VideoCapture(str(config.file), cv2.CAP_FFMPEG)
     try:
         rate = video.get(cv2.CAP_PROP_FPS)
@@ -54,9 +54,9 @@ def _frames(config: Config) -> Iterator[Frame]:
         video.release()
 
 
-def _frame(image: np.ndarray, frame_id: int, index: int, rate: float, config: Config) -> Frame:
+def _frame(image: np.ndarray, frame_id: int, index: int, rate: float, config: Config) -> Frame | DroppedFrame:
     """Stamps are counted, not read: containers with edited time lines give stamps that go back."""
     rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
     intrinsics = config.intrinsics.resized(rgb.shape[1], rgb.shape[0]) if config.intrinsics else None
     name = f"{printable_name(config.file.stem, _LONGEST_STEM)}_{index:06d}.png"
-    return Frame(frame_id, name, round(index / rate * 1e9), rgb, intrinsics)
+    return framed(frame_id, name, round(index / rate * 1e9), rgb, intrinsics)

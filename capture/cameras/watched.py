@@ -11,7 +11,7 @@ from typing import Annotated
 import msgspec
 
 from splatnode.capture.cameras.folder import foreign_file, frame_name, image_paths
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.image_file import (
     MAX_PIXELS,
     MaxPixels,
@@ -105,7 +105,7 @@ def _decoded(name: str, data: bytes, config: Config, frame_id: int) -> Frame | D
         return DroppedFrame(name, str(error))
     if config.intrinsics is not None:
         intrinsics = config.intrinsics.resized(image.shape[1], image.shape[0])
-    return Frame(frame_id, name, time.monotonic_ns(), image, intrinsics, encoded=data)
+    return framed(frame_id, name, time.monotonic_ns(), image, intrinsics, encoded=data)
 
 
 def _listed(folder: Path) -> list[Path]:

@@ -40,7 +40,6 @@ class Subscriber(Endpoint):
         super().__init__(network)
         self.schema = schema
         self.lost = 0  # messages of the present session that were sent and never came
-        self.refused = 0  # malformed
         self._session, self._sequence = "", -1
         self._heard = -math.inf
         self._socket_in = self._connect(service, zmq.SUB, queue=queue)
@@ -69,8 +68,8 @@ class Subscriber(Endpoint):
                 break
             try:
                 newest = decode(parts, self.schema, self.network.limits)
-            except WireError:
-                self.refused += 1
+            except WireError as error:
+                self._refuse("a message", error)
             else:
                 self._count(newest.header)
         return newest

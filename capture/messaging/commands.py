@@ -13,10 +13,20 @@ import zmq
 
 from splatnode.capture.messaging.network import REQUEST_LIMITS, Endpoint, Network
 from splatnode.capture.messaging.services import Service
+from splatnode.capture.messaging.values import Text
 from splatnode.capture.messaging.wire import WireError, decode, encode
 
 QUEUE = 16  # requests that wait, and that one call of `serve` replies to
 CONNECT_POLL_MS = 20  # between looks at whether the service refuses this machine
+
+
+class Seen(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="seen"):
+    """Somebody has seen the problems that the status tells; they need not be told again."""
+
+
+class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="answer"):
+    done: bool
+    message: Text
 
 
 class NoAnswer(RuntimeError):
@@ -31,7 +41,6 @@ class CommandServer(Endpoint):
     def __init__(self, service: Service, network: Network, schema: Any) -> None:
         super().__init__(network, offers=service)
         self.schema = schema
-        self.refused = 0  # malformed
         self._router = self._bind(service, zmq.ROUTER, queue=QUEUE)
 
     def serve(self, timeout_s: float, reply: Callable[[Any], msgspec.Struct]) -> None:
@@ -45,8 +54,8 @@ class CommandServer(Endpoint):
                 return
             try:
                 request = decode(parts, self.schema, REQUEST_LIMITS).header
-            except WireError:
-                self.refused += 1
+            except WireError as error:
+                self._refuse("a command", error)
                 continue
             with contextlib.suppress(zmq.Again):
                 self._router.send_multipart([identity, *encode(reply(request))], zmq.NOBLOCK)

@@ -1,4 +1,8 @@
-"""The messages between capture and recon: frames one way, readiness and acknowledgements the other."""
+"""The messages between capture and recon: frames one way, readiness and answers the other.
+
+A frame's message is preceded by a Delivery, which says which frame it is: what cannot be read can be refused by its
+number.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +10,26 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import msgspec
+import zmq
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.messaging.spool import Key
-from splatnode.capture.messaging.wire import Header, Message, Numbering, Part, Sequential, SessionId, WireError, encode
+from splatnode.capture.messaging.values import Name, Sequential, SessionId, Text
+from splatnode.capture.messaging.wire import (
+    Header,
+    Limits,
+    Message,
+    Numbering,
+    Part,
+    WireError,
+    decode,
+    encode,
+    size_bytes,
+)
+from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
 
-_LONGEST_NAME = 255  # characters, as of a file
-_LONGEST_TEXT = 1000  # characters
-_MOST_HELD = 64  # frames that a client may hold without acknowledging them
-
-Name = Annotated[str, msgspec.Meta(min_length=1, max_length=_LONGEST_NAME)]
-Text = Annotated[str, msgspec.Meta(max_length=_LONGEST_TEXT)]
+MOST_HELD = 64  # frames that a client may hold without acknowledging them
+DELIVERY_PARTS = 2  # that come before a frame's own
 
 
 class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="frame"):
@@ -35,11 +48,28 @@ class DroppedHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     reason: Text
 
 
+class Delivery(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="delivery"):
+    """The rest of this message is that frame."""
+
+    session: SessionId
+    sequence: Sequential
+
+
+class Served(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="served"):
+    """capture's answer to Ready: whether this recon gets its keyframes, or another one does."""
+
+    served: bool
+    message_bytes: Sequential  # of the largest keyframe that capture sends
+
+
 class Ready(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="ready"):
     """The sender takes frames until it has `capacity` that are not acknowledged; `holding` it has received already."""
 
-    capacity: Annotated[int, msgspec.Meta(ge=0, le=_MOST_HELD)]
-    holding: Annotated[list[tuple[SessionId, Sequential]], msgspec.Meta(max_length=_MOST_HELD)]
+    recon: SessionId  # its checkpoint, which a restarted process has from the one before
+    process: SessionId
+    capacity: Annotated[int, msgspec.Meta(ge=0, le=MOST_HELD)]
+    holding: Annotated[list[tuple[SessionId, Sequential]], msgspec.Meta(max_length=MOST_HELD)]
+    message_bytes: Sequential  # of the largest keyframe that it can take
 
 
 class Acknowledge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="acknowledge"):
@@ -47,6 +77,17 @@ class Acknowledge(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
 
     session: SessionId
     sequence: Sequential
+
+
+class Refuse(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="refuse"):
+    """The sender cannot take this frame, now or later; the receiver may set it aside."""
+
+    session: SessionId
+    sequence: Sequential
+    reason: Text
+
+
+Request = Ready | Acknowledge | Refuse
 
 
 @dataclass(frozen=True)
@@ -62,30 +103,47 @@ class ReceivedFrame:
 
 def to_message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
     """The parts of the message that carries `frame`, with the next number."""
-    name = frame.name[-_LONGEST_NAME:]
     if isinstance(frame, DroppedFrame):
-        return encode(DroppedHeader(**numbering.next(), name=name, reason=frame.reason[:_LONGEST_TEXT]))
+        name = printable(frame.name, LONGEST_NAME) or "?"
+        return encode(DroppedHeader(**numbering.next(), name=name, reason=printable(frame.reason, LONGEST_TEXT)))
     header = FrameHeader(
         **numbering.next(),
         frame_id=frame.frame_id,
-        name=name,
+        name=frame.name,
         stamp_ns=frame.stamp_ns,
         intrinsics=frame.intrinsics,
     )
     return encode(header, [frame.image])
 
 
-def received(message: Message) -> ReceivedFrame:
-    """The frame in a decoded message. Raises WireError where what it says is not possible."""
+def delivered(key: Key, message: list[Part]) -> list[Part]:
+    """The message with the Delivery that precedes it."""
+    return [*encode(Delivery(*key)), *message]
+
+
+def received(key: Key, parts: list[zmq.Frame], limits: Limits) -> ReceivedFrame:
+    """The frame in what followed a Delivery. Raises WireError where it is none, or another one."""
+    message: Message[FrameHeader | DroppedHeader] = decode(parts, FrameHeader | DroppedHeader, limits)
     header = message.header
+    if (header.session, header.sequence) != key:
+        raise WireError(f"frame {header.sequence} was delivered as frame {key.sequence}")
     if isinstance(header, DroppedHeader):
         if message.arrays:
             raise WireError("a dropped frame has no image")
-        return ReceivedFrame(header.session, header.sequence, DroppedFrame(header.name, header.reason))
-    if len(message.arrays) != 1 or min(message.arrays[0].shape, default=0) < 1:
-        raise WireError("a frame has one image")
+        return ReceivedFrame(*key, DroppedFrame(header.name, header.reason))
+    if len(message.arrays) != 1:
+        raise WireError(f"a frame has one image, got {len(message.arrays)}")
     try:
         frame = Frame(header.frame_id, header.name, header.stamp_ns, message.arrays[0], header.intrinsics)
     except ValueError as error:
         raise WireError(str(error)) from error
-    return ReceivedFrame(header.session, header.sequence, frame)
+    return ReceivedFrame(*key, frame)
+
+
+def name_in(parts: list[Part]) -> str:
+    """The name in a message that need not be a frame's; a question mark where it does not tell."""
+    try:
+        header = decode(parts, dict, Limits(total_bytes=size_bytes(parts), own=True)).header
+    except WireError:
+        return "?"
+    return printable(header.get("name", "?"), LONGEST_NAME) or "?"

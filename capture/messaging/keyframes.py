@@ -1,14 +1,17 @@
 """Keyframes from capture to recon, none of which is lost once it is offered.
 
     capture                                      recon
-      offer: to the spool on disk     <------    Ready(capacity, holding): at start and every half second
+      offer: to the spool on disk     <------    Ready(capacity, holding, limits): at start and every half second
+      which recon is served           ------>    Served(served, limits)
       send while there is capacity    ------>    receive: each frame once
                                                  checkpoint
       remove from the spool           <------    Acknowledge(session, sequence)
+      move to the quarantine          <------    Refuse(session, sequence, reason): what it cannot take, now or later
 
-Either process may die at any moment. A frame that is not acknowledged stays in the spool and is sent to the next
-connection that is ready and does not hold it. An acknowledged one is in recon's checkpoint; if it comes again, because
-capture died before it removed it, it is acknowledged again and not delivered.
+Either process may die at any moment. A frame without an answer stays in the spool and is sent to the next connection
+that is ready and does not hold it. An acknowledged one is in recon's checkpoint; if it comes again, because capture
+died before it removed it, it is acknowledged again and not delivered. What is larger than recon allows is not sent: it
+goes to the quarantine at once. Answers of a recon that is not served (turns.py) do not count.
 """
 
 from __future__ import annotations
@@ -17,47 +20,45 @@ import contextlib
 import logging
 import math
 import time
+import uuid
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 
 import zmq
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging.keyframe_messages import (
+    DELIVERY_PARTS,
     Acknowledge,
-    DroppedHeader,
-    FrameHeader,
+    Delivery,
     Ready,
     ReceivedFrame,
+    Refuse,
+    Request,
+    Served,
+    delivered,
+    name_in,
     received,
     to_message,
 )
 from splatnode.capture.messaging.network import REQUEST_LIMITS, Endpoint, Network
 from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES
 from splatnode.capture.messaging.spool import Key, Spool
-from splatnode.capture.messaging.wire import Numbering, WireError, decode, encode
+from splatnode.capture.messaging.turns import Connection, Turns
+from splatnode.capture.messaging.wire import Numbering, Part, WireError, decode, encode, size_bytes
+from splatnode.capture.process.printable import LONGEST_TEXT, printable
 
 log = logging.getLogger(__name__)
 
 READY_EVERY_S = 0.5
-FORGET_CLIENT_S = 20.0  # without a request, a client counts as gone
 REMEMBERED = 10_000  # acknowledged frames that recon recognises if they come again
+REMEMBERED_REFUSED = 1000
 QUEUE = 64  # messages in a socket; as many as a client may hold (Ready.capacity)
 MAX_REQUESTS = 1000  # that one call of `serve` reads
 
 
-@dataclass
-class _Client:
-    """One connection. What was sent over it arrives, or the connection ends."""
-
-    capacity: int = 0
-    outstanding: set[Key] = field(default_factory=set)  # sent or held, not acknowledged
-    heard: float = 0.0
-
-
 class KeyframeServer(Endpoint):
-    """Capture's end: sends what lies in the spool until it is acknowledged."""
+    """Capture's end: sends what lies in the spool until it is answered."""
 
     def __init__(self, network: Network, spool: Spool) -> None:
         """Takes the spool over and closes it. Raises AlreadyRunning where another process offers keyframes."""
@@ -67,27 +68,32 @@ class KeyframeServer(Endpoint):
             self._resources.push(taken.pop_all())
         self.spool = spool
         self.numbering = Numbering()
-        self.refused = 0  # malformed requests
         self.acknowledged = 0
-        self._clients: dict[bytes, _Client] = {}
+        self.set_aside = 0  # by this process
+        self.ignored = 0  # answers of recons that are not served
+        self._turns = Turns()
         self._router = self._bind(CAPTURE_KEYFRAMES, zmq.ROUTER, queue=QUEUE)
         self._router.router_mandatory = True  # a connection that is gone says so
 
     @property
     def queued(self) -> int:
-        """Frames that nobody has acknowledged."""
+        """Frames that nobody has answered."""
         return len(self.spool)
 
     @property
     def connected(self) -> bool:
-        return bool(self._clients)
+        return self._turns.served is not None
+
+    @property
+    def turned_away(self) -> int:
+        """Recons that ask for keyframes while another one is served."""
+        return self._turns.waiting
 
     def offer(self, frame: Frame | DroppedFrame) -> Key:
         """Takes the frame over: on the disk when this returns. Raises SpoolFull, OSError, WireError (too large)."""
         message = to_message(frame, self.numbering)
-        size = sum(memoryview(part).nbytes for part in message)
-        if size > self.network.limits.total_bytes:
-            raise WireError(f"{frame.name}: {size >> 20} MB; network.max_message_mb allows less")
+        if size_bytes(message) > self.network.limits.total_bytes:
+            raise WireError(f"{frame.name}: {size_bytes(message) >> 20} MB; network.max_message_mb allows less")
         key = Key(self.numbering.session, self.numbering.sequence - 1)
         self.spool.put(key, message)
         self._send_due()
@@ -101,68 +107,99 @@ class KeyframeServer(Endpoint):
                     identity, *parts = self._router.recv_multipart(zmq.NOBLOCK)
                 except zmq.Again:
                     break
-                self._answer(identity, parts)
-        now = time.monotonic()
-        self._clients = {name: client for name, client in self._clients.items() if now - client.heard < FORGET_CLIENT_S}
+                try:
+                    self._handle(identity, decode(parts, Request, REQUEST_LIMITS).header)
+                except WireError as error:
+                    self._refuse("a request for keyframes", error)
+        self._turns.forget_silent(time.monotonic())
         self._send_due()
 
-    def _answer(self, identity: bytes, parts: list[bytes]) -> None:
-        try:
-            request = decode(parts, Ready | Acknowledge, REQUEST_LIMITS).header
-        except WireError:
-            self.refused += 1
-            return
-        client = self._clients.setdefault(identity, _Client())
-        client.heard = time.monotonic()
+    def _handle(self, identity: bytes, request: Request) -> None:
+        now_s = time.monotonic()
         if isinstance(request, Ready):
-            client.capacity = request.capacity
-            client.outstanding |= {key for pair in request.holding if (key := Key(*pair)) in self.spool}
+            served = self._turns.ready(identity, request, self.spool, now_s)
+            self._say(identity, encode(Served(served, self.network.limits.total_bytes)))
+            return
+        self._turns.heard(identity, now_s)
+        if not self._turns.is_served(identity):
+            self.ignored += 1
             return
         key = Key(request.session, request.sequence)
-        if key in self.spool:
-            self.spool.remove(key)
-            self.acknowledged += 1
-        for each in self._clients.values():
-            each.outstanding.discard(key)
+        if key not in self.spool:
+            return
+        if isinstance(request, Refuse):
+            self._set_aside(key, f"refused by recon: {request.reason}")
+            return
+        self.spool.remove(key)
+        self.acknowledged += 1
+        self._turns.answered(key)
+
+    def _set_aside(self, key: Key, reason: str, parts: list[Part] | None = None) -> None:
+        """Takes the frame out of the queue for good; says once which one it is, and why."""
+        try:
+            parts = parts or self.spool.get(key)
+            name = name_in(parts)
+        except (OSError, ValueError):
+            name = "?"
+        log.warning("set aside %s: %s", name, reason)
+        self.spool.set_aside(key, name, reason)
+        self.set_aside += 1
+        self._turns.answered(key)
 
     def _send_due(self) -> None:
-        for identity, client in tuple(self._clients.items()):
-            for key in self.spool:
-                if len(client.outstanding) >= client.capacity:
-                    break
-                if key not in client.outstanding and not self._send(identity, client, key):
-                    break
+        client = self._turns.served
+        if client is None:
+            return
+        for key in self.spool:
+            if len(client.outstanding) >= client.capacity:
+                break
+            if key not in client.outstanding and not self._send(client, key):
+                break
 
-    def _send(self, identity: bytes, client: _Client, key: Key) -> bool:
+    def _send(self, client: Connection, key: Key) -> bool:
         """False where this client cannot take more now."""
         try:
             parts = self.spool.get(key)
         except (OSError, ValueError) as error:
-            log.error("a keyframe is lost on the disk: %s", error)
-            self.spool.set_aside(key)
+            self._set_aside(key, f"lost on the disk: {error}")
             return True
-        try:
-            self._router.send_multipart([identity, *parts], zmq.NOBLOCK, copy=False)
-        except zmq.Again:
-            return False
-        except zmq.ZMQError:  # host unreachable: the connection is gone
-            del self._clients[identity]
+        size = size_bytes(parts)
+        if size > client.message_bytes:
+            allowed = f"{client.message_bytes / 1e6:.1f} MB; raise network.max_message_mb there"
+            self._set_aside(key, f"it has {size / 1e6:.1f} MB, and recon takes at most {allowed}", parts)
+            return True
+        if not self._say(client.identity, delivered(key, parts)):
             return False
         client.outstanding.add(key)
         return True
 
+    def _say(self, identity: bytes, parts: list[Part]) -> bool:
+        """Whether it could be sent."""
+        try:
+            self._router.send_multipart([identity, *parts], zmq.NOBLOCK, copy=False)
+        except zmq.Again:
+            return False
+        except zmq.ZMQError:  # that connection has ended
+            self._turns.gone(identity)
+            return False
+        return True
+
 
 class KeyframeClient(Endpoint):
-    """Recon's end: receives each keyframe once and acknowledges it."""
+    """Recon's end: receives each keyframe once, and acknowledges or refuses it."""
 
-    def __init__(self, network: Network, seen: Iterable[tuple[str, int]] = (), capacity: int = 4) -> None:
-        """`seen`: what the checkpoint holds. `capacity`: frames that may be here without being acknowledged."""
+    def __init__(
+        self, network: Network, seen: Iterable[tuple[str, int]] = (), capacity: int = 4, recon: str | None = None
+    ) -> None:
+        """`seen`: what the checkpoint holds, whose id is `recon`. `capacity`: frames that may be here unanswered."""
         super().__init__(network)
         self.capacity = capacity
-        self.refused = 0  # malformed messages
         self.duplicates = 0
-        self._held: dict[Key, None] = {}  # delivered, not acknowledged
+        self.served: bool | None = None  # whether capture sends its keyframes here; None before it says so
+        self._recon, self._process = recon or uuid.uuid4().hex, uuid.uuid4().hex
+        self._held: dict[Key, None] = {}  # delivered, not answered
         self._seen: dict[Key, None] = dict.fromkeys(Key(*pair) for pair in seen)
+        self._refused: dict[Key, str] = {}  # and why
         self._received: deque[ReceivedFrame] = deque()
         self._ready_said = -math.inf
         self._dealer = self._connect(CAPTURE_KEYFRAMES, zmq.DEALER, queue=QUEUE)
@@ -172,7 +209,7 @@ class KeyframeClient(Endpoint):
         deadline = time.monotonic() + timeout_s
         while True:
             self._check_links()
-            self._say_ready()
+            self.say_ready()
             self._take_in()
             if self._received:
                 return self._received.popleft()
@@ -184,45 +221,71 @@ class KeyframeClient(Endpoint):
     def acknowledge(self, frame: ReceivedFrame) -> None:
         """To be called once the frame is on the disk, so that it survives this process."""
         self._held.pop(frame.key, None)
-        self._seen[frame.key] = None
-        while len(self._seen) > REMEMBERED:
-            del self._seen[next(iter(self._seen))]
-        self._say_acknowledged(frame.key)
+        _remember(self._seen, frame.key, None, REMEMBERED)
+        self._say(Acknowledge(*frame.key))
+
+    def refuse(self, key: Key, reason: str) -> None:
+        """To be called where the frame cannot be taken, now or later: capture sets it aside."""
+        self._held.pop(key, None)
+        _remember(self._refused, key, printable(reason, LONGEST_TEXT), REMEMBERED_REFUSED)
+        self._refuse("a keyframe", reason)
+        self._say(Refuse(*key, self._refused[key]))
+
+    def say_ready(self) -> None:
+        """Says that this recon lives, when that is due. To be called where handling a frame takes seconds."""
+        if time.monotonic() - self._ready_said < READY_EVERY_S:
+            return
+        self._ready_said = time.monotonic()
+        held = [(key.session, key.sequence) for key in self._held]
+        self._say(Ready(self._recon, self._process, self.capacity, held, self.network.limits.total_bytes))
 
     def _take_in(self) -> None:
-        for _ in range(self.capacity + 1):
+        for _ in range(self.capacity + 2):
             try:
                 parts = self._dealer.recv_multipart(zmq.NOBLOCK, copy=False)
             except zmq.Again:
                 return
             try:
-                frame = received(decode(parts, FrameHeader | DroppedHeader, self.network.limits))
-            except WireError as error:
-                self.refused += 1
-                if (
-                    self.refused.bit_count() == 1
-                ):  # the 1st, 2nd, 4th, 8th, ...: a faulty sender does not fill the journal
-                    log.warning("refused a keyframe (%d so far): %s", self.refused, error)
+                first = decode(parts[:DELIVERY_PARTS], Delivery | Served, REQUEST_LIMITS).header
+            except WireError as error:  # it does not say which frame it is, if it is one
+                self._refuse("a keyframe without a number", error)
                 continue
-            if frame.key in self._seen:
-                self.duplicates += 1
-                self._say_acknowledged(frame.key)
-            elif frame.key not in self._held:
-                self._held[frame.key] = None
+            if isinstance(first, Delivery):
+                self._take(Key(first.session, first.sequence), parts[DELIVERY_PARTS:])
+            else:
+                self._follow(first)
+
+    def _take(self, key: Key, parts: list[zmq.Frame]) -> None:
+        if key in self._seen:
+            self.duplicates += 1
+            self._say(Acknowledge(*key))
+        elif key in self._refused:
+            self._say(Refuse(*key, self._refused[key]))
+        elif key not in self._held:
+            try:
+                frame = received(key, parts, self.network.limits)
+            except WireError as error:
+                self.refuse(key, str(error))
+            else:
+                self._held[key] = None
                 self._received.append(frame)
 
-    def _say_ready(self) -> None:
-        if time.monotonic() - self._ready_said < READY_EVERY_S:
-            return
-        self._ready_said = time.monotonic()
-        self._say(Ready(self.capacity, [(key.session, key.sequence) for key in self._held]))
+    def _follow(self, answer: Served) -> None:
+        """Where another recon is served, what waits here is its."""
+        self.served = answer.served
+        if not answer.served:
+            self._received.clear()
+            self._held.clear()
 
-    def _say_acknowledged(self, key: Key) -> None:
-        self._say(Acknowledge(*key))
-
-    def _say(self, request: Ready | Acknowledge) -> None:
-        """Sends a request. Where an acknowledgement cannot be sent, the frame comes again and is recognised."""
+    def _say(self, request: Request) -> None:
+        """Sends a request. Where an answer to a frame cannot be sent, the frame comes again and is recognised."""
         try:
             self._dealer.send_multipart(encode(request), zmq.NOBLOCK)
         except zmq.Again:
             log.debug("capture is not there")
+
+
+def _remember(known: dict, key: Key, value: str | None, most: int) -> None:
+    known[key] = value
+    while len(known) > most:
+        del known[next(iter(known))]

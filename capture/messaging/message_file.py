@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from splatnode.capture.messaging.wire import Part
+from splatnode.capture.messaging.wire import MAGIC, Part
 from splatnode.capture.process.durable import write_whole
 from splatnode.capture.process.private import read_own
 
@@ -16,6 +16,7 @@ LARGEST = 4 << 30  # bytes of a body, unless the reader knows better
 _HEAD = struct.Struct("<8sIQI")  # magic, parts, bytes of the body, its CRC-32
 _MAGIC = b"SPLSPOOL"
 _SIZE = struct.Struct("<Q")
+_EARLIER = MAGIC[:-1] + b"\x01"  # of files that version 1 wrote, whose headers and arrays are those of today
 
 
 def size_in_file(parts: Sequence[Part]) -> int:
@@ -45,7 +46,8 @@ def read_message(path: Path, most_bytes: int = LARGEST) -> list[Part]:
     body = content[_HEAD.size :]
     if magic != _MAGIC or len(body) != size or zlib.crc32(body) != checksum:
         raise MessageFileError(f"{path} is damaged")
-    return list(_parts(body, count, path))
+    parts: list[Part] = list(_parts(body, count, path))
+    return [MAGIC, *parts[1:]] if parts and parts[0] == _EARLIER else parts
 
 
 def _parts(body: memoryview, count: int, path: Path) -> Iterator[memoryview]:

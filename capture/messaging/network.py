@@ -26,7 +26,9 @@ from splatnode.capture.messaging import wire
 from splatnode.capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
 from splatnode.capture.messaging.services import Service
 from splatnode.capture.process.lock import Held, exclusive
+from splatnode.capture.process.printable import printable
 from splatnode.capture.process.private import NotPrivate, private_folder
+from splatnode.capture.process.problems import is_said
 
 log = logging.getLogger(__name__)
 
@@ -78,6 +80,8 @@ class Endpoint:
     def __init__(self, network: Network, offers: Service | None = None) -> None:
         """Raises AlreadyRunning, NetworkError, KeyFileError."""
         self.network = network
+        self.refused = 0  # messages that could not be taken
+        self.why_refused = ""  # the last of them
         self._resources = contextlib.ExitStack()
         with self._closed_on_error():
             self._keys = _curve_keys(network)
@@ -98,6 +102,13 @@ class Endpoint:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def _refuse(self, what: str, why: object) -> None:
+        """Counts a message that cannot be taken. The 1st, 2nd, 4th, 8th, ... is logged: nobody can fill the journal."""
+        self.refused += 1
+        self.why_refused = printable(why)
+        if is_said(self.refused):
+            log.warning("refused %s (%d so far): %s", what, self.refused, self.why_refused)
 
     def _lock(self, service: Service) -> None:
         try:

@@ -31,3 +31,4 @@ CAPTURE_STATUS = Service("capture.status", Pattern.BROADCAST, 2)
 RECON_SCENE = Service("recon.scene", Pattern.STATE, 3)  # and 4, for requests
 RECON_STATUS = Service("recon.status", Pattern.BROADCAST, 5)
 RECON_CONTROL = Service("recon.control", Pattern.COMMANDS, 6)
+CAPTURE_CONTROL = Service("capture.control", Pattern.COMMANDS, 7)

@@ -1,7 +1,8 @@
-"""Keyframes on disk until recon has acknowledged them: bounded, oldest first, whole or not there.
+"""Keyframes on disk until recon has answered them: bounded, oldest first, whole or not there.
 
 The name of a message's file gives the order, which is kept from one process to the next: what a killed process left is
-delivered before what its successor adds.
+delivered before what its successor adds. What recon refuses, and what the disk damaged, goes to the quarantine beside
+it.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Annotated, NamedTuple
 
 import msgspec
 
+from splatnode.capture.messaging import quarantine
 from splatnode.capture.messaging.message_file import MessageFileError, read_message, size_in_file, write_message
 from splatnode.capture.messaging.wire import Part
 from splatnode.capture.process.disk_space import shortage
@@ -31,6 +33,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     directory: Path | None = None  # None: state_directory() of capture/process
     max_frames: Annotated[int, msgspec.Meta(ge=1)] = 200
     max_mb: Annotated[int, msgspec.Meta(ge=1)] = 1024
+    quarantine: quarantine.Config = quarantine.Config()
 
 
 _FILE = re.compile(r"[0-9]{12,18}-[0-9a-f]{32}-[0-9]{1,18}\.frame")  # number, session, sequence
@@ -59,6 +62,7 @@ class Spool:
         self._resources.enter_context(exclusive(self.directory / "lock"))
         self._files: dict[Key, Path] = {}  # oldest first
         self._bytes: dict[Key, int] = {}
+        self.quarantine = quarantine.Quarantine(self.directory.with_name("quarantine"), config.quarantine)
         remove_leftovers(self.directory)
         found = own_files(self.directory, _FILE, ".frame")
         for path in found:
@@ -111,14 +115,15 @@ class Spool:
         path = self._files.pop(key, None)
         self._bytes.pop(key, None)
         if path is not None:
-            path.unlink(missing_ok=True)
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:  # after a restart it is sent and acknowledged once more
+                log.error("an acknowledged keyframe cannot be removed: %s", error)
 
-    def set_aside(self, key: Key) -> None:
-        """Renames a message that cannot be read, so that it is not delivered and can be examined."""
-        path = self._files.pop(key)
+    def set_aside(self, key: Key, name: str, reason: str) -> None:
+        """Moves the message that carries the frame `name` to the quarantine: it is not delivered any more."""
         self._bytes.pop(key)
-        with contextlib.suppress(OSError):
-            path.rename(path.with_suffix(".damaged"))
+        self.quarantine.take(self._files.pop(key), name, reason)
 
     def _make_sure_of_room(self, size: int) -> None:
         if len(self) >= self.config.max_frames or self.size_bytes + size > self.config.max_mb << 20:
@@ -135,14 +140,14 @@ class Spool:
             return
         try:
             read_message(path, self.config.max_mb << 20)
+            size = path.stat().st_size
         except StrayFile as error:
             log.warning("left alone: %s (spool.max_mb)", error)
         except (OSError, MessageFileError) as error:
             log.error("put aside a damaged keyframe: %s", error)
-            with contextlib.suppress(OSError):
-                path.rename(path.with_suffix(".damaged"))
+            self.quarantine.take(path, "?", f"damaged on the disk: {error}")
         else:
-            self._files[key], self._bytes[key] = path, path.stat().st_size
+            self._files[key], self._bytes[key] = path, size
 
 
 def _number(path: Path) -> int:

@@ -19,7 +19,8 @@ import zmq
 
 from splatnode.capture.messaging.network import REQUEST_LIMITS, Endpoint, Network
 from splatnode.capture.messaging.services import Service
-from splatnode.capture.messaging.wire import Message, Part, Sequential, SessionId, WireError, decode, encode
+from splatnode.capture.messaging.values import Sequential, SessionId
+from splatnode.capture.messaging.wire import Message, Part, WireError, decode, encode, size_bytes
 
 ASK_EVERY_S = 1.0  # without a state
 MAX_REQUESTS = 1000  # that one call of `serve` reads
@@ -39,14 +40,21 @@ class StateServer(Endpoint):
 
     def __init__(self, service: Service, network: Network) -> None:
         super().__init__(network, offers=service)
-        self.refused = 0  # malformed requests
         self._newest: tuple[tuple[str, int], list[Part]] | None = None
         self._publisher = self._bind(service, zmq.PUB, queue=4)
         self._router = self._bind(service.requests, zmq.ROUTER, queue=2)
 
     def publish(self, header: Any, arrays: Sequence[npt.NDArray] = ()) -> None:
-        """Sends a state (its header is a wire.Header) and keeps it. The arrays must not be written to afterwards."""
+        """Sends a state (its header is a wire.Header) and keeps it. The arrays must not be written to afterwards.
+
+        Raises WireError where it is larger than a client takes: ZeroMQ would end the connection, again and again.
+        """
         parts = encode(header, arrays)
+        size, most = size_bytes(parts), self.network.limits
+        if size > most.total_bytes:
+            raise WireError(f"a state of {size / 1e6:.1f} MB; network.max_message_mb allows {most.total_bytes >> 20}")
+        if len(parts[1]) > most.header_bytes:
+            raise WireError(f"a state with a header of {len(parts[1])} bytes; at most {most.header_bytes} are taken")
         self._newest = (header.session, header.sequence), parts
         with contextlib.suppress(zmq.Again):
             self._publisher.send_multipart(parts, zmq.NOBLOCK, copy=False)
@@ -63,8 +71,8 @@ class StateServer(Endpoint):
                 break
             try:
                 wanted[identity] = decode(parts, Want, REQUEST_LIMITS).header
-            except WireError:
-                self.refused += 1
+            except WireError as error:
+                self._refuse("a request", error)
         for identity, want in wanted.items():
             if self._newest is not None and self._newest[0] != (want.session, want.sequence):
                 with contextlib.suppress(zmq.Again):  # the client has not read the last reply yet
@@ -77,7 +85,6 @@ class StateClient(Endpoint):
     def __init__(self, service: Service, network: Network, schema: Any) -> None:
         super().__init__(network)
         self.schema = schema
-        self.refused = 0  # malformed
         self._session: str | None = None
         self._sequence = 0
         self._ended: deque[str] = deque(maxlen=ENDED_SESSIONS)
@@ -127,8 +134,8 @@ class StateClient(Endpoint):
                 break
             try:
                 message = decode(parts, self.schema, self.network.limits)
-            except WireError:
-                self.refused += 1
+            except WireError as error:
+                self._refuse("a state", error)
                 continue
             if self._is_newer(message.header):
                 newest = message

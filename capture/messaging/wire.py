@@ -2,8 +2,9 @@
 
     [magic, version] [MessagePack: header, (dtype, shape) of each array] [raw array] [raw array] ...
 
-Arrays are little-endian and C-contiguous. Nothing in a message is executed or trusted: msgspec checks types,
-dtypes come from a list, and each part must be exactly as long as its shape requires.
+Arrays are little-endian and C-contiguous. Nothing in a message is executed or trusted: msgspec checks types and ranges,
+`values.check` what types do not say, dtypes come from a list, and each part must be exactly as long as its shape
+requires. Whatever is wrong with a message is a WireError.
 """
 
 from __future__ import annotations
@@ -14,20 +15,22 @@ import time
 import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 import zmq
 
-MAGIC = b"SPLAT\x01"  # the last byte is the version
+from splatnode.capture.messaging.values import Sequential, SessionId, check
+from splatnode.capture.process.foreign import foreign
+
+VERSION = 2  # of the messages: 1 knew no answer to a keyframe that cannot be taken
+MAGIC = b"SPLAT" + bytes([VERSION])
 DTYPES = {name: np.dtype(f"<{name}") for name in ("u1", "u2", "u4", "i4", "i8", "f4", "f8")}
 
 T = TypeVar("T")
 Part = bytes | memoryview
-SessionId = Annotated[str, msgspec.Meta(pattern="^[0-9a-f]{32}$")]
-Sequential = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
 
 class WireError(ValueError):
@@ -62,6 +65,7 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     arrays: int = 4096
     dimensions: int = 4
     total_bytes: int = 256 << 20
+    own: bool = False  # what this process wrote itself may be longer than what a stranger says, and not finite
 
 
 @dataclass(frozen=True)
@@ -85,17 +89,41 @@ def encode(header: msgspec.Struct, arrays: Sequence[npt.NDArray] = ()) -> list[P
 
 def decode(parts: Sequence[Part | zmq.Frame], schema: Any, limits: Limits | None = None) -> Message[Any]:
     """The message in `parts` if its header is a `schema` (a Struct, or a union of tagged ones). Raises WireError."""
-    limits = limits or Limits()
+    with foreign(WireError, "a message"):
+        return _decoded(parts, schema, limits or Limits())
+
+
+def size_bytes(parts: Sequence[Part]) -> int:
+    """Of a message on its way."""
+    return sum(memoryview(part).nbytes for part in parts)
+
+
+def _decoded(parts: Sequence[Part | zmq.Frame], schema: Any, limits: Limits) -> Message[Any]:
+    if len(parts) > limits.arrays + 2:
+        raise WireError(f"too many parts: {len(parts)}, and {limits.arrays} arrays are allowed")
     buffers = [memoryview(part.buffer if isinstance(part, zmq.Frame) else part) for part in parts]
     if len(buffers) < 2 or buffers[0] != MAGIC:
-        raise WireError(f"no message of this version: {len(buffers)} parts, not {MAGIC!r} first")
-    if sum(buffer.nbytes for buffer in buffers) > limits.total_bytes or buffers[1].nbytes > limits.header_bytes:
-        raise WireError(f"too large: {sum(buffer.nbytes for buffer in buffers)} bytes")
+        raise WireError(_no_message(buffers))
+    total_bytes = size_bytes(buffers)
+    if total_bytes > limits.total_bytes or buffers[1].nbytes > limits.header_bytes:
+        raise WireError(
+            f"too large: {total_bytes} bytes, {buffers[1].nbytes} of them its header; "
+            f"{limits.total_bytes} and {limits.header_bytes} are allowed"
+        )
     envelope = _envelope(buffers[1], schema)
-    if len(envelope.arrays) > limits.arrays or len(envelope.arrays) != len(buffers) - 2:
-        raise WireError(f"{len(envelope.arrays)} arrays announced, {len(buffers) - 2} came, {limits.arrays} allowed")
+    if len(envelope.arrays) != len(buffers) - 2:
+        raise WireError(f"{len(envelope.arrays)} arrays announced, {len(buffers) - 2} came")
+    if not limits.own:
+        check(envelope.header)
     pairs = zip(envelope.arrays, buffers[2:], strict=True)
     return Message(envelope.header, tuple(_array(*entry, buffer, limits) for entry, buffer in pairs))
+
+
+def _no_message(buffers: Sequence[memoryview]) -> str:
+    first = bytes(buffers[0][: len(MAGIC)]) if buffers else b""
+    if len(first) == len(MAGIC) and first[:-1] == MAGIC[:-1] and first != MAGIC:
+        return f"a message of version {first[-1]}, and this splatnode speaks version {VERSION}: update the older one"
+    return f"no message of splatnode: {len(buffers)} parts, not {MAGIC!r} first"
 
 
 def _envelope(head: memoryview, schema: Any) -> _Envelope[Any]:
@@ -115,6 +143,9 @@ def _array(name: str, shape: list[int], buffer: memoryview, limits: Limits) -> n
     dtype = DTYPES.get(name)
     if dtype is None or len(shape) > limits.dimensions:
         raise WireError(f"array of dtype {name[:16]!r} with {len(shape)} dimensions refused")
+    # Of an array without elements, too: what its other dimensions promise must be possible.
+    if math.prod(max(1, side) for side in shape) * dtype.itemsize > limits.total_bytes:
+        raise WireError(f"array {name} of shape {shape} is more than {limits.total_bytes} bytes can hold")
     if math.prod(shape) * dtype.itemsize != buffer.nbytes:
         raise WireError(f"array {name} of shape {shape} does not have {buffer.nbytes} bytes")
     array = np.frombuffer(buffer, dtype).reshape(shape)

@@ -23,6 +23,10 @@ class ServiceManager:
         self._next = 0.0
         self._is_ready = False
 
+    @property
+    def is_ready(self) -> bool:
+        return self._is_ready
+
     def ready(self) -> None:
         """Only the first call sends."""
         if not self._is_ready:

@@ -10,6 +10,7 @@ import msgspec
 from splatnode.capture.messaging.network import Network
 from splatnode.recon.config import Config as Reconstruction
 from splatnode.recon.daemon.tracking import Config as Tracking
+from splatnode.recon.result.message import MAX_CAMERAS
 
 Positive = Annotated[int, msgspec.Meta(ge=1)]
 
@@ -20,7 +21,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tracking: Tracking = Tracking()  # of the live camera against a finished scene
     checkpoint: Path | None = None  # None: recon/ in state_directory() of capture/process
     out: Path = Path("out")  # the result of each place is a folder in it: scene-0001, ...
-    max_views: Annotated[int, msgspec.Meta(ge=4)] = 30  # beyond, the view that has most in common with another goes
+    # Beyond, the view that has most in common with another goes.
+    max_views: Annotated[int, msgspec.Meta(ge=4, le=MAX_CAMERAS)] = 30
     max_gaussians: Positive = 300_000
     # Without a keyframe, until the whole scene is verified and built anew. A verification takes seconds for which a
     # keyframe would have to wait: with one every two seconds there is no time for it.

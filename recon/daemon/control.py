@@ -6,8 +6,9 @@ import argparse
 
 import msgspec
 
-from splatnode.capture.messaging.commands import ask
+from splatnode.capture.messaging.commands import Answer, Seen, ask
 from splatnode.capture.messaging.services import RECON_CONTROL
+from splatnode.capture.messaging.values import Name
 from splatnode.capture.process.config import load_config
 from splatnode.capture.process.terminal import say
 from splatnode.recon.daemon.config import Config
@@ -18,12 +19,10 @@ EXIT_GOOD, EXIT_UNKNOWN_NAME = 0, 2
 class Retract(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="retract"):
     """Remove the keyframe with this name."""
 
-    name: str
+    name: Name
 
 
-class Answer(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="answer"):
-    done: bool
-    message: str
+Command = Retract | Seen
 
 
 def retract(args: argparse.Namespace) -> int:

@@ -19,19 +19,22 @@ from collections.abc import Callable, Iterator
 import msgspec
 
 from splatnode.capture.messaging.broadcast import Publisher
-from splatnode.capture.messaging.commands import CommandServer
+from splatnode.capture.messaging.commands import Answer, CommandServer, Seen
 from splatnode.capture.messaging.services import RECON_CONTROL, RECON_SCENE, RECON_STATUS
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
+from splatnode.capture.process.after_ready import after_ready
 from splatnode.capture.process.config import load_config
 from splatnode.capture.process.logs import event, use_structured_lines
 from splatnode.capture.process.memory import resident_mb
+from splatnode.capture.process.printable import printable
+from splatnode.capture.process.problems import Problems, is_said
 from splatnode.capture.process.service_manager import ServiceManager
 from splatnode.capture.process.state_directory import state_directory
 from splatnode.capture.process.stop_signals import on_first
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
-from splatnode.recon.daemon.control import Answer, Retract
+from splatnode.recon.daemon.control import Command
 from splatnode.recon.daemon.disk_space import DiskSpace
 from splatnode.recon.daemon.inbox import Inbox, LeftOut
 from splatnode.recon.daemon.intake import Intake
@@ -42,7 +45,8 @@ from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.export.staged import completed
 from splatnode.recon.result.folder import result_folder
-from splatnode.recon.result.message import camera_record, to_message
+from splatnode.recon.result.message import CameraRecord, camera_record, to_message
+from splatnode.recon.result.snapshot import CameraEstimate
 
 log = logging.getLogger(__name__)
 
@@ -77,7 +81,7 @@ class Daemon:
             network = config.network
             self._scenes = self._resources.enter_context(StateServer(RECON_SCENE, network))
             self._heartbeat = self._resources.enter_context(Publisher(RECON_STATUS, network))
-            self._commands = self._resources.enter_context(CommandServer(RECON_CONTROL, network, Retract))
+            self._commands = self._resources.enter_context(CommandServer(RECON_CONTROL, network, Command))
             self._store = Store(config.checkpoint or state_directory() / "recon")
             self._resources.callback(self._store.close)
             self._resources.enter_context(result_folder(config.out))
@@ -86,9 +90,10 @@ class Daemon:
         self._disk_space = DiskSpace(config, self._store)
         self._inbox = Inbox()
         self._newest = _Newest()
-        self._intake = Intake(network, config.reconstruction, self._store, self._inbox, stopping)
+        self._problems = Problems()
+        self._intake = Intake(network, config.reconstruction, self._store, self._inbox, self._problems, stopping)
         self._worker = Worker(config, self._store, self._inbox, self._newest.put, stopping)
-        self._watcher = Watcher(network, config.tracking, lambda: self._worker.finished, stopping)
+        self._watcher = Watcher(network, config.tracking, lambda: self._worker.finished, self._problems, stopping)
         self._numbering = Numbering()
         self._started_s = time.monotonic()
         self._shown: Published | None = None
@@ -101,8 +106,12 @@ class Daemon:
         self._resources.close()
 
     def run(self) -> None:
-        """Runs until the daemon is stopped. Raises the error that ended one of its threads."""
+        """Runs until the daemon is stopped. Raises Failed where one of its threads ended."""
         manager = ServiceManager()
+        with after_ready(manager):
+            self._run(manager)
+
+    def _run(self, manager: ServiceManager) -> None:
         threads = [self._thread(each.run) for each in (self._intake, self._worker, self._watcher)]
         manager.ready()
         event(log, logging.INFO, "ready", checkpoint=self._store.directory, out=self._config.out)
@@ -151,17 +160,26 @@ class Daemon:
         if shown is None:
             return
         self._shown = shown
-        header, arrays = to_message(shown.snapshot, shown.scene_id, self._numbering.next())
-        self._scenes.publish(header, arrays)
+        try:
+            header, arrays = to_message(shown.snapshot, shown.scene_id, self._numbering.next())
+            self._scenes.publish(header, arrays)
+        except Exception as error:  # of one snapshot; the next one may do
+            if is_said(self._problems.add("scenes that could not be shown", f"{type(error).__name__}: {error}")):
+                log.exception("a scene could not be shown")
 
-    def _answer(self, command: Retract) -> Answer:
+    def _answer(self, command: Command) -> Answer:
+        if isinstance(command, Seen):
+            self._problems.seen()
+            return Answer(True, "the problems are not told again")
         if command.name not in self._store.names:
             known = ", ".join(sorted(self._store.names)) or "none yet"
-            return Answer(False, f"no keyframe {command.name!r}; there are: {known}")
+            return Answer(False, printable(f"no keyframe {command.name!r}; there are: {known}"))
         try:
             self._store.forget(command.name, "retracted")
         except OSError as error:
-            return Answer(False, f"{command.name} cannot be removed ({error.strerror}): make room on the disk")
+            return Answer(
+                False, printable(f"{command.name} cannot be removed ({error.strerror}): make room on the disk")
+            )
         self._inbox.put(LeftOut(command.name), self._stopping)
         event(log, logging.INFO, "retracted", frame=command.name)
         return Answer(True, f"{command.name} is removed; the scene is built anew without it")
@@ -171,7 +189,7 @@ class Daemon:
         intake, worker, motion, tracked = self._intake, self._worker, self._watcher.motion, self._watcher.tracked
         return ReconStatus(
             **self._numbering.next(),
-            state=State.FULL if intake.problem else worker.state,
+            state=State.FULL if intake.full else worker.state,
             uptime_s=time.monotonic() - self._started_s,
             scene_id=self._store.scene_id,
             keyframe=intake.newest,
@@ -181,17 +199,25 @@ class Daemon:
             iterations=snapshot.iterations if snapshot else 0,
             final=bool(snapshot and snapshot.final),
             verdict=snapshot.verdict.code.value if snapshot else "",
-            message=snapshot.verdict.message if snapshot else "",
-            bounds=bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale) if snapshot else "",
+            message=printable(snapshot.verdict.message) if snapshot else "",
+            bounds=printable(bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale)) if snapshot else "",
             keyframe_s=worker.keyframe_s,
             refused=intake.refused + self._commands.refused + self._scenes.refused,
             duplicates=intake.duplicates,
             rss_mb=resident_mb(),
             camera_moved=motion.moved if motion else None,
             moved=str(motion) if motion and motion.moved else "",
-            tracked=camera_record(tracked) if tracked else None,
-            problem=intake.problem or worker.problem or self._disk_space.problem(),
+            tracked=_shown_camera(tracked),
+            problem=self._problem(),
         )
+
+    def _problem(self) -> str:
+        """What keeps the node from working as it should now, and what went wrong that nobody has seen yet."""
+        for what, endpoint in (("commands", self._commands), ("requests for scenes", self._scenes)):
+            self._problems.count(f"{what} that were refused", endpoint.refused, endpoint.why_refused)
+        intake = self._intake
+        now = intake.full or intake.unconnected or self._worker.problem or self._disk_space.problem()
+        return printable("; ".join(filter(None, (now, str(self._problems)))))
 
     @contextlib.contextmanager
     def _closing_on_error(self) -> Iterator[None]:
@@ -200,6 +226,15 @@ class Daemon:
         except BaseException:
             self._resources.close()
             raise
+
+
+def _shown_camera(tracked: CameraEstimate | None) -> CameraRecord | None:
+    """None, too, for one that nothing can be seen through: tracking went astray."""
+    try:
+        return None if tracked is None else camera_record(tracked)
+    except ValueError as error:
+        log.debug("where the live camera is cannot be told: %s", error)
+        return None
 
 
 class _Newest:

@@ -29,9 +29,12 @@ class DiskSpace:
         further_keyframes = max(0, self._config.max_views - len(self._store.names))
         most_gaussians = self._config.max_gaussians
         checkpoint_bytes = further_keyframes * BYTES_A_KEYFRAME + most_gaussians * BYTES_A_GAUSSIAN
-        problem = shortage(self._store.directory, checkpoint_bytes, "the checkpoint") or shortage(
-            self._config.out, result_bytes(most_gaussians), "the result"
-        )
+        try:
+            problem = shortage(self._store.directory, checkpoint_bytes, "the checkpoint") or shortage(
+                self._config.out, result_bytes(most_gaussians), "the result"
+            )
+        except OSError as error:
+            problem = f"the disk does not tell how much is free ({error.strerror or error})"
         if bool(problem) != bool(self._told):
             event(log, logging.WARNING if problem else logging.INFO, "disk_space", problem=problem or "none")
         self._told = problem

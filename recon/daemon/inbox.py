@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from splatnode.recon.frames.keyframe import Keyframe
@@ -30,6 +31,10 @@ class LeftOut:
 Event = Arrived | LeftOut
 
 
+def _nothing() -> None:
+    """Nobody waits for the one that puts."""
+
+
 class Inbox:
     def __init__(self) -> None:
         self._events: deque[Event] = deque()
@@ -38,11 +43,12 @@ class Inbox:
     def __len__(self) -> int:
         return len(self._events)
 
-    def put(self, event: Event, stopping: threading.Event) -> None:
-        """Waits where the inbox is full, until there is room or the daemon stops."""
+    def put(self, event: Event, stopping: threading.Event, meanwhile: Callable[[], None] = _nothing) -> None:
+        """Waits where the inbox is full, until there is room or the daemon stops; calls `meanwhile` again and again."""
         with self._changed:
             while len(self._events) >= CAPACITY and not stopping.is_set():
                 self._changed.wait(WAIT_S)
+                meanwhile()
             self._events.append(event)
             self._changed.notify_all()
 

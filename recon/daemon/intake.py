@@ -1,4 +1,7 @@
-"""The thread that receives keyframes: stores, acknowledges, extracts features; it does not wait for the worker."""
+"""The thread that receives keyframes: stores, acknowledges, extracts features; it does not wait for the worker.
+
+What cannot be stored because of what it is, is refused; what the disk does not take is tried again.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,8 @@ import time
 
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.keyframes import KeyframeClient
-from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.network import Network, NotAllowed
+from splatnode.capture.process.problems import Problems, is_said
 from splatnode.recon.config import Config
 from splatnode.recon.daemon.checkpoint.store import Store, StoredFrame
 from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
@@ -17,25 +21,50 @@ from splatnode.recon.pipeline import prepare
 log = logging.getLogger(__name__)
 
 RECEIVE_S = 0.2  # between looks at whether the daemon stops
-RETRY_S = 1.0  # after a frame could not be written
+RETRY_S = 1.0  # after a frame could not be written, or the connection failed
+ANOTHER_IS_SERVED = "capture gives its keyframes to another splatnode recon; stop one of the two"
 
 
 class Intake:
-    def __init__(self, network: Network, config: Config, store: Store, inbox: Inbox, stopping: threading.Event) -> None:
+    def __init__(
+        self,
+        network: Network,
+        config: Config,
+        store: Store,
+        inbox: Inbox,
+        problems: Problems,
+        stopping: threading.Event,
+    ) -> None:
         self._network, self._config, self._store, self._inbox = network, config, store, inbox
-        self._stopping = stopping
-        self.problem = ""
+        self._problems, self._stopping = problems, stopping
+        self.full = ""  # why keyframes cannot be stored
+        self.unconnected = ""  # why none come
         self.refused = self.duplicates = 0
         self.newest = -1  # number of the last frame that was taken
 
     def run(self) -> None:
-        """Until the daemon stops. Raises NotAllowed."""
-        with KeyframeClient(self._network, self._store.seen) as client:
-            while not self._stopping.is_set():
-                received = client.receive(timeout_s=RECEIVE_S)
-                self.refused, self.duplicates = client.refused, client.duplicates
-                if received is not None:
-                    self._take(client, received)
+        """Until the daemon stops. A connection that fails is made anew: the other end may have been put right."""
+        while not self._stopping.is_set():
+            try:
+                with KeyframeClient(self._network, self._store.seen, recon=self._store.identity) as client:
+                    self._receive(client)
+            except Exception as error:
+                expected = isinstance(error, NotAllowed)
+                self._say_unconnected(str(error) if expected else f"{type(error).__name__}: {error}")
+                if not expected and is_said(self._problems.add("failures of the keyframes' connection", error)):
+                    log.exception("the connection that keyframes come by failed")
+                self._stopping.wait(RETRY_S)
+
+    def _receive(self, client: KeyframeClient) -> None:
+        before = self.refused
+        while not self._stopping.is_set():
+            received = client.receive(timeout_s=RECEIVE_S)
+            self.refused, self.duplicates = before + client.refused, client.duplicates
+            self._problems.count("keyframes that were refused", self.refused, client.why_refused)
+            if client.served is not None:
+                self._say_unconnected("" if client.served else ANOTHER_IS_SERVED)
+            if received is not None:
+                self._take(client, received)
 
     def _take(self, client: KeyframeClient, received: ReceivedFrame) -> None:
         arrived_s = time.monotonic()
@@ -43,29 +72,46 @@ class Intake:
             try:
                 stored = self._store.put(received)
             except OSError as error:
-                self._complain(f"{received.frame.name} cannot be stored ({error.strerror}): make room on the disk")
+                self._say_full(f"{received.frame.name} cannot be stored ({error.strerror}): make room on the disk")
                 self._stopping.wait(RETRY_S)
+                client.say_ready()
                 continue
-            self.problem = ""
+            except Exception as error:
+                client.refuse(received.key, f"it cannot be stored: {type(error).__name__}: {error}")
+                return
+            self.full = ""
             client.acknowledge(received)
             if stored is None:
-                self._inbox.put(LeftOut(received.frame.name), self._stopping)
+                self._inbox.put(LeftOut(received.frame.name), self._stopping, client.say_ready)
             else:
-                self._hand_over(stored, arrived_s)
+                self._hand_over(client, stored, arrived_s)
             return
 
-    def _hand_over(self, stored: StoredFrame, arrived_s: float) -> None:
+    def _hand_over(self, client: KeyframeClient, stored: StoredFrame, arrived_s: float) -> None:
         self.newest = stored.number
+        name = stored.frame.name
         try:
             keyframe = prepare(stored.frame, self._config)
         except Exception as error:  # a frame that cannot be used must not stop those that can
-            log.exception("%s cannot be used", stored.frame.name)
-            self._store.forget(stored.frame.name, f"cannot be used: {error}")
-            self._inbox.put(LeftOut(stored.frame.name), self._stopping)
+            if is_said(self._problems.add("keyframes that cannot be used", f"{name}: {error}")):
+                log.exception("%s cannot be used", name)
+            self._forget(name, f"cannot be used: {error}")
+            self._inbox.put(LeftOut(name), self._stopping, client.say_ready)
             return
-        self._inbox.put(Arrived(keyframe, arrived_s), self._stopping)
+        self._inbox.put(Arrived(keyframe, arrived_s), self._stopping, client.say_ready)
 
-    def _complain(self, problem: str) -> None:
-        if problem != self.problem:
+    def _forget(self, name: str, reason: str) -> None:
+        try:
+            self._store.forget(name, reason)
+        except OSError as error:  # it stays stored, and is found to be unusable again after a restart
+            log.error("%s cannot be removed from the checkpoint: %s", name, error)
+
+    def _say_full(self, problem: str) -> None:
+        if problem != self.full:
             log.error("%s", problem)
-        self.problem = problem
+        self.full = problem
+
+    def _say_unconnected(self, problem: str) -> None:
+        if problem and problem != self.unconnected:
+            log.error("%s", problem)
+        self.unconnected = problem

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 
+from splatnode.capture.messaging.values import Amount, Count, Name, Text
 from splatnode.capture.messaging.wire import Header
 from splatnode.recon.result.message import CameraRecord
 
@@ -19,22 +20,22 @@ class State(enum.Enum):
 
 class ReconStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
     state: State
-    uptime_s: float
-    scene_id: str
-    keyframe: int  # number of the last one that was taken, -1 before
-    queue: int  # keyframes that are stored and not in the scene yet
-    keyframes: int  # that the scene is made of
-    num_gaussians: int
-    iterations: int
+    uptime_s: Amount
+    scene_id: Name
+    keyframe: Count  # number of the last one that was taken, -1 before
+    queue: Count  # keyframes that are stored and not in the scene yet
+    keyframes: Count  # that the scene is made of
+    num_gaussians: Count
+    iterations: Count
     final: bool
-    verdict: str
-    message: str
-    bounds: str  # the widest of the scene's cameras, in words; empty where there are none
-    keyframe_s: float | None  # from the last keyframe's arrival until the scene showed it
-    refused: int  # malformed messages
-    duplicates: int  # keyframes that came again
-    rss_mb: float
+    verdict: Text
+    message: Text
+    bounds: Text  # the widest of the scene's cameras, in words; empty where there are none
+    keyframe_s: Amount | None  # from the last keyframe's arrival until the scene showed it
+    refused: Count  # malformed messages
+    duplicates: Count  # keyframes that came again
+    rss_mb: Amount
     camera_moved: bool | None  # None: not watched
-    moved: str  # by how much and with what certainty; empty while it stands still
+    moved: Text  # by how much and with what certainty; empty while it stands still
     tracked: CameraRecord | None  # where the live camera is in the finished scene, if that is known
-    problem: str  # what keeps the node from working as it should; empty where nothing does
+    problem: Text  # what keeps the node from working as it should; empty where nothing does

@@ -11,16 +11,18 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.messaging.broadcast import Subscriber
-from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.network import Network, NotAllowed
 from splatnode.capture.messaging.services import CAPTURE_PREVIEW
-from splatnode.capture.messaging.wire import WireError
 from splatnode.capture.preview import PreviewHeader, decode_preview
 from splatnode.capture.process.logs import event
+from splatnode.capture.process.problems import Problems, is_said
 from splatnode.recon.daemon.tracking import Config, Motion, Tracker, landmarks
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
 log = logging.getLogger(__name__)
+
+RETRY_S = 1.0  # after the connection failed
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,33 +35,48 @@ class Finished:
 
 class Watcher:
     def __init__(
-        self, network: Network, config: Config, finished: Callable[[], Finished | None], stopping: threading.Event
+        self,
+        network: Network,
+        config: Config,
+        finished: Callable[[], Finished | None],
+        problems: Problems,
+        stopping: threading.Event,
     ) -> None:
         """`finished` returns the finished scene, the same object until it changes; None while it is being changed."""
-        self._network, self._config, self._finished, self._stopping = network, config, finished, stopping
+        self._network, self._config, self._finished = network, config, finished
+        self._problems, self._stopping = problems, stopping
         self.tracked: CameraEstimate | None = None  # the live camera in the finished scene, where it is known
         self.motion: Motion | None = None  # since the scene was finished
 
     def run(self) -> None:
-        """Until the daemon stops. Raises NotAllowed."""
-        if self._config.every_s <= 0:
-            return
+        """Until the daemon stops. A connection that fails is made anew: the other end may have been put right."""
+        while self._config.every_s > 0 and not self._stopping.is_set():
+            try:
+                with Subscriber(CAPTURE_PREVIEW, self._network, PreviewHeader, queue=4) as previews:
+                    self._watch(previews)
+            except NotAllowed:  # which the keyframes' connection tells, too
+                self._stopping.wait(RETRY_S)
+
+    def _watch(self, previews: Subscriber) -> None:
+        """Raises NotAllowed."""
         watched: Finished | None = None
         tracker = None
-        with Subscriber(CAPTURE_PREVIEW, self._network, PreviewHeader, queue=4) as previews:
-            while not self._stopping.wait(self._config.every_s):
-                finished = self._finished()
-                if finished is not watched:
-                    watched, tracker, self.motion, self.tracked = finished, None, None, None
-                message = previews.latest(0)
-                if watched is None or message is None:
-                    continue
-                if tracker is None:
-                    tracker = Tracker(landmarks(watched.snapshot, watched.keyframes, self._config), self._config)
-                try:
-                    self._track(tracker, decode_preview(message), watched.snapshot)
-                except WireError as error:
-                    log.warning("a preview was refused: %s", error)
+        while not self._stopping.wait(self._config.every_s):
+            finished = self._finished()
+            if finished is not watched:
+                watched, tracker, self.motion, self.tracked = finished, None, None, None
+            message = previews.latest(0)
+            self._problems.count("previews that were refused", previews.refused, previews.why_refused)
+            if watched is None or message is None:
+                continue
+            try:
+                image = decode_preview(message)
+                tracker = tracker or Tracker(landmarks(watched.snapshot, watched.keyframes, self._config), self._config)
+                self._track(tracker, image, watched.snapshot)
+            except Exception as error:  # of one picture; the next one may do
+                self.tracked = None
+                if is_said(self._problems.add("previews in which the camera could not be tracked", error)):
+                    log.warning("the camera could not be tracked: %s: %s", type(error).__name__, error)
 
     def _track(self, tracker: Tracker, image: npt.NDArray[np.uint8], snapshot: Snapshot) -> None:
         height, width = image.shape[:2]

@@ -23,7 +23,7 @@ def undistorted(frame: Frame) -> Frame:
     """The frame without its lens' distortion and with fx = fy; the frame itself where there is nothing to undo.
 
     It has the same size in pixels and shows the largest rectangle without unseen corners, whose pixels would be
-    invented. Raises ValueError for coefficients that OpenCV's model does not have, or that fold the picture over.
+    invented. Raises ValueError for coefficients that fold the picture over.
     """
     given = frame.intrinsics
     if given is None:
@@ -32,7 +32,7 @@ def undistorted(frame: Frame) -> Frame:
     straight = not any(given.distortion)
     if straight and abs(given.fx / given.fy - 1.0) < SQUARE_TOLERANCE:
         return frame if given == frame.intrinsics else replace(frame, intrinsics=given)
-    coefficients = _coefficients(frame.name, given)
+    coefficients = _coefficients(given)
     left, top, right, bottom = _seen_rectangle(frame.name, given, coefficients)
     focal = max(frame.width / (right - left), frame.height / (bottom - top))
     pinhole = replace(
@@ -55,14 +55,9 @@ def undistorted(frame: Frame) -> Frame:
     return replace(frame, image=image.astype(np.uint8), intrinsics=pinhole)
 
 
-def _coefficients(name: str, given: Intrinsics) -> Array:
-    """The lens' coefficients, filled up with zeros to a number that OpenCV takes. Raises ValueError for too many."""
+def _coefficients(given: Intrinsics) -> Array:
+    """The lens' coefficients, filled up with zeros to a number that OpenCV takes."""
     values = given.distortion or (0.0,)
-    if len(values) > max(_NUM_COEFFICIENTS):
-        raise ValueError(
-            f"{name}: distortion must be OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]], "
-            f"got {len(values)} numbers. Calibrate with cv2.calibrateCamera."
-        )
     wanted = next(count for count in _NUM_COEFFICIENTS if count >= len(values))
     return np.array([*values, *[0.0] * (wanted - len(values))])
 

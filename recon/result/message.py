@@ -15,22 +15,30 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.frame import LARGEST_SIDE, DroppedFrame
 from splatnode.capture.messaging.jpeg import from_jpeg, to_jpeg
+from splatnode.capture.messaging.values import Amount, Count, Finite, Name, Text
 from splatnode.capture.messaging.wire import Header, Message, WireError
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import LONGEST_NAME, printable
 from splatnode.recon.result.bounds import Bounds
+from splatnode.recon.result.camera_check import camera_problem
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 
 THUMBNAIL_SIDE = 320  # pixels
 THUMBNAIL_QUALITY = 85  # of 100, as JPEG
+MAX_NAMES = 1000  # of frames that a verdict is about
+MAX_DROPPED = 200  # that are named with their reasons
+MAX_PIXELS = 1 << 26  # of a camera's picture at modelled size, which a viewer may have to paint
+LARGEST_VALUE = 1e9  # of a Gaussian; one with a larger number is left out
+SH_BASES = (1, 4, 9, 16)  # of degrees 0 to 3
 MAX_CAMERAS = 1000  # of a message: bounds what a hostile one can make a viewer allocate
 GAUSSIAN_FIELDS = ("means", "quats", "scales", "opacities", "sh", "source_frame")
 
-Finite = Annotated[float, msgspec.Meta(ge=-1e12, le=1e12)]
-Bound = Annotated[float, msgspec.Meta(ge=0.0, le=1e12)]
-Pixels = Annotated[int, msgspec.Meta(ge=1, le=65536)]
+Pixels = Annotated[int, msgspec.Meta(ge=1, le=LARGEST_SIDE)]
 Matrix4 = Annotated[tuple[Finite, ...], msgspec.Meta(min_length=16, max_length=16)]
+Names = Annotated[tuple[Name, ...], msgspec.Meta(max_length=MAX_NAMES)]
 Vector3 = tuple[Finite, Finite, Finite]
 Matrix3 = Annotated[tuple[Finite, ...], msgspec.Meta(min_length=9, max_length=9)]
 
@@ -38,37 +46,46 @@ Matrix3 = Annotated[tuple[Finite, ...], msgspec.Meta(min_length=9, max_length=9)
 class BoundsRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A Bounds."""
 
-    rotation_deg: Bound
-    centre: Bound
-    centre_percent: Bound
-    focal_percent: Bound
+    rotation_deg: Amount
+    centre: Amount
+    centre_percent: Amount
+    focal_percent: Amount
     axes: tuple[Vector3, Vector3, Vector3]
 
 
 class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A CameraEstimate."""
+    """A CameraEstimate, which can be looked through: a rigid motion, and a lens with a picture."""
 
-    name: str
-    frame_id: int
+    name: Name
+    frame_id: Count
     T_world_camera: Matrix4  # row by row
     K: Matrix3  # row by row
     width: Pixels
     height: Pixels
     bounds: BoundsRecord | None
 
+    def __post_init__(self) -> None:
+        """Raises ValueError, of which msgspec makes its own error, where nothing can be seen through it."""
+        T_world_camera, K = np.array(self.T_world_camera).reshape(4, 4), np.array(self.K).reshape(3, 3)
+        why = camera_problem(T_world_camera, K, self.width, self.height)
+        if not why and self.width * self.height > MAX_PIXELS:
+            why = f"a picture of {self.width} x {self.height} pixels, more than {MAX_PIXELS}"
+        if why:
+            raise ValueError(f"camera {self.name[:60]!a}: {why}")
+
 
 class SceneHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    scene_id: str  # another one is another place
-    code: str
-    message: str
-    advice: str
-    frames: tuple[str, ...]
+    scene_id: Name  # another one is another place
+    code: Code
+    message: Text
+    advice: Text
+    frames: Names
     publishable: bool
     provisional: bool  # evidence is still to be looked at
     cameras: Annotated[tuple[CameraRecord, ...], msgspec.Meta(max_length=MAX_CAMERAS)]
-    dropped: tuple[tuple[str, str], ...]  # name, reason
-    iterations: int
-    seconds: dict[str, float]
+    dropped: Annotated[tuple[tuple[Name, Text], ...], msgspec.Meta(max_length=MAX_DROPPED)]  # name, reason
+    iterations: Count
+    seconds: Annotated[dict[Name, Amount], msgspec.Meta(max_length=64)]
     final: bool
 
 
@@ -90,14 +107,17 @@ def to_message(
     header = SceneHeader(
         **numbering,  # pyright: ignore[reportArgumentType]
         scene_id=scene_id,
-        code=verdict.code.value,
-        message=verdict.message,
-        advice=verdict.advice,
-        frames=verdict.frames,
+        code=verdict.code,
+        message=printable(verdict.message),
+        advice=printable(verdict.advice),
+        frames=verdict.frames[:MAX_NAMES],
         publishable=verdict.publishable,
         provisional=verdict.provisional,
         cameras=tuple(camera_record(camera) for camera in snapshot.cameras),
-        dropped=tuple((frame.name, frame.reason) for frame in snapshot.dropped),
+        dropped=tuple(
+            (printable(frame.name, LONGEST_NAME) or "?", printable(frame.reason))
+            for frame in snapshot.dropped[-MAX_DROPPED:]
+        ),
         iterations=snapshot.iterations,
         seconds=snapshot.seconds,
         final=snapshot.final,
@@ -108,17 +128,20 @@ def to_message(
 
 def from_message(message: Message[SceneHeader]) -> LiveScene:
     """The scene in a message. Raises WireError where arrays and header do not belong together."""
+    with foreign(WireError, "a scene"):
+        return _live_scene(message)
+
+
+def _live_scene(message: Message[SceneHeader]) -> LiveScene:
     header = message.header
     gaussians = _gaussians(message.arrays[: len(GAUSSIAN_FIELDS)])
     thumbnails = message.arrays[len(GAUSSIAN_FIELDS) :]
     if len(thumbnails) != len(header.cameras):
         raise WireError(f"{len(header.cameras)} cameras with {len(thumbnails)} thumbnails")
-    if header.code not in Code.__members__:
-        raise WireError(f"no verdict is called {header.code[:40]!r}")
     snapshot = Snapshot(
         sequence=header.sequence,
         verdict=Verdict(
-            Code[header.code],
+            header.code,
             header.message,
             header.advice,
             header.frames,
@@ -183,9 +206,19 @@ def _gaussians(arrays: tuple[npt.NDArray, ...]) -> GaussianArrays:
         raise WireError(f"{len(arrays)} arrays of Gaussians, expected {', '.join(GAUSSIAN_FIELDS)}")
     count = len(arrays[0]) if arrays[0].ndim else 0
     bases = arrays[4].shape[1] if arrays[4].ndim == 3 else 0
+    if bases not in SH_BASES:
+        raise WireError(f"sh must have {', '.join(map(str, SH_BASES))} bases, got {arrays[4].shape}")
     expected = [(count, 3), (count, 4), (count, 3), (count,), (count, bases, 3), (count,)]
     for name, array, shape in zip(GAUSSIAN_FIELDS, arrays, expected, strict=True):
         kind = np.int32 if name == "source_frame" else np.float32
         if array.dtype != kind or array.shape != shape:
             raise WireError(f"{name} must be {np.dtype(kind)} {shape}, got {array.dtype} {array.shape}")
-    return GaussianArrays(*arrays)
+    return _within_bounds(arrays)
+
+
+def _within_bounds(arrays: tuple[npt.NDArray, ...]) -> GaussianArrays:
+    """The Gaussians whose numbers are finite and not absurd."""
+    kept = np.ones(len(arrays[0]), bool)
+    for array in arrays[:-1]:
+        kept &= (np.abs(array) <= LARGEST_VALUE).all(axis=tuple(range(1, array.ndim)))  # not so where it is nan
+    return GaussianArrays(*arrays) if kept.all() else GaussianArrays(*(array[kept] for array in arrays))

@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
 import socket
 import subprocess
 import sys
+import threading
+from importlib import import_module
 
 import cv2
 import numpy as np
 import pytest
 
+from splatnode.capture import selection
+from splatnode.capture.cameras import folder
+from splatnode.capture.config import Camera, CaptureConfig
+from splatnode.capture.daemon import capture
+from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.broadcast import Subscriber
+from splatnode.capture.messaging.keyframe_messages import FrameHeader
 from splatnode.capture.messaging.keyframes import KeyframeClient
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import CAPTURE_PREVIEW, CAPTURE_STATUS
+from splatnode.capture.messaging.spool import Config as SpoolConfig
+from splatnode.capture.messaging.spool import Key, Spool
+from splatnode.capture.messaging.wire import encode
 from splatnode.capture.preview import PreviewHeader, decode_preview
-from splatnode.capture.status import CaptureStatus
+from splatnode.capture.process.after_ready import Failed
+from splatnode.capture.status import CaptureStatus, heartbeats
 from tests.capture.messaging.test_sockets import wait_for
 from tests.conftest import ROOT
 
@@ -186,3 +199,86 @@ def test_a_disk_that_may_not_hold_the_spool_is_told_at_the_start(tmp_path, start
     assert "further keyframes (spool.max_mb) may take" in status.why
     process.terminate()
     assert process.stderr.read().count("event=disk_space") == 1
+
+
+def test_status_tells_what_was_refused_until_it_is_seen(tmp_path, start):
+    """Also of the processes before, and after a restart."""
+    state = tmp_path / "state"
+    with contextlib.closing(Spool(SpoolConfig(directory=state))) as spool:
+        for index in range(3):
+            header = FrameHeader(session="0" * 32, sequence=index, mono_ns=0, frame_id=0, name=f"old{index}.png",
+                                 stamp_ns=5 * 10**18, intrinsics=None)  # fmt: skip
+            spool.put(Key("0" * 32, index), encode(header, [np.zeros((4, 4, 3), np.uint8)]))
+    process = start(", loops: 1000")
+    with KeyframeClient(network(tmp_path)) as client:
+        wait_for(lambda: client.receive(0.05))  # a good one comes after those that are refused
+    status = wait_for(lambda: (it := heartbeats(network(tmp_path))["capture"]) and it["set_aside"] == 3 and it)
+    assert [each["name"] for each in status["newest_set_aside"]] == ["old2.png", "old1.png", "old0.png"]
+    assert "3 keyframes were set aside, the last: old2.png: refused by recon" in status["problem"]
+    command = [sys.executable, "-m", "splatnode", "status", "--config", str(tmp_path / "capture.yaml")]
+    told = subprocess.run([*command, "--seen"], cwd=ROOT, capture_output=True, text=True)
+    assert "old0.png: refused by recon" in told.stdout and "not told again" in told.stdout
+    process.terminate()
+    assert process.wait(60) == 0
+    start(", loops: 1000")
+    status = wait_for(lambda: heartbeats(network(tmp_path))["capture"])
+    assert status["set_aside"] == 3 and status["problem"] == ""
+
+
+@pytest.mark.parametrize("what", ["offer", "examine", "preview"])
+def test_one_frame_that_fails_costs_that_frame_alone(tmp_path, photographs, monkeypatch, what):
+    failed = []
+
+    def failing(do, error):
+        def once(*args, **kwargs):
+            if len(failed) < 2:
+                failed.append(args)
+                raise error
+            return do(*args, **kwargs)
+
+        return once
+
+    target, error = {
+        "offer": ("splatnode.capture.messaging.spool.write_message", OSError(5, "Input/output error")),
+        "examine": ("splatnode.capture.selection.assess", ArithmeticError("for the test")),
+        "preview": ("splatnode.capture.daemon.encode_preview", ArithmeticError("for the test")),
+    }[what]
+    module, name = target.rsplit(".", 1)
+    monkeypatch.setattr(target, failing(getattr(import_module(module), name), error))
+    config = CaptureConfig(
+        camera=Camera("folder", folder.Config(folder=photographs)),
+        selection=selection.Config(every_frame=True),
+        spool=SpoolConfig(directory=tmp_path / "state"),
+        network=network(tmp_path),
+    )
+    items = []
+
+    def recon():
+        with KeyframeClient(network(tmp_path)) as client:
+            while thread.is_alive():
+                if (received := client.receive(0.05)) is not None:
+                    items.append(received.frame.name)
+                    client.acknowledge(received)
+
+    thread = threading.Thread(target=capture, args=[config])
+    thread.start()
+    recon()
+    thread.join()
+    expected = {"offer": ["2.png", "3.png", "4.png", "9.jpg"]}
+    assert len(failed) == 2 and len(items) >= 4
+    assert items == expected.get(what, items) and items[-1] == "9.jpg"
+
+
+def test_a_camera_that_fails_after_it_gave_frames_is_no_fault_of_the_configuration(tmp_path, photographs, monkeypatch):
+    def fails(config):
+        yield Frame(0, "a.png", 0, np.zeros((40, 40, 3), np.uint8), None)
+        raise ValueError("half way")
+
+    monkeypatch.setattr(folder, "stream", fails)
+    config = CaptureConfig(
+        camera=Camera("folder", folder.Config(folder=photographs)),
+        spool=SpoolConfig(directory=tmp_path / "state"),
+        network=network(tmp_path),
+    )
+    with pytest.raises(Failed, match="half way"):
+        capture(config)

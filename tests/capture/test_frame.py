@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.frame import LARGEST_IMAGE, DroppedFrame, Frame, Intrinsics, framed, renamed
 
 
 def test_K_and_its_size_of_a_resized_image():
@@ -35,6 +35,44 @@ def test_resizing_keeps_where_a_ray_meets_the_image():
 def test_a_frame_refuses_what_is_no_rgb_image(image):
     with pytest.raises(ValueError, match=r"\(H, W, 3\) uint8"):
         Frame(0, "a.jpg", 0, image, None)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"width": 65_536}, {"height": 2**62}, {"fx": 1e-300}, {"fy": 1e10}, {"cy": -1e10}, {"distortion": (0.0,) * 15},
+        {"distortion": (1e300,)}, {"source": "\x1b[2J"}, {"source": ""},
+    ],
+    ids=str,
+)  # fmt: skip
+def test_what_no_camera_of_ours_has_is_refused(change):
+    with pytest.raises(ValueError, match="intrinsics must be|distortion must be|the source of intrinsics"):
+        replace(Intrinsics(640, 480, 500.0, 510.0, 320.0, 236.0, source="given"), **change)
+
+
+def image(height, width):
+    """One that takes no memory."""
+    return np.broadcast_to(np.uint8(0), (height, width, 3))
+
+
+OUT_OF_BOUNDS = {
+    "id": {"frame_id": -1}, "id of 64 bits": {"frame_id": 2**63}, "stamp": {"stamp_ns": -1},
+    "stamp beyond": {"stamp_ns": 5 * 10**18}, "no name": {"name": ""}, "no pixels": {"image": image(0, 5)},
+    "side": {"image": image(1, 65_536)}, "pixels": {"image": image(40_000, LARGEST_IMAGE // 40_000 + 1)},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("change", OUT_OF_BOUNDS.values(), ids=OUT_OF_BOUNDS)
+def test_what_keeps_no_bounds_is_no_frame_and_is_left_out_with_the_reason(change):
+    good = {"frame_id": 0, "name": "a.jpg", "stamp_ns": 0, "image": image(4, 5), "intrinsics": None}
+    assert isinstance(framed(**good), Frame)
+    with pytest.raises(ValueError):
+        Frame(**(good | change))
+    dropped = framed(**(good | change))
+    assert isinstance(dropped, DroppedFrame) and dropped.reason.startswith("it cannot be a frame: ")
+    if not {"image"} & change.keys():
+        kept = {key: value for key, value in (good | change).items() if key not in ("image", "intrinsics")}
+        assert renamed(Frame(**good), **kept) == dropped
 
 
 def test_frame_size():

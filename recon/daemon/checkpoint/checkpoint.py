@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.config import Config
 from splatnode.recon.daemon.checkpoint import saved, saved_estimate
 from splatnode.recon.daemon.checkpoint.store import Store
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.frames.screening import Screened
 from splatnode.recon.incremental import IncrementalReconstruction, Known
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -41,20 +41,34 @@ def save(store: Store, work: IncrementalReconstruction, final: bool) -> None:
 
 
 def restore(store: Store, config: Config) -> Restored:
-    """The reconstruction that the checkpoint holds."""
+    """The reconstruction that the checkpoint holds. A frame that cannot be used is left out of it for good."""
     frames = [stored.frame for stored in store.frames()]
     try:
         return _restored(store, frames, config)
-    except ValueError as error:
-        log.warning("the checkpoint's scene is made anew: %s", error)
-        keyframes = [prepare(frame, config) for frame in frames]
-        return Restored(IncrementalReconstruction(config), len(frames), keyframes, final=False)
+    except Exception as error:  # whatever the files of another version, or of a faulty disk, make fail
+        log.warning("the checkpoint's scene is made anew: %s: %s", type(error).__name__, error)
+        keyframes = _prepared(store, frames, config, {})
+        return Restored(IncrementalReconstruction(config), len(keyframes), list(keyframes.values()), final=False)
+
+
+def _prepared(
+    store: Store, frames: Sequence[Frame], config: Config, known: Mapping[str, Features]
+) -> dict[str, Keyframe]:
+    """The keyframes by their names, with the features that are known."""
+    keyframes = {}
+    for frame in frames:
+        try:
+            keyframes[frame.name] = prepare(frame, config, known.get(frame.name))
+        except Exception as error:
+            log.error("%s cannot be used: %s", frame.name, error)
+            store.forget(frame.name, f"cannot be used: {error}")
+    return keyframes
 
 
 def _restored(store: Store, frames: Sequence[Frame], config: Config) -> Restored:
     record = store.load("graph", saved.GraphRecord)
     before = saved.graph_from(record) if record is not None else saved.SavedGraph({}, {}, [])
-    keyframes = {frame.name: prepare(frame, config, before.features.get(frame.name)) for frame in frames}
+    keyframes = _prepared(store, frames, config, before.features)
     record = store.load("scene", saved.SceneRecord)
     scene = saved.scene_from(record, keyframes) if record is not None else None
     final = record is not None and record.header.final and scene is not None

@@ -14,9 +14,11 @@ is whole or not there, and has a checksum. A place is what one scene shows.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import re
 import threading
+import uuid
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -28,9 +30,11 @@ import msgspec
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.message_file import read_message, write_message
+from splatnode.capture.messaging.values import SessionId
 from splatnode.capture.messaging.wire import Limits, Message, WireError, decode, encode
 from splatnode.capture.process.durable import remove_leftovers
 from splatnode.capture.process.lock import Held, exclusive
+from splatnode.capture.process.printable import LONGEST_NAME, printable
 from splatnode.capture.process.private import own_files, private_folder
 
 log = logging.getLogger(__name__)
@@ -42,7 +46,8 @@ REMEMBERED_DROPPED = 100  # names and reasons
 FILE = "{:012d}.frame"
 _FILE = re.compile(r"[0-9]{12,18}\.frame")
 _INSTEAD = "--checkpoint (or $XDG_STATE_HOME)"
-LIMITS = Limits(header_bytes=64 << 20, arrays=1 << 20, total_bytes=4 << 30)  # of what this process wrote itself
+# Of what this process wrote itself.
+LIMITS = Limits(header_bytes=64 << 20, arrays=1 << 20, total_bytes=4 << 30, own=True)
 
 
 class CheckpointError(ValueError):
@@ -67,6 +72,7 @@ class Ledger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     next: int = 0  # at least this is the number of the next frame
     gone: tuple[tuple[str, int], ...] = ()  # session and sequence of frames that are no longer stored
     dropped: tuple[tuple[str, str], ...] = ()  # name and reason, newest last
+    identity: SessionId | None = None  # of this checkpoint, for whoever sends keyframes to it
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +103,7 @@ class Store:
             ) from error
         remove_leftovers(directory)
         remove_leftovers(self._frames)
-        self.ledger = self._read_ledger()
+        self.ledger = self._identified(self._read_ledger())
         self._keys: dict[int, tuple[str, int]] = {}
         self._names: dict[str, int] = {}
         self._next = self.ledger.next
@@ -110,6 +116,11 @@ class Store:
     @property
     def scene_id(self) -> str:
         return f"scene-{self.ledger.place:04d}"
+
+    @property
+    def identity(self) -> str:
+        """Of this checkpoint: 32 hexadecimal digits that stay."""
+        return self.ledger.identity or ""
 
     @property
     def names(self) -> set[str]:
@@ -161,9 +172,7 @@ class Store:
                 self._leave_out({}, key, (frame.name, frame.reason))
                 return None
             number = self._next
-            # What is saved of a frame that was dropped may still be on the disk: no other gets its name.
-            taken = frame.name in self._names or any(frame.name == name for name, _ in self.ledger.dropped)
-            name = f"{number:06d}-{frame.name}" if taken else frame.name
+            name = self._unused(frame.name, number)
             header = FrameRecord(VERSION, *key, name, frame.stamp_ns, frame.intrinsics)
             write_message(self._frames / FILE.format(number), encode(header, [frame.image]))
             stored = StoredFrame(number, key, Frame(number, name, frame.stamp_ns, frame.image, frame.intrinsics))
@@ -186,7 +195,8 @@ class Store:
             before = {number: name for name, number in self._names.items() if number < first}
             gone = (*self.ledger.gone, *(self._keys[number] for number in before))
             place = self.ledger.place + 1
-            self._write(Ledger(VERSION, place, first, self._next, gone[-REMEMBERED:]))
+            began = {"place": place, "first": first, "next": self._next, "gone": gone[-REMEMBERED:], "dropped": ()}
+            self._write(msgspec.structs.replace(self.ledger, **began))
             self._unlink(before)
 
     def save(self, name: str, header: msgspec.Struct, arrays: list[Any]) -> None:
@@ -205,12 +215,13 @@ class Store:
 
     def _leave_out(self, frames: dict[int, str], key: tuple[str, int], dropped: tuple[str, str]) -> None:
         ledger = self.ledger
+        shown = printable(dropped[0], LONGEST_NAME), printable(dropped[1])
         self._write(
             msgspec.structs.replace(
                 ledger,
                 next=self._next,
                 gone=(*ledger.gone, key)[-REMEMBERED:],
-                dropped=(*ledger.dropped, dropped)[-REMEMBERED_DROPPED:],
+                dropped=(*ledger.dropped, shown)[-REMEMBERED_DROPPED:],
             )
         )
         self._unlink(frames)
@@ -231,6 +242,25 @@ class Store:
         self._names[stored.frame.name] = stored.number
         self._keys[stored.number] = stored.key
 
+    def _unused(self, name: str, number: int) -> str:
+        """The name, or one made of it that no other frame has."""
+        further = (f"{number:06d}-{copy}-{name}" for copy in itertools.count(2))
+        names = (each[:LONGEST_NAME] for each in itertools.chain((name, f"{number:06d}-{name}"), further))
+        # What is saved of a frame that was dropped may still be on the disk: no other gets its name.
+        taken = {*self._names, *(dropped for dropped, _ in self.ledger.dropped)}
+        return next(each for each in names if each not in taken)
+
+    def _identified(self, ledger: Ledger) -> Ledger:
+        """The ledger with the checkpoint's identity, which it is given where it has none."""
+        if ledger.identity:
+            return ledger
+        identified = msgspec.structs.replace(ledger, identity=uuid.uuid4().hex)
+        try:
+            write_message(self.directory / "ledger", encode(identified))
+        except OSError as error:
+            log.warning("the checkpoint's identity is this process's alone: %s", error)
+        return identified
+
     def _write(self, ledger: Ledger) -> None:
         write_message(self.directory / "ledger", encode(ledger))
         self.ledger = ledger
@@ -238,7 +268,7 @@ class Store:
     def _read_ledger(self) -> Ledger:
         path = self.directory / "ledger"
         try:
-            found = decode(read_message(path), Ledger).header
+            found = decode(read_message(path), Ledger, LIMITS).header
         except FileNotFoundError:
             return Ledger()
         except (OSError, ValueError) as error:

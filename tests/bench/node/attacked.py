@@ -17,14 +17,14 @@ from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.messaging import keys
 from splatnode.capture.messaging.broadcast import Publisher, Subscriber
 from splatnode.capture.messaging.commands import CommandServer
-from splatnode.capture.messaging.keyframe_messages import DroppedHeader
+from splatnode.capture.messaging.keyframe_messages import DroppedHeader, FrameHeader, delivered
 from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
 from splatnode.capture.messaging.network import Network, runtime_directory
 from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES, CAPTURE_PREVIEW, RECON_CONTROL, RECON_SCENE, Service
 from splatnode.capture.messaging.spool import Config as SpoolConfig
-from splatnode.capture.messaging.spool import Spool
+from splatnode.capture.messaging.spool import Key, Spool
 from splatnode.capture.messaging.state import StateClient, StateServer, Want
-from splatnode.capture.messaging.wire import Numbering
+from splatnode.capture.messaging.wire import Numbering, decode
 from splatnode.capture.preview import PreviewHeader
 from splatnode.capture.process.memory import resident_mb
 from tests.bench.node.malformed import FRAME, IMAGE, Parts, good_messages, malformed
@@ -153,7 +153,10 @@ def client_batch(rng: random.Random, context: zmq.Context, folder: Path, goods: 
             client.receive(0.01)
         identity = impostor.recv_multipart()[0]
         for index in range(count):
-            impostor.send_multipart([identity, *(malformed(rng, rng.choice(goods[:2])) or [b""])])
+            good = rng.choice(goods[:2])
+            header = decode(good, FrameHeader | DroppedHeader).header
+            frame = delivered(Key(header.session, header.sequence), good)
+            impostor.send_multipart([identity, *(malformed(rng, [bytes(part) for part in frame]) or [b""])])
             if index % 4 == 0 and (received := client.receive(0)) is not None:
                 client.acknowledge(received)
             if index % 100 == 0:

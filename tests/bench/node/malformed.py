@@ -8,7 +8,16 @@ from typing import Any
 import numpy as np
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.messaging.keyframe_messages import Acknowledge, DroppedHeader, FrameHeader, Ready
+from splatnode.capture.messaging.keyframe_messages import (
+    Acknowledge,
+    Delivery,
+    DroppedHeader,
+    FrameHeader,
+    Ready,
+    Refuse,
+    Request,
+    Served,
+)
 from splatnode.capture.messaging.state import Want
 from splatnode.capture.messaging.wire import Numbering, encode
 from splatnode.capture.preview import Config as PreviewConfig
@@ -33,8 +42,10 @@ def good_messages() -> list[tuple[Parts, Any]]:
         (encode(frame, [IMAGE]), FrameHeader | DroppedHeader),
         (encode(dropped), FrameHeader | DroppedHeader),
         (encode(preview, arrays), PreviewHeader),
-        (encode(Ready(4, [(session, 1), (session, 2)])), Ready | Acknowledge),
-        (encode(Acknowledge(session, 7)), Ready | Acknowledge),
+        (encode(Ready(session, session, 4, [(session, 1), (session, 2)], 1 << 20)), Request),
+        (encode(Acknowledge(session, 7)), Request),
+        (encode(Refuse(session, 7, "its stamp")), Request),
+        (encode(Served(True, 1 << 20)), Delivery | Served),
         (encode(Want(session, 7)), Want),
     ]
     return [([bytes(part) for part in parts], schema) for parts, schema in messages]

@@ -60,7 +60,7 @@ def _spooling(disk: Path, tell: Tell) -> None:
         spool.remove(Key(SESSION, sequence))
     tell("setting 1 aside")
     if Key(SESSION, 1) in spool:
-        spool.set_aside(Key(SESSION, 1))
+        spool.set_aside(Key(SESSION, 1), "1.png", "refused by recon")
     _put(spool, 4, tell)
     spool.close()
 
@@ -82,8 +82,9 @@ def _spool_after(disk: Path, told: list[str]) -> None:
     assert there == sorted(there), "in another order"
     for key in spool:
         assert [bytes(part) for part in spool.get(key)] == _parts(key.sequence)
-    damaged = list(disk.rglob("*.damaged"))
-    assert all(path.name.endswith("-1.damaged") for path in damaged), damaged
+    aside = spool.quarantine.newest(9)
+    assert all(each.file.endswith("-1.frame") or each.reason == "its reason was lost" for each in aside), aside
+    assert len(aside) <= 1 and len(list(spool.quarantine.directory.glob("*.frame"))) == len(aside)
     spool.put(Key(SESSION, 9), _parts(9))
     spool.close()
     assert list(_spool(disk))[-1] == Key(SESSION, 9)

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,12 +16,12 @@ import pytest
 import zmq
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.messaging.keyframe_messages import FrameHeader
+from splatnode.capture.messaging.keyframe_messages import Delivery, FrameHeader, Refuse, Request, delivered
 from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
 from splatnode.capture.messaging.network import AlreadyRunning, Network, runtime_directory
 from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES
 from splatnode.capture.messaging.spool import Config, Key, Spool, SpoolFull, spool_directory
-from splatnode.capture.messaging.wire import WireError, encode
+from splatnode.capture.messaging.wire import WireError, decode, encode
 from splatnode.capture.process.lock import Held
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 from tests.conftest import ROOT
@@ -160,35 +161,170 @@ def test_one_process_offers_keyframes(tmp_path):
     open_spool(tmp_path / "other").close()  # the one that came too late has let go of its spool
 
 
-def test_what_is_no_keyframe_is_refused(tmp_path, caplog):
-    header = FrameHeader(
-        session="0" * 32, sequence=0, mono_ns=0, frame_id=0, name="a.png", stamp_ns=0, intrinsics=INTRINSICS
-    )
-    lens = msgspec.structs.replace
-    nan = replace(INTRINSICS)
-    object.__setattr__(nan, "fx", float("nan"))  # that no process of ours makes
-    images = [np.zeros((6, 8, 3), np.uint8)]
-    bad = [
-        encode(header),
-        encode(header, images * 2),
-        encode(header, [images[0][..., 0]]),
-        encode(header, [images[0].astype(np.float32)]),
-        encode(header, [images[0][:0]]),
-        encode(lens(header, intrinsics=nan), images),
-        [b"SPLAT\x01", b"junk"],
-    ]
-    network = ipc(tmp_path)
-    with zmq.Context() as context, context.socket(zmq.ROUTER) as impostor, KeyframeClient(network) as client:
+HEADER = FrameHeader(
+    session="0" * 32, sequence=0, mono_ns=0, frame_id=0, name="a.png", stamp_ns=0, intrinsics=INTRINSICS
+)
+IMAGE = np.zeros((6, 8, 3), np.uint8)
+changed = msgspec.structs.replace
+
+
+def unusual(**numbers):
+    """Intrinsics that no process of ours makes."""
+    made = replace(INTRINSICS)
+    for name, number in numbers.items():
+        object.__setattr__(made, name, number)
+    return made
+
+
+NO_KEYFRAMES = {
+    "no image": encode(HEADER),
+    "two images": encode(HEADER, [IMAGE, IMAGE]),
+    "grey": encode(HEADER, [IMAGE[..., 0]]),
+    "floats": encode(HEADER, [IMAGE.astype(np.float32)]),
+    "empty": encode(HEADER, [IMAGE[:0]]),
+    "empty and endless": [*encode(HEADER)[:1], msgspec.msgpack.encode([HEADER, [["u1", [0, 2**62, 4]]]]), b""],
+    "side": encode(HEADER, [np.zeros((1, 70_000, 3), np.uint8)]),
+    "another number": encode(changed(HEADER, sequence=7), [IMAGE]),
+    "stamp": encode(changed(HEADER, stamp_ns=5 * 10**18), [IMAGE]),
+    "negative stamp": encode(changed(HEADER, stamp_ns=-1), [IMAGE]),
+    "id": encode(changed(HEADER, frame_id=2**63), [IMAGE]),
+    "no name": encode(changed(HEADER, name=""), [IMAGE]),
+    "terminal": encode(changed(HEADER, name="\x1b[2J"), [IMAGE]),
+    "long name": encode(changed(HEADER, name="a" * 256), [IMAGE]),
+    "nan": encode(changed(HEADER, intrinsics=unusual(fx=float("nan"))), [IMAGE]),
+    "focal": encode(changed(HEADER, intrinsics=unusual(fy=1e300)), [IMAGE]),
+    "lens": encode(changed(HEADER, intrinsics=unusual(distortion=(0.0,) * 15)), [IMAGE]),
+    "lens's size": encode(changed(HEADER, intrinsics=unusual(width=2**40)), [IMAGE]),
+    "source": encode(changed(HEADER, intrinsics=unusual(source="\x1b")), [IMAGE]),
+    "rubbish": [b"SPLAT\x02", b"junk"],
+    "version 1": [b"SPLAT\x01", *encode(HEADER, [IMAGE])[1:]],
+    "nothing": [],
+}
+
+
+@contextmanager
+def impostor_of_capture(network, client):
+    """Sends what it likes to the client."""
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as impostor:
         impostor.linger = 0
         impostor.bind(f"ipc://{runtime_directory(network) / CAPTURE_KEYFRAMES.name}")
         wait_for(lambda: client.receive(0.01) or impostor.poll(10))
         identity, *_ = impostor.recv_multipart()
-        for parts in [*bad, encode(header, images)]:
+
+        def send(parts):
             impostor.send_multipart([identity, *parts])
+
+        def answers():
+            while impostor.poll(0):
+                yield decode(impostor.recv_multipart()[1:], Request).header
+
+        send.answers = answers
+        yield send
+
+
+@pytest.mark.parametrize("parts", NO_KEYFRAMES.values(), ids=NO_KEYFRAMES)
+def test_what_is_no_keyframe_is_refused_by_its_number_and_the_next_is_taken(tmp_path, parts):
+    network = ipc(tmp_path)
+    with KeyframeClient(network) as client, impostor_of_capture(network, client) as send:
+        for _ in range(2):  # a refused one that comes again is known
+            send(delivered(KEY, parts))
+        send(delivered(Key("0" * 32, 1), encode(changed(HEADER, sequence=1), [IMAGE])))
+        received = client.receive(30)
+        assert received.key.sequence == 1 and client.refused == 1
+        client.receive(0.1)
+        refusals = [answer for answer in send.answers() if isinstance(answer, Refuse)]
+        assert [(each.session, each.sequence) for each in refusals] == [KEY, KEY] and refusals[0].reason
+
+
+def test_what_does_not_say_which_frame_it_is_is_counted_and_the_journal_is_not_filled(tmp_path, caplog):
+    network = ipc(tmp_path)
+    with KeyframeClient(network) as client, impostor_of_capture(network, client) as send:
+        rubbish = [
+            [b""],
+            [b"hello"],
+            [b"SPLAT\x02", b"\x90"],
+            encode(HEADER, [IMAGE]),
+            encode(Delivery("x", 0)),
+            [b"x"] * 50,
+        ]
+        for parts in rubbish:
+            send(parts)
+        send(delivered(KEY, encode(HEADER, [IMAGE])))
         assert client.receive(30).frame.name == "a.png"
-        assert client.refused == len(bad)
+        assert client.refused == len(rubbish)
     told = [record for record in caplog.records if "refused a keyframe" in record.message]
-    assert len(told) == len(bad).bit_length()  # the 1st, 2nd, 4th, ...: the journal cannot be filled
+    assert len(told) == len(rubbish).bit_length()  # the 1st, 2nd, 4th, ...
+
+
+def test_refused_keyframes_make_way_and_are_named(tmp_path):
+    network, spool = ipc(tmp_path), open_spool(tmp_path)
+    with KeyframeServer(network, spool) as server:
+        for index in range(30):
+            server.offer(frame(index))
+        with KeyframeClient(network) as client:
+            taken = []
+
+            def done():
+                server.serve(0.005)
+                one = client.receive(0.005)
+                if one is not None and one.sequence % 3 == 0:
+                    client.refuse(one.key, f"no room for {one.frame.name}")
+                elif one is not None:
+                    client.acknowledge(one)
+                    taken.append(one.sequence)
+                return server.queued == 0
+
+            wait_for(done)
+            assert taken == [index for index in range(30) if index % 3]
+            named = spool.quarantine.newest(30)
+            assert [each.name for each in named] == [f"{index}.png" for index in range(27, -1, -3)]
+            assert named[0].reason == "refused by recon: no room for 27.png"
+            assert server.set_aside == 10 and server.acknowledged == 20 and client.refused == 10
+
+
+def test_eight_frames_that_recon_refuses_block_no_queue(tmp_path):
+    """What an earlier splatnode accepted and recon does not: more of them than recon holds at a time."""
+    network, spool = ipc(tmp_path), open_spool(tmp_path)
+    for index in range(8):
+        header = changed(HEADER, sequence=index, stamp_ns=5 * 10**18, name=f"{index}.png")
+        spool.put(Key(header.session, index), encode(header, [IMAGE]))
+    with KeyframeServer(network, spool) as server, KeyframeClient(network) as client:
+        server.offer(frame(0))
+        (received,) = receive(server, client, 1)
+        assert received.frame.name == "0.png" and server.queued == 1
+        assert {each.name for each in spool.quarantine.newest(9)} == {f"{index}.png" for index in range(8)}
+        assert "stamp_ns" in spool.quarantine.newest(1)[0].reason
+
+
+def test_what_is_larger_than_recon_allows_is_set_aside_without_being_sent(tmp_path):
+    network, spool = ipc(tmp_path), open_spool(tmp_path)
+    with KeyframeServer(network, spool) as server:
+        server.offer(frame(0, size=(700, 700)))
+        server.offer(frame(1))
+        with KeyframeClient(msgspec.structs.replace(network, max_message_mb=1)) as client:
+            (received,) = receive(server, client, 1)
+            assert received.frame.name == "1.png" and client.refused == 0
+        (record,) = spool.quarantine.newest(2)
+        assert record.name == "0.png" and "raise network.max_message_mb there" in record.reason
+
+
+def test_what_version_1_spooled_is_delivered(tmp_path):
+    network, spool = ipc(tmp_path), open_spool(tmp_path)
+    spool.put(KEY, [b"SPLAT\x01", *encode(HEADER, [IMAGE])[1:]])
+    with KeyframeServer(network, spool) as server, KeyframeClient(network) as client:
+        assert receive(server, client, 1)[0].frame.name == "a.png"
+
+
+@pytest.mark.parametrize("request_of_another", [[b"SPLAT\x01", b"\x92"], [b"SPLAT\x09", b"\x92"]])
+def test_another_version_is_told_which_is_older(tmp_path, request_of_another):
+    network = ipc(tmp_path)
+    with KeyframeServer(network, open_spool(tmp_path)) as server, zmq.Context() as context:
+        with context.socket(zmq.DEALER) as other:
+            other.linger = 0
+            other.connect(f"ipc://{runtime_directory(network) / CAPTURE_KEYFRAMES.name}")
+            other.send_multipart(request_of_another)
+            wait_for(lambda: server.serve(0.01) or server.refused)
+        assert "update the older one" in server.why_refused
 
 
 def test_too_large_is_said_before_it_is_spooled(tmp_path):
@@ -241,8 +377,9 @@ def test_damaged_files_are_put_aside(tmp_path):
     again = open_spool(tmp_path)
     assert [key.sequence for key in again] == [1]
     assert [bytes(part) for part in again.get(KEY._replace(sequence=1))] == [b"content", b"of the message"]
-    assert len(list(spool.directory.glob("*.damaged"))) == 3 and not (spool.directory / ".half.tmp").exists()
+    assert len(again.quarantine) == 3 and "damaged on the disk" in again.quarantine.newest(1)[0].reason
     assert (spool.directory / "stranger.frame").read_bytes() == b"?"  # it is not ours
+    assert not list(spool.directory.glob(".*"))
 
 
 def test_a_frame_that_the_disk_loses_does_not_block_the_others(tmp_path):

@@ -15,5 +15,6 @@ def test_names_and_ports_stay():
         "recon.scene": 3,
         "recon.status": 5,
         "recon.control": 6,
+        "capture.control": 7,
     }
     assert services.RECON_SCENE.requests == Service("recon.scene.requests", services.Pattern.STATE, 4)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import msgspec
 import numpy as np
 import pytest
@@ -10,6 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from splatnode.capture.messaging.wire import MAGIC, Header, Limits, Numbering, WireError, decode, encode
+
+EDGES = st.sampled_from([-1, 0, 1, 2, 4, 31, 2**16, 2**31, 2**32, 2**62, 2**63]) | st.integers(0, 8)
 
 
 class Apple(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="apple"):
@@ -70,6 +74,7 @@ def envelope(header, table):
 
 
 RAW = msgspec.to_builtins(HEADER)
+ENDLESS = ([0, 2**62, 4], [2**62, 0], [0, 2**31, 2**31], [0, 2**27, 1], [2**32, 2**32, 0], [0, 2**61, 2**61, 2**61])
 
 
 @pytest.mark.parametrize(
@@ -77,7 +82,8 @@ RAW = msgspec.to_builtins(HEADER)
     [
         [],
         [MAGIC],
-        [b"SPLAT\x02", parts_of()[1]],
+        [b"SPLAT\x01", parts_of()[1]],
+        [b"SPLAT\x03", parts_of()[1]],
         [parts_of()[1], MAGIC],
         [MAGIC, b""],
         [MAGIC, parts_of()[1] + b"\0"],
@@ -96,6 +102,7 @@ RAW = msgspec.to_builtins(HEADER)
         [MAGIC, envelope(RAW, [["u1", [1, 1, 1, 1, 1]]]), b"1"],
         [MAGIC, envelope(RAW, [["u1", [-1, -1]]]), b"1"],
         [MAGIC, envelope(RAW, [["u1", [2**62, 4]]]), b""],
+        *([MAGIC, envelope(RAW, [["f4", shape]]), b""] for shape in ENDLESS),
         [MAGIC, b"\xdd\xff\xff\xff\xff"],
         [MAGIC, b"\x91" * 100_000],
         [MAGIC, b"\x92\x82\xa4type\xa4pear\xa4name\xa1\xff\x90"],
@@ -104,6 +111,51 @@ RAW = msgspec.to_builtins(HEADER)
 def test_malformed_messages_are_refused(parts):
     with pytest.raises(WireError):
         decode(parts, Apple | Pear)
+
+
+def test_another_version_is_told_what_to_do():
+    with pytest.raises(WireError, match="of version 1, and this splatnode speaks version 2: update the older one"):
+        decode([b"SPLAT\x01", parts_of()[1]], Pear)
+
+
+class Anything(msgspec.Struct, forbid_unknown_fields=True):
+    value: Any
+
+
+NESTED: Any = 1
+for _ in range(20):
+    NESTED = [NESTED]
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        float("nan"), float("inf"), -float("inf"), 2**63, 2**62 + 1, -(2**63), "\x1b[2J", "a\nb", "\u202e", "\u2028",
+        "x" * 1001, b"bytes", [["", "\x07"]], {"a\n": 1}, {"a": {"b": "\r"}}, NESTED, list(range(10**4)),
+        msgspec.msgpack.Ext(1, b""), msgspec.msgpack.Ext(-1, bytes(4)), {1.5: float("nan")},
+    ],
+)  # fmt: skip
+def test_no_header_holds_what_a_terminal_or_a_sum_cannot_take(value):
+    with pytest.raises(WireError):
+        decode([MAGIC, msgspec.msgpack.encode([{"value": value}, []])], Anything)
+
+
+@pytest.mark.parametrize("value", [None, True, 0, -(2**62), 2**62, 5e-324, -1e300, "", "ä 中", [], {"a": [1.5, None]}])
+def test_a_header_holds_everything_else(value):
+    assert decode([MAGIC, msgspec.msgpack.encode([{"value": value}, []])], Anything).header.value == value
+
+
+@given(
+    st.lists(st.tuples(st.sampled_from(["u1", "f4", "f8", "i8", "x"]), st.lists(EDGES, max_size=6)), max_size=3),
+    st.lists(st.binary(max_size=32), max_size=3),
+)
+def test_whatever_shapes_are_announced_is_refused_or_there(table, buffers):
+    try:
+        message = decode([MAGIC, envelope(RAW, table), *buffers], Pear)
+    except WireError:
+        return
+    for array, buffer, (_, shape) in zip(message.arrays, buffers, table, strict=True):
+        assert list(array.shape) == shape and array.nbytes == len(buffer)
 
 
 def test_limits():

@@ -76,8 +76,7 @@ def test_what_is_straight_stays_as_it_is():
     assert undistorted(pinhole) is pinhole
 
 
-@pytest.mark.parametrize("distortion", [(-2.0, 0.0, 0.0, 0.0), (0.1,) * 15])
-def test_coefficients_that_cannot_be_are_named(distortion: tuple[float, ...]):
-    given = Intrinsics(WIDTH, HEIGHT, 200.0, 200.0, 160.0, 120.0, "given", distortion)
+def test_coefficients_that_cannot_be_are_named():
+    given = Intrinsics(WIDTH, HEIGHT, 200.0, 200.0, 160.0, 120.0, "given", (-2.0, 0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="a.png.*alibrat"):
         undistorted(Frame(0, "a.png", 0, np.zeros((HEIGHT, WIDTH, 3), np.uint8), given))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import msgspec
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.messaging.jpeg import to_jpeg
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
 from splatnode.recon.result.bounds import Bounds
-from splatnode.recon.result.message import SceneHeader, bounds_record, from_message, to_message
+from splatnode.recon.result.message import SceneHeader, from_message, to_message
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 
@@ -18,11 +20,19 @@ RANDOM = np.random.default_rng(0)
 NUMBERED = Numbering(session="0123456789abcdef" * 2).next() | {"sequence": 7}
 
 
+def turned(angle: float) -> np.ndarray:
+    """A camera's pose, turned about y."""
+    T = np.eye(4)
+    T[:3, :3] = [[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]]
+    T[:3, 3] = RANDOM.normal(size=3)
+    return T
+
+
 def camera(index: int) -> CameraEstimate:
     return CameraEstimate(
         f"{index}.png",
         index,
-        RANDOM.normal(size=(4, 4)),
+        turned(0.3 * index),
         np.diag([300.0, 301, 1]),
         320,
         200,
@@ -112,35 +122,83 @@ def test_arrays_that_do_not_belong_to_the_header_are_refused(change, words):
         from_message(Message(header, tuple(change(arrays))))
 
 
-def test_an_unknown_verdict_is_refused():
-    header, arrays = to_message(snapshot(), "scene-0001", NUMBERED)
-    with pytest.raises(WireError, match="FINE"):
-        from_message(Message(msgspec.structs.replace(header, code="FINE"), tuple(arrays)))
+LEAVES = {
+    "cameras.0.T_world_camera": [(1.0, 2.0), (float("nan"),) * 16, (1e300,) * 16, (0.0,) * 16, np.diag([1, 1, -1, 1])],
+    "cameras.0.T_world_camera.3": [float("nan"), float("inf"), 1e10, -1e10],
+    "cameras.0.T_world_camera.15": [0.0, 2.0],
+    "cameras.0.K": [(1.0, 2.0), (float("nan"),) * 9, (0.0,) * 9, np.diag([-1, 1, 1]), np.diag([5e-324, 1, 1])],
+    "cameras.0.K.0": [0.0, -1.0, float("nan"), float("inf"), 1e10, 5e-324],
+    "cameras.0.K.1": [1.0],
+    "cameras.0.K.8": [0.0],
+    "cameras.0.width": [0, -1, 2**16, 2**31, 2**62, 2**63, 1.5, "1"],
+    "cameras.0.height": [0, -1, 65_535 + 1],
+    "cameras.0.frame_id": [-2, 2**63],
+    "cameras.0.name": ["", "\x1b[2J", "a" * 256, "\u202egnp", 5],
+    "cameras.0.bounds.rotation_deg": [-1.0, float("nan")],
+    "cameras.0.bounds.centre": [float("inf"), 1e300],
+    "cameras.0.bounds.axes": [((0.0, 0.0, 0.0),) * 2, ((0.0, float("nan"), 0.0),) * 3],
+    "code": ["FINE", "", 5, "\x07"],
+    "message": ["\n", "a" * 1001],
+    "advice": ["\u2028"],
+    "scene_id": ["", "\x00"],
+    "frames": [["\x1b"], ["a"] * 1001, "abc"],
+    "dropped": [[["a", "\x1b"]], [["", ""]], [["a"]], [["a", "b"]] * 201],
+    "iterations": [-2, 2**63, 1.5],
+    "seconds": [{"poses": float("nan")}, {"poses": -1.0}, {"\x1b": 1.0}, {f"{i}": 1.0 for i in range(65)}],
+    "cameras": [None, [1]],
+    "session": ["0" * 31, "0" * 32 + "\n"],
+}
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"rotation_deg": -1.0},
-        {"centre": float("inf")},
-        {"axes": ((0.0, 0.0, 0.0),) * 2},
-        {"axes": ((0.0, float("nan"), 0.0),) * 3},
-    ],
-)
-def test_bounds_without_meaning_do_not_pass_the_wire(change):
+def header_with(path: str, value: object) -> list[bytes]:
+    """The parts of a scene whose header has this value in this place."""
     header, arrays = to_message(snapshot(), "scene-0001", NUMBERED)
-    bounds = msgspec.structs.replace(bounds_record(snapshot().cameras[0].bounds), **change)
-    broken = msgspec.structs.replace(header.cameras[0], bounds=bounds)
-    parts = encode(msgspec.structs.replace(header, cameras=(broken, *header.cameras[1:])), arrays)
+    parts = [bytes(part) for part in encode(header, arrays)]
+    envelope = msgspec.msgpack.decode(parts[1])
+    *way, last = (int(step) if step.isdigit() else step for step in path.split("."))
+    place = envelope[0]
+    for step in way:
+        place = place[step]
+    place[last] = value.ravel().tolist() if isinstance(value, np.ndarray) else value
+    return [parts[0], msgspec.msgpack.encode(envelope), *parts[2:]]
+
+
+@pytest.mark.parametrize(("path", "value"), [(path, value) for path, values in LEAVES.items() for value in values])
+def test_what_makes_no_sense_in_a_header_does_not_pass_the_wire(path, value):
     with pytest.raises(WireError):
-        decode(parts, SceneHeader)
+        decode(header_with(path, value), SceneHeader)
 
 
-@pytest.mark.parametrize("field", ["T_world_camera", "K"])
-def test_a_matrix_of_the_wrong_size_or_without_numbers_does_not_pass_the_wire(field):
+def test_a_camera_whose_picture_nobody_could_paint_does_not_pass_the_wire():
+    parts = header_with("cameras.0.width", 60_000)
+    decode(parts, SceneHeader)
+    envelope = msgspec.msgpack.decode(parts[1])
+    envelope[0]["cameras"][0]["height"] = 60_000
+    with pytest.raises(WireError, match="pixels"):
+        decode([parts[0], msgspec.msgpack.encode(envelope), *parts[2:]], SceneHeader)
+
+
+@pytest.mark.parametrize("bases", [0, 2, 3, 5, 8, 17, 25, 1000])
+def test_a_number_of_bases_that_no_degree_has_is_refused(bases):
     header, arrays = to_message(snapshot(), "scene-0001", NUMBERED)
-    for value in ((1.0, 2.0), (float("nan"),) * len(getattr(header.cameras[0], field))):
-        broken = msgspec.structs.replace(header.cameras[0], **{field: value})
-        parts = encode(msgspec.structs.replace(header, cameras=(broken, *header.cameras[1:])), arrays)
-        with pytest.raises(WireError):
-            decode(parts, SceneHeader)
+    arrays[4] = np.zeros((10, bases, 3), np.float32)
+    with pytest.raises(WireError, match="1, 4, 9, 16 bases"):
+        from_message(Message(header, tuple(arrays)))
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf"), 3e38, -3e38])
+@pytest.mark.parametrize("field", range(5))
+def test_a_gaussian_with_an_absurd_number_is_left_out(field, number):
+    header, arrays = to_message(snapshot(), "scene-0001", NUMBERED)
+    arrays[field] = arrays[field].copy()
+    arrays[field].reshape(10, -1)[3, -1] = number
+    gaussians = from_message(Message(header, tuple(arrays))).snapshot.gaussians
+    assert len(gaussians) == 9 and gaussians.source_frame.tolist() == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+
+
+def test_what_is_said_of_a_scene_is_cut_to_what_a_message_holds():
+    long = "a\n" * 5000
+    verdict = Verdict(Code.OK, long, long, ("x",) * 3000)
+    live = from_message(sent(replace(snapshot(), verdict=verdict, dropped=(DroppedFrame("", long),) * 2500))).snapshot
+    assert len(live.verdict.message) == 1000 and "\n" not in live.verdict.message
+    assert len(live.dropped) == 200 and len(live.verdict.frames) == 1000

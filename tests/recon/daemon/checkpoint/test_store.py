@@ -210,7 +210,9 @@ def test_what_lies_where_a_file_belongs_that_can_be_made_anew_is_no_file(open_st
 
 @pytest.mark.parametrize("make", STRAYS.values(), ids=STRAYS)
 def test_what_lies_where_the_ledger_belongs_is_told(open_store, make):
-    make(open_store().directory / "ledger")
+    ledger = open_store().directory / "ledger"
+    ledger.unlink()
+    make(ledger)
     with pytest.raises(CheckpointError, match="Move the folder away"):
         open_store()
 

@@ -1,0 +1,89 @@
+"""Each keyframe is given away once: one recon is served, and the others are told so."""
+
+from __future__ import annotations
+
+import time
+
+import pytest
+
+from splatnode.capture.messaging import turns
+from splatnode.capture.messaging.keyframe_messages import Acknowledge, Ready, Refuse
+from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging.spool import Key
+from splatnode.capture.messaging.turns import MOST_CONNECTIONS, SILENT_S, Turns
+from tests.capture.messaging.test_keyframes import frame, open_spool, receive, settle
+from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
+
+A, B = "a" * 32, "b" * 32
+KEY = Key("0" * 32, 0)
+
+
+def ready(recon=A, process=A, holding=()):
+    return Ready(recon, process, 4, [*holding], 10**6)
+
+
+def test_the_one_that_is_served_stays_until_it_is_silent():
+    asked = Turns()
+    assert asked.ready(b"1", ready(A, A), (), 0.0)
+    assert not asked.ready(b"2", ready(B, B), (), 1.0) and asked.waiting == 1
+    assert asked.is_served(b"1") and not asked.is_served(b"2")
+    asked.heard(b"1", 4.0)
+    assert not asked.ready(b"2", ready(B, B), (), 4.0 + SILENT_S)
+    assert asked.ready(b"2", ready(B, B), (), 4.1 + SILENT_S) and asked.is_served(b"2")
+    assert not asked.ready(b"1", ready(A, A), (), 4.2 + SILENT_S)
+
+
+def test_a_restarted_one_takes_over_at_once_and_its_predecessor_does_not_come_back():
+    asked = Turns()
+    assert asked.ready(b"1", ready(A, "1" * 32), (), 0.0)
+    assert asked.ready(b"2", ready(A, "2" * 32), (), 0.1)
+    assert not asked.ready(b"1", ready(A, "1" * 32), (), 0.2)  # a copy of the checkpoint: the later one stays
+    assert asked.ready(b"3", ready(A, "2" * 32), (), 0.3)  # the same process by a new connection
+
+
+def test_who_is_gone_makes_room_and_connections_are_bounded():
+    asked = Turns()
+    for index in range(MOST_CONNECTIONS):
+        asked.ready(b"%d" % index, ready(A, f"{index:032x}"), (), 0.0)
+    assert not asked.ready(b"further", ready(B, B), (), 100.0)
+    asked.forget_silent(100.0)
+    assert asked.served is None and asked.ready(b"further", ready(B, B), (), 100.0)
+    asked.gone(b"further")
+    assert asked.served is None
+
+
+def test_what_is_held_is_outstanding_if_it_is_still_there():
+    asked = Turns()
+    asked.ready(b"1", ready(holding=[KEY, ("0" * 32, 1)]), [KEY], 0.0)
+    assert asked.served.outstanding == {KEY}
+    asked.answered(KEY)
+    assert asked.served.outstanding == set()
+
+
+@pytest.mark.parametrize("make", [ipc, tcp], ids=["ipc", "tcp+curve"])
+def test_two_recons_on_one_capture(tmp_path, make, monkeypatch):
+    """The second takes nothing and is told so; when the first falls silent, it gets what is left."""
+    monkeypatch.setattr(turns, "SILENT_S", 1.5)
+    network, spool = make(tmp_path), open_spool(tmp_path)
+    with KeyframeServer(network, spool) as server, KeyframeClient(network) as second:
+        with KeyframeClient(network) as first:
+            for index in range(3):
+                server.offer(frame(index))
+            held = receive(server, first, 3)
+            deadline = time.monotonic() + 3.0
+            while time.monotonic() < deadline:  # longer than one may be silent
+                server.serve(0.01)
+                assert second.receive(0.01) is None
+                assert first.receive(0.01) is None
+            assert first.served and second.served is False and server.turned_away == 1
+            for request in (Acknowledge(*held[0].key), Refuse(*held[1].key, "mine")):
+                second._say(request)  # of one that is not served, neither counts
+            wait_for(lambda: server.serve(0.01) or server.ignored == 2)
+            assert server.queued == 3 and server.acknowledged == server.set_aside == 0
+            first.acknowledge(held[0])
+            settle(server, first, lambda: server.queued == 2)
+        taken = receive(server, second, 2)
+        assert [one.sequence for one in taken] == [1, 2] and second.served
+        for one in taken:
+            second.acknowledge(one)
+        settle(server, second, lambda: server.queued == 0)

@@ -1,0 +1,259 @@
+"""The daemon's threads survive any single input, and say so until somebody has seen it."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from splatnode.capture.frame import Frame
+from splatnode.capture.messaging import keys
+from splatnode.capture.messaging.broadcast import Publisher
+from splatnode.capture.messaging.commands import Answer, Seen, ask
+from splatnode.capture.messaging.keyframe_messages import FrameHeader
+from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
+from splatnode.capture.messaging.services import CAPTURE_PREVIEW, RECON_CONTROL
+from splatnode.capture.messaging.spool import Config as SpoolConfig
+from splatnode.capture.messaging.spool import Key, Spool
+from splatnode.capture.messaging.wire import Numbering, encode
+from splatnode.capture.preview import Config as PreviewConfig
+from splatnode.capture.preview import encode_preview
+from splatnode.capture.process.problems import Problems
+from splatnode.capture.status import heartbeats
+from splatnode.recon.config import Config as Reconstruction
+from splatnode.recon.daemon import intake, watcher
+from splatnode.recon.daemon.checkpoint import checkpoint
+from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.control import Retract
+from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
+from splatnode.recon.daemon.intake import Intake
+from splatnode.recon.daemon.tracking import Config as Tracking
+from splatnode.recon.daemon.watcher import Finished, Watcher
+from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
+from tests.recon.daemon.test_daemon import config, peer, running  # noqa: F401
+from tests.support.synthetic import photographs
+
+IMAGE = np.zeros((6, 8, 3), np.uint8)
+
+
+def frame(index: int, name: str = "") -> Frame:
+    return Frame(index, name or f"{index}.png", index, IMAGE, None)
+
+
+def refused(sequence: int) -> tuple[Key, list]:
+    """A message that an earlier splatnode spooled."""
+    session = "0" * 32
+    header = FrameHeader(
+        session=session, sequence=sequence, mono_ns=0, frame_id=0, name=f"old{sequence}.png", stamp_ns=5 * 10**18,
+        intrinsics=None,
+    )  # fmt: skip
+    return Key(session, sequence), encode(header, [IMAGE])
+
+
+class Taking:
+    """An intake in its thread, and capture's end."""
+
+    def __init__(self, network, folder) -> None:
+        self.server = KeyframeServer(network, Spool(SpoolConfig(directory=folder / "state")))
+        self.store, self.inbox, self.problems = Store(folder / "checkpoint"), Inbox(), Problems()
+        self.stopping = threading.Event()
+        self.intake = Intake(network, Reconstruction(), self.store, self.inbox, self.problems, self.stopping)
+        self.thread = threading.Thread(target=self.intake.run)
+
+    def until(self, condition) -> None:
+        wait_for(lambda: self.server.serve(0.01) or condition())
+
+    def events(self, count: int) -> list:
+        found = []
+
+        def come():
+            self.server.serve(0.01)
+            found.extend(self.inbox.get(0))
+            return len(found) >= count
+
+        wait_for(come)
+        return found
+
+
+@contextmanager
+def taking(network, folder, first=None):
+    """`first`: a recon that is served before."""
+    opened = Taking(network, folder)
+    if first is not None:
+        opened.until(lambda: first.receive(0.01) or first.served)
+    opened.thread.start()
+    try:
+        yield opened
+    finally:
+        opened.stopping.set()
+        opened.thread.join(30)
+        opened.server.close()
+        opened.store.close()
+    assert not opened.thread.is_alive()
+
+
+@pytest.fixture
+def plain(monkeypatch):
+    """Keyframes need no features."""
+    monkeypatch.setattr(intake, "prepare", lambda frame, _: SimpleNamespace(name=frame.name))
+
+
+@pytest.fixture
+def impatient(monkeypatch):
+    monkeypatch.setattr(intake, "RETRY_S", 0.05)
+    monkeypatch.setattr(watcher, "RETRY_S", 0.05)
+
+
+def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path, monkeypatch, plain, impatient):
+    with taking(ipc(tmp_path), tmp_path) as node:
+        put, failures = node.store.put, [OSError(28, "No space left"), OSError(5, "Input/output error")]
+        monkeypatch.setattr(node.store, "put", lambda one: _raise(failures.pop()) if failures else put(one))
+        node.server.offer(frame(0))
+        node.until(lambda: node.server.acknowledged == 1)
+        assert node.store.names == {"0.png"} and not failures and node.intake.full == ""
+
+
+def test_what_cannot_be_stored_is_refused_and_told_until_seen(tmp_path, monkeypatch, plain):
+    with taking(ipc(tmp_path), tmp_path) as node:
+        put = node.store.put
+        monkeypatch.setattr(
+            node.store, "put", lambda one: _raise(ArithmeticError("odd")) if one.frame.name == "0.png" else put(one)
+        )
+        node.server.offer(frame(0))
+        node.server.offer(frame(1))
+        node.until(lambda: node.server.acknowledged == node.server.set_aside == 1)
+        assert node.store.names == {"1.png"}
+        assert "ArithmeticError: odd" in node.server.spool.quarantine.newest(1)[0].reason
+        node.until(lambda: "1 keyframes that were refused, the last: it cannot be stored" in str(node.problems))
+
+
+def test_what_cannot_be_used_is_left_out_also_where_the_checkpoint_cannot_be_changed(tmp_path, monkeypatch):
+    monkeypatch.setattr(intake, "prepare", lambda *_: _raise(MemoryError("for the test")))
+    with taking(ipc(tmp_path), tmp_path) as node:
+        monkeypatch.setattr(node.store, "forget", lambda *_: _raise(OSError(30, "Read-only file system")))
+        for index in range(3):
+            node.server.offer(frame(index))
+        assert node.events(3) == [LeftOut(f"{index}.png") for index in range(3)]
+        assert "3 keyframes that cannot be used, the last: 2.png: for the test" in str(node.problems)
+
+
+def test_two_frames_of_one_name_and_names_that_look_like_ours(tmp_path, plain):
+    long = "n" * 255
+    names = ["a", "000003-a", "000001-a", "a", "a", long, long, "000007-" + "n" * 248, long]
+    with taking(ipc(tmp_path), tmp_path) as node:
+        for index, name in enumerate(names):
+            node.server.offer(frame(index, name))
+        taken = [each.keyframe.name for each in node.events(len(names)) if isinstance(each, Arrived)]
+        assert len(set(taken)) == len(names) and max(map(len, taken)) == 255
+        assert node.store.names == set(taken)
+
+
+def test_another_recon_is_told_that_it_is_not_served(tmp_path, plain):
+    network = ipc(tmp_path)
+    with taking(network, tmp_path) as node, KeyframeClient(network) as other:
+        node.until(lambda: node.server.connected)
+        wait_for(lambda: node.server.serve(0.01) or other.receive(0.01) or other.served is False)
+        node.server.offer(frame(0))
+        node.until(lambda: node.server.acknowledged == 1)
+        assert other.receive(0.2) is None
+
+
+def test_an_intake_that_is_not_served_says_so(tmp_path, plain):
+    network = ipc(tmp_path)
+    with KeyframeClient(network) as first, taking(network, tmp_path, first=first) as node:
+        node.until(lambda: first.receive(0.01) or node.intake.unconnected == intake.ANOTHER_IS_SERVED)
+        assert first.served
+
+
+def test_a_wrong_key_is_a_problem_until_it_is_put_right(tmp_path, plain, impatient):
+    network = tcp(tmp_path)
+    other = tmp_path / "other keys"
+    keys.create_keys(other)
+    keys.expect_server(network.keys, (other / "public.key").read_bytes())
+    with taking(network, tmp_path) as node:
+        node.server.offer(frame(0))
+        node.until(lambda: "does not have the key" in node.intake.unconnected)
+        keys.expect_server(network.keys, (network.keys / "public.key").read_bytes())
+        node.until(lambda: node.server.acknowledged == 1)
+        node.until(lambda: node.intake.unconnected == "")
+
+
+@pytest.mark.parametrize("where", ["landmarks", "track"])
+def test_a_preview_that_makes_tracking_fail_is_one_preview(tmp_path, monkeypatch, where):
+    network, problems, stopping, tracked = ipc(tmp_path), Problems(), threading.Event(), []
+
+    class Failing:
+        def __init__(self, *_) -> None:
+            pass
+
+        def track(self, image, _):
+            tracked.append(image.shape)
+            raise ArithmeticError("for the test")
+
+    monkeypatch.setattr(watcher, "landmarks", lambda *_: _raise(IndexError("none")) if where == "landmarks" else None)
+    monkeypatch.setattr(watcher, "Tracker", Failing)
+    camera = SimpleNamespace(width=8, height=6, K=np.eye(3))
+    finished = Finished(SimpleNamespace(cameras=[camera]), [])
+    watching = Watcher(network, Tracking(every_s=0.01), lambda: finished, problems, stopping)
+    thread = threading.Thread(target=watching.run)
+    thread.start()
+    numbering = Numbering()
+    with Publisher(CAPTURE_PREVIEW, network) as publisher:
+
+        def failed():
+            message = encode_preview(frame(0), numbering, PreviewConfig(), state="streaming", taken=True, reason="")
+            publisher.send(*message)
+            return str(problems)[:1].isdigit() and int(str(problems).split()[0]) >= 3
+
+        wait_for(failed)
+    assert thread.is_alive() and bool(tracked) == (where == "track")
+    stopping.set()
+    thread.join(30)
+
+
+def test_a_stored_frame_that_cannot_be_used_costs_no_other(tmp_path, monkeypatch):
+    store = Store(tmp_path / "checkpoint")
+    prepare = checkpoint.prepare
+    with KeyframeServer(ipc(tmp_path), Spool(SpoolConfig(directory=tmp_path / "state"))):
+        for index in range(3):
+            store.put(SimpleNamespace(session="0" * 32, sequence=index, frame=frame(index)))
+    store.close()
+    monkeypatch.setattr(
+        checkpoint,
+        "prepare",
+        lambda each, *rest: _raise(MemoryError()) if each.name == "1.png" else prepare(each, *rest),
+    )
+    store = Store(tmp_path / "checkpoint")
+    restored = checkpoint.restore(store, Reconstruction())
+    assert [keyframe.name for keyframe in restored.new] == ["0.png", "2.png"]
+    assert store.names == {"0.png", "2.png"} and store.dropped[0].name == "1.png"
+    store.close()
+
+
+def test_the_running_daemon_tells_what_was_refused_and_answers_what_fails(config, peer, monkeypatch):  # noqa: F811
+    with running(config):
+        for index in range(8):
+            peer.server.spool.put(*refused(index))
+        (taken,) = photographs()[:1]
+        peer.server.offer(taken)
+        peer.wait_for_acknowledgements()
+        assert peer.server.set_aside == 8 and peer.server.acknowledged == 1
+
+        def problem() -> str:
+            return heartbeats(config.network)["recon"]["problem"]
+
+        wait_for(lambda: "8 keyframes that were refused" in problem())
+        assert ask(RECON_CONTROL, config.network, Seen(), Answer).done
+        wait_for(lambda: problem() == "")
+        monkeypatch.setattr(Store, "forget", lambda *_: _raise(OSError(30, "Read-only file system")))
+        answer = ask(RECON_CONTROL, config.network, Retract(taken.name), Answer)
+        assert not answer.done and "Read-only" in answer.message
+        monkeypatch.setattr("shutil.disk_usage", lambda _: _raise(OSError(5, "Input/output error")))
+        wait_for(lambda: "does not tell how much is free" in problem())
+
+
+def _raise(error: BaseException):
+    raise error
