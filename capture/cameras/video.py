@@ -11,8 +11,10 @@ import msgspec
 import numpy as np
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
+from splatnode.capture.image_file import MaxPixels
 from splatnode.capture.pace import Pace, paced
 from splatnode.capture.process.printable import LONGEST_NAME, printable_name
+from splatnode.capture.video_process import MAX_VIDEO_PIXELS, VideoError, VideoFrame, decoded
 
 _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes behind it
 
@@ -20,6 +22,7 @@ _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes b
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     file: Path
     every: Annotated[int, msgspec.Meta(ge=1)] = 1  # 3: every third frame; the others are not decoded
+    max_pixels: MaxPixels = MAX_VIDEO_PIXELS  # of a frame; the decoder's memory is bounded accordingly
     pace: Pace = "fastest"
     intrinsics: Intrinsics | None = None  # of a calibration at the same aspect ratio
 
@@ -27,7 +30,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     """The frames at their times in the video; those that cannot be decoded are left out by the decoder, unnamed.
 
-    Raises FileNotFoundError, or ValueError where the file is no video that can be decoded.
+    Raises FileNotFoundError, or ValueError where the file is no video that can be decoded. What goes wrong after a
+    frame is named as a dropped frame, and ends the stream.
     """
     if not config.file.is_file():
         raise FileNotFoundError(f"no file {str(config.file)!r}; give a video, such as an MP4")
@@ -35,28 +39,28 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
 
 
 def _frames(config: Config) -> Iterator[Frame | DroppedFrame]:
-    video = cv2.VideoCapture(str(config.file), cv2.CAP_FFMPEG)
+    frame_id = 0
     try:
-        rate = video.get(cv2.CAP_PROP_FPS)
-        if not video.isOpened() or not rate > 0:
-            raise ValueError(f"{str(config.file)!r} is no video that can be decoded; convert it to MP4 (H.264)")
-        frame_id = index = 0
-        while video.grab():
-            if index % config.every == 0:
-                decoded, image = video.retrieve()
-                if decoded:
-                    yield _frame(image, frame_id, index, rate, config)
-                    frame_id += 1
-            index += 1
+        for found in decoded(config.file, config.every, config.max_pixels):
+            yield _frame(found, frame_id, config)
+            frame_id += 1
+    except VideoError as error:
         if frame_id == 0:
-            raise ValueError(f"{str(config.file)!r} has no frame that can be decoded; is the file whole?")
-    finally:
-        video.release()
+            raise VideoError(f"{str(config.file)!r} is no video that can be used: {error}") from error
+        yield DroppedFrame(f"{_stem(config)}_rest", str(error))
+    if frame_id == 0:
+        raise ValueError(
+            f"{str(config.file)!r} is no video that can be decoded, or has no frame; convert it to MP4 (H.264)"
+        )
 
 
-def _frame(image: np.ndarray, frame_id: int, index: int, rate: float, config: Config) -> Frame | DroppedFrame:
+def _stem(config: Config) -> str:
+    return printable_name(config.file.stem, _LONGEST_STEM)
+
+
+def _frame(found: VideoFrame, frame_id: int, config: Config) -> Frame | DroppedFrame:
     """Stamps are counted, not read: containers with edited time lines give stamps that go back."""
-    rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+    rgb = cv2.cvtColor(found.image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
     intrinsics = config.intrinsics.resized(rgb.shape[1], rgb.shape[0]) if config.intrinsics else None
-    name = f"{printable_name(config.file.stem, _LONGEST_STEM)}_{index:06d}.png"
-    return framed(frame_id, name, round(index / rate * 1e9), rgb, intrinsics)
+    name = f"{_stem(config)}_{found.index:06d}.png"
+    return framed(frame_id, name, round(found.index / found.rate * 1e9), rgb, intrinsics)

@@ -1,0 +1,112 @@
+"""A video decoded in a process of its own, which has a limit on its memory.
+
+FFmpeg takes memory for the frames that a stream describes, as many as it refers to, before anybody sees their size, and
+what it does with a crafted stream is its own affair: here it can end without the process that wants the frames.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import resource
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+MAX_VIDEO_PIXELS = 36_000_000  # of a frame: 8192 x 4320
+BYTES_A_PIXEL = 80  # of memory at most for the decoder: its frames in flight, in colour, and what it refers to
+BASE_BYTES = 500_000_000  # further ones, whatever the size of a frame
+_MAX_THREADS = 8  # each has a frame of its own
+_START, _FRAME = struct.Struct("<d"), struct.Struct("<QII")  # frames a second; index, width, height
+
+
+class VideoError(ValueError):
+    """The file is no video that can be decoded, or its frames are too large; the message says why."""
+
+
+@dataclass(frozen=True)
+class VideoFrame:
+    index: int  # in the video
+    rate: float  # frames a second
+    image: npt.NDArray[np.uint8]  # (H, W, 3) BGR, as it is decoded
+
+
+def decoded(file: Path, every: int, max_pixels: int) -> Iterator[VideoFrame]:
+    """Every `every`-th frame of `file`, all of one size. Those that cannot be decoded are left out.
+
+    Raises VideoError, after the frames before it where it is about a later one.
+    """
+    # Its path of modules is ours, and not the folder in which we happen to be.
+    code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import _main; _main()"
+    command = [sys.executable, "-I", "-c", code, os.fsdecode(file.absolute()), str(every), str(max_pixels)]
+    child = subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,  # what FFmpeg says of a stranger's file is a stranger's text
+        start_new_session=True,  # Ctrl-C is for us
+    )
+    with child, contextlib.ExitStack() as cleanup:
+        cleanup.callback(child.kill)
+        assert child.stdout is not None
+        yield from _received(child.stdout, max_pixels)
+        if child.wait() != 0:
+            raise VideoError(
+                f"its decoder ended ({child.returncode}); is it whole, with frames of {max_pixels} pixels?"
+            )
+
+
+def _received(stream: IO[bytes], max_pixels: int) -> Iterator[VideoFrame]:
+    start = stream.read(_START.size)
+    if len(start) < _START.size:
+        return
+    (rate,) = _START.unpack(start)
+    if not 0.001 <= rate <= 1000:
+        raise VideoError(f"it has {rate:g} frames a second; 0.001 to 1000 can be read")
+    while len(head := stream.read(_FRAME.size)) == _FRAME.size:
+        index, width, height = _FRAME.unpack(head)
+        if width * height > max_pixels:
+            raise VideoError(f"its frames are {width} x {height}: more than {max_pixels} pixels; make them smaller")
+        data = stream.read(width * height * 3)
+        if len(data) < width * height * 3:
+            return
+        yield VideoFrame(index, rate, np.frombuffer(data, np.uint8).reshape(height, width, 3))
+
+
+def _main() -> None:
+    """The decoder's process: FILE EVERY MAX_PIXELS; writes what `_received` reads."""
+    file, every, max_pixels = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    limit = _data_bytes() + BASE_BYTES + BYTES_A_PIXEL * max_pixels
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    threads = min(_MAX_THREADS, os.cpu_count() or 1)
+    video = cv2.VideoCapture(file, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, threads])
+    if not video.isOpened():
+        return
+    out = sys.stdout.buffer
+    out.write(_START.pack(video.get(cv2.CAP_PROP_FPS)))
+    width, height = (round(video.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    if width * height > max_pixels:  # known before a frame is decoded
+        out.write(_FRAME.pack(0, width, height))
+        return
+    index = 0
+    while video.grab():
+        if index % every == 0:
+            found, image = video.retrieve()
+            if found:
+                height, width = image.shape[:2]
+                out.write(_FRAME.pack(index, width, height) + image.tobytes())
+        index += 1
+
+
+def _data_bytes() -> int:
+    """What RLIMIT_DATA counts, of this process just now."""
+    with open("/proc/self/status") as file:
+        return next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmData"))
