@@ -19,14 +19,21 @@ import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_image_file
+from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.durable import sync_folder
-from splatnode.capture.process.printable import LONGEST_NAME, is_printable, marked_name
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import LONGEST_NAME, is_printable, marked_name, printable
 
 log = logging.getLogger(__name__)
 
 INDEX = "splatnode-frames.jsonl"
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+MAX_INDEX_BYTES = 500_000_000  # a million frames and more
 _SYNC_EVERY = 30  # frames; a power cut costs at most these
+
+
+class RecordingError(ValueError):
+    """A folder that is no recording; the message names the file and the line."""
 
 
 class _Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="frame"):
@@ -154,18 +161,17 @@ def is_recording(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Recording:
-    """Raises ValueError where the index is damaged other than at its end, where a recorder may have been killed."""
+    """Raises RecordingError where the index is damaged other than at its end, where a recorder may have been killed."""
     lines: list[_Line | _DroppedLine] = []
-    content = (folder / INDEX).read_bytes()
+    content = read_bounded(folder / INDEX, MAX_INDEX_BYTES, RecordingError, str(folder / INDEX))
     whole, _, _unfinished = content.rpartition(b"\n")
     for number, text in enumerate(whole.splitlines(), start=1):
-        try:
+        where = f"{folder / INDEX}, line {number}"
+        with foreign(RecordingError, where):
             line = msgspec.json.decode(text, type=_Line | _DroppedLine)
-        except msgspec.DecodeError as error:
-            raise ValueError(f"{folder / INDEX}, line {number}: {error}") from error
-        if isinstance(line, _Line) and Path(line.file).name != line.file:
-            raise ValueError(f"{folder / INDEX}, line {number}: {line.file!r} is not a file of this folder")
+        if isinstance(line, _Line) and (Path(line.file).name != line.file or not is_printable(line.file, LONGEST_NAME)):
+            raise RecordingError(f"{where}: {printable(line.file, LONGEST_NAME)!r} is not a file of this folder")
         lines.append(msgspec.structs.replace(line, name=_shown(line.name)))
     if not lines:
-        raise ValueError(f"the recording {str(folder)!r} is empty")
+        raise RecordingError(f"the recording {str(folder)!r} is empty")
     return Recording(folder, tuple(lines))

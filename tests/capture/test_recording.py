@@ -12,7 +12,9 @@ import pytest
 from splatnode.capture import recording
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.recording import INDEX, Recorder
+from splatnode.capture.image_file import encode_png
+from splatnode.capture.recording import INDEX, Recorder, RecordingError
+from tests.support.crafted import recordings
 
 LENS = Intrinsics(16, 12, 20.5, 20.25, 8.0, 6.1, "calibration", (0.1, -0.02, 0.001, 0.0, 1e-17))
 RNG = np.random.default_rng(0)
@@ -128,3 +130,16 @@ def test_a_full_disk_leaves_what_was_recorded(tmp_path, monkeypatch):
                 recorder.write(second)
     assert seen(folder.stream(folder.Config(tmp_path / "walk"))) == seen([first])
     assert len(list((tmp_path / "walk").iterdir())) == 2
+
+
+@pytest.mark.parametrize("crafted", list(recordings()), ids=lambda crafted: crafted.name)
+def test_a_crafted_index_is_named_or_its_frames_are_left_out(tmp_path, crafted):
+    (tmp_path / INDEX).write_bytes(crafted.data)
+    (tmp_path / "a.png").write_bytes(encode_png(np.zeros((4, 4, 3), np.uint8)))
+    try:
+        items = list(recording.read(tmp_path).frames())
+    except RecordingError as error:
+        assert INDEX in str(error) or "is empty" in str(error)
+        assert len(str(error)) < 2000
+    else:
+        assert [type(item) for item in items] == [DroppedFrame]

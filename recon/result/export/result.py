@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
+import msgspec
+
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import is_printable
 from splatnode.recon.result.export.cameras import encode_cameras
+from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.export.formats.tum import encode_tum
+from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.prepare import viewer_safe
 from splatnode.recon.result.export.staged import json_bytes, write_files
 from splatnode.recon.result.snapshot import Snapshot
@@ -57,13 +63,20 @@ def _scene_files(snapshot: Snapshot, preview: bytes | None) -> dict[str, bytes]:
     }
 
 
+class _Entry(msgspec.Struct, frozen=True):
+    sha256: str
+
+
+class _Manifest(msgspec.Struct, frozen=True):
+    files: dict[str, _Entry]
+
+
 def _read_manifest(out_dir: Path) -> dict[str, str]:
     """sha256 by file of the result that is there; empty where there is none that can be read."""
-    try:
-        files = json.loads((out_dir / MANIFEST).read_bytes())["files"]
-        return {str(name): str(entry["sha256"]) for name, entry in files.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return {}
+    with contextlib.suppress(OSError, SceneFileError), foreign(SceneFileError):
+        manifest = msgspec.json.decode(read_json_file(out_dir / MANIFEST), type=_Manifest)
+        return {name: entry.sha256 for name, entry in manifest.files.items() if is_printable(name)}
+    return {}
 
 
 def _sha256(data: bytes) -> str:

@@ -177,3 +177,20 @@ def test_a_living_writers_files_and_a_pipe_of_such_a_name_are_left_alone(tmp_pat
         assert (tmp_path / ".scene.ply.ba9876543210.tmp").exists()
     write_file(tmp_path / "scene.ply", b"again")
     assert not (tmp_path / ".scene.ply.ba9876543210.tmp").exists()
+
+
+@pytest.mark.parametrize(
+    "manifest",
+    [
+        b'{"files":' + b"[" * 100_000,
+        b"[]",
+        b"\xff",
+        b'{"files": {"a\\u0000b": {"sha256": "x"}}}',
+        b'{"files": {"a": {}}}',
+    ],
+    ids=["deep", "list", "bytes", "null", "without"],
+)
+def test_a_crafted_manifest_keeps_no_result_from_being_written(tmp_path, manifest):
+    (tmp_path / "manifest.json").write_bytes(manifest)
+    written = json.loads(write(make_snapshot(), tmp_path).read_text())
+    assert "scene.ply" in written["files"]
