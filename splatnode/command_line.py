@@ -2,6 +2,7 @@
 
 Exit codes: 0 good; 2 usage or configuration; 65 the frames cannot be reconstructed (the verdict says why);
 69 camera or package unavailable; 70 internal; 73, 74 cannot write; 75 try again; 77 not allowed; 130 interrupted.
+A daemon that has been ready ends with none of 2 and 77: what fails then is no fault of its configuration.
 SIGTERM is a clean stop with 0; the second one ends the process at once.
 """
 

@@ -24,7 +24,7 @@ from splatnode.capture.messaging.wire import (
     WireError,
     decode,
     encode,
-    size_bytes,
+    plain_header,
 )
 from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
 
@@ -142,8 +142,4 @@ def received(key: Key, parts: list[zmq.Frame], limits: Limits) -> ReceivedFrame:
 
 def name_in(parts: list[Part]) -> str:
     """The name in a message that need not be a frame's; a question mark where it does not tell."""
-    try:
-        header = decode(parts, dict, Limits(total_bytes=size_bytes(parts), own=True)).header
-    except WireError:
-        return "?"
-    return printable(header.get("name", "?"), LONGEST_NAME) or "?"
+    return printable(plain_header(parts).get("name", "?"), LONGEST_NAME) or "?"

@@ -98,6 +98,15 @@ def size_bytes(parts: Sequence[Part]) -> int:
     return sum(memoryview(part).nbytes for part in parts)
 
 
+def plain_header(parts: Sequence[Part]) -> dict[str, Any]:
+    """What stands in the place of the header, of parts that need not be a message; empty where nothing does."""
+    try:
+        with foreign(WireError):
+            return _envelope(memoryview(parts[1]), dict[str, Any]).header
+    except WireError:
+        return {}
+
+
 def _decoded(parts: Sequence[Part | zmq.Frame], schema: Any, limits: Limits) -> Message[Any]:
     if len(parts) > limits.arrays + 2:
         raise WireError(f"too many parts: {len(parts)}, and {limits.arrays} arrays are allowed")
