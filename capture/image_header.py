@@ -104,16 +104,21 @@ _PNG_NEEDED = {b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"eXIf", b"IEND"}  # eXIf: th
 
 def _png_header(data: bytes) -> ImageHeader:
     """Chunks (PNG, third edition): IHDR comes first and once. Texts and profiles are left out: they are compressed."""
-    tiff, position, kept = b"", _PNG_START, [data[:_PNG_START]]
+    tiff, position, kept, has_pixels = b"", _PNG_START, [data[:_PNG_START]], False
     width, height = struct.unpack_from(">II", data, _PNG_START + 8)
     for part in range(_MAX_PARTS):
         length, kind = struct.unpack_from(">I4s", data, position)
         if (kind == b"IHDR") != (part == 0) or (part == 0 and length != 13):
             raise UnusableImage("damaged: a PNG must state its size once, at its beginning")
+        if position + 12 + length > len(data):
+            raise UnusableImage("truncated: the file ends early")
         if kind in _PNG_NEEDED and not (kind == b"eXIf" and tiff):
             kept.append(data[position : position + 12 + length])
         if kind == b"IEND":
+            if not has_pixels:
+                raise UnusableImage("damaged: a PNG without an image")
             return ImageHeader(width, height, tiff, decodable=b"".join(kept))
+        has_pixels = has_pixels or kind == b"IDAT"
         if kind == b"eXIf":
             tiff = tiff or data[position + 8 : position + 8 + length]
         position += 12 + length

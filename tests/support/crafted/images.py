@@ -74,6 +74,9 @@ def _pngs() -> Iterator[Crafted]:
     yield Crafted("more_pixels.png", png([small, bomb, end]), "100 MB of pixels for an image of 16 x 16")
     yield Crafted("more_data.png", png([small, pixels] + [(b"IDAT", b"")] * 100_000 + [end]), "100 000 empty chunks")
     yield Crafted("long_chunk.png", png([small])[:-4] + b"\xff\xff\xff\xffIDAT", "a chunk of 4 GB")
+    long_end = png([small, pixels]) + b"\xff\0\0\0IEND\xae\x42\x60\x82"
+    yield Crafted("long_end.png", long_end, "an end of 4 GB, which OpenCV reads for seconds")
+    yield Crafted("no_pixels.png", png([small, end]), "no pixels, which OpenCV looks for behind the end")
     yield Crafted("wide.png", png([_ihdr(2**31 - 1, 1), pixels, end]), "one row of 2^31 - 1 pixels")
     yield Crafted("palette.png", png([_ihdr(SIDE, SIDE, 8, 3), pixels, end]), "a palette image without its palette")
     yield Crafted("interlaced.png", png([_ihdr(HUGE, HUGE, 16, 6, 1), pixels, end]), "interlaced: decoded in one piece")
