@@ -288,6 +288,12 @@ def test_live():
     tried, good = sum(fault["tried"] for fault in faults), sum(fault["good"] for fault in faults)
     assert tried == good
     says(f"| {len(faults)} faults, from kill -9 to a wrong key, 20 times each | all {tried} trials ended")
+    for queue in (raw("queue")["two_ends"], raw("queue")["processes"]):
+        acknowledged, refused = queue["messages"] - queue["refused"], queue["refused"]
+        assert queue["acknowledged"] == acknowledged and queue["refused_and_named"] == refused and not queue["left"]
+        says(f"a queue of {queue['messages']} keyframes of which every third is refused")
+        says(f"the other {acknowledged} acknowledged, all {refused} named, nothing restarted | `queue.json` |")
+    assert set(raw("queue")["processes"]["exit_codes"].values()) == {0}
     fuzz = raw("fuzz")
     assert (
         fuzz["decoders"]["errors_other_than_refusal"] == fuzz["tcp_ports"]["messages_that_reached_the_application"] == 0
