@@ -7,7 +7,7 @@ import sys
 
 # Folder -> its benchmarks; its other files are parts of theirs.
 BENCHMARKS = {
-    "node": ("queue", "live", "faults", "writes", "soak", "fuzz", "capture"),
+    "node": ("queue", "live", "faults", "writes", "soak", "siege", "fuzz", "adversary", "guided", "capture"),
     "quality": ("poses", "windows", "fit", "priors", "parsimony", "budgets", "spz"),
     "speed": ("rasterize", "stereo"),
     "viewer": ("viewer", "drive", "beside"),

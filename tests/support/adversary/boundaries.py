@@ -1,0 +1,265 @@
+"""The table of boundaries: what is drawn for each, what reads it, and the only errors that may come of it."""
+
+from __future__ import annotations
+
+import random
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from splatnode.capture import recording
+from splatnode.capture.config import CaptureConfig
+from splatnode.capture.frame import Frame
+from splatnode.capture.image_file import UnusableImage, decode_image
+from splatnode.capture.messaging import keys
+from splatnode.capture.messaging.keyframe_messages import Acknowledge, DroppedHeader, FrameHeader, Ready, received
+from splatnode.capture.messaging.message_file import read_message
+from splatnode.capture.messaging.spool import Config as SpoolConfig
+from splatnode.capture.messaging.spool import Spool
+from splatnode.capture.messaging.state import Want
+from splatnode.capture.messaging.wire import Limits, WireError, decode
+from splatnode.capture.preview import PreviewHeader, decode_preview
+from splatnode.capture.process.config import ConfigError, load_config
+from splatnode.recon.daemon.checkpoint.store import CheckpointError, Ledger, Store
+from splatnode.recon.daemon.config import Config as ReconConfig
+from splatnode.recon.daemon.control import Answer, Retract
+from splatnode.recon.daemon.status import ReconStatus
+from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.result.export import read_cameras, read_gaussians
+from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.message import SceneHeader, from_message
+from splatnode.viewer.sources import load_result
+from tests.support.adversary import cameras, documents, images, messages, scenes, stored
+
+_LIMITS = Limits(header_bytes=1 << 16, arrays=64, total_bytes=1 << 20)
+_MAX_PIXELS = 4_000_000  # of the images that are drawn here: more than any honest one of them has
+
+
+@dataclass(frozen=True)
+class Reader:
+    """The errors by which modules refuse; any other is a defect. Good cases run most of the modules' lines."""
+
+    refusals: tuple[type[Exception], ...]
+    modules: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """What is drawn, what reads it, and the memory that reading may take beside the process itself."""
+
+    name: str
+    draw: Callable[[random.Random], Any]
+    read: Callable[[Any, Path], object]  # with an empty folder of its own
+    reader: Reader
+    bound_mb: float
+    share: float = 1.0  # of all cases
+
+
+def _of(schema: Any, table: Any = lambda rng, header: ()) -> Callable[[random.Random], Any]:
+    return lambda rng: messages.message(rng, schema, table)
+
+
+def _read_frame(parts: Any, folder: Path) -> object:
+    return received(decode(parts, FrameHeader | DroppedHeader, _LIMITS))
+
+
+def _read_scene(parts: Any, folder: Path) -> object:
+    from splatnode.viewer.sources import _safe
+
+    return _safe(from_message(decode(parts, SceneHeader, _LIMITS)).snapshot)
+
+
+def _decoding(schema: Any) -> Callable[[Any, Path], object]:
+    return lambda parts, folder: decode(parts, schema, _LIMITS)
+
+
+def _photograph(rng: random.Random, header: Any) -> list[messages.Row]:
+    return [messages.image_row(rng)] if isinstance(header, dict) and header.get("type") == "frame" else []
+
+
+def _preview(rng: random.Random, header: Any) -> list[messages.Row]:
+    kinds = (lambda _: images.sound(".jpg"), images.jpeg, images.image)
+    return [messages.bytes_row(rng.choice(kinds)(rng))]
+
+
+def _scene(rng: random.Random, header: Any) -> list[messages.Row]:
+    found = header.get("cameras") if isinstance(header, dict) else None
+    thumbnails = [_preview(rng, header)[0] for _ in found] if isinstance(found, list) and len(found) < 10 else []
+    return [*messages.gaussian_rows(rng), *thumbnails]
+
+
+def _reading(name: str, read: Callable[[Path], object]) -> Callable[[Any, Path], object]:
+    def reading(data: bytes, folder: Path) -> object:
+        path = folder / name
+        path.write_bytes(data)
+        return read(path)
+
+    return reading
+
+
+def _read_truth(files: dict[str, bytes], folder: Path) -> object:
+    (folder / "images").mkdir()
+    (folder / "images" / "view_0.png").write_bytes(images.sound(".png"))
+    place = folder / "sparse" / "0" if any(name.endswith((".txt", ".bin")) for name in files) else folder
+    stored.lay(dict(files), place)
+    scene = load_scene(folder)
+    return [scene.image(name) for name in scene.paths]
+
+
+def _draw_truth(rng: random.Random) -> dict[str, bytes]:
+    kind = rng.randrange(4)
+    if kind == 0:
+        return {"cameras.json": documents.json_file(rng, cameras.recorded(rng))}
+    if kind == 1:
+        return {"transforms.json": documents.json_file(rng, cameras.transforms(rng))}
+    return cameras.colmap_text(rng) if kind == 2 else cameras.colmap_binary(rng)
+
+
+def _draw_result(rng: random.Random) -> dict[str, bytes]:
+    return {
+        "scene.ply": scenes.ply(rng),
+        "cameras.json": documents.json_file(rng, scenes.cameras(rng)),
+        "report.json": documents.json_file(rng, scenes.report(rng)),
+    }
+
+
+def _read_result(files: dict[str, bytes], folder: Path) -> object:
+    stored.lay(dict(files), folder / "result")
+    return load_result(folder / "result")
+
+
+def _draw_spool(rng: random.Random) -> stored.Files:
+    frames = [stored.message_file(rng, _of(FrameHeader | DroppedHeader, _photograph)(rng)) for _ in range(2)]
+    return stored.state_folder(rng, frames)
+
+
+def _read_spool(files: stored.Files, folder: Path) -> object:
+    stored.lay(files, folder / "spool")
+    spool = Spool(SpoolConfig(folder))
+    try:
+        return [spool.get(key) for key in spool]
+    finally:
+        spool.close()
+
+
+def _draw_store(rng: random.Random) -> tuple[stored.Files, stored.Files]:
+    ledger = stored.message_file(rng, messages.message(rng, Ledger))
+    frame = stored.message_file(rng, _of(FrameHeader, _photograph)(rng))
+    return stored.state_folder(rng, [frame, ledger]), stored.state_folder(rng, [frame])
+
+
+def _read_store(files: tuple[stored.Files, stored.Files], folder: Path) -> object:
+    stored.lay(files[0], folder / "state")
+    stored.lay(files[1], folder / "state" / "frames")
+    store = Store(folder / "state")
+    try:
+        return list(store.frames()), store.load("scene", Ledger)
+    finally:
+        store.close()
+
+
+def _read_keys(files: stored.Files, folder: Path) -> object:
+    stored.lay(files, folder / "keys")
+    return keys.read_keys(folder / "keys")
+
+
+def _read_recording(files: stored.Files, folder: Path) -> object:
+    stored.lay(files, folder / "recorded")
+    return [item.name for item in recording.read(folder / "recorded").frames((), _MAX_PIXELS)]
+
+
+def _read_photograph(data: bytes, folder: Path) -> object:
+    image, lens = decode_image(data, _MAX_PIXELS)
+    return Frame(0, "a.png", 0, image, lens)
+
+
+_CAPTURE = {"camera": {"kind": "folder", "folder": "photos"}, "spool": {"max_mb": 5}, "reader": {"silence_s": 1.0}}
+_RECON = {"network": {"first_port": 5000}, "checkpoint": "state", "reconstruction": {"seed": 1, "max_gaussians": 9}}
+_MESSAGING, _EXPORT = "splatnode.capture.messaging", "splatnode.recon.result.export"
+_WIRE = Reader((WireError,), (f"{_MESSAGING}.wire", f"{_MESSAGING}.keyframe_messages"))
+_PREVIEWS = Reader((WireError,), ("splatnode.capture.preview", f"{_MESSAGING}.jpeg"))
+_SCENES = Reader((WireError,), ("splatnode.recon.result.message",))
+_IMAGES = Reader((UnusableImage,), ("splatnode.capture.image_file", "splatnode.capture.exif"))
+_CAMERAS = Reader((SceneFileError,), (f"{_EXPORT}.cameras",))
+_RESULTS = Reader((ValueError, FileNotFoundError), ("splatnode.viewer.sources",))
+_TRUTH = Reader((ValueError, FileNotFoundError), ("splatnode.recon.evaluate.truth",))
+_RECORDINGS = Reader((ValueError,), ("splatnode.capture.recording",))
+_YAML = Reader((ConfigError,), ("splatnode.capture.process.config",))
+_STORED = Reader((ValueError,), (f"{_MESSAGING}.message_file",))
+_SPOOL = Reader((), (f"{_MESSAGING}.spool",))
+_CHECKPOINT = Reader((CheckpointError,), ("splatnode.recon.daemon.checkpoint.store",))
+_KEYS = Reader((keys.KeyFileError,), (f"{_MESSAGING}.keys",))
+
+
+def _formats(name: str) -> Reader:
+    return Reader((SceneFileError,), (f"{_EXPORT}.formats.{name}",))
+
+
+def _document(tree: Callable[[random.Random], Any]) -> Callable[[random.Random], bytes]:
+    return lambda rng: documents.json_file(rng, tree(rng))
+
+
+def _settings(tree: Any) -> Callable[[random.Random], bytes]:
+    return lambda rng: documents.yaml_file(rng, tree)
+
+
+def _capture_config(path: Path) -> object:
+    return load_config(path, CaptureConfig)
+
+
+def _recon_config(path: Path) -> object:
+    return load_config(path, ReconConfig)
+
+
+def _draw_stored(rng: random.Random) -> bytes:
+    return stored.message_file(rng, [b"a", b"bc"])
+
+
+def _read_preview(parts: Any, folder: Path) -> object:
+    return decode_preview(decode(parts, PreviewHeader, _LIMITS))
+
+
+_MESSAGES = (
+    Boundary("keyframes", _of(FrameHeader | DroppedHeader, _photograph), _read_frame, _WIRE, 10, 6),
+    Boundary("keyframe requests", _of(Ready | Acknowledge), _decoding(Ready | Acknowledge), _WIRE, 10, 4),
+    Boundary("previews", _of(PreviewHeader, _preview), _read_preview, _PREVIEWS, 200, 1),
+    Boundary("scenes", _of(SceneHeader, _scene), _read_scene, _SCENES, 50, 3),
+    Boundary("heartbeats", _of(ReconStatus), _decoding(ReconStatus), _WIRE, 10, 2),
+    Boundary("commands", _of(Retract | Answer), _decoding(Retract | Answer), _WIRE, 10, 2),
+    Boundary("states", _of(Want), _decoding(Want), _WIRE, 10, 2),
+)
+_FILES = (
+    Boundary("photographs", images.image, _read_photograph, _IMAGES, 100, 3),
+    Boundary("scene.ply", scenes.ply, _reading("scene.ply", read_gaussians), _formats("ply"), 20, 0.7),
+    Boundary("scene.spz", scenes.spz, _reading("scene.spz", read_gaussians), _formats("spz"), 20, 0.7),
+    Boundary("scene.splat", scenes.splat, _reading("scene.splat", read_gaussians), _formats("splat"), 20, 0.5),
+    Boundary("cameras.json", _document(scenes.cameras), _reading("cameras.json", read_cameras), _CAMERAS, 20),
+    Boundary("results", _draw_result, _read_result, _RESULTS, 50, 0.5),
+    Boundary("true cameras", _draw_truth, _read_truth, _TRUTH, 50, 0.5),
+    Boundary("recordings", stored.recording, _read_recording, _RECORDINGS, 100, 0.5),
+)
+_CONFIGURATIONS = (
+    Boundary("capture.yaml", _settings(_CAPTURE), _reading("capture.yaml", _capture_config), _YAML, 50, 0.4),
+    Boundary("recon.yaml", _settings(_RECON), _reading("recon.yaml", _recon_config), _YAML, 50, 0.4),
+)
+_STATE = (
+    Boundary("messages on disk", _draw_stored, _reading("ledger", read_message), _STORED, 10, 1),
+    Boundary("spool", _draw_spool, _read_spool, _SPOOL, 20, 0.3),
+    Boundary("checkpoint", _draw_store, _read_store, _CHECKPOINT, 20, 0.3),
+    Boundary("keys", stored.keys, _read_keys, _KEYS, 10, 0.5),
+)
+BOUNDARIES = (*_MESSAGES, *_FILES, *_CONFIGURATIONS, *_STATE)
+
+
+def attempt(boundary: Boundary, case: Any, folder: Path) -> str:
+    """ "read" or "refused". Raises whatever else the boundary raised: a defect."""
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    try:
+        boundary.read(case, folder)
+        return "read"
+    except boundary.reader.refusals:
+        return "refused"
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
