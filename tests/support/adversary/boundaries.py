@@ -188,8 +188,8 @@ _TRUTH = Reader((ValueError, FileNotFoundError), ("splatnode.recon.evaluate.trut
 _RECORDINGS = Reader((ValueError,), ("splatnode.capture.recording",))
 _YAML = Reader((ConfigError,), ("splatnode.capture.process.config",))
 _STORED = Reader((ValueError,), (f"{_MESSAGING}.message_file",))
-_SPOOL = Reader((), (f"{_MESSAGING}.spool",))
-_CHECKPOINT = Reader((CheckpointError,), ("splatnode.recon.daemon.checkpoint.store",))
+_SPOOL = Reader((IsADirectoryError,), (f"{_MESSAGING}.spool",))
+_CHECKPOINT = Reader((CheckpointError, IsADirectoryError), ("splatnode.recon.daemon.checkpoint.store",))
 _KEYS = Reader((keys.KeyFileError,), (f"{_MESSAGING}.keys",))
 
 
