@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
 import shutil
 from collections.abc import Callable
@@ -14,18 +15,28 @@ from splatnode.capture.config import CaptureConfig
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import UnusableImage, decode_image
 from splatnode.capture.messaging import keys
-from splatnode.capture.messaging.keyframe_messages import Acknowledge, DroppedHeader, FrameHeader, Ready, received
+from splatnode.capture.messaging.commands import Answer
+from splatnode.capture.messaging.keyframe_messages import (
+    Delivery,
+    DroppedHeader,
+    FrameHeader,
+    Request,
+    Served,
+    received,
+)
 from splatnode.capture.messaging.message_file import read_message
 from splatnode.capture.messaging.spool import Config as SpoolConfig
-from splatnode.capture.messaging.spool import Spool
+from splatnode.capture.messaging.spool import Key, Spool
 from splatnode.capture.messaging.state import Want
 from splatnode.capture.messaging.wire import Limits, WireError, decode
 from splatnode.capture.preview import PreviewHeader, decode_preview
 from splatnode.capture.process.config import ConfigError, load_config
+from splatnode.capture.status import CaptureStatus, Heartbeat
 from splatnode.recon.daemon.checkpoint.store import CheckpointError, Ledger, Store
 from splatnode.recon.daemon.config import Config as ReconConfig
-from splatnode.recon.daemon.control import Answer, Retract
+from splatnode.recon.daemon.control import Command
 from splatnode.recon.daemon.status import ReconStatus
+from splatnode.recon.evaluate.json_file import EvaluationFileError
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.export.error import SceneFileError
@@ -61,8 +72,16 @@ def _of(schema: Any, table: Any = lambda rng, header: ()) -> Callable[[random.Ra
     return lambda rng: messages.message(rng, schema, table)
 
 
-def _read_frame(parts: Any, folder: Path) -> object:
-    return received(decode(parts, FrameHeader | DroppedHeader, _LIMITS))
+def _draw_frame(rng: random.Random) -> tuple[messages.Parts, messages.Parts]:
+    return messages.message(rng, Delivery), messages.message(rng, FrameHeader | DroppedHeader, _photograph)
+
+
+def _read_frame(case: Any, folder: Path) -> object:
+    delivery = decode(case[0], Delivery, _LIMITS).header
+    message = decode(case[1], FrameHeader | DroppedHeader, _LIMITS).header
+    with contextlib.suppress(WireError):  # it is of another frame
+        received(Key(delivery.session, delivery.sequence), case[1], _LIMITS)
+    return received(Key(message.session, message.sequence), case[1], _LIMITS)
 
 
 def _read_scene(parts: Any, folder: Path) -> object:
@@ -178,15 +197,18 @@ def _read_photograph(data: bytes, folder: Path) -> object:
 _CAPTURE = {"camera": {"kind": "folder", "folder": "photos"}, "spool": {"max_mb": 5}, "reader": {"silence_s": 1.0}}
 _RECON = {"network": {"first_port": 5000}, "checkpoint": "state", "reconstruction": {"seed": 1, "max_gaussians": 9}}
 _MESSAGING, _EXPORT = "splatnode.capture.messaging", "splatnode.recon.result.export"
+_TRUE, _CAPTURE_ROOM = "splatnode.recon.evaluate", "splatnode.capture"
 _WIRE = Reader((WireError,), (f"{_MESSAGING}.wire", f"{_MESSAGING}.keyframe_messages"))
 _PREVIEWS = Reader((WireError,), ("splatnode.capture.preview", f"{_MESSAGING}.jpeg"))
 _SCENES = Reader((WireError,), ("splatnode.recon.result.message",))
-_IMAGES = Reader((UnusableImage,), ("splatnode.capture.image_file", "splatnode.capture.exif"))
+_IMAGES = Reader(
+    (UnusableImage,), tuple(f"splatnode.capture.{name}" for name in ("image_file", "image_header", "exif"))
+)
 _CAMERAS = Reader((SceneFileError,), (f"{_EXPORT}.cameras",))
-_RESULTS = Reader((ValueError, FileNotFoundError), ("splatnode.viewer.sources",))
-_TRUTH = Reader((ValueError, FileNotFoundError), ("splatnode.recon.evaluate.truth",))
+_RESULTS = Reader((SceneFileError, FileNotFoundError), ("splatnode.viewer.sources",))
+_TRUTH = Reader((EvaluationFileError, SceneFileError, FileNotFoundError), (f"{_TRUE}.truth", f"{_TRUE}.true_cameras"))
 _RECORDINGS = Reader((ValueError,), ("splatnode.capture.recording",))
-_YAML = Reader((ConfigError,), ("splatnode.capture.process.config",))
+_YAML = Reader((ConfigError,), ("splatnode.capture.process.config", "splatnode.capture.process.config_text"))
 _STORED = Reader((ValueError,), (f"{_MESSAGING}.message_file",))
 _SPOOL = Reader((IsADirectoryError,), (f"{_MESSAGING}.spool",))
 _CHECKPOINT = Reader((CheckpointError, IsADirectoryError), ("splatnode.recon.daemon.checkpoint.store",))
@@ -222,12 +244,15 @@ def _read_preview(parts: Any, folder: Path) -> object:
 
 
 _MESSAGES = (
-    Boundary("keyframes", _of(FrameHeader | DroppedHeader, _photograph), _read_frame, _WIRE, 10, 6),
-    Boundary("keyframe requests", _of(Ready | Acknowledge), _decoding(Ready | Acknowledge), _WIRE, 10, 4),
+    Boundary("keyframes", _draw_frame, _read_frame, _WIRE, 10, 6),
+    Boundary("keyframe requests", _of(Request), _decoding(Request), _WIRE, 10, 4),
+    Boundary("keyframe answers", _of(Served), _decoding(Served), _WIRE, 10, 1),
     Boundary("previews", _of(PreviewHeader, _preview), _read_preview, _PREVIEWS, 200, 1),
     Boundary("scenes", _of(SceneHeader, _scene), _read_scene, _SCENES, 50, 3),
-    Boundary("heartbeats", _of(ReconStatus), _decoding(ReconStatus), _WIRE, 10, 2),
-    Boundary("commands", _of(Retract | Answer), _decoding(Retract | Answer), _WIRE, 10, 2),
+    Boundary("recon's heartbeats", _of(ReconStatus), _decoding(ReconStatus), _WIRE, 10, 2),
+    Boundary("capture's heartbeats", _of(CaptureStatus), _decoding(CaptureStatus), _WIRE, 10, 1),
+    Boundary("any heartbeats", _of(CaptureStatus), _decoding(Heartbeat), _WIRE, 10, 1),
+    Boundary("commands", _of(Command | Answer), _decoding(Command | Answer), _WIRE, 10, 2),
     Boundary("states", _of(Want), _decoding(Want), _WIRE, 10, 2),
 )
 _FILES = (
