@@ -211,9 +211,9 @@ def _photographs(cameras: tuple[CameraEstimate, ...], folders: list[Path]) -> di
     for camera in cameras:
         for folder in folders:
             path = folder / camera.name
-            if not path.is_file():
-                continue
             try:
+                if not path.is_file():
+                    continue
                 found[camera.name] = _small(decode_image(read_image_file(path))[0])
             except (UnusableImage, OSError) as error:
                 log.warning("%s is shown without its photograph: %s", camera.name, error)

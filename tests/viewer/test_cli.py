@@ -73,6 +73,14 @@ def test_photographs_are_found_where_the_report_says_that_they_were(result, tmp_
     assert list(load_result(result).snapshot.images) == ["0.png"]
 
 
+def test_a_folder_that_cannot_be_costs_the_photographs_and_not_the_scene(result):
+    (result / "images").rename(result / "elsewhere")
+    report = json.loads((result / "report.json").read_text())
+    (result / "report.json").write_text(json.dumps(report | {"photographs": "y" * 300}))
+    there = load_result(result).snapshot
+    assert len(there.cameras) == 2 and not there.images
+
+
 def test_a_refused_result_says_why(tmp_path):
     refused = snapshot(REFUSAL)
     write_result(refused, tmp_path, build_report(refused, seed=0, preset="fast", peak_rss_mb=None))

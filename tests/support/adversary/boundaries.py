@@ -198,7 +198,8 @@ _CAPTURE = {"camera": {"kind": "folder", "folder": "photos"}, "spool": {"max_mb"
 _RECON = {"network": {"first_port": 5000}, "checkpoint": "state", "reconstruction": {"seed": 1, "max_gaussians": 9}}
 _MESSAGING, _EXPORT = "splatnode.capture.messaging", "splatnode.recon.result.export"
 _TRUE, _CAPTURE_ROOM = "splatnode.recon.evaluate", "splatnode.capture"
-_WIRE = Reader((WireError,), (f"{_MESSAGING}.wire", f"{_MESSAGING}.keyframe_messages"))
+_WIRE = Reader((WireError,), (f"{_MESSAGING}.wire", f"{_MESSAGING}.values"))
+_FRAMES = Reader((WireError,), (*_WIRE.modules, f"{_MESSAGING}.keyframe_messages"))
 _PREVIEWS = Reader((WireError,), ("splatnode.capture.preview", f"{_MESSAGING}.jpeg"))
 _SCENES = Reader((WireError,), ("splatnode.recon.result.message",))
 _IMAGES = Reader(
@@ -244,7 +245,7 @@ def _read_preview(parts: Any, folder: Path) -> object:
 
 
 _MESSAGES = (
-    Boundary("keyframes", _draw_frame, _read_frame, _WIRE, 10, 6),
+    Boundary("keyframes", _draw_frame, _read_frame, _FRAMES, 10, 6),
     Boundary("keyframe requests", _of(Request), _decoding(Request), _WIRE, 10, 4),
     Boundary("keyframe answers", _of(Served), _decoding(Served), _WIRE, 10, 1),
     Boundary("previews", _of(PreviewHeader, _preview), _read_preview, _PREVIEWS, 200, 1),
