@@ -1,4 +1,4 @@
-"""Every boundary reads what an adversary draws for it, or refuses it with its own error. hypothesis chooses, and shrinks.
+"""Every boundary reads what an adversary draws for it, or refuses it with its own error; hypothesis chooses, too.
 
 The bench does the same millions of times and watches the memory and the disk: `python -m tests.bench adversary`.
 """

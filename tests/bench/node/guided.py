@@ -39,7 +39,7 @@ def main() -> None:
     parser.add_argument("boundary")
     parser.add_argument("--seconds", type=int, default=60)
     args = parser.parse_args()
-    import atheris
+    import atheris  # pyright: ignore[reportMissingImports]
 
     with atheris.instrument_imports(include=["splatnode"]):  # pyright: ignore[reportAttributeAccessIssue]
         from tests.support.adversary.boundaries import BOUNDARIES, attempt
