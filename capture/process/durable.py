@@ -11,6 +11,8 @@ from pathlib import Path
 
 from splatnode.capture.process.private import create_own
 
+_BUFFER = 1 << 20  # bytes: the many small arrays of a message are one call each else
+
 
 def write_whole(path: Path, content: Iterable[bytes | memoryview]) -> None:
     """Writes `path` under a temporary name, through to the disk, then renames it. Raises OSError, nothing left.
@@ -19,7 +21,7 @@ def write_whole(path: Path, content: Iterable[bytes | memoryview]) -> None:
     """
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex[:8]}.tmp")
     try:
-        with open(create_own(temporary), "wb") as file:
+        with open(create_own(temporary), "wb", buffering=_BUFFER) as file:
             file.writelines(content)
             file.flush()
             os.fsync(file.fileno())

@@ -15,9 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatnode.command_line import exit_code
-from tests.support.disk_faults import NOWHERE, Point, arm, points, struck
+from tests.support.disk_faults import KINDS, NOWHERE, Point, arm, points, struck
 
 Tell = Callable[[str], None]
+PATIENCE_S = 300  # for one run
 FULL, KILLED = 74, -signal.SIGKILL
 
 
@@ -27,6 +28,7 @@ class Piece:
     prepare: Callable[[Path], None]
     work: Callable[[Path, Tell], None]
     after: Callable[[Path, list[str]], None]  # with what was told
+    kinds: tuple[str, ...] = KINDS
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ def points_of(piece: Piece) -> list[Point]:
 def outcomes(piece: Piece, found: list[Point]) -> Iterator[tuple[Point, str, str]]:
     """Each point and kind of fault, with what was wrong afterwards; empty where all was well."""
     for point in found:
-        for kind in point.kinds:
+        for kind in filter(point.kinds.__contains__, piece.kinds):
             with _place() as place:
                 yield point, kind, _wrong(piece, Path(place).resolve(), point, kind)
 
@@ -101,10 +103,24 @@ def _run(piece: Piece, place: Path, point: Point, kind: str) -> Ended:
     )
 
 
+def in_a_fork(work: Callable[[], None]) -> None:
+    """Does `work` undisturbed in a process of its own. Raises AssertionError where it does not end with 0."""
+    with tempfile.NamedTemporaryFile() as error:
+        child = os.fork()
+        if child == 0:
+            os._exit(_code_of(work, Path(error.name)))
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        if code:
+            raise AssertionError(f"the next start ended with {code}: {Path(error.name).read_text()}")
+
+
 def _code_of(work: Callable[[], None], where: Path) -> int:
     """As the command line ends with what `work` raises."""
+    signal.alarm(PATIENCE_S)
     try:
         work()
+    except SystemExit as error:
+        return error.code if isinstance(error.code, int) else 1
     except BaseException as error:
         where.write_text(traceback.format_exc(limit=-6))
         return exit_code(error)

@@ -46,9 +46,10 @@ def measured(only: list[str] | None) -> dict[str, dict[str, Any]]:
     """A row for each piece: its points, the runs, how many were good, and what was wrong with the others."""
     from tests.bench.node.interrupted import outcomes, points_of
     from tests.bench.node.pieces import PIECES
+    from tests.bench.node.whole_runs import RUNS
 
     rows = {}
-    for piece in PIECES:
+    for piece in (*PIECES, *RUNS):
         if only and piece.name not in only:
             continue
         started = time.monotonic()
