@@ -23,6 +23,7 @@ import splatnode.capture.verbs
 import splatnode.recon.verbs
 import splatnode.viewer.verbs
 from splatnode.capture.process.logs import use_plain_lines
+from splatnode.capture.process.memory import SHORT_OF_MEMORY, is_shortage
 from splatnode.capture.process.printable import printable, printable_lines
 from splatnode.capture.process.stop_signals import on_first
 from splatnode.capture.process.terminal import shown_as_text
@@ -104,6 +105,8 @@ def exit_code(error: BaseException) -> int:
         return 130
     if (own := getattr(error, "exit_code", None)) is not None:
         return own
+    if is_shortage(error):
+        return 75
     if isinstance(error, OSError):
         return _os_exit_code(error)
     if isinstance(error, ModuleNotFoundError):
@@ -119,6 +122,8 @@ def explain(error: BaseException, code: int) -> str:
 def _explained(error: BaseException, code: int) -> str:
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
+    if is_shortage(error):
+        return f"{SHORT_OF_MEMORY} ({type(error).__name__})"
     if isinstance(error, OSError) and error.strerror:
         return error.strerror if error.filename is None else f"{error.strerror}: {_file(error.filename)}"
     if isinstance(error, ModuleNotFoundError):

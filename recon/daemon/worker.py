@@ -12,6 +12,7 @@ from functools import partial
 import msgspec
 
 from splatnode.capture.process.logs import event
+from splatnode.capture.process.memory import SHORT_OF_MEMORY, is_shortage
 from splatnode.recon.daemon import membership
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
@@ -32,6 +33,8 @@ STEP = 10  # iterations between looks at the inbox
 IDLE_S = 0.5  # between looks at whether to stop
 PATIENCE_S = 3.0  # that a thorough judgement of a keyframe that does not fit may keep others waiting
 MOST_ASIDE = 8  # keyframes that may still find their place
+FIRST_WAIT_S, LONGEST_WAIT_S = 5.0, 300.0  # after a step for which the memory did not suffice; doubled each time
+TRIED_AGAIN = f"{SHORT_OF_MEMORY}. What failed is tried again"
 
 
 class _Abandoned(Exception):
@@ -54,6 +57,8 @@ class Worker:
         self._stopping = stopping
         self._work = IncrementalReconstruction(self._recipe)
         self._settled = True  # nothing can be made better before the next keyframe
+        self._owed: list[Arrived] = []  # keyframes that a step that failed did not work in
+        self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory; monotonic
         self.state = State.WAITING
         self.problem = ""
         self.keyframe_s: float | None = None
@@ -61,34 +66,53 @@ class Worker:
         self.moved_s = time.monotonic()  # when the work last got on
 
     def run(self) -> None:
-        """Until the daemon stops; an export that has begun is finished."""
-        self._guarded(self._restore)
+        """Until the daemon stops; an export that has begun is finished. Raises MemoryError and the like."""
+        found = self._restored()
+        if found is not None:
+            self._guarded(lambda: self._go_on(found))
         while not self._stopping.is_set():
             self.moved_s = time.monotonic()
-            events = self._inbox.get(IDLE_S if self._settled else self._config.settle_s)
+            waiting = time.monotonic() < self._not_before_s
+            events = self._inbox.get(IDLE_S if self._settled or waiting else self._config.settle_s)
             arrived = [each for each in events if isinstance(each, Arrived)]
             left_out = [each.name for each in events if isinstance(each, LeftOut)]
             if arrived:
                 self._guarded(lambda arrived=arrived: self._take_in(arrived))
             elif left_out:
                 self._guarded(lambda left_out=left_out: self._leave_out(left_out))
-            elif not self._settled:
-                self._guarded(self._settle)
+            elif not self._settled and not waiting:
+                self._guarded(lambda: self._take_in([]) if self._owed else self._settle())
 
     def _guarded(self, step: Callable[[], None]) -> None:
-        """A step that fails is told and not repeated: what comes next may succeed, and a node runs for weeks."""
+        """A step that fails is told, and repeated only where it was for want of memory: what comes next may succeed."""
         try:
             step()
+            if self._wait_s > FIRST_WAIT_S:
+                self.problem, self._wait_s = self.problem.removeprefix(TRIED_AGAIN), FIRST_WAIT_S
         except _Abandoned:
             pass
         except Exception as error:
             log.exception("a step of the reconstruction failed")
-            self.problem = f"{type(error).__name__}: {error}"
-            self._settled = True
+            short = is_shortage(error)
+            self.problem = TRIED_AGAIN if short else f"{type(error).__name__}: {error}"
+            self._settled = not short
+            if short:
+                self._not_before_s = time.monotonic() + self._wait_s
+                self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
 
-    def _restore(self) -> None:
+    def _restored(self) -> checkpoint.Restored | None:
+        """What an earlier process knew. Raises MemoryError and the like: the next start may have memory enough."""
+        try:
+            return checkpoint.restore(self._store, self._recipe)
+        except Exception as error:
+            if is_shortage(error):
+                raise
+            log.exception("the checkpoint cannot be restored")
+            self.problem = f"the checkpoint cannot be restored: {error}"
+            return None
+
+    def _go_on(self, found: checkpoint.Restored) -> None:
         """Goes on where an earlier process was."""
-        found = checkpoint.restore(self._store, self._recipe)
         self._work = found.work
         self._settled = found.final or not found.keyframes
         if not found.keyframes:
@@ -104,14 +128,23 @@ class Worker:
         """Keyframes that have come, shown together."""
         self.state, self.problem = State.GROWING, ""
         self._settled, self.finished = False, None
+        arrived = self._owed = self._with_those_before(arrived)
         self._make_room(len(arrived))
         keyframes = self._screened([each.keyframe for each in arrived])
         strangers = self._added(keyframes)
+        self._owed = []
         if not strangers or len(strangers) < len(keyframes):
             self._show_grown(arrived)
         if strangers and self._receive(strangers):
             self._show_grown(arrived)
         self.state = State.LOST if self._strangers() else State.GROWING
+
+    def _with_those_before(self, arrived: Sequence[Arrived]) -> list[Arrived]:
+        """Also those keyframes that a step that failed left out, and that nobody has removed since."""
+        there = {*self._work.names, *(keyframe.name for keyframe in self._work.aside)}
+        owed = [each for each in self._owed if each.keyframe.name in self._store.names - there]
+        self._work.retract([each.keyframe.name for each in owed])  # they were screened, and are screened again
+        return [*owed, *arrived]
 
     def _show_grown(self, arrived: Sequence[Arrived]) -> None:
         """The scene with the keyframes that have come to belong to it."""
@@ -144,6 +177,8 @@ class Worker:
         except _Abandoned:
             raise
         except Exception as error:  # one bad frame must not keep others out
+            if is_shortage(error):
+                raise
             self._work.retract([keyframe.name for keyframe in keyframes])
             if len(keyframes) > 1:
                 return set().union(*(self._added([keyframe]) for keyframe in keyframes))

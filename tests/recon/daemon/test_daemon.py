@@ -25,11 +25,12 @@ from splatnode.capture.process.folders import LOCK
 from splatnode.capture.status import heartbeats
 from splatnode.recon.config import PREVIEW
 from splatnode.recon.config import Config as Reconstruction
-from splatnode.recon.daemon import membership
+from splatnode.recon.daemon import membership, worker
 from splatnode.recon.daemon.config import Config
 from splatnode.recon.daemon.control import Answer, Retract
 from splatnode.recon.daemon.daemon import Daemon
 from splatnode.recon.daemon.tracking import Config as Tracking
+from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.optimize import refinement
 from splatnode.recon.result.bounds_in_words import of_cameras
 from splatnode.recon.result.export import read_cameras
@@ -285,3 +286,28 @@ def test_a_keyframe_that_cannot_be_worked_in_keeps_no_other_out(config, peer, mo
         assert [(each.name, "for the test" in each.reason) for each in scene.snapshot.dropped] == [
             (frames[1].name, True)
         ]
+
+
+@pytest.mark.parametrize(
+    ("where", "step"),
+    [(membership, "add"), (IncrementalReconstruction, "update"), (IncrementalReconstruction, "rebuild")],
+)
+def test_a_step_for_which_the_memory_did_not_suffice_costs_no_keyframe(config, peer, monkeypatch, where, step):
+    real, failures = (
+        getattr(where, step),
+        iter([MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")]),
+    )
+
+    def short_of_memory(*args):
+        done = real(*args)
+        if (error := next(failures, None)) is not None:
+            raise error
+        return done
+
+    monkeypatch.setattr(where, step, short_of_memory)
+    monkeypatch.setattr(worker, "FIRST_WAIT_S", 0.1)
+    for frame in photographs()[:3]:
+        peer.server.offer(frame)
+    with running(config):
+        scene = peer.wait(finished(3), "all three")
+        assert not scene.snapshot.dropped and next(failures, None) is None
