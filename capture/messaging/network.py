@@ -12,7 +12,6 @@ import contextlib
 import errno
 import logging
 import os
-import resource
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,6 +24,7 @@ from zmq.utils.monitor import recv_monitor_message
 from splatnode.capture.messaging import wire
 from splatnode.capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
 from splatnode.capture.messaging.services import Service
+from splatnode.capture.process.limits import make_sure_of_room, raise_file_limit
 from splatnode.capture.process.lock import Held, exclusive
 from splatnode.capture.process.printable import printable
 from splatnode.capture.process.private import NotPrivate, private_folder
@@ -39,6 +39,7 @@ _MAX_FAILED_HANDSHAKES = 5  # in a row; one may fail because the other process w
 _RECONNECT_MS, _MAX_RECONNECT_MS = 100, 1000  # pause before connecting again, doubled up to the second
 _HANDSHAKE_MS = 5000  # a connection whose handshake takes longer is closed
 _HEARTBEAT_MS, _HEARTBEAT_TIMEOUT_MS = 1000, 4000  # over tcp: a dead link is noticed, on both ends
+_FILES, _THREADS = 32, 3  # of which an endpoint has need: two threads of libzmq, one that knows whom to let in
 _LONGEST_IPC_PATH = 107  # sun_path, see unix(7)
 
 
@@ -78,7 +79,7 @@ class Endpoint:
     """
 
     def __init__(self, network: Network, offers: Service | None = None) -> None:
-        """Raises AlreadyRunning, NetworkError, KeyFileError."""
+        """Raises AlreadyRunning, NetworkError, KeyFileError, Limited."""
         self.network = network
         self.refused = 0  # messages that could not be taken
         self.why_refused = ""  # the last of them
@@ -87,8 +88,9 @@ class Endpoint:
             self._keys = _curve_keys(network)
             self._links: list[_Link] = []
             if offers is not None:
-                _raise_file_limit()
+                raise_file_limit()
                 self._lock(offers)
+            make_sure_of_room(_FILES, _THREADS)
             self._context = zmq.Context()
             self._resources.callback(self._context.term)
             if offers is not None and self._keys is not None:
@@ -198,16 +200,6 @@ class _Link:
             self._failures = 0 if event == zmq.EVENT_HANDSHAKE_SUCCEEDED else self._failures + 1
         if self._failures >= _MAX_FAILED_HANDSHAKES:
             raise NotAllowed(f"{self._address} does not have the key that server.key in network.keys expects of it")
-
-
-def _raise_file_limit() -> None:
-    """Lets the process have as many open files as the system allows it.
-
-    Every connection takes one, even that of a client that is refused, until its handshake fails. Without one left,
-    no file can be written and libzmq aborts the process.
-    """
-    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 def runtime_directory(network: Network) -> Path:

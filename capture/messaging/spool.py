@@ -8,7 +8,6 @@ it.
 from __future__ import annotations
 
 import contextlib
-import errno
 import logging
 import re
 from collections.abc import Iterator, Sequence
@@ -40,7 +39,7 @@ _FILE = re.compile(r"[0-9]{12,18}-[0-9a-f]{32}-[0-9]{1,18}\.frame")  # number, s
 
 
 class SpoolFull(RuntimeError):
-    """The spool has reached its bound, or the disk is full: no keyframe can be added until one is acknowledged."""
+    """No keyframe can be added now: the spool has reached its bound, or the disk does not take it."""
 
 
 class Key(NamedTuple):
@@ -93,16 +92,14 @@ class Spool:
         return shortage(self.directory, further_bytes, "further keyframes (spool.max_mb)")
 
     def put(self, key: Key, parts: Sequence[Part]) -> None:
-        """Returns when the message is on the disk. Raises SpoolFull; OSError where the disk fails otherwise."""
+        """Returns when the message is on the disk. Raises SpoolFull."""
         size = size_in_file(parts)
         self._make_sure_of_room(size)
         path = self.directory / f"{self._number:012d}-{key.session}-{key.sequence}.frame"
         try:
             write_message(path, parts)
-        except OSError as error:
-            if error.errno in (errno.ENOSPC, errno.EDQUOT):
-                raise SpoolFull(f"no space left for keyframes in {self.directory}: {error.strerror}") from error
-            raise
+        except OSError as error:  # full, read-only, failing: it may be so for a while, and the camera goes on
+            raise SpoolFull(f"keyframes cannot be kept in {self.directory}: {error.strerror}") from error
         self._files[key], self._bytes[key] = path, size
         self._number += 1
 

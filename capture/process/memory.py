@@ -15,7 +15,7 @@ _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 _LARGEST = 64 << 20  # bytes; larger arrays come from the kernel and go back to it. A frame of 20 megapixels is smaller
 
 
-SHORT_OF_MEMORY = "the memory that this process may have does not suffice: end other processes, or raise its limit"
+SHORT_OF_MEMORY = "the memory or the threads that this process may have do not suffice: end others, or raise its limits"
 # PyTorch and OpenCV have no exception of their own for it.
 _OF_LIBRARIES = re.compile(
     r"can't allocate memory|not enough memory|Insufficient memory|Failed to allocate|bad_alloc|can't start new thread",

@@ -51,7 +51,7 @@ class Output:
             measured = in_metres(snapshot, recipe.metric)
             finish(measured, folder, seed=recipe.seed, preset_name="live")
         except OSError as error:
-            self._complain(str(error))
+            self._complain(error.strerror or str(error))
             return False
         known = bounds_in_words.of_cameras(measured.cameras, measured.scale)
         event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians), bounds=known)

@@ -28,6 +28,7 @@ static char target[NAME];       /* the point's name */
 static int occurrence;          /* which call of that name, from 1 */
 static enum kind kind;
 static char room[PATH_MAX];     /* once this file is there, the disk is full no longer */
+static char frozen[PATH_MAX];   /* as long as this file is there, the disk is read-only */
 static int list = -1;           /* what the points are written to, one a line */
 static atomic_int seen, is_full;
 
@@ -55,6 +56,7 @@ void disk_faults_arm(const char *folders, const char *at, int number, const char
 __attribute__((constructor)) static void from_environment(void) {
     const char *folders = getenv("DISK_FAULTS_UNDER"), *at = getenv("DISK_FAULTS_AT"), *n = getenv("DISK_FAULTS_NUMBER");
     const char *how = getenv("DISK_FAULTS_KIND"), *to = getenv("DISK_FAULTS_LIST"), *until = getenv("DISK_FAULTS_ROOM");
+    if (getenv("DISK_FAULTS_READ_ONLY")) snprintf(frozen, sizeof frozen, "%s", getenv("DISK_FAULTS_READ_ONLY"));
     if (folders) disk_faults_arm(folders, at ? at : "", n ? atoi(n) : 0, how ? how : "", to ? to : "", until ? until : "");
 }
 
@@ -100,12 +102,17 @@ static int watched(const char *call, int folder, const char *path, char *name) {
     return 0;
 }
 
+static int is_there(const char *path) {
+    return *path && !syscall(SYS_faccessat, AT_FDCWD, path, F_OK);
+}
+
 /* 0 where the call may be made; else the error that it fails with. Where `half`, half of it is to be done before. */
 static int fault(const char *call, int folder, const char *path, int needs_space, int *half) {
     char name[2 * NAME + 16];
     if (half) *half = 0;
     if (!under[0][0] || !watched(call, folder, path, name)) return 0;
-    int full = atomic_load(&is_full) && needs_space && !(room[0] && !syscall(SYS_faccessat, AT_FDCWD, room, F_OK));
+    if (is_there(frozen)) return EROFS;
+    int full = atomic_load(&is_full) && needs_space && !is_there(room);
     int strikes = kind != NONE && !strcmp(name, target) && atomic_fetch_add(&seen, 1) + 1 == occurrence;
     if (list >= 0) {
         char line[2 * NAME + 32];

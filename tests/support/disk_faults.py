@@ -42,12 +42,12 @@ class Point:
 NOWHERE = Point("", 0)
 
 
-def compiled(folder: Path) -> Path:
+def compiled(folder: Path, source: Path = SOURCE) -> Path:
     """The library to preload, made in `folder`."""
     compiler = find_compiler()  # the one that makes the core
     assert compiler is not None
-    library = folder / "disk_faults.so"
-    subprocess.run([*compiler, "-x", "c", "-shared", "-fPIC", "-O1", "-o", library, SOURCE, "-ldl"], check=True)
+    library = folder / f"{source.stem}.so"
+    subprocess.run([*compiler, "-x", "c", "-shared", "-fPIC", "-O1", "-o", library, source, "-ldl"], check=True)
     return library
 
 
@@ -58,8 +58,12 @@ def environment(
     kind: str = "",
     listing: Path | str = "",
     room: Path | str = "",
+    read_only: Path | str = "",
 ) -> dict[str, str]:
-    """For a process whose disk is to fail; `room`: once this file is there, a full disk is full no longer."""
+    """For a process whose disk is to fail; `room`: once this file is there, a full disk is full no longer.
+
+    `read_only`: as long as this file is there, the disk is read-only.
+    """
     return {
         "LD_PRELOAD": str(library),
         "DISK_FAULTS_UNDER": ":".join(str(folder.resolve()) for folder in under),
@@ -68,6 +72,7 @@ def environment(
         "DISK_FAULTS_KIND": kind,
         "DISK_FAULTS_LIST": str(listing),
         "DISK_FAULTS_ROOM": str(room),
+        "DISK_FAULTS_READ_ONLY": str(read_only),
     }
 
 

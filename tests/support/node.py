@@ -54,18 +54,28 @@ class Node:
             (folder / f"{verb}.yaml").write_text(yaml.safe_dump(config))
         self.processes: dict[str, subprocess.Popen] = {}
 
-    def start(self, verb: str, *, name: str | None = None, before: Sequence[str] = ()) -> subprocess.Popen:
-        """Starts the process of `verb`; `name` tells it from another one, `before` is put before its command."""
-        environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_WAIT_POLICY": "passive"}
-        with open(self.folder / f"{verb}.log", "ab") as log:
+    def start(self, verb: str, *, name: str | None = None, before: Sequence[str] = (), **more: str) -> subprocess.Popen:
+        """Starts the process of `verb`; `name` tells it from another one, `before` is put before its command.
+
+        `more`: environment variables.
+        """
+        return self.run(name or verb, [*before, *self.command(verb)], **more)
+
+    def command(self, verb: str, *arguments: str) -> list[str]:
+        return [sys.executable, "-m", "splatnode", verb, *(arguments or (str(self.folder / f"{verb}.yaml"),))]
+
+    def run(self, name: str, command: Sequence[str], **more: str) -> subprocess.Popen:
+        """Starts any process as one of this node."""
+        environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_WAIT_POLICY": "passive"} | more
+        with open(self.folder / f"{name.split()[-1]}.log", "ab") as log:
             process = subprocess.Popen(
-                [*before, sys.executable, "-m", "splatnode", verb, str(self.folder / f"{verb}.yaml")],
+                command,
                 cwd=self.folder,
                 env=environment,
                 stdout=log,
                 stderr=log,
             )
-        self.processes[name or verb] = process
+        self.processes[name] = process
         return process
 
     def end(self, name: str, number: int = signal.SIGTERM, patience_s: float = 120.0) -> int:
@@ -80,7 +90,17 @@ class Node:
 
     def spooled(self) -> int:
         """Keyframes that capture still keeps."""
-        return len(list((self.folder / "spool").glob("*.frame")))
+        return len(list(Path(self.configs["capture"]["spool"]["directory"], "spool").glob("*.frame")))
+
+    @property
+    def out(self) -> Path:
+        return Path(self.configs["recon"]["out"])
+
+    @property
+    def half_written(self) -> list[Path]:
+        """Temporary files in all folders that the node writes."""
+        folders = {self.folder, self.out, *self.folder.parent.glob("disk")}
+        return [path for folder in folders for path in folder.rglob(".*") if path.suffix in (".tmp", ".renaming")]
 
     def close(self) -> None:
         for process in self.processes.values():

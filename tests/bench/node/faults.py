@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from tests.bench.node import befallen, intruders
+from tests.bench.node import befallen, intruders, pauses, shortages
 from tests.bench.node.trial import NotTried, Trial
 
 FAULTS: tuple[Callable[[Trial], None], ...] = (
@@ -35,6 +35,22 @@ FAULTS: tuple[Callable[[Trial], None], ...] = (
     befallen.stopped_while_exporting,
     intruders.unauthorised,
     intruders.wrong_key,
+    intruders.revoked_key,
+    intruders.rotated_keys,
+    shortages.full_disk_under_checkpoint,
+    shortages.full_disk_under_out,
+    shortages.read_only_at_start,
+    shortages.read_only_while_running,
+    pauses.clocks_jump,
+    pauses.wall_clock_jumps,
+    pauses.recon_stopped_for_a_minute,
+    pauses.capture_stopped_for_a_minute,
+    pauses.viewer_stopped_for_a_minute,
+    shortages.little_memory,
+    shortages.killed_for_memory,
+    shortages.few_descriptors,
+    shortages.few_threads,
+    pauses.recon_absent_for_an_hour,
 )
 
 
@@ -42,6 +58,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=20, help="trials of each fault (default: 20)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--pause", type=float, default=60.0, help="seconds for which a process is stopped")
     parser.add_argument("--only", nargs="*", choices=[fault.__name__ for fault in FAULTS], help="these faults")
     parser.add_argument("--out", type=Path, default=Path("tests/bench/results/faults.json"))
     args = parser.parse_args()
@@ -53,7 +70,7 @@ def main() -> None:
             row = rows.setdefault(fault.__name__, {"tried": 0, "good": 0, "failures": [], "seconds": []})
             started = time.monotonic()
             with tempfile.TemporaryDirectory() as folder:
-                trial = Trial(Path(folder), random.Random(f"{args.seed} {fault.__name__} {index}"))
+                trial = Trial(Path(folder), random.Random(f"{args.seed} {fault.__name__} {index}"), args.pause)
                 try:
                     fault(trial)
                 except NotTried as reason:

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from splatnode.capture.messaging.keys import create_keys, expect_server
+from splatnode.capture.messaging.keys import allow, create_keys, expect_server
 from splatnode.capture.messaging.network import Network, NotAllowed
 from splatnode.capture.messaging.services import RECON_SCENE
 from splatnode.capture.messaging.state import StateClient
@@ -56,6 +56,79 @@ def wrong_key(trial: Trial) -> None:
             expect(node.spooled() > 0, "a keyframe was given to it")
             expect(other.end("recon") == 0, "recon with the wrong key did not end cleanly")
         node.start("recon")
+
+
+def revoked_key(trial: Trial) -> None:
+    """A key that is taken back: who is connected stays so until it connects anew, and is then told what to do."""
+    network, stranger = _over_tcp(trial)
+    allow(Path(network["keys"]), "stranger", (stranger / "public.key").read_bytes())
+    theirs = typed(network | {"keys": str(stranger)}, Network)
+    with running(trial.node(network=network)) as node:
+        node.start("recon")
+        node.start("capture")
+        connected = StateClient(RECON_SCENE, theirs, SceneHeader)
+        wait_for(lambda: connected.poll(0.2) is not None, "scene for who is allowed")
+        (Path(network["keys"]) / "allowed" / "stranger.key").unlink()
+        expect("does not let this machine in. Run there: splatnode keys" in _refusal(theirs), "no word to the revoked")
+        node.end("recon")
+        node.start("recon")
+        wait_for(lambda: _is_refused(connected), "refusal of who was connected", 30)
+        connected.close()
+        expect("is not in" in node.log("recon"), "the log does not tell who was refused")
+        expect_whole(node)
+
+
+def rotated_keys(trial: Trial) -> None:
+    """The robot gets new keys: who expects the old ones is told so, and with the new ones it goes on."""
+    network, other = _over_tcp(trial)
+    own = Path(network["keys"])
+    allow(own, "other", (other / "public.key").read_bytes())
+    theirs = typed(network | {"keys": str(other)}, Network)
+    with running(trial.node(network=network)) as node:
+        node.start("capture")
+        node.start("recon")
+        wait_for(lambda: "event=ready" in node.log("recon"), "recon that runs")
+        for name in ("secret.key", "public.key", "server.key"):
+            (own / name).unlink()
+        new = create_keys(own)
+        for verb in ("recon", "capture"):
+            node.end(verb)
+            node.start(verb)
+        expect("does not have the key that server.key" in _refusal(theirs), "no word of the new key")
+        expect_server(other, new)
+        client = StateClient(RECON_SCENE, theirs, SceneHeader)
+        wait_for(lambda: client.poll(0.2) is not None, "scene with the new key")
+        client.close()
+        (other / "secret.key").unlink()  # and the client gets new keys
+        own_of_client = create_keys(other)
+        expect("does not let this machine in" in _refusal(theirs), "no word of the client's new key")
+        allow(own, "other", own_of_client)
+        client = StateClient(RECON_SCENE, theirs, SceneHeader)
+        wait_for(lambda: client.poll(0.2) is not None, "scene with the client's new key")
+        client.close()
+        expect_whole(node)
+
+
+def _refusal(network: Network) -> str:
+    """What a client of the scene is told that is not let in."""
+    client = StateClient(RECON_SCENE, network, SceneHeader)
+    deadline = time.monotonic() + 30
+    try:
+        while time.monotonic() < deadline:
+            expect(client.poll(0.5) is None, "who is not allowed heard the scene")
+    except NotAllowed as error:
+        return str(error)
+    finally:
+        client.close()
+    return "nothing within 30 s"
+
+
+def _is_refused(client: StateClient) -> bool:
+    try:
+        client.poll(0.2)
+    except NotAllowed:
+        return True
+    return False
 
 
 def _over_tcp(trial: Trial) -> tuple[dict[str, Any], Path]:

@@ -37,17 +37,27 @@ class NotTried(Exception):
 class Trial:
     """A node that replays the photographs, and what is expected of it in the end."""
 
-    def __init__(self, folder: Path, chance: random.Random) -> None:
-        self.folder, self.chance = folder, chance
+    def __init__(self, folder: Path, chance: random.Random, pause_s: float = 60.0) -> None:
+        """`pause_s`: how long a process is stopped that is stopped."""
+        self.folder, self.chance, self.pause_s = folder, chance, pause_s
         self.images = folder / "images"
         self.images.mkdir(parents=True)
         for frame in photographs():
             cv2.imwrite(str(self.images / frame.name), cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR))
 
-    def node(self, camera: dict[str, Any] | None = None, network: dict[str, Any] | None = None, **recon: Any) -> Node:
+    def node(
+        self,
+        camera: dict[str, Any] | None = None,
+        network: dict[str, Any] | None = None,
+        *,
+        name: str = "node",
+        spool: dict[str, Any] | None = None,
+        **recon: Any,
+    ) -> Node:
         replayed = {"kind": "folder", "folder": str(self.images), "frames_per_second": 4.0, "pace": "recorded"}
-        config = {"camera": camera or replayed, "selection": {"every_frame": True}}
-        return Node(self.folder / "node", config, RECON | recon, network)
+        config: dict[str, Any] = {"camera": camera or replayed, "selection": {"every_frame": True}}
+        config["spool"] = {"directory": str(self.folder / name)} | (spool or {})
+        return Node(self.folder / name, config, RECON | recon, network)
 
     def some_time(self, most_s: float) -> None:
         time.sleep(self.chance.uniform(0, most_s))
@@ -70,9 +80,9 @@ def expect_whole(node: Node, views: int = VIEWS) -> None:
     expect_scene(node, views)
     wait_for(lambda: node.spooled() == 0, "acknowledgement of all keyframes", 30)
     expect(node.end("recon") == 0, "recon did not end with 0")
-    expect(any((node.folder / "out").glob("*/manifest.json")), "there is no result")
+    expect(any(node.out.glob("*/manifest.json")), "there is no result")
     expect_exports_whole(node)
-    expect(not list(node.folder.rglob(".*.tmp")), f"half-written files: {list(node.folder.rglob('.*.tmp'))}")
+    expect(not node.half_written, f"half-written files: {node.half_written}")
 
 
 def expect_scene(node: Node, views: int = VIEWS) -> None:
@@ -86,7 +96,7 @@ def expect_scene(node: Node, views: int = VIEWS) -> None:
 
 
 def expect_exports_whole(node: Node) -> None:
-    for manifest in (node.folder / "out").glob("*/manifest.json"):
+    for manifest in node.out.glob("*/manifest.json"):
         for name, entry in json.loads(manifest.read_text())["files"].items():
             content = (manifest.parent / name).read_bytes()
             expect(hashlib.sha256(content).hexdigest() == entry["sha256"], f"{name} is not what the manifest says")
