@@ -61,6 +61,7 @@ class Spool:
         self._resources.enter_context(exclusive(self.directory / "lock"))
         self._files: dict[Key, Path] = {}  # oldest first
         self._bytes: dict[Key, int] = {}
+        self._acknowledged: list[Path] = []  # that are still to be removed
         self.quarantine = quarantine.Quarantine(self.directory.with_name("quarantine"), config.quarantine)
         remove_leftovers(self.directory)
         found = own_files(self.directory, _FILE, ".frame")
@@ -102,6 +103,7 @@ class Spool:
             raise SpoolFull(f"keyframes cannot be kept in {self.directory}: {error.strerror}") from error
         self._files[key], self._bytes[key] = path, size
         self._number += 1
+        self._remove_acknowledged()
 
     def get(self, key: Key) -> list[Part]:
         """The parts as they were put in. Raises OSError or ValueError where the disk has lost them."""
@@ -112,15 +114,23 @@ class Spool:
         path = self._files.pop(key, None)
         self._bytes.pop(key, None)
         if path is not None:
-            try:
-                path.unlink(missing_ok=True)
-            except OSError as error:  # after a restart it is sent and acknowledged once more
-                log.error("an acknowledged keyframe cannot be removed: %s", error)
+            self._acknowledged.append(path)
+            self._remove_acknowledged()
 
     def set_aside(self, key: Key, name: str, reason: str) -> None:
         """Moves the message that carries the frame `name` to the quarantine: it is not delivered any more."""
         self._bytes.pop(key)
         self.quarantine.take(self._files.pop(key), name, reason)
+
+    def _remove_acknowledged(self) -> None:
+        """What the disk does not let go of now is removed later; after a restart it is sent and acknowledged again."""
+        while self._acknowledged:
+            try:
+                self._acknowledged[-1].unlink(missing_ok=True)
+            except OSError as error:
+                log.debug("an acknowledged keyframe cannot be removed: %s", error)
+                return
+            self._acknowledged.pop()
 
     def _make_sure_of_room(self, size: int) -> None:
         if len(self) >= self.config.max_frames or self.size_bytes + size > self.config.max_mb << 20:

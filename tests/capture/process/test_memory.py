@@ -5,8 +5,12 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import cv2
+import numpy as np
 import pytest
+import torch
 
+from splatnode.capture.process.memory import is_shortage
 from tests.conftest import ROOT
 
 FAULTS = """
@@ -34,3 +38,19 @@ def test_frames_of_720p_cost_no_page_faults():
         for kept in ("kept", "given back")
     }
     assert per_frame["kept"] < 20 < per_frame["given back"]
+
+
+@pytest.mark.parametrize(
+    "greedy",
+    [
+        lambda: bytes(1 << 62),
+        lambda: np.zeros(1 << 59),
+        lambda: torch.zeros(1 << 45),
+        lambda: cv2.resize(np.zeros((9, 9), np.uint8), ((1 << 30), (1 << 15))),
+    ],
+)
+def test_no_memory_is_told_from_other_errors_whoever_asked_for_it(greedy):
+    with pytest.raises(Exception) as caught:
+        greedy()
+    assert is_shortage(caught.value), caught.value
+    assert not is_shortage(RuntimeError("mat1 and mat2 shapes cannot be multiplied"))
