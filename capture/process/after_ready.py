@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
+from splatnode.capture.process.memory import is_shortage
 from splatnode.capture.process.service_manager import ServiceManager
 
 _HELPED_BY_A_START = (69, 75)  # exit codes: the camera is not there, another process is still ending
@@ -25,6 +26,7 @@ def after_ready(manager: ServiceManager) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if not manager.is_ready or getattr(error, "exit_code", None) in _HELPED_BY_A_START:
+        helped = is_shortage(error) or getattr(error, "exit_code", None) in _HELPED_BY_A_START
+        if not manager.is_ready or helped:
             raise
         raise Failed(f"{type(error).__name__}: {error}") from error

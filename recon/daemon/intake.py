@@ -12,10 +12,12 @@ import time
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.keyframes import KeyframeClient
 from splatnode.capture.messaging.network import Network, NotAllowed
+from splatnode.capture.process.memory import SHORT_OF_MEMORY, is_shortage
 from splatnode.capture.process.problems import Problems, is_said
 from splatnode.recon.config import Config
 from splatnode.recon.daemon.checkpoint.store import Store, StoredFrame
 from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
+from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.pipeline import prepare
 
 log = logging.getLogger(__name__)
@@ -77,6 +79,9 @@ class Intake:
                 client.say_ready()
                 continue
             except Exception as error:
+                if is_shortage(error):
+                    self._wait_for_memory(client, received.frame.name)
+                    continue
                 client.refuse(received.key, f"it cannot be stored: {type(error).__name__}: {error}")
                 return
             self.full = ""
@@ -91,14 +96,34 @@ class Intake:
         self.newest = stored.number
         name = stored.frame.name
         try:
-            keyframe = prepare(stored.frame, self._config)
+            keyframe = self._prepared(client, stored)
         except Exception as error:  # a frame that cannot be used must not stop those that can
+            if is_shortage(error):  # the daemon stops: the next start prepares it
+                return
             if is_said(self._problems.add("keyframes that cannot be used", f"{name}: {error}")):
                 log.exception("%s cannot be used", name)
             self._forget(name, f"cannot be used: {error}")
             self._inbox.put(LeftOut(name), self._stopping, client.say_ready)
             return
         self._inbox.put(Arrived(keyframe, arrived_s), self._stopping, client.say_ready)
+
+    def _prepared(self, client: KeyframeClient, stored: StoredFrame) -> Keyframe:
+        """Waits where the memory does not suffice; while the daemon stops, that is raised."""
+        while True:
+            try:
+                keyframe = prepare(stored.frame, self._config)
+            except Exception as error:
+                if not is_shortage(error) or self._stopping.is_set():
+                    raise
+                self._wait_for_memory(client, stored.frame.name)
+            else:
+                self.full = ""
+                return keyframe
+
+    def _wait_for_memory(self, client: KeyframeClient, name: str) -> None:
+        self._say_full(f"{name} has to wait: {SHORT_OF_MEMORY}")
+        self._stopping.wait(RETRY_S)
+        client.say_ready()
 
     def _forget(self, name: str, reason: str) -> None:
         try:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from splatnode.capture.frame import Frame
+from splatnode.capture.process.memory import is_shortage
 from splatnode.recon.config import Config
 from splatnode.recon.daemon.checkpoint import saved, saved_estimate
 from splatnode.recon.daemon.checkpoint.store import Store
@@ -41,11 +43,16 @@ def save(store: Store, work: IncrementalReconstruction, final: bool) -> None:
 
 
 def restore(store: Store, config: Config) -> Restored:
-    """The reconstruction that the checkpoint holds. A frame that cannot be used is left out of it for good."""
+    """The reconstruction that the checkpoint holds. A frame that cannot be used is left out of it for good.
+
+    Raises MemoryError and the like: what there is no memory for now is no fault of the files.
+    """
     frames = [stored.frame for stored in store.frames()]
     try:
         return _restored(store, frames, config)
     except Exception as error:  # whatever the files of another version, or of a faulty disk, make fail
+        if is_shortage(error):
+            raise
         log.warning("the checkpoint's scene is made anew: %s: %s", type(error).__name__, error)
         keyframes = _prepared(store, frames, config, {})
         return Restored(IncrementalReconstruction(config), len(keyframes), list(keyframes.values()), final=False)
@@ -60,8 +67,11 @@ def _prepared(
         try:
             keyframes[frame.name] = prepare(frame, config, known.get(frame.name))
         except Exception as error:
+            if is_shortage(error):
+                raise
             log.error("%s cannot be used: %s", frame.name, error)
-            store.forget(frame.name, f"cannot be used: {error}")
+            with contextlib.suppress(OSError):  # the next start finds it again
+                store.forget(frame.name, f"cannot be used: {error}")
     return keyframes
 
 

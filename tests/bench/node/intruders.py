@@ -56,6 +56,7 @@ def wrong_key(trial: Trial) -> None:
             expect(node.spooled() > 0, "a keyframe was given to it")
             expect(other.end("recon") == 0, "recon with the wrong key did not end cleanly")
         node.start("recon")
+        expect_whole(node)
 
 
 def revoked_key(trial: Trial) -> None:

@@ -131,13 +131,27 @@ def test_what_cannot_be_stored_is_refused_and_told_until_seen(tmp_path, monkeypa
 
 
 def test_what_cannot_be_used_is_left_out_also_where_the_checkpoint_cannot_be_changed(tmp_path, monkeypatch):
-    monkeypatch.setattr(intake, "prepare", lambda *_: _raise(MemoryError("for the test")))
+    monkeypatch.setattr(intake, "prepare", lambda *_: _raise(ArithmeticError("for the test")))
     with taking(ipc(tmp_path), tmp_path) as node:
         monkeypatch.setattr(node.store, "forget", lambda *_: _raise(OSError(30, "Read-only file system")))
         for index in range(3):
             node.server.offer(frame(index))
         assert node.events(3) == [LeftOut(f"{index}.png") for index in range(3)]
         assert "3 keyframes that cannot be used, the last: 2.png: for the test" in str(node.problems)
+
+
+def test_what_there_is_no_memory_for_waits_until_there_is(tmp_path, monkeypatch, plain, impatient):
+    with taking(ipc(tmp_path), tmp_path) as node:
+        for module, what in ((node.store, "put"), (intake, "prepare")):
+            real, failures = getattr(module, what), [MemoryError(), RuntimeError("can't allocate memory")]
+
+            def short(*args, real=real, failures=failures):
+                return _raise(failures.pop()) if failures else real(*args)
+
+            monkeypatch.setattr(module, what, short)
+        node.server.offer(frame(0))
+        (arrived,) = node.events(1)
+        assert arrived.keyframe.name == "0.png" and node.intake.full == "" and node.server.set_aside == 0
 
 
 def test_two_frames_of_one_name_and_names_that_look_like_ours(tmp_path, plain):
@@ -224,12 +238,24 @@ def test_a_stored_frame_that_cannot_be_used_costs_no_other(tmp_path, monkeypatch
     monkeypatch.setattr(
         checkpoint,
         "prepare",
-        lambda each, *rest: _raise(MemoryError()) if each.name == "1.png" else prepare(each, *rest),
+        lambda each, *rest: _raise(ArithmeticError()) if each.name == "1.png" else prepare(each, *rest),
     )
     store = Store(tmp_path / "checkpoint")
     restored = checkpoint.restore(store, Reconstruction())
     assert [keyframe.name for keyframe in restored.new] == ["0.png", "2.png"]
     assert store.names == {"0.png", "2.png"} and store.dropped[0].name == "1.png"
+    store.close()
+
+
+def test_a_checkpoint_that_there_is_no_memory_for_is_left_as_it_is(tmp_path, monkeypatch):
+    store = Store(tmp_path / "checkpoint")
+    store.put(SimpleNamespace(session="0" * 32, sequence=0, frame=frame(0)))
+    store.close()
+    monkeypatch.setattr(checkpoint, "prepare", lambda *_: _raise(MemoryError()))
+    store = Store(tmp_path / "checkpoint")
+    with pytest.raises(MemoryError):
+        checkpoint.restore(store, Reconstruction())
+    assert store.names == {"0.png"} and not store.dropped
     store.close()
 
 
