@@ -23,7 +23,7 @@ import splatnode.capture.verbs
 import splatnode.recon.verbs
 import splatnode.viewer.verbs
 from splatnode.capture.process.logs import use_plain_lines
-from splatnode.capture.process.memory import SHORT_OF_MEMORY, is_shortage
+from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
 from splatnode.capture.process.printable import printable, printable_lines
 from splatnode.capture.process.stop_signals import on_first
 from splatnode.capture.process.terminal import shown_as_text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
-from splatnode.capture.process.memory import is_shortage
+from splatnode.capture.process.memory_shortage import is_shortage
 from splatnode.capture.process.service_manager import ServiceManager
 
 _HELPED_BY_A_START = (69, 75)  # exit codes: the camera is not there, another process is still ending

@@ -12,7 +12,7 @@ import time
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.keyframes import KeyframeClient
 from splatnode.capture.messaging.network import Network, NotAllowed
-from splatnode.capture.process.memory import SHORT_OF_MEMORY, is_shortage
+from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
 from splatnode.capture.process.problems import Problems, is_said
 from splatnode.recon.config import Config
 from splatnode.recon.daemon.checkpoint.store import Store, StoredFrame

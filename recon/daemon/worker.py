@@ -12,7 +12,7 @@ from functools import partial
 import msgspec
 
 from splatnode.capture.process.logs import event
-from splatnode.capture.process.memory import SHORT_OF_MEMORY, is_shortage
+from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
 from splatnode.recon.daemon import membership
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store

@@ -53,6 +53,7 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.capture.process.config_text",
         "splatnode.capture.process.foreign",
         "splatnode.capture.process.logs",
+        "splatnode.capture.process.memory_shortage",
         "splatnode.capture.process.printable",
         "splatnode.capture.process.stop_signals",
         "splatnode.capture.process.terminal",

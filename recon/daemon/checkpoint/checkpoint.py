@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from splatnode.capture.frame import Frame
-from splatnode.capture.process.memory import is_shortage
+from splatnode.capture.process.memory_shortage import is_shortage
 from splatnode.recon.config import Config
 from splatnode.recon.daemon.checkpoint import saved, saved_estimate
 from splatnode.recon.daemon.checkpoint.store import Store

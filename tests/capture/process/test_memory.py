@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from splatnode.capture.process.memory import is_shortage
+from splatnode.capture.process.memory_shortage import is_shortage
 from tests.conftest import ROOT
 
 FAULTS = """
