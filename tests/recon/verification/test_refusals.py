@@ -31,7 +31,8 @@ def calls_of_refuse() -> dict[str, list[set[str | None]]]:
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] == "refuse":
                 entry = ast.unparse(node.args[0]).split(".")[-1]
-                found[entry].append({keyword.arg for keyword in node.keywords})
+                if entry.isupper():  # an entry is a constant; keyframes are refused, too
+                    found[entry].append({keyword.arg for keyword in node.keywords})
     return found
 
 
