@@ -56,7 +56,7 @@ class Turns:
         """A recon asks for keyframes: whether it gets them."""
         known = self._connections.get(identity)
         if known is None and len(self._connections) >= MOST_CONNECTIONS:
-            return False
+            self.gone(min(self._connections.values(), key=self._worth).identity)
         asking = known or Connection(identity, request.recon, request.process, now_s)
         self._connections[identity] = asking
         asking.recon, asking.process, asking.heard_s = request.recon, request.process, now_s
@@ -87,6 +87,10 @@ class Turns:
         self._connections.pop(identity, None)
         if self.is_served(identity):
             self._served = None
+
+    def _worth(self, connection: Connection) -> tuple[bool, float]:
+        """The least goes where there are too many, so that nobody can keep others out by asking often."""
+        return self.is_served(connection.identity), connection.heard_s
 
     def _is_served(self, connection: Connection) -> bool:
         return self._served is not None and self._served.process == connection.process

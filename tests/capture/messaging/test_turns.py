@@ -41,14 +41,22 @@ def test_a_restarted_one_takes_over_at_once_and_its_predecessor_does_not_come_ba
     assert asked.ready(b"3", ready(A, "2" * 32), (), 0.3)  # the same process by a new connection
 
 
-def test_who_is_gone_makes_room_and_connections_are_bounded():
+def test_a_crowd_keeps_neither_the_one_that_is_served_out_nor_its_next_process():
     asked = Turns()
-    for index in range(MOST_CONNECTIONS):
-        asked.ready(b"%d" % index, ready(A, f"{index:032x}"), (), 0.0)
-    assert not asked.ready(b"further", ready(B, B), (), 100.0)
+    assert asked.ready(b"1", ready(A, "1" * 32), (), 0.0)
+    for index in range(3 * MOST_CONNECTIONS):
+        assert not asked.ready(b"crowd %d" % index, ready(B, f"{index:032x}"), (), 1.0 + index / 1000)
+    assert asked.waiting == MOST_CONNECTIONS - 1
+    assert asked.ready(b"1", ready(A, "1" * 32), (), 2.0)
+    assert asked.ready(b"2", ready(A, "2" * 32), (), 2.1)  # a restart in the crowd
+
+
+def test_who_is_gone_makes_room():
+    asked = Turns()
+    asked.ready(b"1", ready(A, A), (), 0.0)
     asked.forget_silent(100.0)
-    assert asked.served is None and asked.ready(b"further", ready(B, B), (), 100.0)
-    asked.gone(b"further")
+    assert asked.served is None and asked.ready(b"2", ready(B, B), (), 100.0)
+    asked.gone(b"2")
     assert asked.served is None
 
 
