@@ -163,7 +163,11 @@ def half_written(trial: Trial) -> None:
             if path.exists():
                 path.write_bytes(path.read_bytes()[: trial.chance.randrange(max(1, path.stat().st_size))])
         out.mkdir(parents=True, exist_ok=True)
-        for leftover in (checkpoint / ".scene.1.tmp", checkpoint / "frames" / ".9.1.tmp", out / ".scene.ply.1.tmp"):
+        for leftover in (
+            checkpoint / ".scene.1.tmp",
+            checkpoint / "frames" / ".9.1.tmp",
+            out / ".scene.ply.0123456789ab.tmp",
+        ):
             leftover.write_bytes(b"half")
         node.start("recon")
         expect_whole(node)

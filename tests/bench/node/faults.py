@@ -15,7 +15,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,11 +62,9 @@ def main() -> None:
     parser.add_argument("--only", nargs="*", choices=[fault.__name__ for fault in FAULTS], help="these faults")
     parser.add_argument("--out", type=Path, default=Path("tests/bench/results/faults.json"))
     args = parser.parse_args()
-    rows: dict[str, dict[str, Any]] = {}
+    command, rows = _so_far(args.out, args.only or ())
     for index in range(args.times):
-        for fault in FAULTS:
-            if args.only and fault.__name__ not in args.only:
-                continue
+        for fault in (each for each in FAULTS if not args.only or each.__name__ in args.only):
             row = rows.setdefault(fault.__name__, {"tried": 0, "good": 0, "failures": [], "seconds": []})
             started = time.monotonic()
             with tempfile.TemporaryDirectory() as folder:
@@ -84,6 +82,14 @@ def main() -> None:
             row["tried"] += 1
             row["seconds"].append(round(time.monotonic() - started, 1))
             print(f"{fault.__name__} {index}: {row['good']} of {row['tried']} good", flush=True)
-            command = shlex.join(["python", "-m", "tests.bench", "faults", *sys.argv[1:]])
             args.out.write_text(json.dumps({"command": command, "faults": rows}, indent=1) + "\n")
     sys.exit(any(row["good"] < row["tried"] for row in rows.values()))
+
+
+def _so_far(out: Path, only: Sequence[str]) -> tuple[str, dict[str, dict[str, Any]]]:
+    """The command, and the rows that it leaves alone: with --only the others stay."""
+    command = shlex.join(["python", "-m", "tests.bench", "faults", *sys.argv[1:]])
+    if not only or not out.exists():
+        return command, {}
+    before = json.loads(out.read_text())
+    return f"{before['command']}; {command}", {name: row for name, row in before["faults"].items() if name not in only}
