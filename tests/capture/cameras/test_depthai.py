@@ -16,7 +16,7 @@ import pytest
 
 from splatnode.capture.cameras import depthai as oak
 from splatnode.capture.cameras.depthai import Config, find, read, stream, to_frame
-from splatnode.capture.frame import Intrinsics
+from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.unavailable import CameraUnavailable
 from tests.conftest import ROOT
 
@@ -116,13 +116,20 @@ def use(monkeypatch, fake):
     return fake
 
 
+def framed(message, frame_id: int) -> Frame:
+    """The frame of a message that is one."""
+    frame = to_frame(message, frame_id)
+    assert isinstance(frame, Frame)
+    return frame
+
+
 def test_a_frame_has_its_own_calibration():
-    frame = to_frame(message(7, distortion=(0.1, -0.2, 0, 0, 0.05)), 3)
+    frame = framed(message(7, distortion=(0.1, -0.2, 0, 0, 0.05)), 3)
     assert (frame.frame_id, frame.stamp_ns, frame.name) == (3, 100_000_000_007_000, "100000.000007")
     assert frame.image[0, 0].tolist() == [3, 2, 1]
     expected = Intrinsics(1280, 720, 800.0, 801.0, 640.0, 360.0, "calibration", (0.1, -0.2, 0, 0, 0.05))
     assert frame.intrinsics == expected
-    assert to_frame(message(distortion=(0.0,) * 14), 0).intrinsics.distortion == ()
+    assert framed(message(distortion=(0.0,) * 14), 0).intrinsics.distortion == ()
 
 
 @pytest.mark.parametrize(
@@ -130,7 +137,7 @@ def test_a_frame_has_its_own_calibration():
     [(np.eye(3).tolist(), (), PERSPECTIVE), ([], (), PERSPECTIVE), (LENS, (0.1, 0, 0, 0), "CameraModel.Fisheye")],
 )
 def test_what_is_no_pinhole_calibration_is_unknown(K, distortion, model):
-    assert to_frame(message(K=K, distortion=distortion, model=model), 0).intrinsics is None
+    assert framed(message(K=K, distortion=distortion, model=model), 0).intrinsics is None
 
 
 def test_without_a_camera_it_says_so_at_once(monkeypatch):
