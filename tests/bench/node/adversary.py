@@ -54,16 +54,19 @@ def main() -> None:
             each.name: pool.submit(attack, each, max(1, round(args.cases * each.share / whole)), args)
             for each in chosen
         }
-        rows = {name: told(name, job.result()) for name, job in jobs.items()}
-    result = {
-        "command": shlex.join(["python", "-m", "tests.bench", "adversary", *sys.argv[1:]]),
-        "cases": sum(row["cases"] for row in rows.values()),
-        "defects": sum(row["defects"] for row in rows.values()),
-        "seconds": time.monotonic() - started,
-        "boundaries": rows,
-    }
-    if args.out:
-        args.out.write_text(json.dumps(result, indent=1) + "\n")
+        rows: dict[str, dict[str, Any]] = {}
+        result: dict[str, Any] = {}
+        for name, job in jobs.items():
+            rows[name] = told(name, job.result())
+            result = {
+                "command": shlex.join(["python", "-m", "tests.bench", "adversary", *sys.argv[1:]]),
+                "cases": sum(row["cases"] for row in rows.values()),
+                "defects": sum(row["defects"] for row in rows.values()),
+                "seconds": time.monotonic() - started,
+                "boundaries": rows,
+            }
+            if args.out:
+                args.out.write_text(json.dumps(result, indent=1) + "\n")
     print(f"{result['cases']} cases, {result['defects']} defects, {result['seconds']:.0f} s")
     sys.exit(result["defects"] > 0)
 

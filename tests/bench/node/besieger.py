@@ -60,7 +60,7 @@ def over_ipc(rng: random.Random, network: Network) -> Iterator[None]:
             action = rng.random()
             service = rng.choice(REQUESTS)
             if action < 0.7:
-                draw = DRAWS[rng.choice(("keyframe requests", "commands", "states", "keyframes"))]
+                draw = DRAWS[rng.choice(("keyframe requests", "commands", "states", "recon's heartbeats"))]
                 parts = [sessions.put_into(part) for part in draw(rng)] or [b""]
                 with contextlib.suppress(zmq.Again):
                     links[service].send_multipart(parts, zmq.NOBLOCK)

@@ -126,6 +126,8 @@ class Watched:
                 besieger = self._besieger(phase) if kind == "hostile" else None
                 self._watch(previews, viewer, kind, self._args.phase_s)
                 if besieger is not None:
+                    if besieger.poll() is not None:
+                        raise AssertionError(f"the hostile client ended by itself, with {besieger.returncode}")
                     besieger.kill()
                     besieger.wait(10)
                 phase += 1
@@ -156,7 +158,7 @@ class Watched:
             str(self._args.per_second),
             str(seed),
         ]
-        return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL)
+        return subprocess.Popen(command, cwd=ROOT)
 
     def _watch(self, previews: Subscriber, viewer: Viewer, kind: str, seconds: float) -> None:
         started = time.monotonic()
