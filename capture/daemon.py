@@ -20,6 +20,7 @@ from splatnode.capture.messaging.spool import Spool, SpoolFull
 from splatnode.capture.messaging.wire import Numbering, WireError
 from splatnode.capture.preview import encode_preview
 from splatnode.capture.process.after_ready import after_ready
+from splatnode.capture.process.limits import make_sure_of_room, raise_file_limit
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.memory import keep_freed, resident_mb
 from splatnode.capture.process.printable import printable
@@ -33,6 +34,7 @@ log = logging.getLogger(__name__)
 
 POLL_S = 0.05  # longest wait for a frame, and so for the answer to a request that comes meanwhile
 SOUND_S = 1.0  # a recording that has not failed by then can be read
+_FILES, _THREADS = 96, 10  # of which the process has need: three endpoints, the camera's thread, those of libraries
 PREVIEW_JITTER = 0.1  # share of the time between previews by which a frame may come too early
 
 
@@ -44,6 +46,8 @@ def capture(config: CaptureConfig) -> None:
     """
     keep_freed()
     cv2.setNumThreads(1)  # small images: threads would cost more than they give, and the processor is recon's
+    raise_file_limit()
+    make_sure_of_room(_FILES, _THREADS)
     with ExitStack() as resources:
         manager = ServiceManager()
         server = resources.enter_context(KeyframeServer(config.network, Spool(config.spool)))

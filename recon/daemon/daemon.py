@@ -25,6 +25,7 @@ from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.process.after_ready import after_ready
 from splatnode.capture.process.config import load_config
+from splatnode.capture.process.limits import make_sure_of_room, raise_file_limit
 from splatnode.capture.process.logs import event, use_structured_lines
 from splatnode.capture.process.memory import resident_mb
 from splatnode.capture.process.printable import printable
@@ -51,6 +52,7 @@ from splatnode.recon.result.snapshot import CameraEstimate
 log = logging.getLogger(__name__)
 
 SERVE_S = 0.05  # between looks at what the threads have produced
+_FILES, _THREADS = 128, 20  # of which the daemon has need: five endpoints, its own threads, those that compute
 END_S = 20.0  # for the threads to end; an export takes seconds
 STUCK_S = (
     300.0  # without progress the worker counts as stuck; its longest step, verifying all views, takes tens of seconds
@@ -74,10 +76,12 @@ def recon(args: argparse.Namespace) -> int:
 
 class Daemon:
     def __init__(self, config: Config, stopping: threading.Event) -> None:
-        """Raises AlreadyRunning, CheckpointError, FolderInUse, NetworkError, OSError."""
+        """Raises AlreadyRunning, CheckpointError, FolderInUse, Limited, NetworkError, OSError."""
         self._config, self._stopping = config, stopping
         self._resources = contextlib.ExitStack()
         with self._closing_on_error():
+            raise_file_limit()
+            make_sure_of_room(_FILES, _THREADS)
             network = config.network
             self._scenes = self._resources.enter_context(StateServer(RECON_SCENE, network))
             self._heartbeat = self._resources.enter_context(Publisher(RECON_STATUS, network))

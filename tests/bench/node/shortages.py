@@ -177,7 +177,7 @@ def cgroup(controller: str, limits: dict[str, int]) -> Iterator[tuple[str, ...]]
 def few_descriptors(trial: Trial) -> None:
     """Too few descriptors to start with: each process works, or says so and ends; with enough all is well."""
     for verb in ("capture", "recon"):
-        for number in (8, 16, 24, 32, 64):
+        for number in (8, 16, 24, 32, 64, 128, 160):
             _starts_or_says_so(trial, verb, number, ("prlimit", f"--nofile={number}:{number}"))
     with running(trial.node()) as node:
         node.start("recon", before=("prlimit", "--nofile=256:256"))
@@ -188,7 +188,7 @@ def few_descriptors(trial: Trial) -> None:
 def few_threads(trial: Trial) -> None:
     """Too few processes and threads to start with: as with descriptors."""
     for verb in ("capture", "recon"):
-        for number in (1, 2, 4, 6, 8, 12):
+        for number in (1, 2, 4, 8, 12, 16, 24, 32, 64):
             with cgroup("pids", {"pids.max": number}) as group:
                 _starts_or_says_so(trial, verb, number, group)
     with running(trial.node()) as node:
