@@ -294,6 +294,13 @@ def test_live():
         says(f"a queue of {queue['messages']} keyframes of which every third is refused")
         says(f"the other {acknowledged} acknowledged, all {refused} named, nothing restarted | `queue.json` |")
     assert set(raw("queue")["processes"]["exit_codes"].values()) == {0}
+    sieges = [raw("siege_ipc"), raw("siege_tcp")]
+    assert all(siege["previews_lost"] == 0 and set(siege["exit_codes"].values()) == {0} for siege in sieges)
+    p99, p50 = (
+        " and ".join(f"{siege[f'{name}_hostile_over_quiet'][figure]:.2f}" for siege in sieges)
+        for name, figure in (("preview_ms", "p99"), ("keyframe_s", "p50"))
+    )
+    says(f"the 99th percentile of previews {p99} times that of quiet phases, the median of keyframes {p50} times |")
     fuzz = raw("fuzz")
     assert (
         fuzz["decoders"]["errors_other_than_refusal"] == fuzz["tcp_ports"]["messages_that_reached_the_application"] == 0
