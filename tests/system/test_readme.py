@@ -301,6 +301,14 @@ def test_live():
         for name, figure in (("preview_ms", "p99"), ("keyframe_s", "p50"))
     )
     says(f"the 99th percentile of previews {p99} times that of quiet phases, the median of keyframes {p50} times |")
+    pieces = raw("writes")["pieces"].values()
+    runs = sum(sum(piece["runs"].values()) for piece in pieces)
+    assert runs == sum(piece["good"] for piece in pieces)
+    says(f"and kill -9: {sum(piece['points'] for piece in pieces)} points | all {runs} runs left the old whole")
+    adversary = raw("adversary")
+    assert adversary["defects"] == 0
+    attacked = len(adversary["boundaries"])
+    says(f"{adversary['cases'] / 1e6:.1f} million structured attacks on {attacked} kinds of messages and files")
     fuzz = raw("fuzz")
     assert (
         fuzz["decoders"]["errors_other_than_refusal"] == fuzz["tcp_ports"]["messages_that_reached_the_application"] == 0
