@@ -73,7 +73,7 @@ def revoked_key(trial: Trial) -> None:
         expect("does not let this machine in. Run there: splatnode keys" in _refusal(theirs), "no word to the revoked")
         node.end("recon")
         node.start("recon")
-        wait_for(lambda: _is_refused(connected), "refusal of who was connected", 30)
+        wait_for(lambda: _is_refused(connected), "refusal of who was connected")
         connected.close()
         expect("refused a connection" in node.log("recon"), "the log does not tell who was refused")
         expect_whole(node)
