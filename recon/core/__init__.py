@@ -9,17 +9,22 @@ from __future__ import annotations
 import ctypes
 import functools
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
 from splatnode.recon.core.compile import INSTRUCTION_SETS, library_path, machine
 
-# What /proc/cpuinfo must list before a library may be loaded.
+# What the processor must be able to do before a library may be loaded, in the words of /proc/cpuinfo.
 _REQUIRED_FLAGS = {
     "avx512": {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl", "avx2", "fma", "bmi2"},
     "avx2": {"avx2", "fma", "bmi1", "bmi2", "f16c", "movbe"},
+    "neon_dotprod": {"asimddp"},
+    "neon": set(),
     "baseline": set(),
 }
+_HWCAP = 16  # of the auxiliary vector (Linux, elf.h)
+_HWCAP_ASIMDDP = 1 << 20  # of the processor (Linux on aarch64, asm/hwcap.h)
 
 
 def instruction_sets() -> list[str]:
@@ -73,6 +78,8 @@ def set_threads(threads: int) -> None:
 
 
 def _processor_flags() -> set[str]:
+    if machine() == "aarch64":
+        return _aarch64_flags()
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("flags"):
@@ -80,3 +87,12 @@ def _processor_flags() -> set[str]:
     except OSError:
         pass
     return set()
+
+
+def _aarch64_flags() -> set[str]:
+    """Of those that matter here. An emulator's /proc/cpuinfo is its host's, but what it tells the program is right."""
+    if sys.platform == "darwin":
+        return {"asimddp"}  # from the first processors of Apple's own on
+    capabilities = ctypes.CDLL(None).getauxval
+    capabilities.restype = ctypes.c_ulong
+    return {"asimddp"} if capabilities(ctypes.c_ulong(_HWCAP)) & _HWCAP_ASIMDDP else set()

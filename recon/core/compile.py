@@ -16,7 +16,9 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
@@ -40,7 +42,26 @@ INSTRUCTION_SETS = {
         "avx2": ["-march=x86-64-v3"],
         "baseline": [],
     },
-    "aarch64": {"baseline": []},
+    "aarch64": {
+        "neon_dotprod": ["-march=armv8.2-a+dotprod"],  # Raspberry Pi 5, Jetson Orin, Apple's
+        "neon": [],
+    },
+}
+
+
+@dataclass(frozen=True)
+class Target:
+    """A kind of machine, other than this one perhaps, that Zig compiles the core for."""
+
+    machine: str  # of INSTRUCTION_SETS
+    zig: str  # as Zig names it, with the oldest version of its system
+    platform: str  # as a wheel's name ends
+
+
+TARGETS = {
+    "linux-x86_64": Target("x86_64", f"x86_64-linux-gnu.{OLDEST_GLIBC}", "manylinux_2_17_x86_64"),
+    "linux-aarch64": Target("aarch64", f"aarch64-linux-gnu.{OLDEST_GLIBC}", "manylinux_2_17_aarch64"),
+    "macos-arm64": Target("aarch64", "aarch64-macos.11.0", "macosx_11_0_arm64"),
 }
 
 
@@ -50,8 +71,9 @@ def machine() -> str:
     return {"amd64": "x86_64", "arm64": "aarch64"}.get(name, name)
 
 
-def library_path(instruction_set: str) -> Path:
-    return HERE / f"_core_{machine()}_{instruction_set}.so"
+def library_path(instruction_set: str, of_machine: str | None = None) -> Path:
+    """Where the library for an instruction set of this machine, or of another, lies."""
+    return HERE / f"_core_{of_machine or machine()}_{instruction_set}.so"
 
 
 def find_compiler() -> list[str] | None:
@@ -59,46 +81,55 @@ def find_compiler() -> list[str] | None:
     for name in (os.environ.get("CXX"), "g++", "clang++", "c++"):
         if name and shutil.which(name.split()[0]):
             return name.split()
-    if importlib.util.find_spec("ziglang"):
-        return [sys.executable, "-m", "ziglang", "c++"]
-    return None
+    return find_zig()
 
 
-def platform_tag() -> str:
-    """The platform of a wheel that carries the libraries, for example linux_x86_64.
+def find_zig() -> list[str] | None:
+    """The command of the C++ compiler that PyPI carries, which compiles for every target, or None."""
+    return [sys.executable, "-m", "ziglang", "c++"] if importlib.util.find_spec("ziglang") else None
+
+
+def platform_tag(target: Target | None = None) -> str:
+    """The platform of a wheel that carries the libraries for this machine, or for `target`: linux_x86_64, say.
 
     Zig compiles against an old glibc of choice and links its own C++ library, so its libraries run on any Linux of
     the last ten years; those of another compiler are promised only to machines like this one.
     """
+    if target is not None:
+        return target.platform
     platform_name = sysconfig.get_platform().replace("-", "_").replace(".", "_")
     if platform_name.startswith("linux") and _is_zig(find_compiler() or []):
         return f"manylinux_{OLDEST_GLIBC.replace('.', '_')}_{machine()}"
     return platform_name
 
 
-def compile_core(force: bool = False) -> list[Path]:
-    """Compiles what is out of date and returns the libraries' paths.
+def compile_core(force: bool = False, target: Target | None = None) -> list[Path]:
+    """Compiles what is out of date, for this machine or with Zig for `target`, and returns the libraries' paths.
 
     Raises RuntimeError when there is no compiler (naming the command that installs one) or when compilation fails.
     """
-    compiler = find_compiler()
+    compiler = find_compiler() if target is None else find_zig()
     if compiler is None:
-        raise RuntimeError(
-            "no C++ compiler found (looked for $CXX, g++, clang++, c++ and the Python package ziglang). "
-            "Run: pip install ziglang"
-        )
+        looked_for = "$CXX, g++, clang++, c++ and the Python package ziglang" if target is None else "ziglang"
+        raise RuntimeError(f"no C++ compiler found (looked for {looked_for}). Run: pip install ziglang")
+    family = machine() if target is None else target.machine
+    instruction_sets: Mapping[str, list[str]] = INSTRUCTION_SETS.get(family, {"baseline": []})
+    paths = {name: library_path(name, family) for name in instruction_sets}
     sources = sorted(HERE.glob("*.cpp"))
-    digest = _digest(compiler, sources + sorted(HERE.glob("*.h")))
-    instruction_sets = INSTRUCTION_SETS.get(machine(), {"baseline": []})
-    stale = [name for name in instruction_sets if force or not _is_current(library_path(name), digest)]
+    digest = _digest([*compiler, *([] if target is None else [target.zig])], sources + sorted(HERE.glob("*.h")))
+    stale = [name for name in paths if force or not _is_current(paths[name], digest)]
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as compilers, ThreadPoolExecutor() as linkers:
+        flags = {name: _flags(compiler, instruction_sets[name], target) for name in stale}
         built = [
-            linkers.submit(_build, compilers, compiler, sources, library_path(name), instruction_sets[name], digest)
-            for name in stale
+            linkers.submit(_build, compilers, compiler, sources, paths[name], flags[name], digest) for name in stale
         ]
         for job in built:
             job.result()
-    return [library_path(name) for name in instruction_sets]
+    return list(paths.values())
+
+
+def _flags(compiler: list[str], flags: list[str], target: Target | None) -> list[str]:
+    return _zig_flags(flags, target) if _is_zig(compiler) else flags
 
 
 def _is_current(library: Path, digest: str) -> bool:
@@ -108,7 +139,7 @@ def _is_current(library: Path, digest: str) -> bool:
 
 def _digest(compiler: list[str], files: list[Path]) -> str:
     """Changes when a library would. Zig is the same wherever it is installed (a build environment, a virtual one)."""
-    command = ["ziglang"] if _is_zig(compiler) else compiler
+    command = compiler[compiler.index("ziglang") :] if _is_zig(compiler) else compiler
     digest = hashlib.sha256(repr((command, FLAGS, LINK_FLAGS, INSTRUCTION_SETS, OLDEST_GLIBC)).encode())
     for path in files:
         digest.update(path.name.encode() + path.read_bytes())
@@ -124,8 +155,6 @@ def _build(
     digest: str,
 ) -> None:
     """One library, which replaces the one that is there when it is whole. Sources are compiled by `compilers`."""
-    if _is_zig(compiler):
-        flags = _zig_flags(flags)
     with tempfile.TemporaryDirectory(prefix=".build-", dir=HERE) as folder:
         objects = [Path(folder) / f"{source.stem}.o" for source in sources]
         jobs = [
@@ -145,11 +174,15 @@ def _is_zig(compiler: list[str]) -> bool:
     return "ziglang" in compiler
 
 
-def _zig_flags(flags: list[str]) -> list[str]:
+def _zig_flags(flags: list[str], target: Target | None = None) -> list[str]:
     """Zig spells processors its own way and, without one, compiles for the processor that it runs on."""
-    target = [f"--target={machine()}-linux-gnu.{OLDEST_GLIBC}"] if sys.platform == "linux" else []
+    own = f"{machine()}-linux-gnu.{OLDEST_GLIBC}" if sys.platform == "linux" else None
+    system = own if target is None else target.zig
     processor = [] if any(flag.startswith("-march=") for flag in flags) else ["-mcpu=baseline"]
-    return target + processor + [flag.replace("-march=x86-64-v", "-mcpu=x86_64_v") for flag in flags]
+    spelled = {"-march=x86-64-v": "-mcpu=x86_64_v", "-march=armv8.2-a+": "-mcpu=generic+v8_2a+"}
+    for ours, zigs in spelled.items():
+        flags = [flag.replace(ours, zigs) for flag in flags]
+    return ([f"--target={system}"] if system else []) + processor + flags
 
 
 def _run(command: list[str]) -> None:

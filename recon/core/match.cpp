@@ -1,7 +1,7 @@
 // The two nearest of 8-bit descriptors and the way back, fused with the products: no matrix of distances is kept.
 //
 // A descriptor is 128 bytes below 128 (one factor of _mm256_maddubs is signed) of norm at most 181, so that the dot
-// product of any two, and each part of it, is below 2^15 (Cauchy and Schwarz): products are summed in 16-bit lanes,
+// product of any two, and each part of it, is below 2^15 (Cauchy and Schwarz): products may be summed in 16-bit lanes,
 // exactly and alike on every instruction set.
 // A register holds four bytes of each of several descriptors of the second set ("panel"); four bytes of one descriptor
 // of the first set are broadcast to all its lanes.
@@ -23,14 +23,28 @@ constexpr int kPanels = 2;           // panels of the second set with them
 constexpr int kRowsPerTask = 48;
 constexpr int kOffset = 16320;       // above half the largest squared norm: keeps scores positive
 
+// NEON multiplies bytes into 16-bit lanes of two registers or, since Armv8.2, adds four products into a 32-bit lane.
+#if defined(__ARM_FEATURE_DOTPROD)
+typedef IntVec Sums;
+#elif defined(__aarch64__)
+struct Sums {
+    uint16x8_t low, high;
+};
+#else
 typedef int16_t Sums __attribute__((vector_size(4 * CORE_LANES)));
+#endif
 
-// sums += the products of bytes, added in pairs.
+// sums += the products of bytes, added in pairs or fours, or not yet.
 inline Sums multiply_add(Sums sums, IntVec a, IntVec b) {
 #if CORE_LANES == 16 && defined(__AVX512BW__)
     return sums + (Sums)_mm512_maddubs_epi16((__m512i)a, (__m512i)b);
 #elif CORE_LANES == 8
     return sums + (Sums)_mm256_maddubs_epi16((__m256i)a, (__m256i)b);
+#elif defined(__ARM_FEATURE_DOTPROD)
+    return (Sums)vdotq_u32((uint32x4_t)sums, (uint8x16_t)a, (uint8x16_t)b);
+#elif defined(__aarch64__)
+    const uint8x16_t x = (uint8x16_t)a, y = (uint8x16_t)b;
+    return {vmlal_u8(sums.low, vget_low_u8(x), vget_low_u8(y)), vmlal_high_u8(sums.high, x, y)};
 #else
     const Sums low = (Sums)(a & 0x00ff00ff) * (Sums)(b & 0x00ff00ff);
     const Sums high = (Sums)(((BitVec)a >> 8) & 0x00ff00ffu) * (Sums)(((BitVec)b >> 8) & 0x00ff00ffu);
@@ -38,10 +52,16 @@ inline Sums multiply_add(Sums sums, IntVec a, IntVec b) {
 #endif
 }
 
-// One dot product a lane. Both halves are at least 0 and their sum fits 16 bits.
+// One dot product a lane. Each part of a sum is at least 0, and together they fit 16 bits.
 inline IntVec dot_products(Sums sums) {
+#if defined(__ARM_FEATURE_DOTPROD)
+    return sums;
+#elif defined(__aarch64__)
+    return (IntVec)vpaddq_u32(vpaddlq_u16(sums.low), vpaddlq_u16(sums.high));
+#else
     const BitVec both = (BitVec)sums;
     return (IntVec)((both & 0xffffu) + (both >> 16));
+#endif
 }
 
 inline IntVec larger(IntVec a, IntVec b) { return a > b ? a : b; }

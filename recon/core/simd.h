@@ -65,7 +65,11 @@ inline unsigned bits(Mask mask) {
 #else
 inline unsigned bits(Mask mask) { return (mask[0] & 1) | (mask[1] & 2) | (mask[2] & 4) | (mask[3] & 8); }
 #endif
+#if defined(__aarch64__)
+inline bool any(Mask mask) { return vmaxvq_u32((uint32x4_t)mask) != 0; }
+#else
 inline bool any(Mask mask) { return bits(mask) != 0; }
+#endif
 #endif
 
 // ---- Functions ---------------------------------------------------------------------------------------------------
@@ -76,12 +80,20 @@ inline Vec minimum(Vec a, Vec b) {
     return (Vec)_mm256_min_ps((__m256)a, (__m256)b);
 #elif defined(__x86_64__)
     return (Vec)_mm_min_ps((__m128)a, (__m128)b);
+#elif defined(__aarch64__)
+    return (Vec)vminnmq_f32((float32x4_t)a, (float32x4_t)b);
 #else
     return select(less(a, b), a, b);
 #endif
 }
 
-inline Vec maximum(Vec a, Vec b) { return -minimum(-a, -b); }
+inline Vec maximum(Vec a, Vec b) {
+#if defined(__aarch64__)
+    return (Vec)vmaxnmq_f32((float32x4_t)a, (float32x4_t)b);
+#else
+    return -minimum(-a, -b);
+#endif
+}
 inline Vec clamp(Vec value, Vec low, Vec high) { return minimum(maximum(value, low), high); }
 inline Vec absolute(Vec value) { return (Vec)((BitVec)value & 0x7fffffffu); }
 
@@ -124,6 +136,8 @@ inline Vec multiply_add(Vec a, Vec b, Vec c) {
     return (Vec)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c);
 #elif CORE_LANES == 8
     return (Vec)_mm256_fmadd_ps((__m256)a, (__m256)b, (__m256)c);
+#elif defined(__aarch64__)
+    return (Vec)vfmaq_f32((float32x4_t)c, (float32x4_t)a, (float32x4_t)b);
 #else
     return a * b + c;
 #endif

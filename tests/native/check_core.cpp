@@ -1,13 +1,14 @@
 // Checks of the compiled core that need no Python, so that they run under an emulator or a sanitizer.
 //
 //   check_core CASE      renders the case and compares with the images and gradients stored in it
-//   check_core           without a case: odd sizes, no Gaussians, bad input, the loss and Adam; prints nothing if well
+//   check_core           without a case: odd sizes, no Gaussians, bad input, the loss, matches; prints nothing if well
 //
 // A case is written by tests/recon/core/test_native_core.py from the float64 reference.
 #include <cmath>
 #include <cstdio>
 #include <cstring>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "rasterize.h"
@@ -23,6 +24,7 @@ void core_set_threads(int);
 void core_photometric_moments(const float*, int, int, float*, float*);
 double core_photometric(const float*, const float*, const float*, const float*, const float*, double, double, int, int,
                         float*);
+void core_match(const uint8_t*, int, const uint8_t*, int, int32_t*, int32_t*, int32_t*, int32_t*);
 }
 
 namespace {
@@ -227,6 +229,32 @@ void check_loss() {
     }
 }
 
+// Integers: what a plain loop finds is found exactly, whatever the instruction set.
+void check_matches() {
+    constexpr int kSize = 128;
+    for (const auto& counts : {std::pair(1, 1), std::pair(61, 37), std::pair(100, 130)}) {
+        std::vector<uint8_t> first(size_t(counts.first) * kSize), second(size_t(counts.second) * kSize);
+        for (auto* set : {&first, &second})
+            for (uint8_t& value : *set) value = uint8_t(noise() * 23);  // of norm 143 in the mean
+        std::vector<int32_t> nearest(counts.first), score(counts.first), runner_up(counts.first), back(counts.second);
+        core_match(first.data(), counts.first, second.data(), counts.second, nearest.data(), score.data(),
+                   runner_up.data(), back.data());
+        for (int i = 0; i < counts.first; ++i) {
+            int best = 0, best_score = -1;
+            for (int j = 0; j < counts.second; ++j) {
+                int dot = 0, squared = 0;
+                for (int k = 0; k < kSize; ++k) {
+                    dot += first[size_t(i) * kSize + k] * second[size_t(j) * kSize + k];
+                    squared += second[size_t(j) * kSize + k] * second[size_t(j) * kSize + k];
+                }
+                const int found = 16320 - squared / 2 + dot;
+                if (found > best_score) best = j, best_score = found;
+            }
+            expect(nearest[i] == best && score[i] == best_score, "the nearest descriptor");
+        }
+    }
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
@@ -238,6 +266,7 @@ int main(int argc, char** argv) {
             check_sizes();
             check_bad_input();
             check_loss();
+            check_matches();
         }
     }
     return failures ? 1 : 0;

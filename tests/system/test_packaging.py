@@ -96,6 +96,7 @@ def test_a_source_that_does_not_compile_leaves_the_library_alone(project):
     [
         (["-march=x86-64-v3"], "-mcpu=x86_64_v3"),
         (["-march=x86-64-v4", "-mprefer-vector-width=512"], "-mcpu=x86_64_v4"),
+        (["-march=armv8.2-a+dotprod"], "-mcpu=generic+v8_2a+dotprod"),
         ([], "-mcpu=baseline"),
     ],
 )

@@ -20,7 +20,7 @@ from tests.support.rasterize_cases import HEIGHT, NAMES, WIDTH, Case, image_weig
 CORE = ROOT / "recon" / "core"
 SOURCES = [
     *(CORE / f"{name}.cpp" for name in ("project", "bin", "tile", "blend", "blend_backward", "project_backward")),
-    *(CORE / f"{name}.cpp" for name in ("rasterize", "photometric", "threads")),
+    *(CORE / f"{name}.cpp" for name in ("rasterize", "photometric", "match", "threads")),
     ROOT / "tests" / "native" / "check_core.cpp",
 ]
 
@@ -92,14 +92,15 @@ def test_sanitizers_find_nothing(tmp_path, cases):
         run([str(program), str(case)])
 
 
-def test_aarch64_equals_the_reference(tmp_path, cases):
+@pytest.mark.parametrize("instruction_set", INSTRUCTION_SETS["aarch64"])
+def test_aarch64_equals_the_reference(tmp_path, cases, instruction_set):
     compiler = shutil.which("aarch64-linux-gnu-g++") or pytest.skip(
         "needs an aarch64 compiler (apt-get install g++-aarch64-linux-gnu)"
     )
     emulator = shutil.which("qemu-aarch64") or shutil.which("qemu-aarch64-static")
     if emulator is None:
         pytest.skip("needs an aarch64 emulator (apt-get install qemu-user)")
-    program = build(compiler, tmp_path, "-static")
+    program = build(compiler, tmp_path, "-static", *INSTRUCTION_SETS["aarch64"][instruction_set])
     run([emulator, str(program)])
     for case in cases:
         run([emulator, str(program), str(case)])
