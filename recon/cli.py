@@ -8,6 +8,7 @@ import json
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -28,7 +29,9 @@ from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.metric import in_metres
 from splatnode.recon.pipeline import reconstruct
-from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize import device
+from splatnode.recon.rasterize.device import Device
+from splatnode.recon.rasterize.dispatch import rasterizer
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.size import largest_result_bytes
@@ -99,26 +102,27 @@ def run(
 def demo(args: argparse.Namespace) -> int:
     """Writes the built-in capture, reconstructs it, and measures the result on views that it has not seen."""
     seed = args.seed or 0
-    config, place = overlaid(preset("balanced"), {"seed": seed}), synthetic.Config(seed=seed)
+    config = overlaid(preset("balanced"), {"seed": seed, "device": args.device or "cpu"})
+    place = synthetic.Config(seed=seed)
     needed_bytes = largest_result_bytes([(place.width, place.height)] * place.views, config.size, None)
     with result_folder(args.out, needed_bytes + largest_capture_bytes(place)):
         capture = args.out / "capture"
         split = write_capture(capture, place)
         snapshot = run(folder.stream(folder.Config(folder=capture / "images", names=split.train)), config)
-        measured = held_out_quality(snapshot, capture, split) if snapshot.verdict.publishable else None
+        measured = held_out_quality(snapshot, capture, split, config.device) if snapshot.verdict.publishable else None
         report = finish(snapshot, args.out, seed=seed, preset_name="balanced", held_out=measured)
         _tell(snapshot, args.out, report, as_json=args.json)
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
 
 
-def held_out_quality(snapshot: Snapshot, capture: Path, split: Split) -> dict[str, float | None]:
+def held_out_quality(snapshot: Snapshot, capture: Path, split: Split, on: Device = "cpu") -> dict[str, float | None]:
     """Mean scores over the test views, and the errors of the estimated cameras."""
     row = evaluate(
         snapshot,
         load_scene(capture),
         split,
         Run("balanced", 0, None, snapshot.seconds, None),
-        rasterize=rasterize,
+        rasterize=rasterizer(device.chosen(on)),
         networks=Networks(alex=None, vgg=None),
         settings=Settings(alignment_steps=100),
     )
@@ -134,11 +138,12 @@ def bench(args: argparse.Namespace) -> int:
         found = merged([read_bench(path) for path in args.redraw])
     else:
         chosen = methods.chosen(args.methods)
+        wanted = args.device or "cpu"
         found = run_bench(
             Plan(tuple(args.scenes), args.views, chosen, tuple(range(args.seeds)), args.checkpoints),
-            Entrants(methods.by_name, methods.start_of),
+            Entrants(partial(methods.by_name, device=wanted), methods.start_of),
             args.out,
-            scoring=Scoring(rasterize, load_networks(args.weights_dir), Settings()),
+            scoring=Scoring(rasterizer(device.chosen(wanted)), load_networks(args.weights_dir), Settings()),
             command=shlex.join(["splatnode", *sys.argv[1:]]),
             resume=args.resume,
         )
@@ -169,6 +174,7 @@ def _config(args: argparse.Namespace) -> Config:
         config = overlaid(config, {"metric": {"baseline": [first, second, _metres(metres)]}})
     flags = {
         "size": args.size,
+        "device": args.device,
         "seed": args.seed,
         "budget_s": args.budget_s,
         "max_gaussians": args.max_gaussians,

@@ -14,6 +14,7 @@ from splatnode.recon.frames import screening
 from splatnode.recon.matching import config as matching
 from splatnode.recon.optimize import dropout, refinement
 from splatnode.recon.priors import classical
+from splatnode.recon.rasterize.device import Device
 from splatnode.recon.registration import config as registration
 from splatnode.recon.result.export.formats.ply import most_in_ply
 from splatnode.recon.scene import background, completion, initialisation, pixelwise, seeding
@@ -43,6 +44,7 @@ class Ladder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     size: Annotated[int, Meta(ge=64)] = 512  # longer side of the modelled images, pixels
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0  # what generators of random numbers take
+    device: Device = "cpu"  # that Gaussians are refined on; cuda was never run by us
     quick: bool = False  # whether the first answer stands, also where it is no
     prior: PriorChoice = PriorChoice("classical", classical.Config())
     screening: screening.Config = screening.Config()

@@ -6,12 +6,15 @@ import logging
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
+import torch
+
 from splatnode.capture.frame import DroppedFrame
 from splatnode.recon.budget import Hit
 from splatnode.recon.config import Config
 from splatnode.recon.estimation import Estimate
 from splatnode.recon.optimize import refinement
 from splatnode.recon.optimize.watch import examine, watch
+from splatnode.recon.rasterize.device import chosen
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.scene import growth
@@ -19,6 +22,8 @@ from splatnode.recon.scene.initialisation import initial_scene
 from splatnode.recon.scene.scene import Scene
 
 log = logging.getLogger(__name__)
+
+_PROCESSOR = torch.device("cpu")
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,10 +56,12 @@ def refined(
     """The scene, if there is one, at each checkpoint of its refinement and at its end.
 
     Where it diverges or overfits it ends with a verdict, and with the best scene so far if that is publishable.
-    `deadline` is a time of `time.monotonic()`.
+    `deadline` is a time of `time.monotonic()`. The Gaussians are on the configured device while they are refined, and
+    those that are shown on the processor. Raises DeviceUnavailable.
     """
     if scene is None:
         return
+    scene = scene.on(chosen(config.device))
     watching = watch(scene, steps.iterations)
     limit = config.most_gaussians
     for later in refinement.refine(scene, steps, seed=config.seed, deadline=deadline, max_gaussians=limit):
@@ -62,10 +69,10 @@ def refined(
         if later.losses or later.iterations in config.optimize.checkpoints:
             watching, verdict = examine(watching, later)
         if verdict is not None:
-            best = shown(watching.best, config).scene if verdict.publishable else None
+            best = shown(watching.best.on(_PROCESSOR), config).scene if verdict.publishable else None
             yield Shown(best, verdict)
             return
-        yield shown(later, config)
+        yield shown(later.on(_PROCESSOR), config)
 
 
 def snapshot(

@@ -20,7 +20,7 @@ from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.ladder.ladder import climbed
 from splatnode.recon.matching.match import match
 from splatnode.recon.modelling import begin_scene, refined, shown, snapshot
-from splatnode.recon.preparation import load_prior, prepare
+from splatnode.recon.preparation import load_device, load_prior, prepare
 from splatnode.recon.result.snapshot import Snapshot
 
 
@@ -39,6 +39,7 @@ def estimate_frames(
     frames: Iterable[Frame | DroppedFrame], config: Config, clock: Clock
 ) -> tuple[Estimate, list[DroppedFrame]]:
     """Cameras, verdict and depth of all frames that show something new, and which frames were left out."""
+    load_device(config)
     prior = load_prior(config)
     kept, dropped, rejected = screen_all(frames, config.screening)
     keyframes = [prepare(frame, config) for frame in kept]

@@ -21,7 +21,16 @@ EXPORT_FORMATS = tuple(
 def _demo_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: out/demo")
     parser.add_argument("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)")
+    _add_device(parser)
     add_json(parser)
+
+
+def _add_device(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--device",
+        choices=("cpu", "cuda", "auto"),
+        help="that Gaussians are refined on (default: cpu; auto: a GPU where one can be used)",
+    )
 
 
 def _replay_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,6 +39,7 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with what differs from the defaults")
     parser.add_argument("--preset", metavar="P", help="a named set of parameters (default: balanced)")
     parser.add_argument("--prior", metavar="K", help="what gives poses and first points (default: classical)")
+    _add_device(parser)
     parser.add_argument("--size", type=positive, metavar="PIXELS", help="longer side as modelled (default: 512)")
     parser.add_argument(
         "--budget-s",
@@ -91,6 +101,7 @@ def _bench_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--checkpoints", type=counts, default=(), metavar="N,N", help="iterations scored on the way")
     parser.add_argument("--seeds", type=positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")
+    _add_device(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--resume", action="store_true", help="go on: runs that --out holds are not run again")
     parser.add_argument(

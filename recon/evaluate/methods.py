@@ -20,6 +20,7 @@ from splatnode.recon.optimize import dropout, refinement, regularise
 from splatnode.recon.optimize.losses import depth, normal, point_render, semantic
 from splatnode.recon.optimize.losses.loss import LossChoice
 from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.rasterize.device import Device
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import pixelwise
 
@@ -122,11 +123,14 @@ def start_of(name: str) -> Config | None:
     return foundation(CONFIGS[name]) if name in CONFIGS else None
 
 
-def by_name(frames: Sequence[Frame], name: str, seed: int, start: Start | None = None) -> Iterator[Snapshot]:
+def by_name(
+    frames: Sequence[Frame], name: str, seed: int, start: Start | None = None, device: Device = "cpu"
+) -> Iterator[Snapshot]:
     """Runs the method called `name`, from where `start` stands if it is given one that `start_of` asks for.
 
-    At module level, so that a fresh process can be told to run it.
+    `device` is for methods that are configurations; rivals are measured on the processor. At module level, so that a
+    fresh process can be told to run it.
     """
     if start is None:
         return method(name)(frames, seed)
-    return continued(start, msgspec.structs.replace(CONFIGS[name], seed=seed))
+    return continued(start, msgspec.structs.replace(CONFIGS[name], seed=seed, device=device))

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-_WINDOW, _SIGMA = 11, 1.5
-_C1, _C2 = 0.01**2, 0.03**2
+from splatnode.recon.optimize import photometric_reference
 
 
 def psnr(image: Tensor, truth: Tensor) -> float:
@@ -24,24 +22,7 @@ def ssim(image: Tensor, truth: Tensor) -> float:
     over all pixels and channels, 1 for equal images.
     """
     _check_same_shape(image, truth)
-    x, y = image.double().permute(2, 0, 1), truth.double().permute(2, 0, 1)
-    mean_x, mean_y, mean_xx, mean_yy, mean_xy = _blur(torch.stack([x, y, x * x, y * y, x * y])).unbind(0)
-    variance_x, variance_y = mean_xx - mean_x**2, mean_yy - mean_y**2
-    covariance = mean_xy - mean_x * mean_y
-    luminance = (2 * mean_x * mean_y + _C1) / (mean_x**2 + mean_y**2 + _C1)
-    structure = (2 * covariance + _C2) / (variance_x + variance_y + _C2)
-    return float((luminance * structure).mean())
-
-
-def _blur(images: Tensor) -> Tensor:
-    """(M, 3, H, W) after the window, which is separable."""
-    offsets = torch.arange(_WINDOW, dtype=images.dtype, device=images.device) - _WINDOW // 2
-    window = torch.exp(-(offsets**2) / (2 * _SIGMA**2))
-    window = window / window.sum()
-    flat = images.reshape(-1, 1, *images.shape[-2:])
-    flat = functional.conv2d(flat, window.view(1, 1, -1, 1), padding=(_WINDOW // 2, 0))
-    flat = functional.conv2d(flat, window.view(1, 1, 1, -1), padding=(0, _WINDOW // 2))
-    return flat.reshape(images.shape)
+    return float(photometric_reference.ssim(image.double().permute(2, 0, 1), truth.double().permute(2, 0, 1)).mean())
 
 
 def _check_same_shape(image: Tensor, truth: Tensor) -> None:

@@ -10,10 +10,11 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.core import library
+from splatnode.recon.rasterize import dispatch
 
 
 class Adam:
-    """Adam of all parameters in one native call; `torch.optim.Adam` in values, but for rounding.
+    """Adam of all parameters in one native call, on other devices by torch; `torch.optim.Adam` but for rounding.
 
     Parameters are named; rows are Gaussians (or cameras). `lrs` may be changed between steps. A row that is added
     starts with moments of 0 but shares its parameter's count of steps, so its first steps are about three times as
@@ -22,7 +23,7 @@ class Adam:
 
     def __init__(
         self,
-        params: Mapping[str, Tensor],  # float32 leaves on the CPU, contiguous, any shape
+        params: Mapping[str, Tensor],  # float32 leaves on one device, contiguous, any shape
         lrs: Mapping[str, float],  # by the same names
         betas: tuple[float, float] = (0.9, 0.999),
         eps: float = 1e-15,
@@ -51,15 +52,29 @@ class Adam:
         factors = {name: _row_factors(name, value, self._groups) for name, value in (lr_factors or {}).items()}
         moving = {name: group for name, group in self._groups.items() if group.param.grad is not None}
         gradients = {name: _gradient(name, group.param) for name, group in moving.items()}
+        for group in moving.values():
+            group.steps += 1
+        if all(dispatch.by_core(group.param) for group in moving.values()):
+            self._step_natively(moving, gradients, factors)
+            return
+        for name, group in moving.items():
+            size = self._step_size(name, group)
+            _step_by_torch(group, gradients[name], size, factors.get(name), self.betas, self.eps)
+
+    def _step_size(self, name: str, group: _Group) -> float:
+        return self.lrs[name] / (1 - self.betas[0] ** group.steps)
+
+    def _step_natively(
+        self, moving: Mapping[str, _Group], gradients: Mapping[str, Tensor], factors: Mapping[str, Tensor]
+    ) -> None:
         native = (_NativeGroup * len(moving))()
         for slot, (name, group) in zip(native, moving.items(), strict=True):
-            group.steps += 1
             slot.parameter, slot.gradient = group.param.data_ptr(), gradients[name].data_ptr()
             slot.first, slot.second = group.first.data_ptr(), group.second.data_ptr()
             slot.row_factors = factors[name].data_ptr() if name in factors else None
             slot.count = group.param.numel()
             slot.row_size = group.param[0].numel() if len(group.param) else 1
-            slot.step_size = self.lrs[name] / (1 - self.betas[0] ** group.steps)
+            slot.step_size = self._step_size(name, group)
             slot.root_correction = (1 - self.betas[1] ** group.steps) ** -0.5
         library().core_adam(native, len(moving), *map(ctypes.c_double, (*self.betas, self.eps)))
         for group in moving.values():
@@ -132,6 +147,24 @@ class _NativeGroup(ctypes.Structure):
     ]
 
 
+def _step_by_torch(
+    group: _Group,
+    gradient: Tensor,
+    step_size: float,
+    row_factors: Tensor | None,
+    betas: tuple[float, float],
+    eps: float,
+) -> None:
+    """What the core does, for a parameter on any device."""
+    group.first.lerp_(gradient, 1 - betas[0])
+    group.second.lerp_(gradient**2, 1 - betas[1])
+    root_correction = (1 - betas[1] ** group.steps) ** -0.5
+    direction = group.first / (group.second.sqrt() * root_correction + eps)
+    if row_factors is not None:
+        direction *= _beside(row_factors.to(direction), direction)
+    group.param.add_(direction, alpha=-step_size)
+
+
 def _beside(rows: Tensor, values: Tensor) -> Tensor:
     """`rows` (N,) in a shape that broadcasts with `values` (N, ...)."""
     return rows.view(-1, *[1] * (values.dim() - 1))
@@ -143,10 +176,10 @@ def _new_group(name: str, param: Tensor) -> _Group:
 
 
 def _checked(name: str, param: Tensor) -> Tensor:
-    if param.dtype != torch.float32 or param.device.type != "cpu" or not param.is_contiguous() or param.dim() == 0:
+    if param.dtype != torch.float32 or not param.is_contiguous() or param.dim() == 0:
         raise ValueError(
-            f"{name} must be a contiguous float32 tensor on the CPU with at least one dimension, "
-            f"got {param.dtype} on {param.device} of shape {tuple(param.shape)} and strides {param.stride()}"
+            f"{name} must be a contiguous float32 tensor with at least one dimension, "
+            f"got {param.dtype} of shape {tuple(param.shape)} and strides {param.stride()}"
         )
     if not (param.is_leaf and param.requires_grad):
         raise ValueError(f"{name} must be a leaf that requires its gradient (call .requires_grad_())")

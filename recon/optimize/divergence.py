@@ -45,7 +45,7 @@ def misfit(scene: Scene) -> float:
 
 
 def _misfit(scene: Scene, view: TrainingView, valid: npt.NDArray[np.bool_]) -> float:
-    image = training_image(view, valid, _SCALE, _DSSIM)
+    image = training_image(view, valid, _SCALE, _DSSIM, scene.gaussians.means.device)
     camera = Camera(view.T_world_camera, image.K, image.width, image.height)
     rgb = render_gaussians(scene.gaussians, camera).rgb
     assert rgb is not None  # it was asked for

@@ -49,7 +49,7 @@ class Dropout:
         """
         if self._config.share == 0 or progress >= self._config.until:
             return opacities
-        drawn = torch.rand(len(opacities), generator=self._generator) >= self._probabilities
+        drawn = torch.rand(len(opacities), generator=self._generator).to(opacities) >= self._probabilities
         return (opacities * (drawn / (1 - self._probabilities))).clamp(max=MAX_OPACITY)
 
 
@@ -59,17 +59,18 @@ def uncertainty(gaussians: Gaussians, views: Sequence[TrainingView], sure: float
 
     A Gaussian that no view seeded has 1, one whose view has no point map 0.
     """
-    result = torch.ones(len(gaussians))
+    device = gaussians.means.device
+    result = torch.ones(len(gaussians), device=device)
     for view in views:
         own = (gaussians.source_frame == view.frame_id).nonzero()[:, 0]
         if view.pointmap is None:
             result[own] = 0.0
             continue
-        T, K = view.T_world_camera, view.K
+        T, K = view.T_world_camera.to(device), view.K.to(device)
         x, y, z = (to_camera(gaussians.means[own], T) @ K.T).unbind(1)
         z = z.clamp(min=1e-6)
         column = (x / z).clamp(0, view.width - 1).long()
         row = (y / z).clamp(0, view.height - 1).long()
-        confidence = torch.from_numpy(view.pointmap.confidence)[row, column]
+        confidence = torch.from_numpy(view.pointmap.confidence).to(device)[row, column]
         result[own] = (1 - confidence / sure).clamp(min=0.0)
     return result

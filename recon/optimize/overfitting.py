@@ -61,7 +61,7 @@ def expected(scene: Scene) -> tuple[Expected, ...]:
         rng=np.random.default_rng(0),
     )
     with single_torch_thread():
-        return tuple(_expected(views, view) for view in between)
+        return tuple(_expected(views, view, scene.gaussians.means.device) for view in between)
 
 
 def misfit(expectations: Sequence[Expected], gaussians: Gaussians) -> float:
@@ -77,15 +77,15 @@ def _rgb(gaussians: Gaussians, camera: Camera) -> torch.Tensor:
     return rgb
 
 
-def _expected(views: Sequence[TrainingView], pseudo: PseudoView) -> Expected:
+def _expected(views: Sequence[TrainingView], pseudo: PseudoView, device: torch.device) -> Expected:
     centre = pseudo.T_world_camera[:3, 3]
     distances = [float(np.linalg.norm(view.T_world_camera[:3, 3].double().numpy() - centre)) for view in views]
     nearest = [views[i] for i in np.argsort(distances, kind="stable")[:_SEEN_FROM]]
     T_world_camera, K = pseudo.camera.T_world_camera, pseudo.camera.K
     camera = Camera(T_world_camera, *scaled(K, pseudo.width, pseudo.height, 1 / _STEP))
     shown = _point_render(nearest, pseudo.T_world_camera, camera)
-    weights = torch.from_numpy(shown.seen.astype(np.float32))
-    return Expected(camera, PhotometricLoss(torch.from_numpy(shown.rgb), 1.0, weights))
+    weights = torch.from_numpy(shown.seen.astype(np.float32)).to(device)
+    return Expected(camera, PhotometricLoss(torch.from_numpy(shown.rgb).to(device), 1.0, weights))
 
 
 def _point_render(

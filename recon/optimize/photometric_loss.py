@@ -9,13 +9,16 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.core import library
+from splatnode.recon.optimize import photometric_reference
+from splatnode.recon.rasterize import dispatch
 
 
 class PhotometricLoss:
     """(1 - w) * mean |rgb - target| + w * mean (1 - SSIM), w = `ssim_weight`: the loss of 3DGS.
 
     SSIM has the 11 x 11 Gaussian window of sigma 1.5 and zeros beyond the border. Value and gradient are computed
-    together in the compiled core, in float32; the target's moments are kept.
+    together in the compiled core, in float32; the target's moments are kept. On another device than the processor,
+    which is the target's, the reference computes both.
     """
 
     def __init__(self, target: Tensor, ssim_weight: float = 0.2, weights: Tensor | None = None):
@@ -35,6 +38,8 @@ class PhotometricLoss:
         self.target = _planar(target.detach())
         if not bool(torch.isfinite(self.target).all()):
             raise ValueError("target must be finite")
+        if not dispatch.by_core(self.target):
+            return
         self._mean, self._variance = torch.empty_like(self.target), torch.empty_like(self.target)
         height, width, _ = target.shape
         library().core_photometric_moments(
@@ -48,6 +53,8 @@ class PhotometricLoss:
             raise ValueError(
                 f"rgb must be ({height}, {width}, 3) floats as the target, got {tuple(rgb.shape)} {rgb.dtype}"
             )
+        if not dispatch.by_core(self.target):
+            return photometric_reference.photometric_loss(rgb, self.target, self.ssim_weight, self._weights)
         return _Photometric.apply(rgb, self)
 
     def evaluate(self, planar: Tensor, gradient: Tensor | None) -> float:

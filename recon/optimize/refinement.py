@@ -32,6 +32,7 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(ge=0, le=1)]
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # of Gaussians, that are optimised
 _SCALES = (1.0, 0.5)  # of the photographs' resolution: full, and half
+_PROCESSOR = torch.device("cpu")  # where the cameras are, whatever the Gaussians are on
 _POSE_BETAS = (0.9, 0.99)  # of Adam for the cameras: each gets one gradient in as many steps as there are views
 
 
@@ -71,7 +72,8 @@ def refine(
 
     `deadline` is a time of `time.monotonic()`: the step sizes fall so that they are at their end by then.
     `max_gaussians` is how many there may be at the end; it is for the control to see to that.
-    The first view stays where it is: it is the world.
+    The first view stays where it is: it is the world. All is computed on the device of the scene's Gaussians, except
+    that random numbers are drawn on the processor: they are the same everywhere.
     """
     with single_torch_thread():
         fit = _Fit(scene, config, seed, max_gaussians)
@@ -113,7 +115,10 @@ class _Fit:
         self._pose_moments = [Moments(torch.zeros(6), torch.zeros(6)) for _ in scene.views]
         shown = border.valid_masks([view.image for view in scene.views])
         self._images = [
-            [training_image(*each, scale, config.dssim) for each in zip(scene.views, shown, strict=True)]
+            [
+                training_image(*each, scale, config.dssim, gaussians.means.device)
+                for each in zip(scene.views, shown, strict=True)
+            ]
             for scale in _SCALES
         ]
         self._regularisation = _regularisation(scene, config.regularise, seed)
@@ -134,7 +139,7 @@ class _Fit:
         loss = image.loss(render.rgb)
         self.losses.append(float(loss.detach()))
         if self._regularisation is not None:
-            loss = loss + self._further_losses(self._regularisation, index, render, progress)
+            loss = loss + self._further_losses(self._regularisation, index, render, progress).to(loss)
         loss.backward()
         self._adam.lrs = {name: rate * self._finals[name] ** progress for name, rate in self._rates.items()}
         self._adam.step()
@@ -166,17 +171,18 @@ class _Fit:
             self._adam.follow(_leaves(change.gaussians), change.origin)
             self._dropout.follow(change.gaussians)
 
-    def _further_losses(
-        self, regularisation: Regularisation, index: int, render: Render, progress: float
-    ) -> Tensor | float:
-        """The losses beside the photometric one on training view `index`, as rendered, and on a pseudo view."""
+    def _further_losses(self, regularisation: Regularisation, index: int, render: Render, progress: float) -> Tensor:
+        """The losses beside the photometric one on training view `index`, as rendered, and on a pseudo view.
+
+        They are computed on the processor, where their networks and targets are.
+        """
 
         def draw(view: PseudoView, channels: Collection[str]) -> Render:
-            return render_gaussians(self._gaussians, view.camera, channels)
+            return render_gaussians(self._gaussians, view.camera, channels).on(_PROCESSOR)
 
-        on_training_view = regularisation.training_loss(index, render, progress)
+        on_training_view = regularisation.training_loss(index, render.on(_PROCESSOR), progress)
         parts = (on_training_view, regularisation.pseudo_loss(draw, progress))
-        return sum((part for part in parts if part is not None), 0.0)
+        return sum((part for part in parts if part is not None), torch.zeros(()))
 
     def _move_camera(self, index: int, gradient: Tensor, decay: float) -> None:
         """An Adam step of the camera in its own frame."""

@@ -13,6 +13,7 @@ from torch import Tensor
 from splatnode.recon.optimize.photometric_loss import PhotometricLoss
 from splatnode.recon.scene.scene import TrainingView
 
+_PROCESSOR = torch.device("cpu")
 _WHOLLY_SHOWN = 1e-3  # tolerance on the share of a pixel that shows the scene, above the rounding of the resize
 
 
@@ -24,8 +25,12 @@ class TrainingImage:
     loss: PhotometricLoss  # of a render (height, width, 3), against the photograph where it shows the scene
 
 
-def training_image(view: TrainingView, shown: npt.NDArray[np.bool_], scale: float, dssim: float) -> TrainingImage:
+def training_image(
+    view: TrainingView, shown: npt.NDArray[np.bool_], scale: float, dssim: float, device: torch.device = _PROCESSOR
+) -> TrainingImage:
     """The photograph of `view` at `scale` of its size, with `dssim` the weight of D-SSIM in its loss.
+
+    The photograph lies, and the loss is computed, on `device`: that of the Gaussians which are rendered.
 
     `shown` (h, w), at the photograph's own size, is False on the black border that undistortion leaves. A pixel of the
     smaller image is compared only if all pixels that it covers are shown.
@@ -36,8 +41,9 @@ def training_image(view: TrainingView, shown: npt.NDArray[np.bool_], scale: floa
         image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
     if not shown.all():
         share = cv2.resize(shown.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-        weights = torch.from_numpy(np.floor(share + np.float32(_WHOLLY_SHOWN)))
-    return TrainingImage(K, width, height, PhotometricLoss(torch.from_numpy(image).float() / 255.0, dssim, weights))
+        weights = torch.from_numpy(np.floor(share + np.float32(_WHOLLY_SHOWN))).to(device)
+    target = torch.from_numpy(image).to(device).float() / 255.0
+    return TrainingImage(K, width, height, PhotometricLoss(target, dssim, weights))
 
 
 def scaled(K: Tensor, width: int, height: int, scale: float) -> tuple[Tensor, int, int]:

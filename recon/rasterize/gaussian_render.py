@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize.dispatch import rasterize
 from splatnode.recon.rasterize.render import Render
 from splatnode.recon.scene.gaussians import Gaussians
 
@@ -29,7 +29,7 @@ def render_gaussians(
     *,
     opacities: Tensor | None = None,  # (N,) in [0, 1], in place of the Gaussians' own
 ) -> Render:
-    """The Gaussians as `camera` sees them, by the core, with gradients; see `recon.rasterize.cpu.rasterize`."""
+    """The Gaussians as `camera` sees them, with gradients, on their own device; see `recon.rasterize.dispatch`."""
     return rasterize(
         gaussians.means,
         gaussians.quats,

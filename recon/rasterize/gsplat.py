@@ -13,6 +13,7 @@ are drawn with the Jacobian at that distance; splats end at 3.33 standard deviat
 from __future__ import annotations
 
 from collections.abc import Collection
+from importlib import import_module
 
 import torch
 from torch import Tensor
@@ -76,6 +77,22 @@ def rasterize(
         near,
     )
     return _split(accumulated, alpha, channels)
+
+
+def obstacle() -> str | None:
+    """What keeps gsplat from computing on a GPU here, as the end of a sentence; None where nothing does.
+
+    The first time on a machine with a GPU this compiles gsplat's kernels, which takes minutes.
+    """
+    if not torch.cuda.is_available():
+        return "torch finds none" if torch.version.cuda else "the torch that is installed is one without CUDA"
+    try:
+        kernels = import_module("gsplat.cuda._backend")._C
+    except ImportError as error:
+        return f"gsplat cannot be imported ({error}). Run: pip install 'splatnode[cuda]'"
+    if kernels is None:
+        return "gsplat found no CUDA toolkit (nvcc) to compile its kernels with"
+    return None
 
 
 def intrinsics_warp(K: Tensor) -> Tensor:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
+import torch
 from torch import Tensor
 
 from splatnode.recon.priors.pointmap import Pointmap
@@ -46,6 +47,10 @@ class Scene:
     losses: tuple[float, ...] = ()  # photometric, of each iteration of a refinement that has ended
     num_unlimited: int = 0  # Gaussians that it would have begun with without a limit
     served_by: Mapping[str, str] = field(default_factory=dict)  # by loss that was used: the network or measure in it
+
+    def on(self, device: torch.device) -> Scene:
+        """The same scene with its Gaussians on `device`. Cameras and photographs stay on the processor."""
+        return replace(self, gaussians=self.gaussians.map(lambda tensor: tensor.to(device)))
 
     def cameras(self, bounds: Mapping[str, Bounds] = MappingProxyType({})) -> tuple[CameraEstimate, ...]:
         """The views' cameras as they are published: copies, in float64, with the `bounds` of their errors by name."""

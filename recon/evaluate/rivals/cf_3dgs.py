@@ -32,7 +32,7 @@ from splatnode.recon.optimize import refinement
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.priors.pointmap import world_points
-from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize.dispatch import rasterize
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.points import gaussians_at

@@ -17,7 +17,7 @@ from splatnode.recon.evaluate.stability.case import Measured, Probe, frames
 from splatnode.recon.evaluate.stability.methods import splatnode
 from splatnode.recon.evaluate.stability.places import Photo
 from splatnode.recon.evaluate.truth import EvaluationScene
-from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize.dispatch import rasterize
 from splatnode.recon.result.snapshot import Snapshot
 
 _MAX_OVERFIT_DB = 0.3  # PSNR that ten times the iterations may lose

@@ -53,12 +53,13 @@ def image_gradient(step: Step) -> Tensor:
 
     It follows from the gradient with respect to the means across the line of sight: du = f / z dx.
     """
-    means, T, image = step.gaussians.means, step.Ts_world_camera[step.view], step.images[step.view]
+    means, image = step.gaussians.means, step.images[step.view]
     assert means.grad is not None
+    T = step.Ts_world_camera[step.view].to(means.device)
     z = (means.detach() - T[:3, 3]) @ T[:3, 2]
     across = means.grad @ T[:3, :2] * z[:, None]
     halves = torch.tensor([image.width / 2, image.height / 2]) / torch.diagonal(image.K)[:2]
-    return (across * halves).norm(dim=1)
+    return (across * halves.to(means.device)).norm(dim=1)
 
 
 def limit(step: Step, config: Config) -> int:
@@ -80,20 +81,21 @@ def densified(
     parts = [_drawn_from(split, config.split_factor, generator) for _ in range(_PARTS)]
     grown = concatenate([gaussians.subset(kept), clones, *parts])
     rows = torch.nonzero(kept)[:, 0]
-    return Change(grown, torch.cat([rows, torch.full((len(grown) - len(rows),), -1)]))
+    return Change(grown, torch.cat([rows, rows.new_full((len(grown) - len(rows),), -1)]))
 
 
 def _drawn_from(gaussians: Gaussians, split_factor: float, generator: torch.Generator) -> Gaussians:
     """For each Gaussian one that is smaller by `split_factor`, its mean drawn from it."""
-    drawn = torch.randn(gaussians.means.shape, generator=generator) * gaussians.scales
+    drawn = torch.randn(gaussians.means.shape, generator=generator).to(gaussians.means.device) * gaussians.scales
     offset = (rotations(gaussians.quats) @ drawn[..., None])[..., 0]
     return replace(gaussians, means=gaussians.means + offset, log_scales=gaussians.log_scales - math.log(split_factor))
 
 
 def radius_px(gaussians: Gaussians, step: Step) -> Tensor:
     """(N,) three standard deviations, in pixels, in the training view in which a Gaussian is largest."""
-    largest = torch.zeros(len(gaussians))
-    for T, image in zip(step.Ts_world_camera, step.images, strict=True):
+    largest = torch.zeros_like(gaussians.logit_opacities)
+    for T_world_camera, image in zip(step.Ts_world_camera, step.images, strict=True):
+        T = T_world_camera.to(largest.device)
         z = (gaussians.means - T[:3, 3]) @ T[:3, 2]
         size = 3.0 * gaussians.scales.amax(1) * float(image.K[0, 0]) / z.clamp_min(1e-6)
         largest = torch.where(z > 0, torch.maximum(largest, size), largest)
@@ -120,7 +122,7 @@ class AdaptiveControl:
             change = self._pruned(change, step)
             self._sum = torch.zeros(0)
         if step.iteration % max(1, round(config.reset_every * step.iterations)) == 0:
-            change = change or Change(gaussians, torch.arange(len(gaussians)))
+            change = change or Change(gaussians, torch.arange(len(gaussians), device=gaussians.means.device))
             logits = change.gaussians.logit_opacities.clamp_max(logit(config.reset_opacity))
             change = Change(replace(change.gaussians, logit_opacities=logits), change.origin)
         return change
@@ -128,7 +130,7 @@ class AdaptiveControl:
     def _observe(self, step: Step) -> None:
         length = image_gradient(step)
         if len(length) != len(self._sum):
-            self._sum, self._count = torch.zeros(len(length)), torch.zeros(len(length))
+            self._sum, self._count = torch.zeros_like(length), torch.zeros_like(length)
         self._sum += length
         self._count += length > 0
 

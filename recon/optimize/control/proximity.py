@@ -32,8 +32,10 @@ def unpooled(gaussians: Gaussians, min_distance: float, neighbours: int) -> Gaus
     """
     if len(gaussians) <= neighbours:
         return gaussians.subset(torch.zeros(0, dtype=torch.long))
-    found = KDTree(gaussians.means.numpy()).query(gaussians.means.numpy(), neighbours + 1)
-    distances, nearest = (torch.from_numpy(np.asarray(each))[:, 1:] for each in found)  # itself comes first
+    means = gaussians.means.cpu().numpy()
+    found = KDTree(means).query(means, neighbours + 1)
+    device = gaussians.means.device
+    distances, nearest = (torch.from_numpy(np.asarray(each)[:, 1:]).to(device) for each in found)  # itself comes first
     isolated = distances.mean(1) > min_distance
     source = torch.nonzero(isolated)[:, 0].repeat_interleave(neighbours)
     destination = nearest[isolated].flatten()
@@ -61,7 +63,7 @@ class ProximityControl:
         grown = unpooled(change.gaussians, min_distance, self._config.neighbours)
         if len(change.gaussians) + len(grown) > adaptive.limit(step, self._config.adaptive):
             return change
-        fresh: Tensor = torch.full((len(grown),), -1)
+        fresh: Tensor = change.origin.new_full((len(grown),), -1)
         return Change(concatenate([change.gaussians, grown]), torch.cat([change.origin, fresh]))
 
 

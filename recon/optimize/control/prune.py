@@ -94,14 +94,14 @@ def changes_without(gaussians: Gaussians, cameras: Sequence[Camera], probes: int
     costs no more than a gradient. Pixels count as if the images were REFERENCE_PX wide.
     """
     opacities = gaussians.opacities.requires_grad_(True)
-    total = torch.zeros(len(gaussians))
+    total = torch.zeros_like(gaussians.logit_opacities)
     for camera in cameras:
         scale = max(camera.width, camera.height) / REFERENCE_PX
         rgb = render_gaussians(gaussians, camera, opacities=opacities).rgb
         assert rgb is not None  # it was asked for
-        visible = torch.from_numpy(visibility(rgb.detach().numpy(), scale))
+        visible = torch.from_numpy(visibility(rgb.detach().cpu().numpy(), scale)).to(rgb.device)
         for _ in range(probes):
-            signs = torch.randint(0, 2, rgb.shape, generator=generator) * 2.0 - 1.0
+            signs = (torch.randint(0, 2, rgb.shape, generator=generator) * 2.0 - 1.0).to(rgb.device)
             # Of a sum: of an image and weights torch would first load its symbolic shapes, for half a second.
             (gradient,) = torch.autograd.grad((signs * visible[..., None] * rgb).sum(), opacities, retain_graph=True)
             total += (gradient * opacities.detach() / scale) ** 2

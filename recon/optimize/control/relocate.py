@@ -45,7 +45,7 @@ class Relocation:
     def after_step(self, step: Step) -> Change:
         config = self._config
         gaussians = step.gaussians.map(Tensor.detach)
-        origin = torch.arange(len(gaussians))
+        origin = torch.arange(len(gaussians), device=gaussians.means.device)
         if step.iteration % config.every == 0 and step.progress < config.until:
             gaussians, origin = relocated(gaussians, config.dead, self._generator)
         size = config.noise * config.rate * config.final**step.progress
@@ -60,10 +60,11 @@ def relocated(gaussians: Gaussians, dead: float, generator: torch.Generator) -> 
     opacities = gaussians.opacities
     dead_rows = (opacities <= dead).nonzero()[:, 0]
     alive = (opacities > dead).nonzero()[:, 0]
-    origin = torch.arange(len(gaussians))
+    origin = torch.arange(len(gaussians), device=opacities.device)
     if not len(dead_rows) or not len(alive):
         return gaussians, origin
-    drawn = alive[torch.multinomial(opacities[alive], len(dead_rows), replacement=True, generator=generator)]
+    weights = opacities[alive].cpu()  # where random numbers are drawn
+    drawn = alive[torch.multinomial(weights, len(dead_rows), replacement=True, generator=generator).to(alive.device)]
     copies = torch.bincount(drawn, minlength=len(gaussians)).clamp(max=MAX_COPIES - 1) + 1
     source = origin.clone()
     source[dead_rows] = drawn
@@ -94,6 +95,6 @@ def with_noise(gaussians: Gaussians, size: float, generator: torch.Generator) ->
     """The Gaussians with their means moved by `size` times covariance times normal noise, less the more opaque."""
     weight = torch.sigmoid(-_SHARPNESS * (gaussians.opacities - _TRANSPARENT))
     axes = rotations(gaussians.quats) * gaussians.scales[:, None, :]
-    noise = torch.randn(gaussians.means.shape, generator=generator) * weight[:, None]
+    noise = torch.randn(gaussians.means.shape, generator=generator).to(weight.device) * weight[:, None]
     moves = size * (axes @ (axes.transpose(1, 2) @ noise[:, :, None]))[:, :, 0]
     return replace(gaussians, means=gaussians.means + moves)

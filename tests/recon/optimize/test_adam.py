@@ -26,7 +26,7 @@ def give_gradients(params: dict[str, Tensor], seed: int) -> None:
         param.grad = torch.randn(param.shape, generator=generator)
 
 
-def test_equals_torch():
+def test_equals_torch(computed_by):
     ours, theirs = random_params(0), random_params(0)
     lrs = {"means": 1e-2, "opacities": 5e-2, "sh": 2.5e-3, "cameras": 1e-3}
     optimizer = Adam(ours, lrs)
@@ -40,7 +40,7 @@ def test_equals_torch():
         torch.testing.assert_close(ours[name], theirs[name], rtol=1e-5, atol=1e-6)
 
 
-def test_the_first_step_is_the_learning_rate_against_the_sign():
+def test_the_first_step_is_the_learning_rate_against_the_sign(computed_by):
     param = leaf(torch.tensor([1.0, 1.0, 1.0]))
     optimizer = Adam({"x": param}, {"x": 0.1})
     param.grad = torch.tensor([5.0, -1e-6, 0.0])
@@ -48,7 +48,7 @@ def test_the_first_step_is_the_learning_rate_against_the_sign():
     torch.testing.assert_close(param.detach(), torch.tensor([0.9, 1.1, 1.0]))
 
 
-def test_factors_scale_rows():
+def test_factors_scale_rows(computed_by):
     params = {"x": leaf(torch.zeros(4, 3))}
     optimizer = Adam(params, {"x": 0.1})
     params["x"].grad = torch.ones(4, 3)
@@ -66,7 +66,7 @@ def test_parameters_without_gradient_stay():
     assert torch.equal(params["means"], before)
 
 
-def test_old_rows_go_on_as_if_nothing_was_added_or_removed():
+def test_old_rows_go_on_as_if_nothing_was_added_or_removed(computed_by):
     alone, changing = leaf(torch.zeros(6, 2)), leaf(torch.zeros(6, 2))
     one, other = Adam({"x": alone}, {"x": 0.1}), Adam({"x": changing}, {"x": 0.1})
     generator = torch.Generator().manual_seed(3)

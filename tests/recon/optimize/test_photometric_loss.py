@@ -1,37 +1,14 @@
-"""L1 + D-SSIM against a plain PyTorch version and values worked out by hand."""
+"""L1 + D-SSIM: the core against the reference, and both against values worked out by hand."""
 
 from __future__ import annotations
 
 import pytest
 import torch
-import torch.nn.functional as F
 from torch import Tensor
 
 from splatnode.recon import core
-from splatnode.recon.optimize import photometric_loss
+from splatnode.recon.optimize import photometric_loss, photometric_reference
 from splatnode.recon.optimize.photometric_loss import PhotometricLoss
-
-
-def blur(planes: Tensor) -> Tensor:
-    """(3, H, W) under the normalised 11 x 11 Gaussian of sigma 1.5, zeros beyond the border."""
-    window = torch.exp(-((torch.arange(11, dtype=planes.dtype) - 5) ** 2) / (2 * 1.5**2))
-    window = window / window.sum()
-    rows = F.conv2d(planes[:, None], window.view(1, 1, 1, 11), padding=(0, 5))
-    return F.conv2d(rows, window.view(1, 1, 11, 1), padding=(5, 0))[:, 0]
-
-
-def plain_loss(rgb: Tensor, target: Tensor, weights: Tensor, ssim_weight: float = 0.2) -> Tensor:
-    """The definition: both means weighted; ignored pixels count as the target's."""
-    x, y = rgb.permute(2, 0, 1), target.permute(2, 0, 1)
-    x = torch.where(weights > 0, x, y)
-    mean_x, mean_y = blur(x), blur(y)
-    variance_x, variance_y = blur(x * x) - mean_x**2, blur(y * y) - mean_y**2
-    covariance = blur(x * y) - mean_x * mean_y
-    ssim = ((2 * mean_x * mean_y + 1e-4) * (2 * covariance + 9e-4)) / (
-        (mean_x**2 + mean_y**2 + 1e-4) * (variance_x + variance_y + 9e-4)
-    )
-    per_pixel = ((1 - ssim_weight) * (x - y).abs() + ssim_weight * (1 - ssim)).mean(0)
-    return (weights * per_pixel).sum() / weights.sum()
 
 
 def textured(height: int, width: int, seed: int) -> tuple[Tensor, Tensor]:
@@ -54,7 +31,7 @@ def test_value_and_gradient(height, width, weighted, instruction_set, monkeypatc
         weights[weights < 0.3] = 0
         weights[0, 0] = 1
     expected_rgb = rgb.clone().requires_grad_()
-    expected = plain_loss(expected_rgb, target, weights)
+    expected = photometric_reference.photometric_loss(expected_rgb, target.permute(2, 0, 1), 0.2, weights)
     expected.backward()
     actual_rgb = rgb.float().requires_grad_()
     actual = PhotometricLoss(target, weights=weights if weighted else None)(actual_rgb)
@@ -66,7 +43,7 @@ def test_value_and_gradient(height, width, weighted, instruction_set, monkeypatc
     assert actual_rgb.grad[weights == 0].abs().sum() == 0
 
 
-def test_equal_images_have_no_loss():
+def test_equal_images_have_no_loss(computed_by):
     _, target = textured(30, 40, 1)
     rgb = target.float().requires_grad_()
     loss = PhotometricLoss(target)(rgb)
@@ -75,7 +52,7 @@ def test_equal_images_have_no_loss():
     assert rgb.grad is not None and rgb.grad.abs().max() < 1e-6
 
 
-def test_constant_difference_by_hand():
+def test_constant_difference_by_hand(computed_by):
     """Without SSIM: the mean absolute difference; its gradient is the sign over the count."""
     rgb = torch.full((4, 6, 3), 0.75, requires_grad=True)
     loss = PhotometricLoss(torch.full((4, 6, 3), 0.5), ssim_weight=0)(rgb)
@@ -84,7 +61,7 @@ def test_constant_difference_by_hand():
     torch.testing.assert_close(rgb.grad, torch.full((4, 6, 3), 1 / 72))
 
 
-def test_ignored_pixels_have_no_influence():
+def test_ignored_pixels_have_no_influence(computed_by):
     rgb, target = textured(40, 50, 3)
     weights = torch.ones(40, 50)
     weights[10:20, 10:30] = 0
