@@ -27,7 +27,6 @@ REQUIRED = {
     "cv2": "opencv-contrib-python-headless",
     "msgspec": "msgspec",
     "numpy": "numpy",
-    "poselib": "poselib",
     "scipy": "scipy",
     "torch": "torch",
     "yaml": "pyyaml",
@@ -68,6 +67,8 @@ def findings() -> list[Finding]:
         _compiler(),
         _core(),
         *(_required(module, distribution) for module, distribution in REQUIRED.items()),
+        _poselib(),
+        _gpu(),
         *(_optional(module, *about) for module, about in OPTIONAL.items()),
         *(_lpips(network) for network in ("alex", "vgg")),
         *_learned_parts(),
@@ -111,6 +112,23 @@ def _optional(module: str, distribution: str, extra: str, purpose: str) -> Findi
     if importlib.util.find_spec(module):
         return Finding(module, "ok", _version(distribution))
     return Finding(module, "optional", f"not installed; for {purpose} (the extra named {extra} brings it)")
+
+
+def _poselib() -> Finding:
+    if importlib.util.find_spec("poselib"):
+        return Finding("poselib", "ok", _version("poselib"))
+    return Finding("poselib", "optional", "not installed (it has no wheel for Linux on aarch64): OpenCV finds the poses")
+
+
+def _gpu() -> Finding:
+    """Whether Gaussians can be refined on a GPU: the answer of those who would do it."""
+    try:
+        from splatnode.recon.rasterize.device import chosen, in_words
+
+        device = chosen("auto")
+    except (ImportError, OSError) as error:
+        return Finding("gpu", "optional", f"not examined: {error}")
+    return Finding("gpu", "ok" if device.type == "cuda" else "optional", in_words("auto", device))
 
 
 def _cameras() -> Finding:

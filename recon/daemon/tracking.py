@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 import numpy.typing as npt
-import poselib
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from splatnode.recon import poselib
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.geometry import MIN_DEPTH, project, to_camera
 from splatnode.recon.matching import features, nearest_neighbours

@@ -9,8 +9,8 @@ import cv2
 import msgspec
 import numpy as np
 import numpy.typing as npt
-import poselib
 
+from splatnode.recon import poselib
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE
 
 Array = npt.NDArray[np.float64]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-import poselib
 
+from splatnode.recon import poselib
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import bundle
 from splatnode.recon.registration.cross_product import cross, cross_matrix

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 import numpy.typing as npt
-import poselib
 
+from splatnode.recon import poselib
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import bundle, epipolar
 from splatnode.recon.registration.cross_product import cross
