@@ -117,7 +117,9 @@ def _optional(module: str, distribution: str, extra: str, purpose: str) -> Findi
 def _poselib() -> Finding:
     if importlib.util.find_spec("poselib"):
         return Finding("poselib", "ok", _version("poselib"))
-    return Finding("poselib", "optional", "not installed (it has no wheel for Linux on aarch64): OpenCV finds the poses")
+    return Finding(
+        "poselib", "optional", "not installed (it has no wheel for Linux on aarch64): OpenCV finds the poses"
+    )
 
 
 def _gpu() -> Finding:

@@ -24,6 +24,7 @@ _Found = tuple["Pose", dict[str, Any]]
 _CONFIDENCE, _MAX_ITERATIONS = 0.9999, 5000
 _LOCAL_ITERATIONS, _LOCAL_SAMPLE = 10, 20  # of the local optimisation: rounds, and matches drawn in each
 _NO_LIMIT = 1e9  # baselines: a point may be as far away as it likes
+_ATTEMPTS = 5  # at a relative pose, with other samples: of few matches or a plane the first may be another's
 _MAX_MATCHES = 300  # that a focal length is judged by
 # Focal lengths over half the points' extent, from 127 to 17 degrees of view: those that are looked at, and those among
 # them from which the search starts whatever the fundamental matrix says (of a plane it says nothing).
@@ -99,11 +100,15 @@ def estimate_relative_pose(
     rays1, rays2 = (np.linalg.solve(K, _homogeneous(p).T).T[:, :2] for K, p in ((K1, pixels1), (K2, pixels2)))
     focal = float(np.sqrt(K1[0, 0] * K2[0, 0]))
     limit = options["max_epipolar_error"] / focal
-    pose, inliers = _five_point(rays1, rays2, limit)
-    if inliers.any():
-        (pose, _), _ = _polished(pose, 1.0, rays1[inliers], rays2[inliers], limit, free_focal=False)
-        inliers = _sampson(pose, rays1, rays2) < limit
-    return pose, {"inliers": inliers.tolist()}
+    best, least = (_NOTHING, np.zeros(len(pixels1), bool)), np.inf
+    for state in range(_ATTEMPTS):
+        pose, inliers = _five_point(rays1, rays2, limit, state)
+        if inliers.any():
+            (pose, _), _ = _polished(pose, 1.0, rays1[inliers], rays2[inliers], limit, free_focal=False)
+        found = np.minimum(_errors_in_front(pose, rays1, rays2) / limit, 1)
+        if (cost := float((found**2).sum())) < least:
+            best, least = (pose, found < 1), cost
+    return best[0], {"inliers": best[1].tolist()}
 
 
 def estimate_shared_focal_relative_pose(
@@ -165,13 +170,16 @@ def _starts(centred1: Array, centred2: Array, focals: Array) -> Array:
     return focals[sorted(chosen)]
 
 
-def _five_point(rays1: Array, rays2: Array, limit: float) -> tuple[Pose, npt.NDArray[np.bool_]]:
-    """The relative pose from rays (M, 2) at depth 1, and its inliers (M,); none where no pose is found."""
+def _five_point(rays1: Array, rays2: Array, limit: float, state: int = 0) -> tuple[Pose, npt.NDArray[np.bool_]]:
+    """The relative pose from rays (M, 2) at depth 1, and its inliers (M,); none where no pose is found.
+
+    Another `state` of the random generator draws other samples.
+    """
     nothing = _NOTHING, np.zeros(len(rays1), bool)
     if len(rays1) < 5:
         return nothing
     rays1, rays2, identity = np.ascontiguousarray(rays1), np.ascontiguousarray(rays2), np.eye(3)
-    essential, _ = cv2.findEssentialMat(rays1, rays2, identity, identity, None, None, _usac(limit))
+    essential, _ = cv2.findEssentialMat(rays1, rays2, identity, identity, None, None, _usac(limit, state))
     if essential is None or essential.shape != (3, 3):
         return nothing
     rotation, translation = cv2.recoverPose(essential, rays1, rays2, identity, _NO_LIMIT)[1:3]
@@ -189,8 +197,17 @@ def _sampson(pose: Pose, rays1: Array, rays2: Array) -> Array:
     return np.abs((second * line2).sum(1)) / np.sqrt(np.maximum(gradient, 1e-30))
 
 
-def _usac(limit: float) -> cv2.UsacParams:
+def _errors_in_front(pose: Pose, rays1: Array, rays2: Array) -> Array:
+    """(M,) Sampson errors at depth 1; infinite where the rays meet behind a camera."""
+    turned, second = _homogeneous(rays1) @ pose.R.T, _homogeneous(rays2)
+    normal = np.cross(second, turned)
+    depth1, depth2 = (-(normal * np.cross(each, pose.t)).sum(1) for each in (second, turned))
+    return np.where((depth1 > 0) & (depth2 > 0), _sampson(pose, rays1, rays2), np.inf)
+
+
+def _usac(limit: float, state: int = 0) -> cv2.UsacParams:
     params = cv2.UsacParams()
+    params.randomGeneratorState = state
     params.threshold, params.confidence, params.maxIterations = limit, _CONFIDENCE, _MAX_ITERATIONS
     params.sampler, params.score = cv2.SAMPLING_UNIFORM, cv2.SCORE_METHOD_MSAC
     params.loMethod = cv2.LOCAL_OPTIM_INNER_LO
