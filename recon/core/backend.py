@@ -17,7 +17,7 @@ from setuptools.build_meta import (
     prepare_metadata_for_build_wheel,
 )
 
-from splatnode.recon.core.compile import compile_core, find_compiler, platform_tag
+from splatnode.recon.core.compile import TARGETS, compile_core, find_compiler, platform_tag
 
 __all__ = [
     "build_editable",
@@ -42,12 +42,16 @@ def get_requires_for_build_editable(config_settings: Settings = None) -> list[st
 
 
 def build_wheel(wheel_directory: str, config_settings: Settings = None, metadata_directory: str | None = None) -> str:
-    """The wheel's file name, tagged py3-none-<platform>."""
-    compile_core()
-    shutil.rmtree("build/lib", ignore_errors=True)  # setuptools would pack modules left there by an earlier version
+    """The wheel's file name, tagged py3-none-<platform>.
+
+    With the setting `target`, one of TARGETS, it is for that kind of machine; see recon/core/wheels.py.
+    """
     settings = dict(config_settings or {})
+    target = TARGETS[settings.pop("target")] if "target" in settings else None
+    compile_core(target=target)
+    shutil.rmtree("build/lib", ignore_errors=True)  # setuptools would pack modules left there by an earlier version
     given = settings.get("--build-option", [])
-    settings["--build-option"] = ["--plat-name", platform_tag(), *([given] if isinstance(given, str) else given)]
+    settings["--build-option"] = ["--plat-name", platform_tag(target), *([given] if isinstance(given, str) else given)]
     return build_meta.build_wheel(wheel_directory, settings, metadata_directory)
 
 

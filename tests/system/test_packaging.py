@@ -16,9 +16,9 @@ from splatnode.recon.core import backend, compile
 from tests.conftest import ROOT
 
 
-def build(hook: str, project: Path) -> Path:
+def build(hook: str, project: Path, before: str = "", settings: dict[str, str] | None = None) -> Path:
     """What the build backend makes of `project`, with this environment's setuptools and no network."""
-    code = f"from splatnode.recon.core import backend; backend.{hook}('dist')"
+    code = f"from splatnode.recon.core import backend; {before}\nbackend.{hook}('dist', {settings!r})"
     environment = {**os.environ, "PYTHONPATH": str(project)}
     result = subprocess.run([sys.executable, "-c", code], cwd=project, env=environment, capture_output=True, text=True)
     assert result.returncode == 0, result.stderr
@@ -40,6 +40,7 @@ def test_the_wheel_installs_and_its_core_loads(project, tmp_path):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {path.name for path in compile.compile_core()} <= {Path(name).name for name in names}
     assert {"splatnode/__main__.py", "splatnode/capture/frame.py", "splatnode/recon/core/threads.cpp"} <= names
+    assert {"splatnode/configs/webcam.yaml", "splatnode/configs/systemd/splatnode-recon.service"} <= names
     assert not [name for name in names if not name.startswith(("splatnode/", "splatnode-"))]
 
     site = tmp_path / "site"
@@ -50,6 +51,27 @@ def test_the_wheel_installs_and_its_core_loads(project, tmp_path):
         [sys.executable, "-c", code], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(site)}, text=True
     )
     assert Path(loaded.strip()).is_relative_to(site)
+
+
+@pytest.mark.parametrize(
+    ("target", "tag"), [("linux-aarch64", "manylinux_2_17_aarch64"), ("macos-arm64", "macosx_11_0_arm64")]
+)
+def test_a_wheel_for_another_machine_has_that_machines_libraries_alone(project, target, tag):
+    """Here the compiler is left out; recon/core/wheels.py says how such a wheel is made."""
+    for library in (project / "recon" / "core").glob("_core_*"):
+        library.unlink()
+    compiled = """
+from splatnode.recon.core.compile import INSTRUCTION_SETS, library_path
+def compiled(target):
+    for name in INSTRUCTION_SETS[target.machine]:
+        library_path(name, target.machine).write_bytes(b"")
+backend.compile_core = compiled
+"""
+    wheel = build("build_wheel", project, compiled, {"target": target})
+    assert wheel.name.endswith(f"-py3-none-{tag}.whl")
+    names = {Path(name).name for name in zipfile.ZipFile(wheel).namelist()}
+    libraries = {name for name in names if name.startswith("_core_")}
+    assert libraries == {"_core_aarch64_neon_dotprod.so", "_core_aarch64_neon.so"}
 
 
 def test_the_sdist_has_the_sources_and_nothing_compiled(project):
