@@ -62,6 +62,13 @@ def changed(case: Case, **changes: Tensor) -> Case:
     return rounded(**{**{name: getattr(case, name) for name in NAMES}, **changes})
 
 
+def moderate(seed: int) -> Case:
+    """Well inside the image, and nothing nearly opaque: where gsplat and the reference are meant to be equal."""
+    case = random_case(seed, count=40, bases=4)
+    means = case.means * torch.tensor([0.4, 0.4, 0.3]) + torch.tensor([0, 0, 2.8])
+    return changed(case, means=means, opacities=case.opacities.clamp(0.02, 0.9))
+
+
 def needles(seed: int) -> Case:
     case = random_case(seed)
     scales = case.scales.clone()

@@ -1,61 +1,89 @@
-"""The CUDA back-end. Without a GPU: our side of it, with gsplat's place taken by the reference's blending."""
+"""The GPU back-end where there is no GPU: our side of it, and gsplat's own PyTorch in place of its kernels.
+
+tests/gpu compares the same on a device.
+"""
 
 from __future__ import annotations
 
-import sys
-import time
-import types
-
 import pytest
 import torch
-from torch import Tensor
 
-from splatnode.recon.rasterize import gsplat, reference
-from splatnode.recon.rasterize.reference import Splats, blend_weights
-from tests.support.rasterize_cases import HEIGHT, NAMES, WIDTH, random_case, relative_error, render_and_differentiate
-
-needs_cuda = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-
-
-def stand_in(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options) -> tuple:
-    """gsplat.rasterization for what our back-end asks of it, from its documentation. Intrinsics get no gradient."""
-    assert quats.shape == (len(means), 4) and scales.shape == (len(means), 3)
-    assert torch.equal(viewmats[0], torch.eye(4).to(means)) and options["render_mode"] == "RGB"
-    (fx, _, cx), (_, fy, cy), _ = Ks[0].detach()
-    x, y, z = means.unbind(1)
-    zero = torch.zeros_like(z)
-    jacobians = torch.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], 1).view(-1, 2, 3)
-    bare = jacobians @ options["covars"] @ jacobians.mT
-    covariances = bare + options["eps2d"] * torch.eye(2).to(means)
-    if options["rasterize_mode"] == "antialiased":
-        opacities = opacities * (torch.linalg.det(bare) / torch.linalg.det(covariances)).clamp(min=0).sqrt()
-    centres = torch.stack([fx * x / z + cx, fy * y / z + cy], 1)
-    weights = blend_weights(Splats(centres, covariances, opacities, colors, z, colors), width, height)
-    return (weights @ colors).view(1, height, width, -1), weights.sum(1).view(1, height, width, 1), {}
+from splatnode.recon.geometry import twist_gradient
+from splatnode.recon.rasterize import device, dispatch, gsplat, reference
+from splatnode.recon.rasterize.device import DeviceUnavailable
+from tests.support import gsplat_by_torch
+from tests.support.rasterize_cases import (
+    HEIGHT,
+    NAMES,
+    WIDTH,
+    moderate,
+    random_case,
+    relative_error,
+    render_and_differentiate,
+)
 
 
 @pytest.fixture
-def gsplat_stand_in(monkeypatch):
-    module = types.ModuleType("gsplat")
-    module.rasterization = stand_in  # pyright: ignore[reportAttributeAccessIssue]
-    monkeypatch.setitem(sys.modules, "gsplat", module)
-    monkeypatch.setattr(gsplat, "check_input", lambda *_: None)
+def by_torch(monkeypatch):
+    gsplat_by_torch.install(monkeypatch)
 
 
 @pytest.mark.parametrize("antialias", [False, True])
 @pytest.mark.parametrize("channels", [reference.CHANNELS, ("rgb",), ("depth", "normal"), ("alpha",)])
-def test_our_side_gives_every_gradient(gsplat_stand_in, channels, antialias):
-    case = random_case(31, bases=4)
+def test_images_and_all_gradients_are_the_references(by_torch, channels, antialias):
     options = {"channels": channels, "antialias": antialias}
-    expected_images, expected = render_and_differentiate(reference.rasterize, case, **options)
-    actual_images, actual = render_and_differentiate(gsplat.rasterize, case, **options)
+    expected_images, expected = render_and_differentiate(reference.rasterize, moderate(31), **options)
+    actual_images, actual = render_and_differentiate(gsplat.rasterize, moderate(31), **options)
     for image, expected_image in zip(actual_images, expected_images, strict=True):
-        assert relative_error(image, expected_image) < 1e-9
+        assert image.shape == expected_image.shape
+        assert (image - expected_image).abs().max() < 1e-4
     for name, gradient, expected_gradient in zip(NAMES, actual, expected, strict=True):
-        assert (gradient - expected_gradient).norm() <= 1e-7 * expected_gradient.norm(), name
+        assert (gradient - expected_gradient).norm() <= 1e-4 * expected_gradient.norm(), name
 
 
-def test_nothing_in_view(gsplat_stand_in):
+@pytest.mark.parametrize("packed", [False, True])
+def test_it_is_what_gsplat_makes_of_quaternions_harmonics_and_a_pose(by_torch, packed):
+    """We hand it covariances and colours in the camera's frame; this is the usual way, with gsplat's gradients."""
+    import gsplat as package  # pyright: ignore[reportMissingImports]
+
+    ours, theirs = moderate(32).tensors(), moderate(32).tensors()
+    render = gsplat.rasterize(*ours, width=WIDTH, height=HEIGHT, channels=("rgb", "alpha"))
+    means, quats, scales, opacities, sh, T_world_camera, K = theirs
+    colours = reference.colours(sh, means - T_world_camera[:3, 3])
+    image, alpha, _ = package.rasterization(  # pyright: ignore[reportAttributeAccessIssue]
+        means, quats, scales, opacities, colours, torch.linalg.inv(T_world_camera)[None], K[None], WIDTH, HEIGHT,
+        packed=packed,
+    )  # fmt: skip
+    torch.testing.assert_close(render.rgb, image[0], rtol=0, atol=1e-6)
+    torch.testing.assert_close(render.alpha, alpha[0, ..., 0], rtol=0, atol=1e-6)
+    (render.rgb**2).sum().backward()
+    (image**2).sum().backward()
+    for name, mine, other in zip(NAMES[:6], ours, theirs, strict=False):
+        gradients = [mine.grad, other.grad]
+        if name == "T_world_camera":  # in directions that no motion has, the two ways may differ
+            gradients = [twist_gradient(each.detach(), each.grad) for each in (mine, other)]
+        assert relative_error(*gradients) < 1e-4, name
+
+
+def test_a_background_shows_through_what_alpha_leaves(by_torch, monkeypatch):
+    import gsplat as package  # pyright: ignore[reportMissingImports]
+
+    tensors, white = moderate(33).tensors(), torch.full((1, 3), 1.0).double()
+    black = gsplat.rasterize(*tensors, width=WIDTH, height=HEIGHT, channels=("rgb", "alpha"))
+    plain = package.rasterization  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setattr(package, "rasterization", lambda *a, **options: plain(*a, **options, backgrounds=white))
+    on_white = gsplat.rasterize(*tensors, width=WIDTH, height=HEIGHT, channels=("rgb", "alpha"))
+    assert black.rgb is not None and black.alpha is not None
+    torch.testing.assert_close(on_white.rgb, black.rgb + (1 - black.alpha)[..., None], rtol=0, atol=1e-6)
+
+
+def test_the_dispatch_follows_the_tensors(by_torch):
+    tensors = moderate(34).tensors()
+    direct = gsplat.rasterize(*tensors, width=WIDTH, height=HEIGHT)
+    assert torch.equal(dispatch.rasterize(*tensors, WIDTH, HEIGHT).rgb, direct.rgb)
+
+
+def test_nothing_in_view(by_torch):
     tensors = random_case(32).tensors()
     behind = (tensors[0].detach() - torch.tensor([0, 0, 100.0])).requires_grad_()
     render = gsplat.rasterize(behind, *tensors[1:], width=WIDTH, height=HEIGHT)
@@ -69,55 +97,9 @@ def test_tensors_must_be_on_the_gpu():
         gsplat.rasterize(*random_case(33).tensors(), width=WIDTH, height=HEIGHT)
 
 
-def on_cuda(tensors: list[Tensor]) -> list[Tensor]:
-    return [tensor.detach().float().cuda().requires_grad_() for tensor in tensors]
-
-
-@needs_cuda
-@pytest.mark.parametrize("antialias", [False, True])
-@pytest.mark.parametrize("seed", range(3))
-def test_cuda_agrees_with_the_reference(seed, antialias):
-    pytest.importorskip("gsplat", reason="needs the extra cuda")
-    case = random_case(seed)
-    # Opacities below both cut-offs and centres well inside, where the two are meant to be equal.
-    case_tensors = case.tensors()
-    with torch.no_grad():
-        case_tensors[3].clamp_(max=0.9)
-        case_tensors[0][:, :2] *= 0.5
-    expected_leaves = [tensor.detach().clone().requires_grad_() for tensor in case_tensors]
-    actual_leaves = on_cuda(case_tensors)
-    expected = reference.rasterize(*expected_leaves, width=WIDTH, height=HEIGHT, antialias=antialias)
-    actual = gsplat.rasterize(*actual_leaves, width=WIDTH, height=HEIGHT, antialias=antialias)
-    losses = []
-    for render in (expected, actual):
-        assert render.rgb is not None and render.normal is not None and render.alpha is not None
-        losses.append((render.rgb**2).mean() + (render.normal**2).mean() + (render.alpha**2).mean())
-    for loss in losses:
-        loss.backward()
-    assert expected.rgb is not None and actual.rgb is not None
-    assert (actual.rgb.detach().cpu() - expected.rgb.detach()).abs().max() < 5e-3
-    for name, leaf, expected_leaf in zip(NAMES, actual_leaves, expected_leaves, strict=True):
-        assert leaf.grad is not None and expected_leaf.grad is not None
-        assert relative_error(leaf.grad.cpu().double(), expected_leaf.grad) < 2e-2, name
-
-
-@needs_cuda
-def test_cuda_iterates_quickly():
-    pytest.importorskip("gsplat", reason="needs the extra cuda")
-    leaves = on_cuda(random_case(0, count=50_000, bases=1, width=512, height=384).tensors())
-    with torch.no_grad():
-        leaves[2] *= 0.1
-
-    def iterate() -> None:
-        render = gsplat.rasterize(*leaves, width=512, height=384)
-        assert render.rgb is not None
-        render.rgb.mean().backward()
-
-    for _ in range(5):
-        iterate()
-    torch.cuda.synchronize()
-    start = time.perf_counter()
-    for _ in range(20):
-        iterate()
-    torch.cuda.synchronize()
-    assert (time.perf_counter() - start) / 20 < 0.1
+@pytest.mark.skipif(torch.cuda.is_available(), reason="has a GPU")
+def test_a_gpu_that_is_not_there_is_refused_with_what_to_do():
+    with pytest.raises(DeviceUnavailable, match=r"device cuda needs an NVIDIA GPU .* but .* Take device auto or cpu"):
+        device.chosen("cuda")
+    assert device.chosen("auto") == device.chosen("cpu") == torch.device("cpu")
+    assert "on the processor: the torch that is installed" in device.in_words("auto", torch.device("cpu"))

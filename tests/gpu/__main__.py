@@ -1,0 +1,59 @@
+"""`python -m tests.gpu [--out FILE]`: does a GPU give what the processor gives, and how fast? For people who have one.
+
+Prints each difference with its bound, seconds and milliseconds, and a verdict; ends with 0 if all bounds are kept, 1 if
+not, 69 without a GPU that can be used. Nobody has run it on a GPU yet: what it prints is worth sending to the project.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from splatnode.recon.rasterize.device import DeviceUnavailable, chosen, in_words
+from tests.gpu.agreement import Figure, figures, whole_figures
+from tests.gpu.speed import milliseconds
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m tests.gpu", description=__doc__)
+    parser.add_argument("--out", type=Path, metavar="FILE", help="where to write the figures as JSON")
+    arguments = parser.parse_args()
+    try:
+        device = chosen("cuda")
+    except DeviceUnavailable as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    print(in_words("cuda", device), flush=True)
+    found: list[Figure] = []
+    for figure in figures(device):
+        found.append(figure)
+        _tell(figure)
+    with tempfile.TemporaryDirectory() as folder:
+        whole, seconds = whole_figures("cuda", Path(folder))
+    for figure in whole:
+        _tell(figure)
+    times = {**seconds, **milliseconds(device)}
+    for name, value in times.items():
+        print(f"{name:60s} {value:10.4g}")
+    broken = [figure.name for figure in (*found, *whole) if not figure.kept]
+    print(f"differs from the CPU: {', '.join(broken)}" if broken else "agrees with the CPU within all bounds")
+    if arguments.out:
+        machine = {"gpu": torch.cuda.get_device_name(device), "torch": torch.__version__}
+        record = {"machine": machine, "figures": [asdict(each) for each in (*found, *whole)], "times": times}
+        arguments.out.write_text(json.dumps(record, indent=1) + "\n")
+    return 1 if broken else 0
+
+
+def _tell(figure: Figure) -> None:
+    verdict = "ok" if figure.kept else "TOO MUCH"
+    print(f"{figure.name:60s} {figure.value:10.2g}  (bound {figure.bound:.2g}) {verdict}", flush=True)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
