@@ -36,11 +36,9 @@ def exp_se3(twist: Tensor) -> Tensor:
 
     It does not carry gradients; `twist_gradient` is there for them.
     """
-    rho, phi = twist[:3].detach(), twist[3:].detach()
-    cross = twist.new_zeros(3, 3)
-    cross[0, 1], cross[0, 2], cross[1, 2] = -phi[2], phi[1], -phi[0]
-    cross = cross - cross.T
-    angle = float(phi.norm())
+    *rho, x, y, z = twist.tolist()
+    angle = math.sqrt(x * x + y * y + z * z)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     square = cross @ cross
     # Taylor's series where the closed form would subtract nearly equal numbers; the first term left out is below 1e-16.
     if angle < 1e-2:
@@ -50,18 +48,16 @@ def exp_se3(twist: Tensor) -> Tensor:
     else:
         first, second = math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2
         third = (angle - math.sin(angle)) / angle**3
-    identity = torch.eye(3, dtype=twist.dtype, device=twist.device)
-    motion = torch.eye(4, dtype=twist.dtype, device=twist.device)
-    motion[:3, :3] = identity + first * cross + second * square
-    motion[:3, 3] = (identity + second * cross + third * square) @ rho
-    return motion
+    motion = np.eye(4)
+    motion[:3, 3] = rho + (second * cross + third * square) @ rho
+    motion[:3, :3] += first * cross + second * square
+    return torch.from_numpy(motion).to(twist)
 
 
 def twist_gradient(T: Tensor, gradient: Tensor) -> Tensor:
     """(6,) gradient at zero of a twist x in `T @ exp_se3(x)`, from the gradient (4, 4) with respect to `T`."""
-    moved = T.T @ gradient
-    turn = [moved[2, 1] - moved[1, 2], moved[0, 2] - moved[2, 0], moved[1, 0] - moved[0, 1]]
-    return torch.stack([*moved[:3, 3], *turn])
+    (_, xy, xz, x), (yx, _, yz, y), (zx, zy, _, z), _ = (T.T @ gradient).tolist()
+    return T.new_tensor([x, y, z, zy - yz, xz - zx, yx - xy])
 
 
 def quat_from_matrix(rotation: Tensor) -> Tensor:

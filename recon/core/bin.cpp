@@ -46,6 +46,7 @@ int bin(Raster& raster) {
     }
     raster.entries.resize(entries);
     raster.tile_splats.resize(entries + kLanes);  // read a whole register of splats at a time
+    raster.tile_splats[entries] = {0, 0, 0, 0, 0, 2 * kLog2AlphaMin, 0, 0, {}, 0};  // seen by no pixel
     raster.block_bits.resize(words);
 
     run_parallel(chunks, [&](int chunk, int) {

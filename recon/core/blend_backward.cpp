@@ -15,7 +15,7 @@ constexpr int kMoments = 6;
 constexpr int kColumns = 16;  // of a row of sums: moments in even places, features in odd ones
 constexpr int kPairFloats = 2 * kLanes;
 constexpr int kSumsInFlight = 8;  // registers
-constexpr int kPadding = 16;      // sums beyond a tile's splats, for whole registers
+constexpr int kPadding = 16;      // sums, and splats of a block, beyond the last one, for whole groups and registers
 constexpr int kRowsAhead = 2 * kBlockHeight;  // of the images, between asking memory for them and using them
 
 // Sums over the pixels of a tile, of v times a monomial and of the weight times a feature's gradient.
@@ -25,7 +25,7 @@ struct alignas(64) Sums {
 
 struct Scratch {
     Buffer<Sums> sums;          // one per splat, then padding
-    Buffer<uint32_t> places;     // of a block's splats
+    Buffer<uint32_t> list;      // places of a block's splats
     Buffer<float> pairs;        // (splats of a block, 2, lanes)
 };
 
@@ -63,41 +63,39 @@ PixelGradients<Channels> load_gradients(const Camera& camera, const BlockPositio
     return g;
 }
 
-// (a) Repeats the forward pass over the splats in `words`, keeps (alpha, weight), and returns how many there are.
-uint32_t repeat_blending(const TileSplat* splats, const uint64_t* words, uint32_t num_words, Vec x, Vec y,
-                         Vec transmittance, uint32_t* places, float* pairs) {
-    uint32_t count = 0;
-    for (uint32_t word = 0; word < num_words; ++word) {
-        for (uint64_t rest = words[word]; rest; rest &= rest - 1) {
-            const uint32_t place = word * 64 + __builtin_ctzll(rest);
-            const Contribution c = blend_splat(splats[place], x, y, transmittance);
-            store(pairs + count * kPairFloats, c.alpha);
-            store(pairs + count * kPairFloats + kLanes, c.weight);
-            places[count++] = place;
+// (a) Repeats the forward pass over `count` splats and keeps (alpha, weight).
+void repeat_blending(const TileSplat* splats, const uint32_t* list, uint32_t count, Vec x, Vec y, Vec transmittance,
+                     float* pairs) {
+    for (uint32_t first = 0; first < count; first += kGroup) {
+        Vec alphas[kGroup];
+        group_alphas(splats, list + first, x, y, alphas);
+        for (int i = 0; i < kGroup; ++i) {
+            float* pair = pairs + (first + i) * kPairFloats;
+            const Mask open = open_lanes(transmittance);
+            store(pair, keep(open, alphas[i]));
+            store(pair + kLanes, pass_splat(alphas[i], open, transmittance));
         }
     }
-    return count;
 }
 
 // (b) Back to front. With g the gradient-weighted features of a splat and `behind` those of everything behind it, as
 // seen through nothing: dL/d(alpha) = transmittance * (g - behind). Replaces (alpha, weight) by the pairs (v, weight).
 // Neither a division by 1 - alpha nor a difference of sums: both would lose digits behind opaque splats.
 template <int Channels>
-void differentiate(const TileSplat* splats, const uint32_t* places, uint32_t count,
+void differentiate(const TileSplat* splats, const uint32_t* list, uint32_t count,
                    const PixelGradients<Channels>& pixel_gradients, float* pairs) {
     using F = Features<Channels>;
     const PixelGradients<Channels> gradients = pixel_gradients;  // in registers: `pairs` might overlap the original
     Vec behind{};
     for (uint32_t i = count; i-- > 0;) {
-        const TileSplat& splat = splats[places[i]];
+        const TileSplat& splat = splats[list[i]];
         float* pair = pairs + i * kPairFloats;
         const Vec alpha = load(pair), weight = load(pair + kLanes);
         Vec value = gradients.alpha;
         for (int c = 0; c < F::kCount; ++c)
             value = multiply_add(gradients.features[c], core::splat(splat.features[F::place(c)]), value);
-        const Vec difference = value - behind;
-        behind = multiply_add(alpha, difference, behind);
-        const Vec v = keep(less(alpha, core::splat(kAlphaMax)), weight * difference);
+        const Vec v = keep(less(alpha, core::splat(kAlphaMax)), weight * (value - behind));
+        behind = multiply_add(1.0f - alpha, behind, alpha * value);  // one operation from splat to splat
         store_pairs(pair, v, weight);
     }
 }
@@ -117,9 +115,10 @@ void make_columns(Vec x, Vec y, const PixelGradients<Channels>& gradients, float
     store_transposed(by_lane, places);
 }
 
-// (c) sums[splat] += pairs * columns, for several splats at a time to hide the latency of the additions.
+// (c) sums[splat] += pairs * columns, for several splats at a time to hide the latency of the additions. Each step is one
+// operation: free to reorder the sums, GCC made products and additions of them, and kept some of the sums in memory.
 template <int Channels>
-void add_sums(const uint32_t* places, uint32_t count, const float* pairs, const float (&columns)[kLanes][kColumns],
+void add_sums(const uint32_t* list, uint32_t count, const float* pairs, const float (&columns)[kLanes][kColumns],
               Sums* sums) {
     constexpr int kUsed = 2 * (Features<Channels>::kCount > kMoments ? Features<Channels>::kCount : kMoments);
     constexpr int kParts = (kUsed + kLanes - 1) / kLanes;
@@ -130,10 +129,10 @@ void add_sums(const uint32_t* places, uint32_t count, const float* pairs, const 
             for (int i = 0; i < kTogether; ++i) {
                 const Vec pair = broadcast_pair(pairs + (first + i) * kPairFloats + 2 * place);
                 for (int part = 0; part < kParts; ++part)
-                    totals[i][part] += pair * load(columns[place] + part * kLanes);
+                    totals[i][part] = multiply_add(pair, load(columns[place] + part * kLanes), totals[i][part]);
             }
         for (int i = 0; i < kTogether; ++i) {
-            float* to = sums[places[first + i]].columns;
+            float* to = sums[list[first + i]].columns;
             for (int part = 0; part < kParts; ++part)
                 store(to + part * kLanes, load(to + part * kLanes) + totals[i][part]);
         }
@@ -154,16 +153,17 @@ void differentiate_block(const Raster& raster, int tile, int block, const Raster
     const TileSplat* splats = raster.tile_splats.data() + raster.first_entries[tile];
     const Vec x = block_x(block), y = block_y(block);
     const Vec transmittance = initial_transmittance(raster.camera, origin, block);
-    uint32_t* places = scratch.places.data();
+    uint32_t* list = scratch.list.data();
     float* pairs = scratch.pairs.data();
-    const uint32_t count = repeat_blending(splats, words, num_words, x, y, transmittance, places, pairs);
+    const uint32_t count = list_splats(words, num_words, invisible_place(raster, tile), list);
     if (!count) return;
-    differentiate<Channels>(splats, places, count, gradients, pairs);
-    std::fill(places + count, places + count + kSumsInFlight, raster.num_entries(tile));
+    repeat_blending(splats, list, count, x, y, transmittance, pairs);
+    differentiate<Channels>(splats, list, count, gradients, pairs);
+    std::fill(list + count, list + count + kSumsInFlight, raster.num_entries(tile));
     std::fill(pairs + count * kPairFloats, pairs + (count + kSumsInFlight) * kPairFloats, 0.0f);
     alignas(64) float columns[kLanes][kColumns];
     make_columns<Channels>(x, y, gradients, columns);
-    add_sums<Channels>(places, count, pairs, columns, scratch.sums.data());
+    add_sums<Channels>(list, count, pairs, columns, scratch.sums.data());
 }
 
 // Sums become the gradients of kLanes splats: from monomials in the tile's pixels to
@@ -221,7 +221,7 @@ void differentiate_tile(Raster& raster, int tile, const RasterImages& images, co
     if (!count) return;
     const uint32_t padded = count + kPadding;
     scratch.sums.resize(padded);
-    scratch.places.resize(padded);
+    scratch.list.resize(padded);
     scratch.pairs.resize(size_t(padded) * kPairFloats);
     const TileOrigin origin = tile_origin(raster, tile);
     const TileSplat* splats = raster.tile_splats.data() + raster.first_entries[tile];

@@ -21,15 +21,21 @@ uint64_t count_pairs(const Raster& raster, int tile) {
     const TileOrigin origin = tile_origin(raster, tile);
     const uint32_t num_words = raster.num_words(tile);
     const uint64_t* words = raster.block_bits.data() + raster.first_words[tile];
+    Buffer<uint32_t> list;
+    list.resize(raster.num_entries(tile) + kListPadding);
     uint64_t pairs = 0;
     for (int block = 0; block < kBlocks; ++block) {
         Vec transmittance = initial_transmittance(raster.camera, origin, block);
-        for (uint32_t word = 0; word < num_words; ++word)
-            for (uint64_t rest = words[block * num_words + word]; rest; rest &= rest - 1) {
-                const TileSplat& splat = splats[word * 64 + __builtin_ctzll(rest)];
-                const Contribution c = blend_splat(splat, block_x(block), block_y(block), transmittance);
-                pairs += __builtin_popcount(bits(less(Vec{}, c.weight)));
+        const uint32_t count =
+            list_splats(words + block * num_words, num_words, invisible_place(raster, tile), list.data());
+        for (uint32_t first = 0; first < count; first += kGroup) {
+            Vec alphas[kGroup];
+            group_alphas(splats, list.data() + first, block_x(block), block_y(block), alphas);
+            for (const Vec alpha : alphas) {
+                const Vec weight = pass_splat(alpha, open_lanes(transmittance), transmittance);
+                pairs += __builtin_popcount(bits(less(Vec{}, weight)));
             }
+        }
     }
     return pairs;
 }

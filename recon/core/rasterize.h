@@ -86,10 +86,10 @@ struct alignas(64) Splat {
 //   u = k0 * x + k1 * y + u0,  w = k2 * y + w0.
 struct alignas(64) TileSplat {
     float k0, k1, u0, k2, w0, log2_opacity;
-    uint32_t slot;  // of its gradient from this tile
-    float unused;
+    uint32_t slot;    // of its gradient from this tile
+    float extent_at;  // as in Splat
     float features[kFeatures];
-    float unused2;
+    float x;  // of its centre
 };
 
 // Tiles [x0, x1) x [y0, y1) that a splat may touch; empty for a Gaussian that is not seen.

@@ -56,6 +56,8 @@ void load_splats(Raster& raster, int tile) {
         here.w0 = -splat.k2 * y;
         here.log2_opacity = splat.log2_opacity;
         here.slot = splat.slot_origin + tile_y * splat.slot_row + tile_x;
+        here.extent_at = splat.extent_at;
+        here.x = x;
         std::memcpy(here.features, splat.features, sizeof here.features);
     }
 }
@@ -63,25 +65,22 @@ void load_splats(Raster& raster, int tile) {
 void find_blocks(Raster& raster, int tile) {
     const uint32_t count = raster.num_entries(tile), words = raster.num_words(tile);
     if (!count) return;
-    const uint64_t* entries = raster.entries.data() + raster.first_entries[tile];
+    const TileSplat* splats = raster.tile_splats.data() + raster.first_entries[tile];
     uint64_t* block_bits = raster.block_bits.data() + raster.first_words[tile];
     std::memset(block_bits, 0, sizeof(uint64_t) * kBlocks * words);
-    const TileOrigin origin = tile_origin(raster, tile);
     const float slack = 0.005f;  // pixels, against rounding
 
     // A lane is a splat. For each row of blocks: where the ellipse starts and ends in it.
     for (uint32_t first = 0; first < count; first += kLanes) {
-        alignas(64) float columns[7][kLanes];
-        for (int lane = 0; lane < kLanes; ++lane) {
-            const uint32_t entry = std::min(first + lane, count - 1);
-            const float* splat = &raster.splats[entry_gaussian(entries[entry])].x;
-            for (int column = 0; column < 7; ++column) columns[column][lane] = splat[column];
-        }
-        const Vec x = load(columns[0]) - float(origin.x), y = load(columns[1]) - float(origin.y);
-        const Vec slope = load(columns[3]), k2 = load(columns[4]);
-        const Vec radius2 = maximum(load(columns[5]) - kLog2AlphaMin, Vec{});
-        const Vec inverse_k0 = 1.0f / load(columns[2]), extent_y = square_root(radius2) / k2 + slack;
-        const Vec extent_at = load(columns[6]);
+        const float* rows[kLanes];
+        for (uint32_t lane = 0; lane < kLanes; ++lane) rows[lane] = &splats[std::min(first + lane, count - 1)].k0;
+        Vec columns[16];
+        load_transposed(rows, columns);
+        const Vec inverse_k0 = 1.0f / columns[0], k2 = columns[3], inverse_k2 = 1.0f / k2;
+        const Vec slope = -columns[1] * inverse_k0, extent_at = columns[7];
+        const Vec x = columns[15] + float(kTile / 2), y = float(kTile / 2) - columns[4] * inverse_k2;
+        const Vec radius2 = maximum(columns[5] - kLog2AlphaMin, Vec{});
+        const Vec extent_y = square_root(radius2) * inverse_k2 + slack;
         const unsigned valid = (1u << std::min(count - first, uint32_t(kLanes))) - 1;
 
         for (int row = 0; row < kBlocksDown; ++row) {
@@ -99,8 +98,8 @@ void find_blocks(Raster& raster, int tile) {
             const Vec left = x + slope * at_left - half_left - slack;
             for (int column = 0; column < kBlocksAcross; ++column) {
                 const float first_pixel = float(column * kBlockWidth) + 0.5f;
-                const unsigned reached = bits(at_least(right, splat(first_pixel))) &
-                                         bits(at_least(splat(first_pixel + (kBlockWidth - 1)), left)) & touched;
+                const unsigned reached = touched & bits(at_least(right, splat(first_pixel)) &
+                                                        at_least(splat(first_pixel + (kBlockWidth - 1)), left));
                 block_bits[(row * kBlocksAcross + column) * words + first / 64] |= uint64_t(reached) << first % 64;
             }
         }

@@ -36,23 +36,64 @@ void load_splats(Raster& raster, int tile);
 // For each block the tile's splats whose ellipse alpha = 1/255 reaches a pixel centre of it, as bits.
 void find_blocks(Raster& raster, int tile);
 
-// What the pixels of a block take of a splat.
-struct Contribution {
-    Vec alpha, weight;
-};
+// A block's splats, nearest first, are listed before they are blended, in groups whose alphas are computed in turns.
+constexpr int kGroup = 6;
 
-// Blends `splat` into the lanes at (x, y) that still let light through. `transmittance` becomes what is left; where it
-// is already too small it goes on falling, so that a splat waits for little of what the one before it computes.
-inline Contribution blend_splat(const TileSplat& splat_, Vec x, Vec y, Vec& transmittance) {
-    const Vec u = multiply_add(splat(splat_.k0), x, multiply_add(splat(splat_.k1), y, splat(splat_.u0)));
-    const Vec w = multiply_add(splat(splat_.k2), y, splat(splat_.w0));
-    const Vec log2_alpha = multiply_add(-u, u, multiply_add(-w, w, splat(splat_.log2_opacity)));
-    const Mask visible = at_least(log2_alpha, splat(kLog2AlphaMin));
-    const Mask open = at_least(transmittance, splat(kTransmittanceMin));
-    const Vec alpha = keep(visible, minimum(exp2_nonpositive(log2_alpha), splat(kAlphaMax)));
+// The place, counted from the tile's first splat, of one that no pixel sees: it fills up the last group.
+inline uint32_t invisible_place(const Raster& raster, int tile) {
+    return raster.first_entries[raster.num_tiles()] - raster.first_entries[tile];
+}
+
+// The places of the bits of every byte, from the lowest.
+struct BitPlaces {
+    uint8_t places[256][8];
+    constexpr BitPlaces() : places() {
+        for (int byte = 0; byte < 256; ++byte)
+            for (int bit = 0, count = 0; bit < 8; ++bit)
+                if (byte >> bit & 1) places[byte][count++] = uint8_t(bit);
+    }
+};
+inline constexpr BitPlaces kBitPlaces;
+constexpr uint32_t kListPadding = 8 + kGroup;  // of a list's memory
+
+// Lists the places whose bits are set, fills up the last group with `invisible`, and returns how many there are. Eight
+// are written at a time, of which as many stay as there are bits: a loop over bits is mispredicted once a word.
+inline uint32_t list_splats(const uint64_t* words, uint32_t num_words, uint32_t invisible, uint32_t* list) {
+    uint32_t* next = list;
+    for (uint32_t word = 0; word < num_words; ++word)
+        for (int byte = 0; byte < 8; ++byte) {
+            const unsigned here = words[word] >> 8 * byte & 255;
+            for (int i = 0; i < 8; ++i) next[i] = word * 64 + 8 * byte + kBitPlaces.places[here][i];
+            next += __builtin_popcount(here);
+        }
+    for (int i = 0; i < kGroup; ++i) next[i] = invisible;
+    return uint32_t(next - list);
+}
+
+// What pixels would take of each splat of a group with nothing before it.
+inline void group_alphas(const TileSplat* splats, const uint32_t* group, Vec x, Vec y, Vec (&alphas)[kGroup]) {
+    const TileSplat* s[kGroup];
+    Vec u[kGroup], w[kGroup], log2_alpha[kGroup];
+    for (int i = 0; i < kGroup; ++i) s[i] = splats + group[i];
+    for (int i = 0; i < kGroup; ++i) u[i] = multiply_add(splat(s[i]->k1), y, splat(s[i]->u0));
+    for (int i = 0; i < kGroup; ++i) w[i] = multiply_add(splat(s[i]->k2), y, splat(s[i]->w0));
+    for (int i = 0; i < kGroup; ++i) u[i] = multiply_add(splat(s[i]->k0), x, u[i]);
+    for (int i = 0; i < kGroup; ++i) log2_alpha[i] = multiply_add(-w[i], w[i], splat(s[i]->log2_opacity));
+    for (int i = 0; i < kGroup; ++i) log2_alpha[i] = multiply_add(-u[i], u[i], log2_alpha[i]);
+    exp2_nonpositive(log2_alpha, alphas);
+    for (int i = 0; i < kGroup; ++i)
+        alphas[i] = keep(at_least(log2_alpha[i], splat(kLog2AlphaMin)), minimum(alphas[i], splat(kAlphaMax)));
+}
+
+// Lanes that still let light through.
+inline Mask open_lanes(Vec transmittance) { return at_least(transmittance, splat(kTransmittanceMin)); }
+
+// The weight of a splat in the open lanes. `transmittance` becomes what is left; where it is already too small it goes on
+// falling, so that a splat waits for little of what the one before it computes.
+inline Vec pass_splat(Vec alpha, Mask open, Vec& transmittance) {
     const Vec weight = keep(open, alpha * transmittance);
     transmittance = multiply_add(-alpha, transmittance, transmittance);
-    return {keep(open, alpha), weight};
+    return weight;
 }
 
 // Lanes of a block whose pixel is inside the image let all light through, the others none.

@@ -41,6 +41,7 @@ class Dropout:
         """Goes on with `gaussians`, after a density control has changed them."""
         if self._config.share:
             self._probabilities = self._config.share * uncertainty(gaussians, self._views, self._config.sure)
+            self._raised = 1 / (1 - self._probabilities)
 
     def __call__(self, opacities: Tensor, progress: float) -> Tensor:
         """The opacities (N,) of a render at `progress` in [0, 1]: 0 in what is left out, raised in the rest.
@@ -50,7 +51,7 @@ class Dropout:
         if self._config.share == 0 or progress >= self._config.until:
             return opacities
         drawn = torch.rand(len(opacities), generator=self._generator).to(opacities) >= self._probabilities
-        return (opacities * (drawn / (1 - self._probabilities))).clamp(max=MAX_OPACITY)
+        return (opacities * (drawn * self._raised)).clamp(max=MAX_OPACITY)
 
 
 @torch.no_grad()

@@ -40,6 +40,8 @@ class PhotometricLoss:
             raise ValueError("target must be finite")
         if not dispatch.by_core(self.target):
             return
+        pixels = float(target.shape[0] * target.shape[1])
+        self._total_weight = pixels if self._weights is None else float(self._weights.sum(dtype=torch.float64))
         self._mean, self._variance = torch.empty_like(self.target), torch.empty_like(self.target)
         height, width, _ = target.shape
         library().core_photometric_moments(
@@ -60,13 +62,12 @@ class PhotometricLoss:
     def evaluate(self, planar: Tensor, gradient: Tensor | None) -> float:
         """The loss of a planar (3, H, W) image; fills `gradient`, of the same shape, where given."""
         _, height, width = self.target.shape
-        weights = self._weights
-        total = float(height * width) if weights is None else float(weights.sum(dtype=torch.float64))
         evaluate = library().core_photometric
         evaluate.restype = ctypes.c_double
         return evaluate(
-            _address(planar), _address(self.target), _address(self._mean), _address(self._variance), _address(weights),
-            ctypes.c_double(total), ctypes.c_double(self.ssim_weight), width, height, _address(gradient),
+            _address(planar), _address(self.target), _address(self._mean), _address(self._variance),
+            _address(self._weights), ctypes.c_double(self._total_weight), ctypes.c_double(self.ssim_weight),
+            width, height, _address(gradient),
         )  # fmt: skip
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 
-import torch
 from torch import Tensor
 
 from splatnode.recon.rasterize.reference import CHANNELS
@@ -66,16 +66,16 @@ def check_input(
 
 
 def _check_camera(T_world_camera: Tensor, K: Tensor) -> None:
-    T = T_world_camera.to("cpu", torch.float64).numpy()
-    if not abs(T).max() < float("inf"):
-        raise ValueError(f"T_world_camera must be finite, got {T.tolist()}")
-    drift = abs(T[:3, :3] @ T[:3, :3].T - [[1, 0, 0], [0, 1, 0], [0, 0, 1]]).max()
-    if drift > 1e-2 or abs(T[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise ValueError(
-            f"T_world_camera must be a rigid transform (its rotation is off by {drift:.2g}), got {T.tolist()}"
-        )
-    matrix = K.to("cpu", torch.float64).numpy()
-    if not abs(matrix).max() < float("inf") or matrix[0, 0] <= 0 or matrix[1, 1] <= 0:
-        raise ValueError(f"K must be finite with positive focal lengths, got {matrix.tolist()}")
-    if matrix[0, 1] != 0 or matrix[1, 0] != 0 or tuple(matrix[2]) != (0, 0, 1):
-        raise ValueError(f"K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {matrix.tolist()}")
+    T = T_world_camera.tolist()
+    if not all(math.isfinite(value) for row in T for value in row):
+        raise ValueError(f"T_world_camera must be finite, got {T}")
+    drift = max(
+        abs(sum(T[i][k] * T[j][k] for k in range(3)) - (1.0 if i == j else 0.0)) for i in range(3) for j in range(i + 1)
+    )
+    if drift > 1e-2 or max(abs(value - last) for value, last in zip(T[3], (0, 0, 0, 1), strict=True)) > 1e-6:
+        raise ValueError(f"T_world_camera must be a rigid transform (its rotation is off by {drift:.2g}), got {T}")
+    matrix = K.tolist()
+    if not all(math.isfinite(value) for row in matrix for value in row) or matrix[0][0] <= 0 or matrix[1][1] <= 0:
+        raise ValueError(f"K must be finite with positive focal lengths, got {matrix}")
+    if matrix[0][1] != 0 or matrix[1][0] != 0 or matrix[2] != [0, 0, 1]:
+        raise ValueError(f"K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {matrix}")
