@@ -50,6 +50,40 @@ inline float sum(Vec x) {
     return (parts[0][0] + parts[0][2]) + (parts[0][1] + parts[0][3]);
 }
 
+// Moved into [0, most]; INT32_MIN stands for what no integer can hold.
+inline IntVec within(IntVec x, int32_t most) {
+#if CORE_LANES == 16
+    return (IntVec)_mm512_min_epi32(_mm512_max_epi32((__m512i)x, _mm512_setzero_si512()), _mm512_set1_epi32(most));
+#elif CORE_LANES == 8
+    return (IntVec)_mm256_min_epi32(_mm256_max_epi32((__m256i)x, _mm256_setzero_si256()), _mm256_set1_epi32(most));
+#else
+    x &= ~(x >> 31);
+    const IntVec beyond = x > most;
+    return (x & ~beyond) | (most & beyond);
+#endif
+}
+
+constexpr int kStepBits = 6, kSteps = 1 << kStepBits;  // of a pixel, at which sources are sampled
+constexpr float kPerSquaredStep = 1.0f / (kSteps * kSteps);
+
+// The bilinear sample, times kSteps^2, of the four grey values that each lane holds (see patchmatch_pack), `right` and
+// `below` the first by so many steps. Exact, hence the same for all instruction sets.
+inline IntVec between(IntVec four, IntVec right, IntVec below) {
+#if CORE_LANES == 16
+    const IntVec columns = (right << 8) - right + kSteps, rows = (below << 16) - below + kSteps;
+    const __m512i both = _mm512_maddubs_epi16((__m512i)four, (__m512i)(columns | (columns << 16)));
+    return (IntVec)_mm512_madd_epi16(both, (__m512i)rows);
+#elif CORE_LANES == 8
+    const IntVec columns = (right << 8) - right + kSteps, rows = (below << 16) - below + kSteps;
+    const __m256i both = _mm256_maddubs_epi16((__m256i)four, (__m256i)(columns | (columns << 16)));
+    return (IntVec)_mm256_madd_epi16(both, (__m256i)rows);
+#else
+    const IntVec top = (four & 255) * (kSteps - right) + ((four >> 8) & 255) * right;
+    const IntVec bottom = ((four >> 16) & 255) * (kSteps - right) + ((four >> 24) & 255) * right;
+    return top * (kSteps - below) + bottom * below;
+#endif
+}
+
 inline Vec to_float(IntVec x) { return __builtin_convertvector(x, Vec); }
 
 // Grey values as floats with kRadius repeated pixels on every side, so that windows need no bounds.
@@ -173,33 +207,33 @@ struct Pairs {
     int count = 0;
 };
 
-// `centre` is the homogeneous source pixel of the window's centre. Samples outside the image repeat its border.
+// `centre` is the homogeneous source pixel of the window's centre. The window is carried there by the affine map that
+// touches the plane's homography, and samples are taken at 1 / kSteps of a pixel: a division and seven conversions
+// less a sample than exactly. Samples outside the image repeat its border.
 inline void add_moments(
     const Plane& plane, const Window& window, const Pattern& pattern, const Source& source, const Point& centre,
     Pairs& pairs
 ) {
     const float* A = source.from_reference.A;
     const float* t = source.from_reference.t;
-    const float xu = A[0] + t[0] * plane.du, xv = A[1] + t[0] * plane.dv;
-    const float yu = A[3] + t[1] * plane.du, yv = A[4] + t[1] * plane.dv;
+    // The derivatives by the window's pixels of where the plane's points land, in steps of 1 / kSteps pixel.
+    const float inverse_z = 1.0f / std::max(centre.z, kSmallestZ), step = kSteps * inverse_z;
+    const float landing_x = centre.x * inverse_z, landing_y = centre.y * inverse_z;
     const float zu = A[6] + t[2] * plane.du, zv = A[7] + t[2] * plane.dv;
-    const Vec max_x = splat(float(source.width - 1)), max_y = splat(float(source.height - 1));
-    const Vec zero = {}, smallest_z = splat(kSmallestZ);
+    const Vec xu = splat(step * (A[0] + t[0] * plane.du - landing_x * zu));
+    const Vec xv = splat(step * (A[1] + t[0] * plane.dv - landing_x * zv));
+    const Vec yu = splat(step * (A[3] + t[1] * plane.du - landing_y * zu));
+    const Vec yv = splat(step * (A[4] + t[1] * plane.dv - landing_y * zv));
+    const Vec x0 = splat(kSteps * (landing_x - 0.5f)), y0 = splat(kSteps * (landing_y - 0.5f));
+    const Vec mean = splat(window.mean);
 
     Vec first = {}, second = {}, product = {};
     for (int k = 0; k < kVectors; ++k) {
         const Vec dx = pattern.right[k], dy = pattern.down[k];
-        const Vec inverse_z = 1.0f / maximum(centre.z + zu * dx + zv * dy, smallest_z);
-        const Vec x = minimum(maximum((centre.x + xu * dx + xv * dy) * inverse_z - 0.5f, zero), max_x);
-        const Vec y = minimum(maximum((centre.y + yu * dx + yv * dy) * inverse_z - 0.5f, zero), max_y);
-        const IntVec column = __builtin_convertvector(x, IntVec), row = __builtin_convertvector(y, IntVec);
-        const Vec right = x - to_float(column), below = y - to_float(row);
-        const IntVec four = gather(source.packed, row * source.width + column);
-        const Vec top_left = to_float(four & 255), top_right = to_float((four >> 8) & 255);
-        const Vec bottom_left = to_float((four >> 16) & 255), bottom_right = to_float((four >> 24) & 255);
-        const Vec top = top_left + right * (top_right - top_left);
-        const Vec bottom = bottom_left + right * (bottom_right - bottom_left);
-        const Vec grey = top + below * (bottom - top) - window.mean;
+        const IntVec x = within(core::nearest_int(x0 + xu * dx + xv * dy), kSteps * (source.width - 1));
+        const IntVec y = within(core::nearest_int(y0 + yu * dx + yv * dy), kSteps * (source.height - 1));
+        const IntVec four = gather(source.packed, (y >> kStepBits) * source.width + (x >> kStepBits));
+        const Vec grey = to_float(between(four, x & (kSteps - 1), y & (kSteps - 1))) * kPerSquaredStep - mean;
         const Vec weighted = window.weight[k] * grey;
         first += weighted;
         second += weighted * grey;

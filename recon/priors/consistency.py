@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from splatnode.recon.core import library, pointer
 from splatnode.recon.priors.patchmatch import Level, Matching, Planes, Transfer, transfer
+from splatnode.recon.workers import each
 
 Float32 = npt.NDArray[np.float32]
 
@@ -87,15 +88,20 @@ class _Agreement(ctypes.Structure):
     _fields_ = tuple((name, ctypes.c_void_p) for name in Agreement.__dataclass_fields__)
 
 
-def cross_check(views: Sequence[Level], planes: Sequence[Planes], matching: Matching, config: Config) -> list[DepthMap]:
-    """The depth maps of all views, each compared with all others."""
-    maps = []
-    for index, view in enumerate(views):
-        others = [*views[:index], *views[index + 1 :]]
-        other_planes = [*planes[:index], *planes[index + 1 :]]
-        agreeing = agreement(view, planes[index], others, other_planes, config)
-        maps.append(depth_map(view, planes[index], agreeing, matching, config))
-    return maps
+def cross_check(
+    views: Sequence[Level],
+    planes: Sequence[Planes],
+    partners: Sequence[Sequence[int]],
+    matching: Matching,
+    config: Config,
+) -> list[DepthMap]:
+    """The depth maps of all views, each compared with those of its `partners`."""
+
+    def checked(view: Level, own: Planes, others: Sequence[int]) -> DepthMap:
+        agreeing = agreement(view, own, [views[i] for i in others], [planes[i] for i in others], config)
+        return depth_map(view, own, agreeing, matching, config)
+
+    return each(checked, views, planes, partners)
 
 
 def agreement(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +14,33 @@ from splatnode.recon.priors.pointmap import Pointmap
 Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
+
+OVERLAP_STEP = 8  # pixels between the points that tell how much two maps share
+
+
+def overlapping(pointmaps: Sequence[Pointmap], most: int) -> list[list[int]]:
+    """For each point map the others that share most with it, at most so many, in order.
+
+    Two maps share the points of either that fall into the other's image; a point of OVERLAP_STEP squared is asked.
+    """
+    if len(pointmaps) <= most + 1:
+        return [[i for i in range(len(pointmaps)) if i != j] for j in range(len(pointmaps))]
+    thinned = [
+        pointmap.points[::OVERLAP_STEP, ::OVERLAP_STEP][pointmap.depth[::OVERLAP_STEP, ::OVERLAP_STEP] > 0]
+        for pointmap in pointmaps
+    ]
+    inside = np.array([[_num_inside(points, pointmap) for pointmap in pointmaps] for points in thinned])
+    shared = inside + inside.T
+    np.fill_diagonal(shared, -1)
+    return [sorted(np.argsort(-row, kind="stable")[:most].tolist()) for row in shared]
+
+
+def _num_inside(points: Float32, pointmap: Pointmap) -> int:
+    """How many of the world's points (M, 3) fall into the point map's image."""
+    height, width = pointmap.depth.shape
+    T_camera_world = np.linalg.inv(pointmap.T_world_camera)
+    x, y, z = pointmap.K @ (T_camera_world[:3, :3] @ points.T + T_camera_world[:3, 3:])
+    return int(((z > 0) & (x >= 0) & (y >= 0) & (x < width * z) & (y < height * z)).sum())
 
 
 def nearest(source: Pointmap, target: Pointmap) -> tuple[Float32, Float32]:

@@ -1,7 +1,7 @@
 """PatchMatch multi-view stereo: a depth, a normal and a confidence for every pixel of views with known cameras.
 
 `depth_maps` does it for a set of views, `further_depth_map` for one more beside those that have a map: there
-`choose_sources` names the views to compare it with, and `estimate` matches it alone.
+`rank_partners` tells which views to compare it with, and `estimate` matches it alone.
 """
 
 from __future__ import annotations
@@ -13,9 +13,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.deadline import OutOfTime
 from splatnode.recon.priors import consistency
 from splatnode.recon.priors.consistency import DepthMap
 from splatnode.recon.priors.patchmatch import Level, Matching, Planes, Search, improve, make_level, resized
+from splatnode.recon.workers import each
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -23,6 +25,7 @@ Float64 = npt.NDArray[np.float64]
 MIN_SOURCE_SCORE = 0.01  # of a view to compare with, in [0, 1]: below, the two overlap in next to nothing
 DEPTH_PERCENTILES = 1.0, 99.0  # of sparse depths, that count as the nearest and the farthest: few points are wrong
 MIN_SPARSE_POINTS = 3  # to know a depth range
+NEEDED_STAGES = 2  # those at a quarter of the resolution: without the second, no view's depth agrees with another's
 PROBES = 8, 6, 5  # columns, rows and depths of the grid that stands in for sparse points
 
 
@@ -36,16 +39,17 @@ class Stage:
 
 
 DEFAULT_STAGES = (
-    Stage(2, Search(iterations=4, perturbation=4.0, random_starts=16), geometric=False),
-    Stage(2, Search(iterations=2, perturbation=1.0)),
-    Stage(1, Search(iterations=2, perturbation=1.0)),
-    Stage(0, Search(iterations=1, perturbation=0.5)),
+    Stage(2, Search(iterations=3, perturbation=4.0, random_starts=8), geometric=False),
+    Stage(2, Search(iterations=1, perturbation=1.0)),
+    Stage(1, Search(iterations=2, perturbation=1.0, directions=3)),
+    Stage(0, Search(iterations=1, perturbation=0.5, directions=3)),
 )
 
 
 @dataclass(frozen=True)
 class Config:
     num_sources: int = 4  # views that each view is compared with, at most
+    num_checked: int = 8  # views that each view's depth is checked against, at most
     best_angle_deg: float = 12.0  # triangulation angle that matches best
     stages: tuple[Stage, ...] = DEFAULT_STAGES
     matching: Matching = field(default_factory=Matching)
@@ -92,31 +96,51 @@ def depth_maps(
     """A depth map for every view, in order. A view that overlaps with no other comes back without any depth.
 
     The result depends on the arguments only, not on the number of threads. `pause` is called several times a second;
-    it may raise to abandon the work.
+    it may raise to abandon the work, and OutOfTime
+    to end it: after NEEDED_STAGES, depth is as fine as it is by then.
     """
     known_points = list(sparse) if sparse is not None else [None] * len(views)
     if len(known_points) != len(views):
         raise ValueError(f"sparse must have one entry a view, got {len(known_points)} for {len(views)} views")
-    sources = [choose_sources(views, index, config, known_points[index]) for index in range(len(views))]
+    partners = [rank_partners(views, index, config, known_points[index]) for index in range(len(views))]
+    sources = [compared_with(ranked, config) for ranked in partners]
+    finest = config.stages[-1].level
     levels: dict[int, list[Level]] = {}
     planes: list[Planes] = []
     for stream, stage in enumerate(config.stages):
         if stage.level not in levels:
-            levels[stage.level] = [_level(view, stage.level) for view in views]
+            levels[stage.level] = each(_level, views, [stage.level] * len(views))
         at_level = levels[stage.level]
         if not planes:
-            planes = [_start(*start) for start in zip(views, at_level, known_points, strict=True)]
-        planes = [resized(p, level) for p, level in zip(planes, at_level, strict=True)]
+            planes = each(_start, views, at_level, known_points)
+        planes = each(resized, planes, at_level)
         improved = list(planes)
-        for i in (index for index, chosen in enumerate(sources) if chosen):
-            pause()
-            improved[i] = improve(
-                at_level[i], [at_level[j] for j in sources[i]], planes[i], stage.search, config.matching,
-                known={n: planes[j].inverse_depth for n, j in enumerate(sources[i])} if stage.geometric else {},
-                seed=seed, stream=stream,
-            )  # fmt: skip
+        try:
+            for i in (index for index, chosen in enumerate(sources) if chosen):
+                _ask(pause, may_end=stream >= NEEDED_STAGES)
+                improved[i] = improve(
+                    at_level[i], [at_level[j] for j in sources[i]], planes[i], stage.search, config.matching,
+                    known={n: planes[j].inverse_depth for n, j in enumerate(sources[i])} if stage.geometric else {},
+                    seed=seed, stream=stream,
+                )  # fmt: skip
+        except OutOfTime:
+            planes = improved
+            break
         planes = improved
-    return consistency.cross_check(levels[config.stages[-1].level], planes, config.matching, config.consistency)
+    if finest not in levels:
+        levels[finest] = each(_level, views, [finest] * len(views))
+    planes = each(resized, planes, levels[finest])
+    checked = [checked_against(ranked, config) for ranked in partners]
+    return consistency.cross_check(levels[finest], planes, checked, config.matching, config.consistency)
+
+
+def _ask(pause: Callable[[], None], may_end: bool) -> None:
+    """Pauses; work that is needed goes on when time is over."""
+    try:
+        pause()
+    except OutOfTime:
+        if may_end:
+            raise
 
 
 def further_depth_map(
@@ -133,11 +157,12 @@ def further_depth_map(
     `depths` holds the depth maps (h, w), 0 where unknown, of other views by their index. They stay as they are, and
     the new map is checked against them.
     """
-    sources = choose_sources(views, index, config, sparse)
+    partners = rank_partners(views, index, config, sparse)
+    sources = compared_with(partners, config)
     known = {n: depths[j] for n, j in enumerate(sources) if j in depths}
     planes = estimate(views[index], [views[j] for j in sources], config, seed=seed, sparse=sparse, known=known)
     finest = config.stages[-1].level
-    checked = [j for j in depths if j != index]
+    checked = [j for j, _ in partners if j in depths][: config.num_checked]
     levels = {j: _level(views[j], finest) for j in (index, *checked)}
     others = [resized(_flat(depths[j]), levels[j]) for j in checked]
     agreeing = consistency.agreement(levels[index], planes, [levels[j] for j in checked], others, config.consistency)
@@ -172,10 +197,20 @@ def estimate(
     return planes
 
 
-def choose_sources(
+def compared_with(partners: Sequence[tuple[int, float]], config: Config) -> list[int]:
+    """Of a view's ranked partners, those that it is compared with, best first: at most `config.num_sources`, maybe none."""
+    return [other for other, score in partners[: config.num_sources] if score > MIN_SOURCE_SCORE]
+
+
+def checked_against(partners: Sequence[tuple[int, float]], config: Config) -> list[int]:
+    """Of a view's ranked partners, those that its depth is checked against."""
+    return [other for other, _ in partners[: config.num_checked]]
+
+
+def rank_partners(
     views: Sequence[StereoView], index: int, config: Config, sparse: SparsePoints | None = None
-) -> list[int]:
-    """The views that view `index` should be compared with, best first: at most `config.num_sources`, maybe none.
+) -> list[tuple[int, float]]:
+    """All other views with how well view `index` can be compared with them, in [0, 1], best first.
 
     A candidate scores for every probe point of the view that falls into its image, by the triangulation angle: too
     small tells nothing, too large does not match. The probes are the sparse points, or a grid over the depth range.
@@ -189,8 +224,7 @@ def choose_sources(
         for other, candidate in enumerate(views)
         if other != index
     }
-    useful = [other for other, score in scores.items() if score > MIN_SOURCE_SCORE]
-    return sorted(useful, key=lambda other: -scores[other])[: config.num_sources]
+    return sorted(scores.items(), key=lambda scored: -scored[1])
 
 
 def depth_range(depths: Float64, margin: float = 1.5) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import msgspec
@@ -21,6 +22,7 @@ from scipy.sparse.linalg import spsolve
 
 from splatnode.recon.priors import reprojection
 from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.workers import each
 
 Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
@@ -42,6 +44,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     foreground_depth: float = 0.4  # of an unknown foreground, over the nearest known depth of its view
     background_depth: float = 1.5  # of an unknown background, over the farthest known depth of its view
     confidence: float = 0.1  # of filled depths
+    most_partners: int = 16  # other views that a view is compared with, at most: those that share most with it
     reduction: int = 4  # the smooth depth is found at 1 / `reduction` of the resolution
     edge_contrast: float = 0.06  # difference of colour, in [0, 1], by which smoothness weakens to 1 / e
     occlusion_tolerance: float = 0.03  # relative depth by which a filled point may lie before a known surface
@@ -51,21 +54,23 @@ def complete(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Con
     """The point maps with unknown pixels filled or, where that would contradict another view, empty."""
     known = [pointmap.masked(pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
     blurred = [np.asarray(cv2.GaussianBlur(image, (BLUR_PX, BLUR_PX), 0), np.uint8) for image in images]
+    partners = reprojection.overlapping(known, config.most_partners)
+    smooth = each(partial(_smooth, config=config), known, images)
     completed = list(known)
     for j in sorted(range(len(known)), key=lambda i: -float(known[i].confidence.mean())):
-        rest = [i for i in range(len(known)) if i != j]
-        others = [(completed[i], blurred[i]) for i in rest]
+        others = [(completed[i], blurred[i]) for i in partners[j]]
         covered, explained = _seen_by_others(known[j], blurred[j], others, config.colour_tolerance)
         unknown = known[j].depth <= 0
         # Single pixels of another colour are noise and edges; an object that only this view sees is larger.
         object_size = np.ones((config.min_object_px, config.min_object_px), np.uint8)
         occluder = cv2.morphologyEx((unknown & covered & ~explained).astype(np.uint8), cv2.MORPH_OPEN, object_size) > 0
         hole = unknown & (~covered | occluder)
-        if not hole.any() or not (known[j].depth > 0).any():
+        filling = smooth[j]
+        if filling is None or not hole.any():
             continue
-        for guess in _guesses(pointmaps[j], known[j], images[j], covered, occluder, config):
+        for guess in _guesses(pointmaps[j], known[j], filling, covered, occluder, config):
             guess = guess.masked(hole)
-            guess = guess.masked(~_hides_known(guess, [known[i] for i in rest], config.occlusion_tolerance))
+            guess = guess.masked(~_hides_known(guess, [known[i] for i in partners[j]], config.occlusion_tolerance))
             completed[j] = replace(
                 completed[j],
                 depth=completed[j].depth + guess.depth,
@@ -77,14 +82,20 @@ def complete(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Con
 
 
 def _guesses(
-    doubtful: Pointmap, known: Pointmap, image: Image, covered: Mask, occluder: Mask, config: Config
+    doubtful: Pointmap, known: Pointmap, smooth: Float32, covered: Mask, occluder: Mask, config: Config
 ) -> Iterator[Pointmap]:
     """The point maps that a hole may be filled from, the best first."""
     near, far = np.percentile(known.depth[known.depth > 0], [NEAREST_PERCENTILE, 100.0])
     yield doubtful
-    yield _facing_camera(known, smooth_depth(known, image, config)).masked(~covered)
-    yield _facing_camera(known, config.background_depth * far).masked(~covered)
-    yield _facing_camera(known, config.foreground_depth * near).masked(occluder)
+    facing = _facing_camera(known)
+    yield replace(facing, depth=smooth).masked(~covered)
+    yield replace(facing, depth=np.full_like(smooth, config.background_depth * far)).masked(~covered)
+    yield replace(facing, depth=np.full_like(smooth, config.foreground_depth * near)).masked(occluder)
+
+
+def _smooth(pointmap: Pointmap, image: Image, config: Config) -> Float32 | None:
+    """`smooth_depth`; None where no depth is known."""
+    return smooth_depth(pointmap, image, config) if (pointmap.depth > 0).any() else None
 
 
 def smooth_depth(pointmap: Pointmap, image: Image, config: Config) -> Float32:
@@ -144,11 +155,11 @@ def _hides_known(filled: Pointmap, others: Sequence[Pointmap], occlusion_toleran
     return wrong
 
 
-def _facing_camera(pointmap: Pointmap, depth: Float32 | float) -> Pointmap:
-    """The point map at another depth, a number or (h, w), with normals along the rays towards the camera."""
+def _facing_camera(pointmap: Pointmap) -> Pointmap:
+    """The point map with normals along the rays towards the camera."""
     height, width = pointmap.depth.shape
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     K = pointmap.K
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], -1)
-    normal = (-rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32)
-    return replace(pointmap, depth=np.full_like(pointmap.depth, depth), normal=normal)
+    u = ((np.arange(width) + 0.5 - K[0, 2]) / K[0, 0]).astype(np.float32)
+    v = ((np.arange(height) + 0.5 - K[1, 2]) / K[1, 1]).astype(np.float32)[:, None]
+    inverse_length = -1 / np.sqrt(u * u + v * v + 1)
+    return replace(pointmap, normal=np.stack([u * inverse_length, v * inverse_length, inverse_length], -1))

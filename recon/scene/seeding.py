@@ -8,6 +8,7 @@ Gaussians follows from what there is to see and not from how many pixels show it
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import cv2
 import msgspec
@@ -21,6 +22,7 @@ from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.scene.contrast_masking import visibility
 from splatnode.recon.scene.gaussians import SH_C0, Gaussians, concatenate, logit
 from splatnode.recon.scene.partition import partition
+from splatnode.recon.workers import each
 
 Mask = npt.NDArray[np.bool_]
 Array = npt.NDArray[np.float64]
@@ -54,17 +56,19 @@ def redundant_pixels(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask
     Beyond the paper, a pixel is kept where the other map's point was seen from so far away that detail would be lost.
     """
     score = [float(pointmap.confidence.mean()) for pointmap in pointmaps]  # equation 14
-    masks = []
-    for j, target in enumerate(pointmaps):
-        covered = np.zeros(target.depth.shape, bool)
-        for i, source in enumerate(pointmaps):
+
+    def covered(j: int) -> Mask:
+        target = pointmaps[j]
+        mask = np.zeros(target.depth.shape, bool)
+        for i in range(len(pointmaps)):
             if (score[i], -i) > (score[j], -j):
-                projected, footprint = reprojection.nearest(source, target)
+                projected, footprint = reprojection.nearest(pointmaps[i], target)
                 near = np.abs(projected - target.depth) < config.depth_tolerance * target.depth
                 own = target.depth / target.K[0, 0]
-                covered |= near & (footprint < config.max_footprint_ratio * own)
-        masks.append(covered & (target.depth > 0))
-    return masks
+                mask |= near & (footprint < config.max_footprint_ratio * own)
+        return mask & (target.depth > 0)
+
+    return each(covered, range(len(pointmaps)))
 
 
 def gaussians_from_pointmap(
@@ -215,7 +219,7 @@ def initial_gaussians(
     ]
     for _ in range(ATTEMPTS):
         gaussians = concatenate(
-            [gaussians_from_pointmap(*view, config) for view in zip(pointmaps, images, wanted, strict=True)]
+            each(partial(gaussians_from_pointmap, config=config), pointmaps, images, wanted)
         )
         if max_gaussians is None or len(gaussians) <= max_gaussians:
             return gaussians

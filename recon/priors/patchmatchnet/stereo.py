@@ -45,11 +45,13 @@ class NetworkStereo:
         """
         levels = [make_level(view.image, view.K, view.T_world_camera, view.depth_range, 0) for view in views]
         images = [_source(view) for view in views]
-        planes = []
+        planes, checked = [], []
         for index, view in enumerate(views):
             pause()
             points = None if sparse is None else sparse[index]
-            chosen = stereo.choose_sources(views, index, config, points)
+            partners = stereo.rank_partners(views, index, config, points)
+            checked.append(stereo.checked_against(partners, config))
+            chosen = stereo.compared_with(partners, config)
             inverse_depth = np.zeros(view.image.shape[:2], np.float32)
             if chosen:
                 generator = torch.Generator().manual_seed(seed)
@@ -58,7 +60,7 @@ class NetworkStereo:
                 found = _resized(depth.clamp(*view.depth_range).numpy(), view.image)
                 inverse_depth = np.reciprocal(found, dtype=np.float32)
             planes.append(_planes(inverse_depth))
-        return consistency.cross_check(levels, planes, config.matching, config.consistency)
+        return consistency.cross_check(levels, planes, checked, config.matching, config.consistency)
 
 
 def _source(view: StereoView) -> Source:

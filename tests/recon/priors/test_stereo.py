@@ -14,7 +14,7 @@ from splatnode.recon.priors.stereo import (
     SparsePoints,
     Stage,
     StereoView,
-    choose_sources,
+    compared_with,
     depth_maps,
     depth_range,
     estimate,
@@ -156,7 +156,7 @@ def check_side_by_side(first: Planes, second: Planes, config: consistency.Config
     """Two cameras side by side before a striped wall at z = 4, with the planes given."""
     stripes = np.repeat((np.arange(WIDTH) % 16 * 10).astype(np.uint8)[None, :, None], HEIGHT, 0).repeat(3, 2)
     levels = [make_level(stripes, K, camera(x, 0.0), (1.0, 10.0), 0) for x in (0.0, 0.4)]
-    return consistency.cross_check(levels, [first, second], Matching(), config)
+    return consistency.cross_check(levels, [first, second], [[1], [0]], Matching(), config)
 
 
 def test_depth_is_the_mean_of_agreeing_views():
@@ -205,8 +205,9 @@ def test_sparse_points_replace_the_search_over_the_depth_range(views):
 def test_sources_overlap_and_have_parallax(views):
     behind = StereoView(views[0].image, K, camera(0.0, 180.0), (1.5, 12.0))
     same_place = StereoView(views[0].image, K, camera(0.001, 0.0), (1.5, 12.0))
-    assert choose_sources([views[1], same_place, behind, views[0], views[2]], 0, Config())[:2] in ([3, 4], [4, 3])
-    assert 2 not in choose_sources([views[1], same_place, behind, views[0], views[2]], 0, Config())
+    partners = rank_partners([views[1], same_place, behind, views[0], views[2]], 0, Config())
+    assert compared_with(partners, Config())[:2] in ([3, 4], [4, 3])
+    assert 2 not in compared_with(partners, Config())
 
 
 def test_a_view_without_overlap_has_no_depth(views):
@@ -237,4 +238,4 @@ def test_wrong_input_says_what_was_expected(views):
 
 def test_a_view_without_sparse_points_still_finds_its_sources(views):
     none = SparsePoints(np.empty((0, 2)), np.empty(0))
-    assert choose_sources(views, 1, Config(), none) == choose_sources(views, 1, Config())
+    assert rank_partners(views, 1, Config(), none) == rank_partners(views, 1, Config())
