@@ -39,7 +39,7 @@ class Stage:
 
 
 DEFAULT_STAGES = (
-    Stage(2, Search(iterations=3, perturbation=4.0, random_starts=8), geometric=False),
+    Stage(2, Search(iterations=3, perturbation=4.0, random_starts=16), geometric=False),
     Stage(2, Search(iterations=1, perturbation=1.0)),
     Stage(1, Search(iterations=2, perturbation=1.0, directions=3)),
     Stage(0, Search(iterations=1, perturbation=0.5, directions=3)),
