@@ -71,7 +71,13 @@ def _seconds(config: Config, begun: Scene, scene: Scene, seconds: Mapping[str, f
         return None
     gain = _gain(done / planned, EARLIER)
     if not done:
-        basis = "cameras and points alone took this long, nothing was refined, and refining takes time on top"
+        stages = {
+            "cameras": seconds.get("poses", 0.0) + seconds.get("ladder", 0.0),
+            "points": seconds.get("points", 0.0),
+        }
+        taken = ", ".join(f"{name} {spent:.1f} s" for name, spent in stages.items())
+        beyond = seconds["total"] - config.budget_s
+        basis = f"the least took {beyond:.1f} s too long ({taken}), nothing was refined, and refining takes time on top"
         return Hit("budget_s", config.budget_s, round(seconds["total"], 1), gain, basis)
     each = seconds.get("optimise", 0.0) / done
     would_take = round(seconds["total"] + each * (planned - done), 1)

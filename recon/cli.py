@@ -13,6 +13,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+from torch import Tensor
 
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.frame import DroppedFrame, Frame
@@ -21,7 +22,8 @@ from splatnode.capture.process.terminal import say
 from splatnode.recon.config import Config, overlaid, preset
 from splatnode.recon.evaluate import methods
 from splatnode.recon.evaluate.bench import Entrants, Plan, Scoring, run_bench, run_line
-from splatnode.recon.evaluate.demo import largest_capture_bytes, write_capture
+from splatnode.recon.evaluate.demo import largest_capture_bytes, write_held_out, write_photographs
+from splatnode.recon.evaluate.metrics import psnr
 from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
 from splatnode.recon.evaluate.records import merged, read_bench
 from splatnode.recon.evaluate.report import redraw
@@ -40,6 +42,8 @@ from splatnode.recon.result.write import finish
 from splatnode.recon.viewer_process import viewer
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
+# Of the search for a held-out view's pose, half of them at half the resolution: as near as 100 at full.
+DEMO_STEPS = 60
 LOOK_EVERY = 50  # iterations between the snapshots that a viewer is shown
 
 
@@ -59,7 +63,10 @@ def replay(args: argparse.Namespace) -> int:
         where = str(args.folder.resolve())
         preset_name = args.preset or "balanced"
         report = finish(snapshot, args.out, seed=config.seed, preset_name=preset_name, photographs=where)
-        _tell(snapshot, args.out, report, as_json=args.json)
+        if args.json:
+            print(json.dumps(report))
+        else:
+            _tell(snapshot, args.out)
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
 
 
@@ -76,8 +83,8 @@ def _check_apart(out: Path, photographs: Path) -> None:
         raise ValueError(f"--out must not be the folder of the photographs; give one in it, such as {out / 'out'}")
 
 
-def _shown_to_nobody(snapshot: Snapshot) -> None:
-    """What is done with a snapshot where nobody watches."""
+def _shown_to_nobody(_: object) -> None:
+    """What is done with a snapshot, or a line, where nobody watches."""
 
 
 def with_looks(config: Config, every: int) -> Config:
@@ -100,23 +107,47 @@ def run(
 
 
 def demo(args: argparse.Namespace) -> int:
-    """Writes the built-in capture, reconstructs it, and measures the result on views that it has not seen."""
+    """Writes the built-in capture, reconstructs it, and then measures the result on views that it has not seen."""
     seed = args.seed or 0
     config = overlaid(preset("balanced"), {"seed": seed, "device": args.device or "cpu"})
     place = synthetic.Config(seed=seed)
     needed_bytes = largest_result_bytes([(place.width, place.height)] * place.views, config.size, None)
+    tell, show = (_shown_to_nobody, _shown_to_nobody) if args.json else (say, _tell_progress)
     with result_folder(args.out, needed_bytes + largest_capture_bytes(place)):
         capture = args.out / "capture"
-        split = write_capture(capture, place)
-        snapshot = run(folder.stream(folder.Config(folder=capture / "images", names=split.train)), config)
-        measured = held_out_quality(snapshot, capture, split, config.device) if snapshot.verdict.publishable else None
-        report = finish(snapshot, args.out, seed=seed, preset_name="balanced", held_out=measured)
-        _tell(snapshot, args.out, report, as_json=args.json)
+        tell(f"photographing the built-in place, {place.views} times")
+        split = write_photographs(capture, place)
+        tell("finding the cameras")
+        snapshot = run(folder.stream(folder.Config(folder=capture / "images", names=split.train)), config, show)
+        write = partial(finish, snapshot, args.out, seed=seed, preset_name="balanced")
+        report = write()
+        if not args.json:
+            _tell(snapshot, args.out)
+        if snapshot.verdict.publishable:
+            tell(f"measuring it on {len(split.test)} views that it has not seen")
+            write_held_out(capture, place)
+            report = write(held_out=held_out_quality(snapshot, capture, split, config.device, tell))
+        if args.json:
+            print(json.dumps(report))
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
 
 
-def held_out_quality(snapshot: Snapshot, capture: Path, split: Split, on: Device = "cpu") -> dict[str, float | None]:
-    """Mean scores over the test views, and the errors of the estimated cameras."""
+def _tell_progress(snapshot: Snapshot) -> None:
+    """Says in a line that there is a scene, and how far it is."""
+    if snapshot.final or not snapshot.verdict.publishable:
+        return
+    state = f"{snapshot.iterations} iterations" if snapshot.iterations else "a scene, coarse so far"
+    say(f"{snapshot.seconds['total']:.1f} s: {state}, {len(snapshot.gaussians)} Gaussians")
+
+
+def held_out_quality(
+    snapshot: Snapshot, capture: Path, split: Split, on: Device = "cpu", tell: Callable[[str], None] = say
+) -> dict[str, float | None]:
+    """Mean scores over the test views, each of which is told, and the errors of the estimated cameras."""
+
+    def measured(name: str, truth: Tensor, image: Tensor) -> None:
+        tell(f"{name}: {psnr(image, truth):.1f} dB")
+
     row = evaluate(
         snapshot,
         load_scene(capture),
@@ -124,8 +155,10 @@ def held_out_quality(snapshot: Snapshot, capture: Path, split: Split, on: Device
         Run("balanced", 0, None, snapshot.seconds, None),
         rasterize=rasterizer(device.chosen(on)),
         networks=Networks(alex=None, vgg=None),
-        settings=Settings(alignment_steps=100),
+        settings=Settings(alignment_steps=DEMO_STEPS, alignment_levels=2),
+        show=measured,
     )
+    tell(f"held-out views: {row.psnr:.1f} dB PSNR, {row.ssim:.3f} SSIM")
     wanted = ("psnr", "ssim", "rotation_error_deg", "centre_error_pct", "focal_error_pct")
     return {name: getattr(row, name) for name in wanted}
 
@@ -197,17 +230,11 @@ def _chosen(args: argparse.Namespace) -> tuple[str, ...]:
     return tuple(names[i] for i in np.linspace(0, len(names) - 1, args.views).round().astype(int))
 
 
-def _tell(snapshot: Snapshot, out: Path, report: dict[str, object], *, as_json: bool) -> None:
-    if as_json:
-        print(json.dumps(report))
-        return
+def _tell(snapshot: Snapshot, out: Path) -> None:
     verdict = snapshot.verdict
     say(f"{verdict.code.value}: {verdict.message}" + (f" {verdict.advice}" if verdict.advice else ""))
     for frame in snapshot.dropped:
         say(f"left out: {frame.name}: {frame.reason}")
-    held_out = report.get("held_out")
-    if isinstance(held_out, dict):
-        say(f"held-out views: {held_out['psnr']:.1f} dB PSNR, {held_out['ssim']:.3f} SSIM")
     for hit in snapshot.budget:
         say(hit["message"])
     if verdict.publishable:

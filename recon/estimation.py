@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from splatnode.recon.config import Config
+from splatnode.recon.deadline import pausing_until
 from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
@@ -89,10 +90,16 @@ def estimate_cameras(
     return Estimate(graph, registration, evidence, decide(graph, registration, evidence, config.decision))
 
 
-def estimate_depth(estimate: Estimate, prior: Prior, pause: Callable[[], None] = lambda: None) -> Estimate:
-    """With a point map for each camera; with none where the verdict forbids a scene. `pause` as above."""
+def estimate_depth(
+    estimate: Estimate, prior: Prior, pause: Callable[[], None] = lambda: None, until: float | None = None
+) -> Estimate:
+    """With a point map for each camera; with none where the verdict forbids a scene. `pause` as above.
+
+    A prior that can end early gives coarser depth from `until` on, a time of `time.monotonic()`.
+    """
     if estimate.registration is None or not estimate.verdict.publishable:
         return estimate
+    pause = pausing_until(until, pause) if prior.ends_early else pause
     pointmaps = prior.pointmaps(estimate.graph, estimate.registration, pause)
     return replace(estimate, pointmaps={pointmap.name: pointmap for pointmap in pointmaps})
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -18,10 +18,13 @@ from splatnode.recon.rasterize.device import chosen
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.scene import growth
+from splatnode.recon.scene.first_look import first_look
 from splatnode.recon.scene.initialisation import initial_scene
 from splatnode.recon.scene.scene import Scene
 
 log = logging.getLogger(__name__)
+
+COARSE = "Coarse so far: the matched points alone; depth and refinement follow."
 
 _PROCESSOR = torch.device("cpu")
 
@@ -37,6 +40,14 @@ class Shown:
 def shown(scene: Scene | None, config: Config) -> Shown:
     """The scene with as many Gaussians as there may be."""
     return Shown(None if scene is None else growth.limited(scene, config.most_gaussians))
+
+
+def looked_at_first(estimate: Estimate, config: Config) -> Shown | None:
+    """A coarse scene as soon as there are cameras, with a verdict that says so; None where no scene is published."""
+    if estimate.registration is None or not estimate.verdict.publishable:
+        return None
+    scene = first_look(estimate.graph, estimate.registration, config.most_gaussians)
+    return Shown(scene, replace(estimate.verdict, message=f"{estimate.verdict.message} {COARSE}"))
 
 
 def begin_scene(estimate: Estimate, config: Config) -> Scene | None:

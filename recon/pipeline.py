@@ -8,6 +8,7 @@ Either way the final scene is made afresh from all frames: it depends on which f
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterable, Iterator
 
 from splatnode.capture.frame import DroppedFrame, Frame
@@ -19,20 +20,30 @@ from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.ladder.ladder import climbed
 from splatnode.recon.matching.match import match
-from splatnode.recon.modelling import begin_scene, refined, shown, snapshot
+from splatnode.recon.modelling import begin_scene, looked_at_first, refined, shown, snapshot
 from splatnode.recon.preparation import load_device, load_prior, prepare
+from splatnode.recon.priors.prior import Prior
 from splatnode.recon.result.snapshot import Snapshot
+
+DEPTH_SHARE = 0.4  # of the seconds that the cameras left of a budget: the refinement needs most of them
 
 
 def reconstruct(frames: Iterable[Frame | DroppedFrame], config: Config) -> Iterator[Snapshot]:
-    """Snapshots of the scene as it begins and while it is refined, the last of them with `final` set.
+    """Snapshots of the scene at a first look, as it begins and while it is refined, the last of them with `final` set.
 
     A snapshot names the frames that were left out, and holds Gaussians only if its verdict is publishable.
     Raises ValueError where the intrinsics of a frame cannot be used.
     """
-    clock = Clock()
-    estimate, dropped = estimate_frames(frames, config, clock)
-    yield from model(estimate, dropped, config, clock)
+    clock, numbers = Clock(), itertools.count(1)
+    load_device(config)
+    prior = load_prior(config)
+    estimate, dropped = _estimate_cameras(frames, prior, config, clock)
+    look = looked_at_first(estimate, config)
+    clock.lap("points")
+    if look is not None:
+        yield snapshot(next(numbers), estimate, look, seconds=clock.booked, dropped=dropped)
+        clock.lap("wait")
+    yield from model(_with_depth(estimate, prior, config, clock), dropped, config, clock, numbers)
 
 
 def estimate_frames(
@@ -41,16 +52,32 @@ def estimate_frames(
     """Cameras, verdict and depth of all frames that show something new, and which frames were left out."""
     load_device(config)
     prior = load_prior(config)
+    estimate, dropped = _estimate_cameras(frames, prior, config, clock)
+    return _with_depth(estimate, prior, config, clock), dropped
+
+
+def _estimate_cameras(
+    frames: Iterable[Frame | DroppedFrame], prior: Prior, config: Config, clock: Clock
+) -> tuple[Estimate, list[DroppedFrame]]:
     kept, dropped, rejected = screen_all(frames, config.screening)
     keyframes = [prepare(frame, config) for frame in kept]
     graph = match(keyframes, config.matching, prior.matcher)
     estimate = estimate_cameras(graph, rejected, config)
     clock.lap("poses")
-    estimate = climbed(estimate, rejected, config)
+    deadline = clock.deadline(config.budget_s)
+    estimate = climbed(estimate, rejected, config, until=math.inf if deadline is None else deadline)
     clock.lap("ladder")
-    estimate = estimate_depth(estimate, prior)
-    clock.lap("points")
     return estimate, dropped
+
+
+def _with_depth(estimate: Estimate, prior: Prior, config: Config, clock: Clock) -> Estimate:
+    """With depth; with a budget, it is found in DEPTH_SHARE of what is left, or as near to that as can be."""
+    until = clock.deadline(config.budget_s)
+    if until is not None:
+        until = clock.last + DEPTH_SHARE * max(0.0, until - clock.last)
+    estimate = estimate_depth(estimate, prior, until=until)
+    clock.lap("points")
+    return estimate
 
 
 def model(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from splatnode.capture.cameras import synthetic
@@ -10,6 +11,7 @@ from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.staged import write_file, write_files
 from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.workers import each
 
 
 def write_capture(folder: Path, place: synthetic.Config) -> Split:
@@ -17,16 +19,45 @@ def write_capture(folder: Path, place: synthetic.Config) -> Split:
 
     The cameras are for evaluation: reconstruction reads the photographs in `folder`/images and nothing else.
     """
-    training = {synthetic.frame_name(i): camera for i, camera in enumerate(synthetic.scene_cameras(place))}
-    testing = {f"test_{i:03d}.png": camera for i, camera in enumerate(synthetic.held_out_cameras(place))}
-    files, cameras = {}, []
-    for number, (name, (T_world_camera, K)) in enumerate({**training, **testing}.items()):
-        image = synthetic.photograph(place, (T_world_camera, K), noise_seed=number)
-        files[name] = encode_png(image)
-        cameras.append(CameraEstimate(name, number, T_world_camera, K, place.width, place.height))
-    write_files(folder / "images", files)
+    split = write_photographs(folder, place)
+    write_held_out(folder, place)
+    return split
+
+
+def write_photographs(folder: Path, place: synthetic.Config) -> Split:
+    """Writes the photographs that are reconstructed; returns the names of all."""
+    training = _training(place)
+    _write(folder, place, training, first=0)
+    return Split(tuple(training), tuple(_testing(place)))
+
+
+def write_held_out(folder: Path, place: synthetic.Config) -> None:
+    """Writes the photographs held out for testing, and the true cameras of all."""
+    training, testing = _training(place), _testing(place)
+    _write(folder, place, testing, first=len(training))
+    cameras = [
+        CameraEstimate(name, number, T_world_camera, K, place.width, place.height)
+        for number, (name, (T_world_camera, K)) in enumerate({**training, **testing}.items())
+    ]
     write_file(folder / "cameras.json", encode_cameras(cameras))
-    return Split(tuple(training), tuple(testing))
+
+
+def _training(place: synthetic.Config) -> dict[str, synthetic.Camera]:
+    return {synthetic.frame_name(i): camera for i, camera in enumerate(synthetic.scene_cameras(place))}
+
+
+def _testing(place: synthetic.Config) -> dict[str, synthetic.Camera]:
+    return {f"test_{i:03d}.png": camera for i, camera in enumerate(synthetic.held_out_cameras(place))}
+
+
+def _write(folder: Path, place: synthetic.Config, cameras: Mapping[str, synthetic.Camera], first: int) -> None:
+    """Photographs by name, rendered side by side; `first` is the number of the first one's noise."""
+
+    def png(camera: synthetic.Camera, number: int) -> bytes:
+        return encode_png(synthetic.photograph(place, camera, noise_seed=number))
+
+    files = each(png, cameras.values(), range(first, first + len(cameras)))
+    write_files(folder / "images", dict(zip(cameras, files, strict=True)))
 
 
 def largest_capture_bytes(place: synthetic.Config) -> int:

@@ -7,6 +7,7 @@ find more to estimate from, and cameras are estimated again. An answer is never 
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -33,15 +34,17 @@ def climbed(
     config: Config,
     pause: Callable[[], None] = lambda: None,
     rungs: Sequence[Rung] = RUNGS,
+    until: float = math.inf,
 ) -> Estimate:
     """The best of `estimate` and what the `rungs` lead to; a refusal then says what was tried.
 
     With `config.quick` it is `estimate`. `config.ladder.seconds` bounds the work that is added: they are looked at
-    between pairs and before each rung. A pair and an estimate that have begun are finished. `pause` may raise.
+    between pairs and before each rung, as is `until`, a time of `time.monotonic()`. A pair and an estimate that have
+    begun are finished. `pause` may raise.
     """
     if config.quick or not _lacks_matches(estimate):
         return estimate
-    means, until = Means(estimate.graph, config), time.monotonic() + config.ladder.seconds
+    means, until = Means(estimate.graph, config), min(until, time.monotonic() + config.ladder.seconds)
     tried: list[str] = []
     not_tried: list[str] = []
     for rung in rungs:

@@ -47,6 +47,7 @@ class ClassicalPrior(Prior):
         self, config: Config, depth_maps: DepthMaps = stereo.depth_maps, matcher: Matcher | None = None
     ) -> None:
         self._config, self._depth_maps, self.matcher = config, depth_maps, matcher
+        self.ends_early = depth_maps is stereo.depth_maps
 
     def pointmaps(
         self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None

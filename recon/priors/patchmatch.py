@@ -94,7 +94,10 @@ class _Problem(ctypes.Structure):
         *((name, ctypes.c_int32) for name in ("width", "height")),
         *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "min_inverse_depth", "max_inverse_depth")),
         ("sources", ctypes.c_void_p),
-        *((name, ctypes.c_int32) for name in ("num_sources", "active_sources", "random_starts", "directions", "iterations")),
+        *(
+            (name, ctypes.c_int32)
+            for name in ("num_sources", "active_sources", "random_starts", "directions", "iterations")
+        ),
         *((name, ctypes.c_uint32) for name in ("stream", "seed")),
         *((name, ctypes.c_float) for name in ("perturbation", *Matching.__dataclass_fields__)),
     )

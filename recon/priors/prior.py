@@ -23,6 +23,7 @@ class Prior(Protocol):
     """
 
     matcher: Matcher | None  # what the view graph asks where plain features find few matches
+    ends_early: bool = False  # whether `pause` may raise OutOfTime, after which depth comes soon and coarser
 
     def pointmaps(
         self, graph: ViewGraph, registration: Registration, pause: Callable[[], None] = lambda: None

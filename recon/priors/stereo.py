@@ -198,7 +198,7 @@ def estimate(
 
 
 def compared_with(partners: Sequence[tuple[int, float]], config: Config) -> list[int]:
-    """Of a view's ranked partners, those that it is compared with, best first: at most `config.num_sources`, maybe none."""
+    """Of a view's ranked partners, those that it is compared with, best first; maybe none."""
     return [other for other, score in partners[: config.num_sources] if score > MIN_SOURCE_SCORE]
 
 

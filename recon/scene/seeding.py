@@ -218,9 +218,7 @@ def initial_gaussians(
         for pointmap, covered in zip(pointmaps, redundant_pixels(pointmaps, config), strict=True)
     ]
     for _ in range(ATTEMPTS):
-        gaussians = concatenate(
-            each(partial(gaussians_from_pointmap, config=config), pointmaps, images, wanted)
-        )
+        gaussians = concatenate(each(partial(gaussians_from_pointmap, config=config), pointmaps, images, wanted))
         if max_gaussians is None or len(gaussians) <= max_gaussians:
             return gaussians
         config = _coarsened(config, len(gaussians) / max(max_gaussians, 1))

@@ -15,11 +15,11 @@ from splatnode.recon.priors.stereo import (
     Stage,
     StereoView,
     compared_with,
-    rank_partners,
     depth_maps,
     depth_range,
     estimate,
     further_depth_map,
+    rank_partners,
 )
 from tests.bench.speed import stereo as bench
 
