@@ -43,7 +43,7 @@ from splatnode.recon.viewer_process import viewer
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
 # Of the search for a held-out view's pose, half of them at half the resolution: as near as 100 at full.
-DEMO_STEPS = 60
+DEMO_STEPS = 80
 LOOK_EVERY = 50  # iterations between the snapshots that a viewer is shown
 
 

@@ -9,7 +9,7 @@ import sys
 BENCHMARKS = {
     "node": ("queue", "live", "faults", "writes", "soak", "siege", "fuzz", "adversary", "guided", "capture"),
     "quality": ("poses", "windows", "fit", "priors", "parsimony", "budgets", "spz"),
-    "speed": ("rasterize", "stereo"),
+    "speed": ("rasterize", "stereo", "growth"),
     "viewer": ("viewer", "drive", "beside"),
 }
 MODULES = {name: f"tests.bench.{folder}.{name}" for folder, names in BENCHMARKS.items() for name in names}

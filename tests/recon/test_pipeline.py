@@ -139,8 +139,10 @@ def test_held_out_photographs_are_predicted_with_few_gaussians(streamed):
 
 
 def test_frames_at_hand_are_worked_in_together(at_hand):
-    assert [snapshot.iterations for snapshot in at_hand] == [0, 50, 150, 150]
-    assert [snapshot.final for snapshot in at_hand] == [False, False, False, True]
+    assert [snapshot.iterations for snapshot in at_hand] == [0, 0, 50, 150, 150]
+    assert [snapshot.final for snapshot in at_hand] == [False] * 4 + [True]
+    assert "Coarse" in at_hand[0].verdict.message and "Coarse" not in at_hand[1].verdict.message
+    assert len(at_hand[0].gaussians) > 100 and at_hand[0].cameras
     assert {snapshot.verdict.code for snapshot in at_hand} == {Code.OK}
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.core import library, set_threads
+from splatnode.recon.deadline import OutOfTime
 from splatnode.recon.priors import consistency
 from splatnode.recon.priors.patchmatch import Matching, Planes, Search, make_level
 from splatnode.recon.priors.stereo import (
@@ -145,6 +146,17 @@ def test_the_work_can_be_abandoned_between_views(views):
     with pytest.raises(InterruptedError):
         depth_maps(views, Config(), pause=pause)
     assert len(calls) == 2
+
+
+def test_when_time_is_over_depth_is_as_fine_as_it_is_by_then(views):
+    def over() -> None:
+        raise OutOfTime
+
+    for T, early in zip(CAMERAS, depth_maps(views, Config(), seed=1, pause=over), strict=True):
+        _, depth, _ = render(T)
+        known = early.depth > 0
+        assert early.depth.shape == depth.shape and known.mean() > 0.3
+        assert np.median(np.abs(early.depth[known] / depth[known] - 1)) < 0.05
 
 
 def flat_planes(inverse_depth: float) -> Planes:
