@@ -11,7 +11,8 @@ import numpy.typing as npt
 from scipy.spatial import KDTree
 
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Features
-from splatnode.recon.matching.nearest_neighbours import quantise
+from splatnode.recon.matching import sift
+from splatnode.recon.matching.nearest_neighbours import DESCRIPTOR_SIZE, quantise
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
@@ -74,16 +75,9 @@ def _detect(image: Image, tilt: float, config: Config) -> tuple[Array, npt.NDArr
         grey = cv2.GaussianBlur(grey, (0, 0), sigmaX=sigma_x, sigmaY=sigma_y)
     if size != (width, height):
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC)
-    sift = cv2.SIFT.create(
-        nfeatures=config.num_features, contrastThreshold=config.contrast, enable_precise_upscale=True
-    )
-    keypoints, raw = sift.detectAndCompute(grey, None)
-    if len(keypoints) == 0:
-        return np.zeros((0, 2)), np.zeros((0, 128), np.uint8)
-    order = np.argsort([-keypoint.response for keypoint in keypoints], kind="stable")
-    # OpenCV's pixel centres are whole numbers; ours are at halves.
-    points = (np.array([keypoint.pt for keypoint in keypoints])[order] + 0.5) * (width / size[0], height / size[1])
-    return points, root_sift(np.asarray(raw, np.float32)[order])
+    points, descriptors = sift.detect(np.asarray(grey, np.uint8), config.num_features, config.contrast)
+    # The detector's pixel centres are whole numbers; ours are at halves.
+    return (points + 0.5) * (width / size[0], height / size[1]), descriptors
 
 
 def describe(grey: Image, points: Array, size: float) -> npt.NDArray[np.uint8]:
@@ -92,7 +86,7 @@ def describe(grey: Image, points: Array, size: float) -> npt.NDArray[np.uint8]:
     `size` is the diameter of a keypoint in pixels; its descriptor covers a square 6 times as wide.
     """
     if not len(points):
-        return np.zeros((0, 128), np.uint8)
+        return np.zeros((0, DESCRIPTOR_SIZE), np.uint8)
     keypoints = [cv2.KeyPoint(float(x), float(y), size, 0.0) for x, y in points - 0.5]
     kept, raw = cv2.SIFT.create().compute(grey, keypoints)
     assert len(kept) == len(points)  # SIFT describes every keypoint that it is given

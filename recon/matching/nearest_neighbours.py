@@ -11,6 +11,7 @@ from splatnode.recon.core import library, pointer
 Bytes = npt.NDArray[np.uint8]
 Index = npt.NDArray[np.int64]
 
+DESCRIPTOR_SIZE = 128
 QUANTISED_NORM = 175.0  # length of a descriptor in bytes: with rounding at most 181, so that products fit 16 bits
 _MAX_BYTE = 127  # the core multiplies signed bytes
 _MAX_DESCRIPTORS = 65535  # that recon/core/match.cpp is written for
@@ -33,7 +34,7 @@ def match(descriptors1: Bytes, descriptors2: Bytes, config: Config) -> Index:
     (*, 128) bytes, as `quantise` makes them, of at most 65535 rows.
     """
     for descriptors in (descriptors1, descriptors2):
-        if descriptors.dtype != np.uint8 or descriptors.ndim != 2 or descriptors.shape[1] != 128:
+        if descriptors.dtype != np.uint8 or descriptors.ndim != 2 or descriptors.shape[1] != DESCRIPTOR_SIZE:
             raise ValueError(f"descriptors must be (M, 128) uint8, got {descriptors.shape} {descriptors.dtype}")
         if len(descriptors) > _MAX_DESCRIPTORS:
             raise ValueError(f"at most {_MAX_DESCRIPTORS} descriptors can be matched, got {len(descriptors)}")
