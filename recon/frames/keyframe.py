@@ -24,6 +24,11 @@ class Features:
     # (D,) simulated tilt: by which the image's width was divided; below 1, its height was multiplied by it; 1 for none
     tilt: npt.NDArray[np.float64]
 
+    def strongest(self, count: int) -> Features:
+        """With the descriptors of the first `count` points alone, which are the strongest of the plain image."""
+        chosen = self.point_of < count
+        return Features(self.points, self.descriptors[chosen], self.point_of[chosen], self.tilt[chosen])
+
 
 _KEY_POINTS = 64  # features whose places tell any two photographs apart
 

@@ -1,8 +1,8 @@
-"""Matches the keyframes of a view graph, one pair at a time: work that is abandoned loses one pair at most."""
+"""Matches the keyframes of a view graph: work that is abandoned loses the few pairs that are under way."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -11,12 +11,17 @@ import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import features, pair_matching
+from splatnode.recon.matching.candidates import to_glance_at
 from splatnode.recon.matching.config import Config
+from splatnode.recon.matching.image_code import image_code
 from splatnode.recon.matching.pair_matching import MatchedPair
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
+from splatnode.recon.workers import in_turn
 
 FIRST_COMPARISONS = 4  # keyframes that a further one is matched with at once
 MIN_PARTNERS = 2  # verified pairs that it then needs; with fewer it is matched with all
+
+Steps = Generator[ViewGraph, None, ViewGraph]  # the graph after each step, and in the end
 
 
 class Matcher(Protocol):
@@ -61,31 +66,63 @@ def matched_soon(graph: ViewGraph, matcher: Matcher | None) -> Iterator[ViewGrap
 
 
 def completed(graph: ViewGraph, matcher: Matcher | None) -> Iterator[ViewGraph]:
-    """The graph after each pair that was pending; the last one is complete.
+    """The graph after each pair that was pending and is worth matching; the last one is complete.
 
-    Every pair is matched by plain features. Pairs that match weakly but may overlap (`tilting.pairs_to_tilt`) are
-    matched again with tilted features, which bridge wider baselines, and with what a prior's matcher proposes.
+    Pairs are matched by plain features. Those that match weakly but may overlap (`tilting.pairs_to_tilt`) are matched
+    again with tilted features, which bridge wider baselines, and with what a prior's matcher proposes.
     """
-    for pair in sorted(graph.pending):
-        graph = _matched_plain(graph, pair)
-        yield graph
+    graph = yield from _glanced(graph)
+    while pairs := sorted(graph.to_match()):
+        graph = yield from _all_matched_plain(graph, pairs)
     to_tilt = graph.to_tilt()
-    for pair in [pair for pair in graph.plain if pair in to_tilt and pair not in graph.tilted]:
-        graph = matched_further(graph, pair, graph.config.tilting.tilts, matcher)
-        yield graph
+    weak = [pair for pair in graph.plain if pair in to_tilt and pair not in graph.tilted]
+    graph = yield from _all_matched_further(graph, weak, graph.config.tilting.tilts, matcher)
     yield graph.chosen()
+
+
+def _glanced(graph: ViewGraph) -> Steps:
+    """With codes of the images and matches at a glance, as far as these are needed to choose the pairs."""
+    config = graph.config
+    if len(graph.keyframes) <= config.candidates.exhaustive:
+        return graph
+    without = [keyframe for keyframe in graph.keyframes if keyframe.name not in graph.codes]
+    codes = dict(graph.codes)
+    for keyframe, code in zip(without, in_turn(lambda k: image_code(k.features), without), strict=True):
+        codes[keyframe.name] = code
+    graph = replace(graph, codes=codes)
+    yield graph
+
+    def glance(pair: Pair) -> int:
+        first, second = (graph.keyframes[index] for index in graph.in_order_of_content(*pair))
+        return pair_matching.glance(first, second, config.candidates.glance_features, config.pair_matching)
+
+    wanted = to_glance_at([codes[name] for name in graph.names], config.candidates)
+    missing = sorted(wanted.difference(graph.glanced))
+    found = dict(graph.glanced)
+    for pair, count in zip(missing, in_turn(glance, missing), strict=True):
+        found[pair] = count
+    return replace(graph, glanced=found)
 
 
 def _matched_plain(graph: ViewGraph, pair: Pair) -> ViewGraph:
     """With two keyframes matched by their plain features."""
-    first, second = graph.in_order_of_content(*pair)
-    found = pair_matching.match_plain(graph.keyframes[first], graph.keyframes[second], graph.config.pair_matching)
-    pairs = dict(graph.pairs)
-    if found.geometry is not None:
-        pairs[pair] = found.geometry if first < second else found.geometry.swapped()
-    return replace(
-        graph, pairs=pairs, pending=graph.pending - {pair}, plain={**graph.plain, (first, second): found}
-    )  # fmt: skip
+    *_, matched = _all_matched_plain(graph, [pair])
+    return matched
+
+
+def _all_matched_plain(graph: ViewGraph, pairs: Sequence[Pair]) -> Steps:
+    """After each of the `pairs` that is matched by plain features."""
+    keyframes, config = graph.keyframes, graph.config.pair_matching
+    ordered = [graph.in_order_of_content(*pair) for pair in pairs]
+    matches = in_turn(lambda pair: pair_matching.match_plain(*_of(keyframes, pair), config), ordered)
+    for pair, (first, second), found in zip(pairs, ordered, matches, strict=True):
+        verified = dict(graph.pairs)
+        if found.geometry is not None:
+            verified[pair] = found.geometry if first < second else found.geometry.swapped()
+        plain = {**graph.plain, (first, second): found}
+        graph = replace(graph, pairs=verified, pending=graph.pending - {pair}, plain=plain)
+        yield graph
+    return graph
 
 
 def _most_promising(graph: ViewGraph, new: int) -> int:
@@ -104,20 +141,40 @@ def matched_further(graph: ViewGraph, pair: Pair, tilts: Sequence[float], matche
 
     They are added to what is known of `pair`, a key of `plain`. `ViewGraph.chosen` makes them count.
     """
-    keyframes = list(graph.keyframes)
-    found = graph.tilted.get(pair, graph.plain[pair])
-    if tilts:
-        for index in pair:
-            keyframes[index] = _with_tilted_features(keyframes[index], tilts, graph.config)
-        found = pair_matching.match_tilted(*_of(keyframes, pair), found, tilts, graph.config.pair_matching)
-    if matcher is not None:
-        for index in pair:
-            keyframes[index] = matcher.with_points(keyframes[index])
-        found = _with_matcher(*_of(keyframes, pair), found, matcher, graph.config)
-    return replace(graph, keyframes=tuple(keyframes), tilted={**graph.tilted, pair: found})
+    *_, matched = _all_matched_further(graph, [pair], tilts, matcher)
+    return matched
 
 
-def _of(keyframes: list[Keyframe], pair: Pair) -> tuple[Keyframe, Keyframe]:
+def _all_matched_further(
+    graph: ViewGraph, pairs: Sequence[Pair], tilts: Sequence[float], matcher: Matcher | None
+) -> Steps:
+    """After each step of `matched_further` for all `pairs`."""
+    config = graph.config
+    for index in sorted({index for pair in pairs for index in pair}):
+        keyframes = list(graph.keyframes)
+        keyframes[index] = _with_tilted_features(keyframes[index], tilts, config)
+        graph = replace(graph, keyframes=tuple(keyframes))
+        yield graph
+    known = graph
+
+    def tilted(pair: Pair) -> MatchedPair:
+        found = known.tilted.get(pair, known.plain[pair])
+        both = _of(known.keyframes, pair)
+        return pair_matching.match_tilted(*both, found, tilts, config.pair_matching) if tilts else found
+
+    for pair, found in zip(pairs, in_turn(tilted, pairs), strict=True):
+        if matcher is not None:
+            keyframes = list(graph.keyframes)
+            for index in pair:
+                keyframes[index] = matcher.with_points(keyframes[index])
+            graph = replace(graph, keyframes=tuple(keyframes))
+            found = _with_matcher(*_of(graph.keyframes, pair), found, matcher, config)
+        graph = replace(graph, tilted={**graph.tilted, pair: found})
+        yield graph
+    return graph
+
+
+def _of(keyframes: Sequence[Keyframe], pair: Pair) -> tuple[Keyframe, Keyframe]:
     return keyframes[pair[0]], keyframes[pair[1]]
 
 

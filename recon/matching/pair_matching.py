@@ -23,6 +23,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     nearest_neighbours: nearest_neighbours.Config = nearest_neighbours.Config()
     two_view: two_view.Config = two_view.Config()
     max_static_px: float = 1.0  # median motion, pixels at REFERENCE_SIDE, below which matches may show the robot itself
+    # Of many features the strongest are matched first, and the others only where too few of these are verified. Of the
+    # pairs of 30 photographs of a castle and of a fox two thirds need no more, and the cameras are no less exact.
+    strongest: int = 4000
+    ample_matches: int = 200  # verified matches of the strongest features with which no more are looked for
     min_moving: int = 60  # matches that move by more, for a geometry of these alone
 
 
@@ -35,9 +39,23 @@ class MatchedPair:
     log10_nfa: float  # log10 of the number of false alarms, also without geometry: below 0 it hints at an overlap
 
 
+def glance(keyframe1: Keyframe, keyframe2: Keyframe, num_features: int, config: Config) -> int:
+    """The number of descriptor matches of the strongest plain features of both images: a hint at an overlap."""
+    some = keyframe1.features.strongest(num_features), keyframe2.features.strongest(num_features)
+    return len(_match(*some, (PLAIN, PLAIN), config.nearest_neighbours))
+
+
 def match_plain(keyframe1: Keyframe, keyframe2: Keyframe, config: Config) -> MatchedPair:
-    """Matches the features of both images as they are."""
-    matches = _match(keyframe1.features, keyframe2.features, (PLAIN, PLAIN), config.nearest_neighbours)
+    """Matches the features of both images as they are: the strongest ones first, and all unless that is ample."""
+    features1, features2 = keyframe1.features, keyframe2.features
+    if max(len(features1.points), len(features2.points)) > config.strongest:
+        some = features1.strongest(config.strongest), features2.strongest(config.strongest)
+        matches = _match(*some, (PLAIN, PLAIN), config.nearest_neighbours)
+        if len(matches) >= config.ample_matches:
+            found = _verified(keyframe1, keyframe2, matches, config)
+            if found.geometry is not None and len(found.geometry.matches) >= config.ample_matches:
+                return found
+    matches = _match(features1, features2, (PLAIN, PLAIN), config.nearest_neighbours)
     return _verified(keyframe1, keyframe2, matches, config)
 
 

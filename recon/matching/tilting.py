@@ -8,6 +8,7 @@ import msgspec
 
 from splatnode.recon.matching.components import connected_components
 from splatnode.recon.matching.pair_matching import MatchedPair
+from splatnode.recon.matching.two_view import TwoView
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -21,6 +22,11 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     hint_log10_nfa: float = -1.0
 
 
+def is_firm(geometry: TwoView | None, config: Config) -> bool:
+    """Whether a pair has so many verified matches that nothing need be done to find more."""
+    return geometry is not None and len(geometry.matches) >= config.firm_matches
+
+
 def pairs_to_tilt(
     plain: Mapping[tuple[int, int], MatchedPair], num_keyframes: int, config: Config
 ) -> set[tuple[int, int]]:
@@ -31,11 +37,7 @@ def pairs_to_tilt(
     """
     if not config.tilts:
         return set()
-    firm = {
-        pair
-        for pair, matched in plain.items()
-        if matched.geometry is not None and len(matched.geometry.matches) >= config.firm_matches
-    }
+    firm = {pair for pair, matched in plain.items() if is_firm(matched.geometry, config)}
     everyone = range(num_keyframes)
     partners = [{i + j - index for i, j in firm if index in (i, j)} for index in everyone]
     components = connected_components(everyone, firm)

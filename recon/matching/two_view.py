@@ -153,37 +153,44 @@ def fit_rotation(points1: Array, points2: Array, threshold: float, longer_side: 
     """
     focals = longer_side * _ROTATION_FOCALS
     some = slice(None, None, 1 + len(points1) // _COARSE_MATCHES)
-    counts = [_rotation_inliers(points1[some], points2[some], focal, threshold) for focal in focals[::_COARSE_STEP]]
+    counts = _rotation_inliers(points1[some], points2[some], focals[::_COARSE_STEP], threshold)
     best = _COARSE_STEP * int(np.argmax(counts))
     near = focals[max(0, best - _COARSE_STEP + 1) : best + _COARSE_STEP]
-    counts = [_rotation_inliers(points1, points2, focal, threshold) for focal in near]
-    return max(counts), float(near[int(np.argmax(counts))])
+    counts = _rotation_inliers(points1, points2, near, threshold)
+    return int(counts.max()), float(near[int(np.argmax(counts))])
 
 
-def _rotation_inliers(points1: Array, points2: Array, focal: float, threshold: float) -> int:
-    """How many matches the best rotation with this focal length explains.
+def _rotation_inliers(points1: Array, points2: Array, focals: Array, threshold: float) -> npt.NDArray[np.int64]:
+    """(F,) how many matches the best rotation explains, for each of the `focals` (F,).
 
     The rotation has a closed form (Kabsch, 1976); it is refitted to its inliers until they stay the same.
     """
-    rays1, rays2 = _unit_rays(points1, focal), _unit_rays(points2, focal)
-    inlier, error = np.ones(len(points1), bool), np.zeros(len(points1))
+    rays1, rays2 = _unit_rays(points1, focals), _unit_rays(points2, focals)
+    inlier, error = np.ones(rays1.shape[:2], bool), np.zeros(rays1.shape[:2])
+    unsettled = np.arange(len(focals))
     for _ in range(_ROTATION_REFITS):
-        u, _, vt = np.linalg.svd(rays2[inlier].T @ rays1[inlier])
-        rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-        turned = rays1 @ rotation.T
-        error = np.linalg.norm(turned[:, :2] / np.maximum(turned[:, 2:], _MIN_DEPTH) * focal - points2, axis=1)
+        before, ours = inlier[unsettled], rays1[unsettled]
+        u, _, vt = np.linalg.svd((rays2[unsettled] * before[..., None]).swapaxes(1, 2) @ ours)
+        u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
+        turned = ours @ (u @ vt).swapaxes(1, 2)
+        projected = turned[..., :2] / np.maximum(turned[..., 2:], _MIN_DEPTH) * focals[unsettled, None, None]
+        errors = np.linalg.norm(projected - points2, axis=2)
+        error[unsettled] = errors
         # A fit to all matches is spoiled by outliers: its threshold is wide, later ones are not.
-        widest = float(np.quantile(error, _FIRST_QUANTILE)) if inlier.all() else threshold
-        agreed = error < max(threshold, widest)
-        if agreed.sum() < _MIN_ROTATION_INLIERS or (agreed == inlier).all():
+        widest = np.where(before.all(1), np.quantile(errors, _FIRST_QUANTILE, axis=1), threshold)
+        agreed = errors < np.maximum(threshold, widest)[:, None]
+        settled = (agreed.sum(1) < _MIN_ROTATION_INLIERS) | (agreed == before).all(1)
+        inlier[unsettled] = agreed
+        unsettled = unsettled[~settled]
+        if not len(unsettled):
             break
-        inlier = agreed
-    return int(np.count_nonzero(error < threshold))
+    return np.count_nonzero(error < threshold, axis=1)
 
 
-def _unit_rays(points: Array, focal: float) -> Array:
-    rays = np.column_stack([points / focal, np.ones(len(points))])
-    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+def _unit_rays(points: Array, focals: Array) -> Array:
+    """(F, M, 3) directions of the pixels `points` (M, 2) for each focal length."""
+    rays = np.concatenate([points / focals[:, None, None], np.ones((len(focals), len(points), 1))], axis=2)
+    return rays / np.linalg.norm(rays, axis=2, keepdims=True)
 
 
 def _shared_focal(points1: Array, points2: Array, threshold: float) -> float:

@@ -11,10 +11,12 @@ from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
 from splatnode.recon.frames.keyframe import Keyframe, content_key
+from splatnode.recon.matching.candidates import worth_matching
 from splatnode.recon.matching.components import connected_components
 from splatnode.recon.matching.config import Config
+from splatnode.recon.matching.image_code import Code
 from splatnode.recon.matching.pair_matching import MatchedPair
-from splatnode.recon.matching.tilting import pairs_to_tilt
+from splatnode.recon.matching.tilting import is_firm, pairs_to_tilt
 from splatnode.recon.matching.two_view import TwoView
 
 T = TypeVar("T")
@@ -26,16 +28,19 @@ class ViewGraph:
     """Keyframes by position, and their pairs, which do not depend on the order in which the keyframes came.
 
     `plain` and `tilted` hold pairs as matched by plain and by tilted features, the first frame in order of content
-    first. `pairs` holds what was chosen of them, by position (i < j); pairs that were restored from a checkpoint, which
+    first. `glanced` holds how many matches pairs have at a glance, `codes` the code of each image by its name. `pairs`
+    holds what was chosen of them, by position (i < j); pairs that were restored from a checkpoint, which
     this process has not matched, stay as they are.
     """
 
     config: Config
     keyframes: tuple[Keyframe, ...] = ()
     pairs: Mapping[Pair, TwoView] = field(default_factory=dict)  # verified
-    pending: frozenset[Pair] = frozenset()  # (i < j) that have not been matched
+    pending: frozenset[Pair] = frozenset()  # (i < j) that have not been matched; not all of them are worth it
     plain: Mapping[Pair, MatchedPair] = field(default_factory=dict)
     tilted: Mapping[Pair, MatchedPair] = field(default_factory=dict)
+    glanced: Mapping[Pair, int] = field(default_factory=dict)  # (i < j)
+    codes: Mapping[str, Code] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -63,8 +68,10 @@ class ViewGraph:
             frozenset(remaining(dict.fromkeys(self.pending))),
             remaining(self.plain),
             remaining(self.tilted),
+            remaining(self.glanced),
+            {name: code for name, code in self.codes.items() if name not in names},
         )
-        return rest if rest.pending else rest.chosen()
+        return rest if rest.to_match() else rest.chosen()
 
     def joined(self, other: ViewGraph) -> ViewGraph:
         """The view graph of the keyframes of both, by frame id, with the pairs that either has matched.
@@ -96,6 +103,8 @@ class ViewGraph:
             pending=self.pending.difference(_ascending(number[i], number[j]) for i, j in known),
             plain={**self.plain, **{(number[i], number[j]): found for (i, j), found in graph.plain.items()}},
             tilted={**self.tilted, **{(number[i], number[j]): found for (i, j), found in graph.tilted.items()}},
+            glanced={**self.glanced, **{_ascending(number[i], number[j]): n for (i, j), n in graph.glanced.items()}},
+            codes={**self.codes, **graph.codes},
         )
 
     def in_order_of_content(self, *indices: int) -> tuple[int, ...]:
@@ -109,18 +118,39 @@ class ViewGraph:
         """Positions of the keyframes that verified pairs connect, the largest component first."""
         return connected_components(range(len(self.keyframes)), self.pairs)
 
+    def worth_matching(self) -> set[Pair]:
+        """The pairs (i < j), matched or not, that are worth it (`candidates.worth_matching`)."""
+        firm = {_ascending(i, j) for (i, j), pair in self.plain.items() if is_firm(pair.geometry, self.config.tilting)}
+        firm |= {pair for pair, geometry in self.pairs.items() if is_firm(geometry, self.config.tilting)}
+        return worth_matching(
+            len(self.keyframes),
+            self.glanced,
+            lambda pair: pair not in self.pending,
+            firm.__contains__,
+            self.config.candidates,
+        )
+
+    def to_match(self) -> set[Pair]:
+        """The pending pairs that are worth matching; once they are matched, others may follow."""
+        return self.worth_matching() & self.pending
+
     def to_tilt(self) -> set[Pair]:
         """The pairs that tilted features are worth their time for, by what the plain ones say of all pairs."""
-        return pairs_to_tilt(self.plain, len(self.keyframes), self.config.tilting)
+        worth = self.worth_matching()
+        plain = {pair: found for pair, found in self.plain.items() if _ascending(*pair) in worth}
+        return pairs_to_tilt(plain, len(self.keyframes), self.config.tilting)
 
     def chosen(self) -> ViewGraph:
-        """With the geometry of tilted features for the pairs that need them, and of plain ones for the others."""
-        to_tilt, pairs = self.to_tilt(), dict(self.pairs)
+        """With the geometry of tilted features for the pairs that need them, and of plain ones for the others.
+
+        Pairs that were matched and turned out not to be worth it do not count.
+        """
+        to_tilt, worth, pairs = self.to_tilt(), self.worth_matching(), dict(self.pairs)
         for (first, second), plain in self.plain.items():
             tilted = self.tilted.get((first, second)) if (first, second) in to_tilt else None
             geometry = (tilted.geometry if tilted else None) or plain.geometry
             pairs.pop(_ascending(first, second), None)
-            if geometry is not None:
+            if geometry is not None and _ascending(first, second) in worth:
                 pairs[_ascending(first, second)] = geometry if first < second else geometry.swapped()
         return replace(self, pairs=pairs)
 

@@ -151,9 +151,10 @@ def test_without_a_keyframe_the_graph_is_that_of_the_others(compared):
 
 
 def test_pairs_from_elsewhere_stay_when_a_keyframe_comes(compared):
-    graph: Any = ViewGraph(matching.Config(), (keyframe("a1"), keyframe("a2")), {(0, 1): "as it was"})
+    before = {(0, 1): Verified(range(77), ("a1", "a2"))}
+    graph: Any = ViewGraph(matching.Config(), (keyframe("a1"), keyframe("a2")), before)
     graph = complete(graph.with_keyframe(keyframe("b1")))
-    assert graph.pairs == {(0, 1): "as it was"}
+    assert graph.pairs == before
 
 
 @pytest.mark.parametrize("pairs", [[(0, 1), (1, 2), (2, 3)], [(2, 3), (0, 1), (1, 2)], [(0, 3), (2, 3), (1, 2)]])

@@ -1,0 +1,90 @@
+"""Which pairs of keyframes are worth matching, so that the work grows with the keyframes and not with their pairs.
+
+Up to `exhaustive` keyframes all pairs are. Of more, each is matched with its likeliest partners: by the codes of their
+images a short list, of which those count that have most matches among their strongest features, "at a glance". Where a
+keyframe does not become firmly connected with the others, further partners follow, in the end all.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Collection, Mapping, Sequence
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.matching.components import connected_components
+from splatnode.recon.matching.image_code import Code, similarities
+
+Pair = tuple[int, int]
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    exhaustive: int = 12  # keyframes up to which all pairs are matched
+    partners: int = (
+        8  # of a keyframe, to begin with. With 8 of 29 the cameras of two real sets were as exact as with all
+    )
+    short_list: int = 24  # keyframes with similar codes, which are matched at a glance
+    glance_features: int = 500  # the strongest of each; 1000 chose no better partners
+    enough_firm: int = 3  # firm partners, by which a keyframe is firmly connected
+
+
+def to_glance_at(codes: Sequence[Code], config: Config) -> set[Pair]:
+    """The pairs (i < j) of which either keyframe has the other on its short list."""
+    if len(codes) <= config.exhaustive:
+        return set()
+    if len(codes) - 1 <= config.short_list:
+        return set(itertools.combinations(range(len(codes)), 2))
+    alike = similarities(codes)
+    return _union([_best(alike[index], index)[: config.short_list] for index in range(len(codes))])
+
+
+def worth_matching(
+    num_keyframes: int,
+    glanced: Mapping[Pair, int],
+    is_known: Callable[[Pair], bool],
+    is_firm: Callable[[Pair], bool],
+    config: Config,
+) -> set[Pair]:
+    """The pairs (i < j) that are to be matched, as far as that can be said from those that are.
+
+    `glanced` has the number of matches of pairs at a glance. Once all pairs of the answer are known, it is the same
+    whatever the order in which the keyframes came.
+    """
+    everyone = range(num_keyframes)
+    if num_keyframes <= config.exhaustive:
+        return set(itertools.combinations(everyone, 2))
+    likeness = np.full((num_keyframes, num_keyframes), -1)
+    for (i, j), count in glanced.items():
+        likeness[i, j] = likeness[j, i] = count
+    ranked = [_best(likeness[index], index) for index in everyone]
+    depth = [config.partners] * num_keyframes
+    while True:
+        chosen = _union([ranked[index][: depth[index]] for index in everyone])
+        if not all(map(is_known, chosen)):
+            return chosen
+        loose = [
+            index for index in _loose(everyone, set(filter(is_firm, chosen)), config) if depth[index] < len(ranked)
+        ]
+        if not loose:
+            return chosen
+        for index in loose:
+            depth[index] += config.partners
+
+
+def _best(scores: npt.NDArray[np.generic], index: int) -> list[int]:
+    """The other keyframes, that with the highest score first."""
+    order = np.argsort(-scores, kind="stable").tolist()
+    return [other for other in order if other != index]
+
+
+def _union(partners: Sequence[Sequence[int]]) -> set[Pair]:
+    return {(min(index, other), max(index, other)) for index, those in enumerate(partners) for other in those}
+
+
+def _loose(everyone: Collection[int], firm: Collection[Pair], config: Config) -> list[int]:
+    """The keyframes with few firm partners, or outside of the largest group that firm pairs connect."""
+    (largest, *_) = connected_components(everyone, firm)
+    counts = np.bincount(np.array(sorted(firm), np.int64).ravel(), minlength=len(everyone))
+    return [index for index in everyone if counts[index] < config.enough_firm or index not in largest]
