@@ -18,6 +18,7 @@ constexpr int kMaxPixels = kMaxSide * kMaxSide;
 constexpr int kWarp = 6;            // numbers of an affine warp: four of the matrix, two of the shift
 constexpr int kModel = kWarp + 2;   // with gain and offset
 constexpr int kPatchesPerTask = 16;
+constexpr float kRounding = 1e-3f;     // pixels
 constexpr float kConverged = 0.005f;   // pixels
 constexpr float kLargestStretch = 4;   // of an axis of the warp: beyond it, two patches are not told apart from others
 
@@ -45,24 +46,33 @@ struct Image {
     int width, height;
 };
 
-// Bilinear; false outside of what the pixels' centres enclose.
-inline bool sample(const Image& image, float x, float y, float* value) {
-    x -= 0.5f;
-    y -= 0.5f;
-    if (!(x >= 0 && y >= 0 && x < image.width - 1 && y < image.height - 1)) return false;
-    const int column = int(x), row = int(y);
-    const float* at = image.pixels + size_t(row) * image.width + column;
-    const float right = x - column, down = y - row;
-    const float above = at[0] + right * (at[1] - at[0]);
-    const float below = at[image.width] + right * (at[image.width + 1] - at[image.width]);
-    *value = above + down * (below - above);
-    return true;
+// Whether there are bilinear samples at all of x +- across, y +- down: pixels' centres enclose them.
+inline bool encloses(const Image& image, float x, float y, float across, float down) {
+    return x - across >= 0.5f && y - down >= 0.5f && x + across < image.width - 0.5f - kRounding &&
+           y + down < image.height - 0.5f - kRounding;
 }
+
+// The place of each pixel of a patch from its middle, and its weight: of the sum 1.
+struct Window {
+    int count;
+    float x[kMaxPixels], y[kMaxPixels], weight[kMaxPixels];
+
+    explicit Window(int radius) : count(0) {
+        const float spread = 0.6f * radius;
+        float total = 0;
+        for (int row = -radius; row <= radius; ++row)
+            for (int column = -radius; column <= radius; ++column, ++count) {
+                x[count] = float(column), y[count] = float(row);
+                total += weight[count] = std::exp(-(x[count] * x[count] + y[count] * y[count]) / (2 * spread * spread));
+            }
+        for (int i = 0; i < count; ++i) weight[i] /= total;
+    }
+};
 
 // The reference patch, and the inverse normal equations of its small changes.
 struct Reference {
-    int count;
-    float x[kMaxPixels], y[kMaxPixels], weight[kMaxPixels], value[kMaxPixels];  // value: mean 0, variance 1
+    const Window& window;
+    float value[kMaxPixels];           // of mean 0 and variance 1
     float slopes[kModel][kMaxPixels];  // weighted: how the value changes with each number of the model
     double inverse[kModel][kModel];
 };
@@ -104,48 +114,49 @@ bool invert(double (&matrix)[kModel][kModel], double (&inverse)[kModel][kModel])
 // Without `to_move`, only what a correlation takes.
 bool prepare(const Image& image, float x, float y, int radius, bool to_move, Reference& reference) {
     const int side = 2 * radius + 1, wide = side + 2;
+    if (!encloses(image, x, y, radius + 1, radius + 1)) return false;
     float around[(kMaxSide + 2) * (kMaxSide + 2)];
-    for (int row = 0; row < wide; ++row)
-        for (int column = 0; column < wide; ++column)
-            if (!sample(image, x + column - radius - 1, y + row - radius - 1, &around[row * wide + column]))
-                return false;
-    reference.count = side * side;
-    const float spread = 0.6f * radius;
-    float total = 0;
-    for (int row = 0; row < side; ++row)
-        for (int column = 0; column < side; ++column) {
-            const int i = row * side + column;
-            const float dx = reference.x[i] = float(column - radius), dy = reference.y[i] = float(row - radius);
-            reference.value[i] = around[(row + 1) * wide + column + 1];
-            total += reference.weight[i] = std::exp(-(dx * dx + dy * dy) / (2 * spread * spread));
+    const float left = x - 0.5f - radius - 1, top = y - 0.5f - radius - 1;
+    const float right = left - int(left), down = top - int(top);
+    for (int row = 0; row < wide; ++row) {
+        const float* above = image.pixels + (int(top) + row) * image.width + int(left);
+        const float* below = above + image.width;
+        for (int column = 0; column < wide; ++column) {
+            const float upper = above[column] + right * (above[column + 1] - above[column]);
+            const float lower = below[column] + right * (below[column + 1] - below[column]);
+            around[row * wide + column] = upper + down * (lower - upper);
         }
-    for (int i = 0; i < reference.count; ++i) reference.weight[i] /= total;
-    const Moments of = moments(reference.value, reference.weight, reference.count);
+    }
+    const Window& window = reference.window;
+    for (int row = 0; row < side; ++row)
+        for (int column = 0; column < side; ++column)
+            reference.value[row * side + column] = around[(row + 1) * wide + column + 1];
+    const Moments of = moments(reference.value, window.weight, window.count);
     if (!(of.deviation > 1)) return false;  // grey levels: what is flatter is noise
     const float contrast = 1 / of.deviation;
+    for (int i = 0; i < window.count; ++i) reference.value[i] = contrast * (reference.value[i] - of.mean);
+    if (!to_move) return true;
     for (int row = 0; row < side; ++row)
         for (int column = 0; column < side; ++column) {
             const int i = row * side + column;
             const float* centre = &around[(row + 1) * wide + column + 1];
             const float gx = 0.5f * contrast * (centre[1] - centre[-1]);
             const float gy = 0.5f * contrast * (centre[wide] - centre[-wide]);
-            const float dx = reference.x[i], dy = reference.y[i];
-            reference.value[i] = contrast * (reference.value[i] - of.mean);
+            const float dx = window.x[i], dy = window.y[i];
             const float slopes[kModel] = {gx * dx, gx * dy, gy * dx, gy * dy, gx, gy, reference.value[i], 1};
             for (int k = 0; k < kModel; ++k) reference.slopes[k][i] = slopes[k];
         }
-    if (!to_move) return true;
     double normal[kModel][kModel];
     for (int k = 0; k < kModel; ++k)
         for (int j = 0; j <= k; ++j) {
             float sum = 0;
-            for (int i = 0; i < reference.count; ++i)
-                sum += reference.weight[i] * reference.slopes[k][i] * reference.slopes[j][i];
+            for (int i = 0; i < reference.window.count; ++i)
+                sum += reference.window.weight[i] * reference.slopes[k][i] * reference.slopes[j][i];
             normal[k][j] = normal[j][k] = sum;
         }
     if (!invert(normal, reference.inverse)) return false;
     for (int k = 0; k < kModel; ++k)
-        for (int i = 0; i < reference.count; ++i) reference.slopes[k][i] *= reference.weight[i];
+        for (int i = 0; i < reference.window.count; ++i) reference.slopes[k][i] *= reference.window.weight[i];
     return true;
 }
 
@@ -155,14 +166,32 @@ struct Warp {
 
 // The target's patch under `warp`, of mean 0 and variance 1; false where it leaves the image or shows nothing.
 bool fetch(const Image& image, const Reference& reference, const Warp& warp, float* values) {
-    for (int i = 0; i < reference.count; ++i) {
-        const float dx = reference.x[i], dy = reference.y[i];
-        if (!sample(image, warp.x + warp.a * dx + warp.b * dy, warp.y + warp.c * dx + warp.d * dy, &values[i]))
-            return false;
+    const Window& window = reference.window;
+    const float radius = -window.x[0];
+    if (!encloses(image, warp.x, warp.y, radius * (std::abs(warp.a) + std::abs(warp.b)),
+                  radius * (std::abs(warp.c) + std::abs(warp.d))))
+        return false;
+    const Warp w = warp;
+    const int count = window.count, width = image.width;
+    const float *dx = window.x, *dy = window.y, *pixels = image.pixels;
+    int32_t at[kMaxPixels];
+    float right[kMaxPixels], down[kMaxPixels];
+    for (int i = 0; i < count; ++i) {
+        const float x = w.x - 0.5f + w.a * dx[i] + w.b * dy[i], y = w.y - 0.5f + w.c * dx[i] + w.d * dy[i];
+        const int column = int(x), row = int(y);
+        at[i] = row * width + column;
+        right[i] = x - column;
+        down[i] = y - row;
     }
-    const Moments of = moments(values, reference.weight, reference.count);
+    for (int i = 0; i < count; ++i) {
+        const float *above = pixels + at[i], *below = above + width;
+        const float upper = above[0] + right[i] * (above[1] - above[0]);
+        const float lower = below[0] + right[i] * (below[1] - below[0]);
+        values[i] = upper + down[i] * (lower - upper);
+    }
+    const Moments of = moments(values, reference.window.weight, reference.window.count);
     if (!(of.deviation > 1)) return false;
-    for (int i = 0; i < reference.count; ++i) values[i] = (values[i] - of.mean) / of.deviation;
+    for (int i = 0; i < reference.window.count; ++i) values[i] = (values[i] - of.mean) / of.deviation;
     return true;
 }
 
@@ -188,7 +217,7 @@ float position_sigma(const Reference& reference, const Warp& warp, float correla
     // Both patches have variance 1: what is left after the best gain has the variance 1 - correlation^2. Weights are
     // normalised; they hold as many independent pixels as the inverse of the sum of their squares.
     float squares = 0;
-    for (int i = 0; i < reference.count; ++i) squares += reference.weight[i] * reference.weight[i];
+    for (int i = 0; i < reference.window.count; ++i) squares += reference.window.weight[i] * reference.window.weight[i];
     const double variance = std::max(1.0 - double(correlation) * correlation, 1e-6) * squares;
     const double xx = reference.inverse[4][4], xy = reference.inverse[4][5], yy = reference.inverse[5][5];
     const double half = 0.5 * (xx + yy), apart = std::sqrt(0.25 * (xx - yy) * (xx - yy) + xy * xy);
@@ -215,7 +244,7 @@ void align(const Images& images, const Patches& patches, int patch, Reference& r
         float right[kModel] = {};
         for (int k = 0; k < kModel; ++k) {
             float sum = 0;
-            for (int i = 0; i < reference.count; ++i) sum += reference.slopes[k][i] * (values[i] - reference.value[i]);
+            for (int i = 0; i < reference.window.count; ++i) sum += reference.slopes[k][i] * (values[i] - reference.value[i]);
             right[k] = sum;
         }
         double step[kWarp] = {};
@@ -227,8 +256,8 @@ void align(const Images& images, const Patches& patches, int patch, Reference& r
     }
     if (!converged) return;
     float correlation = 0;
-    for (int i = 0; i < reference.count; ++i)
-        correlation += reference.weight[i] * values[i] * reference.value[i];
+    for (int i = 0; i < reference.window.count; ++i)
+        correlation += reference.window.weight[i] * values[i] * reference.value[i];
     const float result[] = {warp.a, warp.b, warp.c, warp.d};
     std::copy(result, result + 4, affine);
     at[0] = warp.x;
@@ -248,7 +277,8 @@ using namespace core;
 CORE_API int core_align(const Images* images, const Patches* patches) {
     if (patches->radius < 1 || patches->radius > kMaxRadius) return 1;
     run_ranges(patches->count, kPatchesPerTask, [&](int begin, int end, int) {
-        Reference reference;
+        const Window window(patches->radius);
+        Reference reference{window, {}, {}, {}};
         for (int patch = begin; patch < end; ++patch) align(*images, *patches, patch, reference);
     });
     return 0;

@@ -24,7 +24,7 @@ _MIN_NOISE_PX = 0.05  # at REFERENCE_SIDE: no observation is believed to be bett
 _POSE, _LENS = 6, 4  # parameters of a pose (rotation vector, translation) and of a lens (log focal, radial, shift x, y)
 _MIN_DEPTH = 1e-9  # in the problem's unit of length, in place of 0
 _BEHIND_PX = 1e3  # the error that the robust cost counts for a point behind its camera
-_UNDISTORT_ITERATIONS = 5  # of the fixed-point iteration; radial coefficients are small
+UNDISTORT_ITERATIONS = 5  # of the fixed-point iteration; radial coefficients are small
 _MIN_CURVATURE = 1e-30  # in place of 0 for a parameter on which no observation depends
 _MIN_EIGENVALUE = 1e-14  # of the information at unit curvature: what is flatter is rounding
 
@@ -106,7 +106,7 @@ def normalise(problem: Problem, camera: Index, pixels: Array) -> Array:
     lens = problem.lens_of_camera[camera]
     distorted = (pixels - problem.shifts[lens]) / np.exp(problem.log_focals[lens])[:, None]
     result = distorted
-    for _ in range(_UNDISTORT_ITERATIONS if np.any(problem.radials) else 0):
+    for _ in range(UNDISTORT_ITERATIONS if np.any(problem.radials) else 0):
         result = distorted / (1.0 + problem.radials[lens] * (result**2).sum(1))[:, None]
     return result
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
+
 import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon import poselib
+from splatnode.recon.core import library, pointer
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import bundle
-from splatnode.recon.registration.cross_product import cross, cross_matrix
 
 Array = npt.NDArray[np.float64]
 
@@ -37,26 +39,38 @@ def sampson_errors(estimate: bundle.Problem, views: tuple[int, int], pair: TwoVi
 
     Infinite where a match's point lies behind a camera (Hartley and Zisserman, 2004, 11.4.3 for the error).
     """
-    rays = []
-    for view, points in zip(views, (pair.points1, pair.points2), strict=True):
-        normalised = bundle.normalise(estimate, np.full(len(points), view), points)
-        rays.append(np.column_stack([normalised, np.ones(len(points))]))
-    rotation = estimate.rotations[views[1]] @ estimate.rotations[views[0]].T
-    translation = estimate.translations[views[1]] - rotation @ estimate.translations[views[0]]
-    essential = cross_matrix(translation[None])[0] @ rotation
-    line2, line1 = rays[0] @ essential.T, rays[1] @ essential
-    residual = np.abs((rays[1] * line2).sum(1))
-    focal1, focal2 = np.exp(estimate.log_focals[estimate.lens_of_camera[list(views)]])
-    gradient = (line2[:, :2] ** 2).sum(1) / focal2**2 + (line1[:, :2] ** 2).sum(1) / focal1**2
-    errors = residual / np.sqrt(np.maximum(gradient, 1e-30))
-    # Depths along both rays where they come closest: depth1 * R ray1 + t = depth2 * ray2, up to a positive factor.
-    turned = rays[0] @ rotation.T
-    normal = cross(rays[1], turned)
-    parallax = np.linalg.norm(normal, axis=1)
-    depth1 = -(normal * cross(rays[1], translation)).sum(1)
-    depth2 = -(normal * cross(turned, translation)).sum(1)
-    in_front = ((depth1 > 0) & (depth2 > 0)) | (parallax < _MIN_PARALLAX_PX / max(focal1, focal2))
-    return np.where(in_front, errors, np.inf)
+    first, second = views
+    rotation = estimate.rotations[second] @ estimate.rotations[first].T
+    lenses = estimate.lens_of_camera[list(views)]
+    focals, radials = np.exp(estimate.log_focals[lenses]), estimate.radials[lenses]
+    pose = _Pose(
+        tuple(rotation.ravel()),
+        tuple(estimate.translations[second] - rotation @ estimate.translations[first]),
+        tuple(focals),
+        tuple(radials),
+        tuple(estimate.shifts[lenses].ravel()),
+        _MIN_PARALLAX_PX / focals.max(),
+        bundle.UNDISTORT_ITERATIONS if radials.any() else 0,
+    )
+    points1, points2 = (np.ascontiguousarray(points, np.float64) for points in (pair.points1, pair.points2))
+    errors = np.empty(len(points1))
+    native = ctypes.byref(pose), pointer(points1), pointer(points2), len(points1), pointer(errors)
+    library().core_sampson_errors(*native)
+    return errors
+
+
+class _Pose(ctypes.Structure):
+    """`EpipolarPose` of recon/core/epipolar.cpp."""
+
+    _fields_ = (
+        ("rotation", ctypes.c_double * 9),
+        ("translation", ctypes.c_double * 3),
+        ("focals", ctypes.c_double * 2),
+        ("radials", ctypes.c_double * 2),
+        ("shifts", ctypes.c_double * 4),
+        ("min_parallax", ctypes.c_double),
+        ("undistort_iterations", ctypes.c_int32),
+    )
 
 
 def pinhole(focal: float) -> dict[str, object]:

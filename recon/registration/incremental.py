@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import replace
 
 import msgspec
@@ -12,6 +13,7 @@ from splatnode.recon.registration import bundle, epipolar, inliers, resection, t
 from splatnode.recon.registration.mapping_problem import MappingProblem, Pair, PartialMap
 from splatnode.recon.registration.resection import Resection
 from splatnode.recon.registration.tracks import Tracks
+from splatnode.recon.workers import each
 
 Array = npt.NDArray[np.float64]
 
@@ -116,7 +118,8 @@ def extend(problem: MappingProblem, partial: PartialMap, config: Config) -> Part
     failed: set[int] = set()
     while len(partial.registered) + len(failed) < len(problem.views):
         candidates = _next_views(problem, partial, failed)[: config.candidates]
-        tried = {view: resection.resect(problem, partial, view, config.resection) for view in candidates}
+        resect = functools.partial(resection.resect, problem, partial, config=config.resection)
+        tried = dict(zip(candidates, each(resect, candidates), strict=True))
         found: dict[int, Resection] = {view: resected for view, resected in tried.items() if resected is not None}
         failed |= tried.keys() - found.keys()
         if not found:

@@ -9,15 +9,16 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.core import library, pointer
 from splatnode.recon.registration import bundle
 from splatnode.recon.registration.tracks import Tracks
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
+Index32 = npt.NDArray[np.int32]
 
 
 _ROUNDS = 3  # of triangulation: the worst observation of a track is left out twice at most
-_MIN_WEIGHT = 1e-12  # of a homogeneous point of unit length: with less it lies at infinity
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -31,16 +32,11 @@ def triangulate(matrices: Array, rays: Array, camera_of: Index, track_of: Index,
     `rays` (O, 2) are normalised image coordinates, `matrices` (C, 3, 4) world to camera. A point with fewer than two
     observations, or at infinity, is NaN.
     """
-    rows = rays[:, :, None] * matrices[camera_of, 2][:, None, :] - matrices[camera_of, :2]
-    rows /= np.linalg.norm(rows, axis=2, keepdims=True)
-    normal = np.einsum("oki,okj->oij", rows, rows)
-    index = track_of[:, None, None] * 16 + np.arange(16).reshape(4, 4)
-    summed = np.bincount(index.ravel(), weights=normal.ravel(), minlength=num_tracks * 16).reshape(-1, 4, 4)
-    homogeneous = np.linalg.eigh(summed)[1][:, :, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        points = homogeneous[:, :3] / homogeneous[:, 3:]
-    observed = np.bincount(track_of, minlength=num_tracks) >= 2
-    return np.where((np.abs(homogeneous[:, 3:]) > _MIN_WEIGHT) & observed[:, None], points, np.nan)
+    camera_of, (rays,), first = _by_point(camera_of, track_of, num_tracks, rays)
+    matrices, points = np.ascontiguousarray(matrices), np.empty((num_tracks, 3))
+    native = pointer(matrices), pointer(rays), pointer(camera_of), pointer(first), num_tracks, pointer(points)
+    library().core_triangulate(*native)
+    return points
 
 
 def largest_angles(centres: Array, points: Array, camera_of: Index, track_of: Index) -> Array:
@@ -48,13 +44,22 @@ def largest_angles(centres: Array, points: Array, camera_of: Index, track_of: In
 
     `centres` (C, 3) are those of the cameras.
     """
-    directions = np.zeros((len(points), len(centres), 3))
-    towards = points[track_of] - centres[camera_of]
-    directions[track_of, camera_of] = towards / np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-    seen = np.zeros((len(points), len(centres)), bool)
-    seen[track_of, camera_of] = True
-    cosine = np.where(seen[:, :, None] & seen[:, None, :], directions @ directions.transpose(0, 2, 1), 1.0)
-    return np.degrees(np.arccos(np.clip(cosine.min(axis=(1, 2)), -1.0, 1.0)))
+    camera_of, _, first = _by_point(camera_of, track_of, len(points))
+    centres, points, cosines = np.ascontiguousarray(centres), np.ascontiguousarray(points), np.empty(len(points))
+    native = pointer(centres), pointer(points), pointer(camera_of), pointer(first), len(points), pointer(cosines)
+    library().core_widest_angles(*native)
+    return np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
+
+
+def _by_point(
+    camera_of: Index, point_of: Index, num_points: int, *values: Array
+) -> tuple[Index32, list[Array], Index32]:
+    """The cameras and `values` of observations in the order of their points, and where those of each point begin."""
+    if np.any(np.diff(point_of) < 0):
+        order = np.argsort(point_of, kind="stable")
+        camera_of, point_of, values = camera_of[order], point_of[order], tuple(value[order] for value in values)
+    first = np.searchsorted(point_of, np.arange(num_points + 1)).astype(np.int32)
+    return np.ascontiguousarray(camera_of, np.int32), [np.ascontiguousarray(value) for value in values], first
 
 
 def retriangulate(

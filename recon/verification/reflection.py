@@ -6,8 +6,9 @@ pixel. But it shows the details that are not symmetric, too, the wrong way round
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -15,6 +16,7 @@ import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.matching import nearest_neighbours
+from splatnode.recon.workers import in_turn
 
 Array = npt.NDArray[np.float64]
 Bytes = npt.NDArray[np.uint8]
@@ -37,15 +39,17 @@ class Reflection:
     gain: float  # mean logarithm of the matches of mirrored over plain pairs of one of them and one of the others
 
 
-def measure(keyframes: Sequence[Keyframe], config: Config) -> Reflection:
-    """Of two frames or more."""
+def measure(keyframes: Sequence[Keyframe], pairs: Collection[tuple[int, int]], config: Config) -> Reflection:
+    """Of two frames or more, by those `pairs` (i < j) of their positions that are compared."""
     plain = [_strongest(keyframe.features, config.num_features) for keyframe in keyframes]
     mirrored = [mirrored_descriptors(descriptors) for descriptors in plain]
-    gains = np.zeros((len(plain), len(plain)))
-    for j in range(len(plain)):
-        for i in range(j):
-            gains[i, j] = gains[j, i] = _gain(plain[i], mirrored[j], plain[j], config)
-    grown = [_grown(gains, first) for first in range(len(plain))]
+    gains, compared = np.zeros((len(plain), len(plain))), np.zeros((len(plain), len(plain)))
+    ordered = sorted(pairs)
+    of_pairs = in_turn(lambda pair: _gain(plain[pair[0]], mirrored[pair[1]], plain[pair[1]], config), ordered)
+    for (i, j), gain in zip(ordered, of_pairs, strict=True):
+        gains[i, j] = gains[j, i] = gain
+        compared[i, j] = compared[j, i] = 1.0
+    grown = [_grown(gains, compared, first) for first in range(len(plain))]
     group, gain = grown[int(np.argmax([gain for _, gain in grown]))]  # the first NaN, where there is one
     return Reflection(tuple(keyframes[index].name for index in np.flatnonzero(group).tolist()), gain)
 
@@ -87,19 +91,29 @@ def mirrored_descriptors(descriptors: Bytes) -> Bytes:
     return np.ascontiguousarray(cells[:, ::-1][..., -np.arange(8) % 8].reshape(-1, 128))
 
 
-def _grown(gains: Array, first: int) -> tuple[Flags, float]:
-    """The group with the largest mean gain across its border, grown from one frame by the frame that suits best."""
+def _grown(gains: Array, compared: Array, first: int) -> tuple[Flags, float]:
+    """The group with the largest mean gain across its border, grown from one frame by the frame that suits best.
+
+    Pairs that are not `compared` (1, else 0) have a gain of 0 and do not count.
+    """
     group = np.zeros(len(gains), bool)
     group[first] = True
-    best = group, _across(gains, group)
+    total, count = gains[first].sum(), compared[first].sum()
+    best = group.copy(), _mean(total, count)
     while 2 * (group.sum() + 1) <= len(gains):
-        larger = [group | (np.arange(len(gains)) == other) for other in np.nonzero(~group)[0]]
-        group = max(larger, key=lambda candidate: _across(gains, candidate))
-        gain = _across(gains, group)
-        if gain > best[1]:
-            best = group, gain
+        # A frame that joins the group takes its pairs with the group from the border, and adds those with the others.
+        totals, counts = (
+            across + (each @ ~group) - each @ group for across, each in ((total, gains), (count, compared))
+        )
+        means = np.where(group, -np.inf, _mean(totals, counts))
+        other = int(means.argmax())
+        group[other], total, count = True, totals[other], counts[other]
+        if means[other] > best[1]:
+            best = group.copy(), float(means[other])
     return best
 
 
-def _across(gains: Array, group: Flags) -> float:
-    return float(gains[np.ix_(group, ~group)].mean())
+def _mean(total: Array, count: Array) -> Any:
+    """Minus infinity where nothing was compared."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(count > 0, total / count, -np.inf)

@@ -170,8 +170,11 @@ def flat_share(graph: ViewGraph, index: int) -> float:
 
 
 def _reflection(graph: ViewGraph, registration: Registration, config: reflection.Config) -> Reflection:
-    registered = [graph.keyframes[camera.index] for camera in registration.cameras]
-    return reflection.measure(registered, config)
+    """By the registered pairs that are worth matching: of many keyframes each has enough of them."""
+    place = {camera.index: position for position, camera in enumerate(registration.cameras)}
+    worth = {(place[i], place[j]) for i, j in graph.worth_matching() if i in place and j in place}
+    pairs = {(min(pair), max(pair)) for pair in worth}
+    return reflection.measure([graph.keyframes[index] for index in place], pairs, config)
 
 
 def _reflections_of_further(

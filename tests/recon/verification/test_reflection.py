@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from tests.support.synthetic import photographs
 
 FEATURES = features.Config(num_features=1500)
 CONFIG = reflection.Config()
+PAIRS = set(itertools.combinations(range(5), 2))
 
 
 def keyframes(mirrored: tuple[int, ...] = (), count: int = 5) -> list[Keyframe]:
@@ -34,7 +36,7 @@ def test_mirrored_descriptors_are_those_of_the_mirrored_image():
 
 
 def test_frames_that_were_mirrored_are_found():
-    found = reflection.measure(keyframes((1, 4)), CONFIG)
+    found = reflection.measure(keyframes((1, 4)), PAIRS, CONFIG)
     assert found.frames == tuple(photographs()[number].name for number in (1, 4))
     assert found.gain > 0.4
 
@@ -52,4 +54,10 @@ def test_the_strongest_is_one_that_is_not_a_number_where_there_is_one():
 
 
 def test_plain_frames_fit_better_as_they_are():
-    assert reflection.measure(keyframes(), CONFIG).gain < 0.0
+    assert reflection.measure(keyframes(), PAIRS, CONFIG).gain < 0.0
+
+
+def test_pairs_that_are_not_compared_say_nothing():
+    found = reflection.measure(keyframes((1, 4)), PAIRS - {(0, 1), (2, 4), (1, 4)}, CONFIG)
+    assert found.frames and set(found.frames) <= {photographs()[number].name for number in (1, 4)}
+    assert found.gain > 0.4

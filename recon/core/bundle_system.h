@@ -1,0 +1,192 @@
+// The normal equations of a bundle, its points eliminated by the Schur complement.
+//
+// The work is in the points: each is linearised and eliminated by itself, so that they are dealt with in chunks that sum
+// into systems of their own. The number of chunks is fixed, and with it the order of all sums: the result does not
+// depend on the number of threads.
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <vector>
+
+#include "bundle_algebra.h"
+#include "bundle_cost.h"
+#include "threads.h"
+
+namespace core {
+namespace {
+
+constexpr double kFloor = 1e-12;  // added to diagonals that damping scales
+constexpr int kRowsPerTask = 16;   // of the system, when the chunks are added up
+
+// Parameters of one camera or lens that a point touches: `size` of them from `start` on, and their place among the
+// columns of the point.
+struct Block {
+    int start, size, place;
+};
+
+// Sums of a chunk of points, and scratch for one point.
+struct Sums {
+    std::vector<double> matrix, diagonal, gradient;  // (size, size) lower triangle, (size,) before elimination, (size,)
+    std::vector<Block> blocks;
+    std::vector<double> mixed[3], scaled[3];  // columns of the point's parameters, times the inverse of their matrix
+};
+
+// The normal equations of all poses and lenses after the points are eliminated, and what brings the points back.
+struct System {
+    int size;                      // parameters
+    std::vector<double> matrix;    // (size, size), lower triangle
+    std::vector<double> gradient;  // (size,)
+    std::vector<double> spread;    // (O, 10, 3): (J_camera^T w J_point) (J_point^T w J_point)^-1
+    std::vector<double> shift;     // (P, 3): (J_point^T w J_point)^-1 J_point^T w residual
+    std::vector<Sums> sums;        // of each chunk
+
+    explicit System(const Bundle& bundle)
+        : size(kPose * bundle.num_cameras + kLens * bundle.num_lenses),
+          matrix(size_t(size) * size),
+          gradient(size),
+          spread(size_t(bundle.first_of_point[bundle.num_points]) * 3 * kOwn),
+          shift(size_t(bundle.num_points) * 3),
+          sums(kChunks) {}
+};
+
+// Where the k-th of an observation's ten parameters is among all.
+inline int parameter(const Bundle& bundle, int camera, int k) {
+    return k < kPose ? kPose * camera + k
+                     : kPose * bundle.num_cameras + kLens * bundle.lens_of_camera[camera] + k - kPose;
+}
+
+// The columns of the block from `start` on, which is added (filled with 0) if the point does not have it yet.
+int columns_of(Sums& sums, int start, int size, int& num_columns) {
+    for (const Block& block : sums.blocks)
+        if (block.start == start) return block.place;
+    sums.blocks.push_back({start, size, num_columns});
+    for (auto& row : sums.mixed) {
+        row.resize(std::max(row.size(), size_t(num_columns + size)));
+        std::fill(row.begin() + num_columns, row.begin() + num_columns + size, 0.0);
+    }
+    num_columns += size;
+    return sums.blocks.back().place;
+}
+
+// What an observation says of its camera and lens, into the sums and the point's columns.
+void add_observation(const Bundle& bundle, int observation, const Projection& p, const Derivatives& d, System& system,
+                     Sums& sums, int& num_columns) {
+    const int camera = bundle.camera_of[observation];
+    const int pose = parameter(bundle, camera, 0), lens = parameter(bundle, camera, kPose);
+    const int of_pose = columns_of(sums, pose, kPose, num_columns), of_lens = columns_of(sums, lens, kLens, num_columns);
+    for (int k = 0; k < kOwn; ++k) {
+        const double w0 = d.weight * d.by_camera[0][k], w1 = d.weight * d.by_camera[1][k];
+        const int row = k < kPose ? pose + k : lens + k - kPose;
+        double* of_row = &sums.matrix[size_t(row) * system.size];
+        for (int j = 0; j <= std::min(k, kPose - 1); ++j)
+            of_row[pose + j] += w0 * d.by_camera[0][j] + w1 * d.by_camera[1][j];
+        for (int j = kPose; j <= k; ++j)
+            of_row[lens + j - kPose] += w0 * d.by_camera[0][j] + w1 * d.by_camera[1][j];
+        sums.diagonal[row] += w0 * d.by_camera[0][k] + w1 * d.by_camera[1][k];
+        sums.gradient[row] += w0 * p.residual[0] + w1 * p.residual[1];
+        const int column = k < kPose ? of_pose + k : of_lens + k - kPose;
+        double* own = &system.spread[(size_t(observation) * kOwn + k) * 3];
+        for (int i = 0; i < 3; ++i) {
+            own[i] = w0 * d.by_point[0][i] + w1 * d.by_point[1][i];
+            sums.mixed[i][column] += own[i];
+        }
+    }
+}
+
+// to -= the products of kSize columns with one of them.
+template <int kSize>
+inline void subtract(const double (&factors)[3], const Sums& sums, int place, double* to) {
+    const double *m0 = &sums.mixed[0][place], *m1 = &sums.mixed[1][place], *m2 = &sums.mixed[2][place];
+    for (int c = 0; c < kSize; ++c) to[c] -= factors[0] * m0[c] + factors[1] * m1[c] + factors[2] * m2[c];
+}
+
+// What the eliminated point takes away: columns^T inverse columns, the lower triangle by blocks.
+void reduce(const double inverse[3][3], const double* right, int num_columns, int size, Sums& sums) {
+    for (int i = 0; i < 3; ++i) {
+        sums.scaled[i].resize(std::max(sums.scaled[i].size(), size_t(num_columns)));
+        for (int a = 0; a < num_columns; ++a)
+            sums.scaled[i][a] = inverse[i][0] * sums.mixed[0][a] + inverse[i][1] * sums.mixed[1][a] +
+                                inverse[i][2] * sums.mixed[2][a];
+    }
+    for (const Block& rows : sums.blocks)
+        for (int r = 0; r < rows.size; ++r) {
+            const int a = rows.place + r;
+            const double factors[3] = {sums.scaled[0][a], sums.scaled[1][a], sums.scaled[2][a]};
+            sums.gradient[rows.start + r] -= factors[0] * right[0] + factors[1] * right[1] + factors[2] * right[2];
+            double* of_row = &sums.matrix[size_t(rows.start + r) * size];
+            for (const Block& columns : sums.blocks) {
+                if (columns.start > rows.start) continue;
+                if (columns.size == kPose) subtract<kPose>(factors, sums, columns.place, of_row + columns.start);
+                else subtract<kLens>(factors, sums, columns.place, of_row + columns.start);
+            }
+        }
+}
+
+void eliminate(const Bundle& bundle, int point, double damping, System& system, Sums& sums) {
+    const int first = bundle.first_of_point[point], last = bundle.first_of_point[point + 1];
+    double block[3][3] = {}, right[3] = {};
+    int num_columns = 0;
+    sums.blocks.clear();
+    for (int o = first; o < last; ++o) {
+        const int camera = bundle.camera_of[o];
+        const Projection p = project(bundle, camera, bundle.points + 3 * point, bundle.pixels + 2 * o);
+        const Derivatives d = differentiate(bundle, p, camera);
+        add_observation(bundle, o, p, d, system, sums, num_columns);
+        for (int i = 0; i < 3; ++i) {
+            for (int j = 0; j < 3; ++j)
+                block[i][j] += d.weight * (d.by_point[0][i] * d.by_point[0][j] + d.by_point[1][i] * d.by_point[1][j]);
+            right[i] += d.weight * (d.by_point[0][i] * p.residual[0] + d.by_point[1][i] * p.residual[1]);
+        }
+    }
+    for (int i = 0; i < 3; ++i) block[i][i] += block[i][i] * damping + kFloor;
+    double inverse[3][3] = {};
+    invert(block, inverse);
+    multiply(inverse, right, &system.shift[size_t(point) * 3]);
+    for (int o = first; o < last; ++o)
+        for (int k = 0; k < kOwn; ++k) {
+            double* own = &system.spread[(size_t(o) * kOwn + k) * 3];
+            const double mixed[3] = {own[0], own[1], own[2]};
+            multiply(inverse, mixed, own);
+        }
+    reduce(inverse, right, num_columns, system.size, sums);
+}
+
+void assemble(const Bundle& bundle, double damping, System& system) {
+    const int size = system.size;
+    run_parallel(kChunks, [&](int chunk, int) {
+        Sums& mine = system.sums[chunk];
+        mine.matrix.assign(size_t(size) * size, 0.0);
+        mine.diagonal.assign(size, 0.0);
+        mine.gradient.assign(size, 0.0);
+        const int begin = int64_t(bundle.num_points) * chunk / kChunks;
+        const int end = int64_t(bundle.num_points) * (chunk + 1) / kChunks;
+        for (int point = begin; point < end; ++point) eliminate(bundle, point, damping, system, mine);
+    });
+    run_ranges(size, kRowsPerTask, [&](int begin, int end, int) {
+        for (int i = begin; i < end; ++i) {
+            double* row = &system.matrix[size_t(i) * size];
+            double diagonal = 0;
+            std::fill(row, row + i + 1, 0.0);
+            system.gradient[i] = 0;
+            for (const Sums& part : system.sums) {
+                const double* of_part = &part.matrix[size_t(i) * size];
+                for (int j = 0; j <= i; ++j) row[j] += of_part[j];
+                diagonal += part.diagonal[i];
+                system.gradient[i] += part.gradient[i];
+            }
+            row[i] += diagonal * damping + kFloor;
+        }
+    });
+    for (int g = 0; g < bundle.num_lenses; ++g) {
+        const LensPrior prior(bundle, g);
+        for (int k = 0; k < kLens; ++k) {
+            const int at = kPose * bundle.num_cameras + kLens * g + k;
+            system.matrix[size_t(at) * size + at] += prior.weights[k] * (1 + damping);
+            system.gradient[at] += prior.weights[k] * prior.deviations[k];
+        }
+    }
+}
+
+}  // namespace
+}  // namespace core
