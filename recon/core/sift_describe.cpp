@@ -31,8 +31,12 @@ struct Window {
         const Vec factor = splat(-0.5f * 1.44269504f / (sigma * sigma));  // exp2 instead of exp
         Vec distance;
         for (int lane = 0; lane < kLanes; ++lane) distance[lane] = float(lane - radius);
-        for (int i = 0; i <= 2 * radius + kLanes; i += kLanes, distance += float(kLanes))
-            store(weights + i, exp2_nonpositive(maximum(distance * distance * factor, splat(-120.0f))));
+        for (int i = 0; i <= 2 * radius + kLanes; i += kLanes, distance += float(kLanes)) {
+            const Vec exponent[1] = {maximum(distance * distance * factor, splat(-120.0f))};
+            Vec weight[1];
+            exp2_nonpositive(exponent, weight);
+            store(weights + i, weight[0]);
+        }
     }
 
     const float* at(int distance) const { return weights + radius + distance; }

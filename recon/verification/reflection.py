@@ -99,7 +99,7 @@ def _grown(gains: Array, compared: Array, first: int) -> tuple[Flags, float]:
     group = np.zeros(len(gains), bool)
     group[first] = True
     total, count = gains[first].sum(), compared[first].sum()
-    best = group.copy(), _mean(total, count)
+    best = group.copy(), float(_mean(total, count))
     while 2 * (group.sum() + 1) <= len(gains):
         # A frame that joins the group takes its pairs with the group from the border, and adds those with the others.
         totals, counts = (
