@@ -24,9 +24,9 @@ class Features:
     # (D,) simulated tilt: by which the image's width was divided; below 1, its height was multiplied by it; 1 for none
     tilt: npt.NDArray[np.float64]
 
-    def strongest(self, count: int) -> Features:
-        """With the descriptors of the first `count` points alone, which are the strongest of the plain image."""
-        chosen = self.point_of < count
+    def of_tilt(self, tilt: float) -> Features:
+        """With the descriptors of this tilt alone, in their order: the strongest first."""
+        chosen = self.tilt == tilt
         return Features(self.points, self.descriptors[chosen], self.point_of[chosen], self.tilt[chosen])
 
 

@@ -114,7 +114,7 @@ def _patches(grey: Grey, config: Config) -> Array:
     """(M, 2) pixels: the best corner of each cell of a grid, where it has contrast."""
     size = max(grey.shape) / config.cells
     rows, columns = (max(1, round(side / size)) for side in grey.shape)
-    corner = cv2.cornerMinEigenVal(grey, CORNER_BLOCK)
+    corner, contrast = cv2.cornerMinEigenVal(grey, CORNER_BLOCK), _contrast(grey, config.patch)
     margin = config.patch
     found = []
     for row in range(rows):
@@ -125,11 +125,15 @@ def _patches(grey: Grey, config: Config) -> Array:
                 continue
             cell = corner[top:bottom, left:right]
             y, x = np.unravel_index(int(cell.argmax()), cell.shape)
-            half = config.patch // 2
-            around = grey[top + y - half : top + y + half + 1, left + x - half : left + x + half + 1]
-            if around.std() >= config.min_contrast:
+            if contrast[top + y, left + x] >= config.min_contrast:
                 found.append((left + x + 0.5, top + y + 0.5))
     return np.array(found).reshape(-1, 2)
+
+
+def _contrast(grey: Grey, side: int) -> Array:
+    """(h, w) the standard deviation of the square of `side` pixels around each pixel."""
+    mean, squares = (box(grey, cv2.CV_64F, (side, side)) for box in (cv2.boxFilter, cv2.sqrBoxFilter))
+    return np.sqrt(np.maximum(squares - mean**2, 0.0))
 
 
 def _planes(pixels: Array, points: Array, depths: Array, config: Config) -> Array:

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.inliers import pooled_ratio
-from splatnode.recon.registration.register import Registration
+from splatnode.recon.registration.register import RegisteredCamera, Registration
 from splatnode.recon.verification import (
     cycles,
     epipolar_consistency,
@@ -30,6 +30,7 @@ from splatnode.recon.verification.epipolar_consistency import Picture
 from splatnode.recon.verification.errors import PoseErrors
 from splatnode.recon.verification.evidence import CameraEvidence, Evidence
 from splatnode.recon.verification.reflection import Reflection
+from splatnode.recon.workers import each
 
 Array = npt.NDArray[np.float64]
 
@@ -138,6 +139,11 @@ def _of_cameras(
     by_third = times_seen[registration.observed_point] >= 3
     confirmed = np.bincount(registration.observed_by[by_third], minlength=len(graph.keyframes))
     scales = {index: graph.keyframes[index].scale for index in views}
+    measured = [camera for camera in registration.cameras if camera.index in sizes]
+    patches = each(
+        lambda camera: epipolar_consistency.in_partners(camera.index, views, registration, config.epipolar_consistency),
+        measured,
+    )
     gains = exposure.gains({index: picture.grey for index, picture in views.items()}, registration, scales)
     return tuple(
         CameraEvidence(
@@ -147,11 +153,10 @@ def _of_cameras(
             coverage=coverage(graph.keyframes[camera.index], registration.observed_pixels[by == camera.index]),
             flat_share=flat_share(graph, camera.index),
             gain=gains[camera.index],
-            patches=epipolar_consistency.in_partners(camera.index, views, registration, config.epipolar_consistency),
+            patches=found,
             errors=sizes[camera.index],
         )
-        for camera in registration.cameras
-        if camera.index in sizes
+        for camera, found in zip(measured, patches, strict=True)
     )
 
 
@@ -206,20 +211,24 @@ def pictures(
     graph: ViewGraph, registration: Registration, config: epipolar_consistency.Config, asked: Collection[int]
 ) -> dict[int, epipolar_consistency.Picture]:
     """The registered views among the keyframes `asked`, at modelled size, by keyframe."""
-    views = {}
-    for camera in (camera for camera in registration.cameras if camera.index in asked):
-        keyframe = graph.keyframes[camera.index]
-        scale = np.array(keyframe.scale)
-        (fx, fy), (cx, cy) = camera.focal * scale, camera.principal * scale
-        mine = registration.observed_by == camera.index
-        to_camera = np.linalg.inv(camera.T_world_camera)
-        points = registration.points[registration.observed_point[mine]]
-        views[camera.index] = epipolar_consistency.picture(
-            cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY).astype(np.float32),
-            np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
-            camera.T_world_camera,
-            registration.observed_pixels[mine] * scale,
-            points @ to_camera[2, :3] + to_camera[2, 3],
-            config,
-        )
-    return views
+    cameras = [camera for camera in registration.cameras if camera.index in asked]
+    found = each(lambda camera: _picture(graph.keyframes[camera.index], camera, registration, config), cameras)
+    return {camera.index: picture for camera, picture in zip(cameras, found, strict=True)}
+
+
+def _picture(
+    keyframe: Keyframe, camera: RegisteredCamera, registration: Registration, config: epipolar_consistency.Config
+) -> Picture:
+    scale = np.array(keyframe.scale)
+    (fx, fy), (cx, cy) = camera.focal * scale, camera.principal * scale
+    mine = registration.observed_by == camera.index
+    to_camera = np.linalg.inv(camera.T_world_camera)
+    points = registration.points[registration.observed_point[mine]]
+    return epipolar_consistency.picture(
+        cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY).astype(np.float32),
+        np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
+        camera.T_world_camera,
+        registration.observed_pixels[mine] * scale,
+        points @ to_camera[2, :3] + to_camera[2, 3],
+        config,
+    )

@@ -12,6 +12,7 @@ from splatnode.recon.matching.components import connected_components
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.verification import epipolar_consistency
+from splatnode.recon.workers import each
 
 MIN_CONSISTENT_SHARE = 0.6  # of a pair's matches that the poses explain, for it to connect its frames
 MIN_CONSISTENT_MATCHES = 20  # that the poses explain, for a pair to connect its frames
@@ -49,12 +50,13 @@ def measure(
     shared = shared_points(registration)
     one, other = _two_parts(indices, shared)
     across = sorted(((i, j) for i in one for j in other), key=lambda pair: (-shared[pair], pair))
-    scores = [
-        epipolar_consistency.score(pictures[a], pictures[b], config)
+    asked = [
+        (pictures[a], pictures[b], config)
         for i, j in across[:MAX_PAIRS_SCORED]
         for a, b in ((i, j), (j, i))
         if i in pictures and j in pictures
     ]
+    scores = each(lambda one_way: epipolar_consistency.score(*one_way), asked)
     verified = [key for i, j in across if (key := (min(i, j), max(i, j))) in registration.inlier_ratios]
     return WeakestLink(
         smaller_part=tuple(names[index] for index in sorted(min(one, other, key=len))),
