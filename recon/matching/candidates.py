@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -73,7 +74,7 @@ def worth_matching(
             depth[index] += config.partners
 
 
-def _best(scores: npt.NDArray[np.generic], index: int) -> list[int]:
+def _best(scores: npt.NDArray[Any], index: int) -> list[int]:
     """The other keyframes, that with the highest score first."""
     order = np.argsort(-scores, kind="stable").tolist()
     return [other for other in order if other != index]

@@ -77,7 +77,7 @@ def _detect(image: Image, tilt: float, config: Config) -> tuple[Array, npt.NDArr
         grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA if scale < 1.0 else cv2.INTER_CUBIC)
     points, descriptors = sift.detect(np.asarray(grey, np.uint8), config.num_features, config.contrast)
     # The detector's pixel centres are whole numbers; ours are at halves.
-    return (points + 0.5) * (width / size[0], height / size[1]), descriptors
+    return (points.astype(np.float64) + 0.5) * (width / size[0], height / size[1]), descriptors
 
 
 def describe(grey: Image, points: Array, size: float) -> npt.NDArray[np.uint8]:

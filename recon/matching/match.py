@@ -174,7 +174,7 @@ def _all_matched_further(
     return graph
 
 
-def _of(keyframes: Sequence[Keyframe], pair: Pair) -> tuple[Keyframe, Keyframe]:
+def _of(keyframes: Sequence[Keyframe], pair: Sequence[int]) -> tuple[Keyframe, Keyframe]:
     return keyframes[pair[0]], keyframes[pair[1]]
 
 

@@ -32,9 +32,9 @@ def triangulate(matrices: Array, rays: Array, camera_of: Index, track_of: Index,
     `rays` (O, 2) are normalised image coordinates, `matrices` (C, 3, 4) world to camera. A point with fewer than two
     observations, or at infinity, is NaN.
     """
-    camera_of, (rays,), first = _by_point(camera_of, track_of, num_tracks, rays)
+    cameras, (rays,), first = _by_point(camera_of, track_of, num_tracks, rays)
     matrices, points = np.ascontiguousarray(matrices), np.empty((num_tracks, 3))
-    native = pointer(matrices), pointer(rays), pointer(camera_of), pointer(first), num_tracks, pointer(points)
+    native = pointer(matrices), pointer(rays), pointer(cameras), pointer(first), num_tracks, pointer(points)
     library().core_triangulate(*native)
     return points
 
@@ -44,9 +44,9 @@ def largest_angles(centres: Array, points: Array, camera_of: Index, track_of: In
 
     `centres` (C, 3) are those of the cameras.
     """
-    camera_of, _, first = _by_point(camera_of, track_of, len(points))
+    cameras, _, first = _by_point(camera_of, track_of, len(points))
     centres, points, cosines = np.ascontiguousarray(centres), np.ascontiguousarray(points), np.empty(len(points))
-    native = pointer(centres), pointer(points), pointer(camera_of), pointer(first), len(points), pointer(cosines)
+    native = pointer(centres), pointer(points), pointer(cameras), pointer(first), len(points), pointer(cosines)
     library().core_widest_angles(*native)
     return np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
 

@@ -50,5 +50,5 @@ def test_who_stops_asking_begins_no_more():
     begun = []
     results = in_turn(begun.append, range(1000))
     next(results)
-    results.close()
+    results.close()  # pyright: ignore[reportAttributeAccessIssue]
     assert len(begun) <= default_threads() + 2

@@ -88,8 +88,8 @@ def test_a_turned_image_has_the_same_descriptors():
     back = np.stack([299 - turned_points[:, 1], turned_points[:, 0]], 1)
     # The image is enlarged towards one corner: a turned one is shifted by half a pixel of the enlarged image.
     _, nearest = KDTree(back).query(points, distance_upper_bound=0.8)
-    near = nearest < len(back)
-    similar = np.linalg.norm(descriptors[near].astype(int) - turned_descriptors[nearest[near]], axis=1) < 60
+    near = np.asarray(nearest) < len(back)
+    similar = np.linalg.norm(descriptors[near].astype(int) - turned_descriptors[np.asarray(nearest)[near]], axis=1) < 60
     assert near.mean() > 0.6 and similar.mean() > 0.6
 
 

@@ -174,6 +174,7 @@ def test_flatness_of_points_that_are_nowhere_is_not_known():
 
 
 def test_a_gain_by_mirroring_that_is_not_a_number_is_not_passed_over(monkeypatch):
-    monkeypatch.setattr(reflection, "_across", lambda gains, group: math.nan if group[1] else 0.0)
+    gains = iter([0.0, math.nan, 0.0])
+    monkeypatch.setattr(reflection, "_gain", lambda *_: next(gains))
     monkeypatch.setattr(reflection, "_strongest", lambda features, count: np.zeros((4, 128), np.uint8))
     assert math.isnan(reflection.measure(graph(3, {}).keyframes, [(0, 1), (0, 2), (1, 2)], reflection.Config()).gain)
