@@ -61,11 +61,12 @@ def _estimate_cameras(
 ) -> tuple[Estimate, list[DroppedFrame]]:
     kept, dropped, rejected = screen_all(frames, config.screening)
     keyframes = [prepare(frame, config) for frame in kept]
-    graph = match(keyframes, config.matching, prior.matcher)
+    deadline = clock.deadline(config.budget_s) or math.inf
+    half = clock.started + (deadline - clock.started) / 2  # the least that cameras take is not bound by a budget
+    graph = match(keyframes, config.matching, prior.matcher, until=half)
     estimate = estimate_cameras(graph, rejected, config)
     clock.lap("poses")
-    deadline = clock.deadline(config.budget_s)
-    estimate = climbed(estimate, rejected, config, until=math.inf if deadline is None else deadline)
+    estimate = climbed(estimate, rejected, config, until=deadline)
     clock.lap("ladder")
     return estimate, dropped
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
@@ -41,12 +43,13 @@ def match(
     config: Config,
     matcher: Matcher | None = None,
     pause: Callable[[], None] = lambda: None,
+    until: float = math.inf,
 ) -> ViewGraph:
-    """The view graph of the keyframes, each matched with all others. `pause` may raise to abandon the work."""
+    """The complete view graph of the keyframes. `pause` may raise to abandon the work; `until` as for `completed`."""
     graph = ViewGraph(config)
     for keyframe in keyframes:
         graph = graph.with_keyframe(keyframe)
-    for further in completed(graph, matcher):
+    for further in completed(graph, matcher, until):
         pause()
         graph = further
     return graph
@@ -65,18 +68,22 @@ def matched_soon(graph: ViewGraph, matcher: Matcher | None) -> Iterator[ViewGrap
         yield from completed(graph, matcher)
 
 
-def completed(graph: ViewGraph, matcher: Matcher | None) -> Iterator[ViewGraph]:
+def completed(graph: ViewGraph, matcher: Matcher | None, until: float = math.inf) -> Iterator[ViewGraph]:
     """The graph after each pair that was pending and is worth matching; the last one is complete.
 
     Pairs are matched by plain features. Those that match weakly but may overlap (`tilting.pairs_to_tilt`) are matched
-    again with tilted features, which bridge wider baselines, and with what a prior's matcher proposes.
+    again with tilted features, which bridge wider baselines, and with what a prior's matcher proposes: but for those of
+    which the turn comes after `until`, a time of `time.monotonic()`.
     """
     graph = yield from _glanced(graph)
     while pairs := sorted(graph.to_match()):
         graph = yield from _all_matched_plain(graph, pairs)
     to_tilt = graph.to_tilt()
     weak = [pair for pair in graph.plain if pair in to_tilt and pair not in graph.tilted]
-    graph = yield from _all_matched_further(graph, weak, graph.config.tilting.tilts, matcher)
+    for further in _all_matched_further(graph, weak, graph.config.tilting.tilts, matcher):
+        if time.monotonic() >= until:
+            break
+        yield (graph := further)
     yield graph.chosen()
 
 

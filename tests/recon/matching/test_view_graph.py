@@ -150,6 +150,12 @@ def test_without_a_keyframe_the_graph_is_that_of_the_others(compared):
     assert len(graph.keyframes) == 5 and ("a1", "a2") in names_of(graph)
 
 
+def test_out_of_time_no_pair_is_matched_with_tilted_features(compared):
+    graph: Any = ViewGraph(matching.Config(), (keyframe("a1"),))
+    *_, whole = completed(graph.with_keyframe(keyframe("A2")), None, until=0.0)
+    assert compared == [("A2", "a1")] and not whole.pending and not whole.tilted
+
+
 def test_pairs_from_elsewhere_stay_when_a_keyframe_comes(compared):
     before = {(0, 1): Verified(range(77), ("a1", "a2"))}
     graph: Any = ViewGraph(matching.Config(), (keyframe("a1"), keyframe("a2")), before)
