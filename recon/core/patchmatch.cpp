@@ -16,9 +16,8 @@
 namespace patchmatch {
 namespace {
 
-// Pixels of parallax, over the whole window, below which two planes match alike: the challenger is not compared. At
-// .1 depths were no better; at .5 those of slanted planes were half as far off again.
-constexpr float kSamePlanePx = 0.2f;
+// Pixels of parallax, over the whole window, below which two planes match alike: the challenger is not compared.
+constexpr float kSamePlanePx = 0.1f;
 
 // Least squared z of a random unit normal: 82 degrees off the optical axis. It bounds the slope of random planes.
 constexpr float kMinSquaredNormalZ = 0.02f;
@@ -134,31 +133,24 @@ void start(Task& task, int x, int y) {
     }
 }
 
-// In each direction, the neighbour of the other colour with the lowest cost among several distances; of these, the
-// `directions` with the lowest costs.
+// In each direction, the neighbour of the other colour with the lowest cost among several distances.
 void spread(const Problem& problem, int x, int y, Contest& contest) {
     static constexpr int kDistances[4] = {1, 3, 7, 15};
-    Plane planes[4];
-    float costs[4];
-    for (int n = 0; n < 4; ++n) {
+    for (const auto& direction : kNear) {
         int nearest = 0;
-        costs[n] = INFINITY;
+        float lowest = INFINITY;
         for (int distance : kDistances) {
-            const int nx = x + kNear[n][0] * distance, ny = y + kNear[n][1] * distance;
+            const int nx = x + direction[0] * distance, ny = y + direction[1] * distance;
             if (nx < 0 || ny < 0 || nx >= problem.width || ny >= problem.height) break;
             const float cost = problem.costs[size_t(ny) * problem.width + nx];
-            nearest = cost < costs[n] ? distance : nearest;
-            costs[n] = std::min(cost, costs[n]);
+            nearest = cost < lowest ? distance : nearest;
+            lowest = std::min(cost, lowest);
         }
-        const int dx = kNear[n][0] * nearest, dy = kNear[n][1] * nearest;
-        planes[n] = problem.planes[size_t(y + dy) * problem.width + x + dx];
-        planes[n].inverse_depth = planes[n].at(float(-dx), float(-dy));
-    }
-    for (int n = 0; n < 4; ++n) {
-        int rank = 0;
-        for (int other = 0; other < 4; ++other)
-            rank += costs[other] < costs[n] || (costs[other] == costs[n] && other < n);
-        if (rank < problem.directions && costs[n] < INFINITY) contest.add(planes[n]);
+        if (nearest == 0) continue;
+        const int dx = direction[0] * nearest, dy = direction[1] * nearest;
+        Plane plane = problem.planes[size_t(y + dy) * problem.width + x + dx];
+        plane.inverse_depth = plane.at(float(-dx), float(-dy));
+        contest.add(plane);
     }
     contest.decide();
 }

@@ -48,7 +48,6 @@ struct Problem {
 
     int32_t active_sources;  // of each pixel, those that explain its plane best: new planes are compared in these
     int32_t random_starts;   // planes tried per pixel before the first iteration, beside the one given
-    int32_t directions;      // of the four, in which planes of neighbours are tried: those where the cost is lowest
     int32_t iterations;      // each visits every pixel once, in two half-steps of a checkerboard
     uint32_t stream, seed;   // choose the random numbers
 

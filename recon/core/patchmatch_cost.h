@@ -207,31 +207,26 @@ struct Pairs {
     int count = 0;
 };
 
-// `centre` is the homogeneous source pixel of the window's centre. The window is carried there by the affine map that
-// touches the plane's homography, and samples are taken at 1 / kSteps of a pixel: a division and seven conversions
-// less a sample than exactly. Samples outside the image repeat its border.
+// `centre` is the homogeneous source pixel of the window's centre. Samples are taken at 1 / kSteps of a pixel; outside
+// the image they repeat its border.
 inline void add_moments(
     const Plane& plane, const Window& window, const Pattern& pattern, const Source& source, const Point& centre,
     Pairs& pairs
 ) {
     const float* A = source.from_reference.A;
     const float* t = source.from_reference.t;
-    // The derivatives by the window's pixels of where the plane's points land, in steps of 1 / kSteps pixel.
-    const float inverse_z = 1.0f / std::max(centre.z, kSmallestZ), step = kSteps * inverse_z;
-    const float landing_x = centre.x * inverse_z, landing_y = centre.y * inverse_z;
+    const float xu = A[0] + t[0] * plane.du, xv = A[1] + t[0] * plane.dv;
+    const float yu = A[3] + t[1] * plane.du, yv = A[4] + t[1] * plane.dv;
     const float zu = A[6] + t[2] * plane.du, zv = A[7] + t[2] * plane.dv;
-    const Vec xu = splat(step * (A[0] + t[0] * plane.du - landing_x * zu));
-    const Vec xv = splat(step * (A[1] + t[0] * plane.dv - landing_x * zv));
-    const Vec yu = splat(step * (A[3] + t[1] * plane.du - landing_y * zu));
-    const Vec yv = splat(step * (A[4] + t[1] * plane.dv - landing_y * zv));
-    const Vec x0 = splat(kSteps * (landing_x - 0.5f)), y0 = splat(kSteps * (landing_y - 0.5f));
-    const Vec mean = splat(window.mean);
+    const Vec mean = splat(window.mean), smallest_z = splat(kSmallestZ), half = splat(0.5f * kSteps);
 
     Vec first = {}, second = {}, product = {};
     for (int k = 0; k < kVectors; ++k) {
         const Vec dx = pattern.right[k], dy = pattern.down[k];
-        const IntVec x = within(core::nearest_int(x0 + xu * dx + xv * dy), kSteps * (source.width - 1));
-        const IntVec y = within(core::nearest_int(y0 + yu * dx + yv * dy), kSteps * (source.height - 1));
+        const Vec steps = float(kSteps) / maximum(centre.z + zu * dx + zv * dy, smallest_z);
+        const Vec right = (centre.x + xu * dx + xv * dy) * steps, below = (centre.y + yu * dx + yv * dy) * steps;
+        const IntVec x = within(core::nearest_int(right - half), kSteps * (source.width - 1));
+        const IntVec y = within(core::nearest_int(below - half), kSteps * (source.height - 1));
         const IntVec four = gather(source.packed, (y >> kStepBits) * source.width + (x >> kStepBits));
         const Vec grey = to_float(between(four, x & (kSteps - 1), y & (kSteps - 1))) * kPerSquaredStep - mean;
         const Vec weighted = window.weight[k] * grey;

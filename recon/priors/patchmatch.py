@@ -38,7 +38,6 @@ class Search:
     iterations: int  # each visits every pixel once
     perturbation: float  # size of random changes in the first iteration, pixels of parallax; halved in each
     active_sources: int = 3  # per pixel: those that explain its plane best; new planes are compared in these alone
-    directions: int = 4  # of four, in which neighbours' planes are tried: those where the matching cost is lowest
     random_starts: int = 0  # planes tried per pixel over the whole depth range before the first iteration
 
 
@@ -94,10 +93,7 @@ class _Problem(ctypes.Structure):
         *((name, ctypes.c_int32) for name in ("width", "height")),
         *((name, ctypes.c_float) for name in ("fx", "fy", "cx", "cy", "min_inverse_depth", "max_inverse_depth")),
         ("sources", ctypes.c_void_p),
-        *(
-            (name, ctypes.c_int32)
-            for name in ("num_sources", "active_sources", "random_starts", "directions", "iterations")
-        ),
+        *((name, ctypes.c_int32) for name in ("num_sources", "active_sources", "random_starts", "iterations")),
         *((name, ctypes.c_uint32) for name in ("stream", "seed")),
         *((name, ctypes.c_float) for name in ("perturbation", *Matching.__dataclass_fields__)),
     )
@@ -165,7 +161,7 @@ def improve(
         pointer(view.grey), pointer(values), pointer(costs), view.shape[1], view.shape[0],
         view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2], 1 / far, 1 / near,
         ctypes.cast(array, ctypes.c_void_p), len(sources),
-        search.active_sources, search.random_starts, search.directions, search.iterations,
+        search.active_sources, search.random_starts, search.iterations,
         stream, seed & 0xFFFFFFFF, search.perturbation,
         *(getattr(matching, name) for name in Matching.__dataclass_fields__),
     )  # fmt: skip

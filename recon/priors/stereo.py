@@ -39,10 +39,10 @@ class Stage:
 
 
 DEFAULT_STAGES = (
-    Stage(2, Search(iterations=3, perturbation=4.0, random_starts=16), geometric=False),
-    Stage(2, Search(iterations=1, perturbation=1.0)),
-    Stage(1, Search(iterations=2, perturbation=1.0, directions=3)),
-    Stage(0, Search(iterations=1, perturbation=0.5, directions=3)),
+    Stage(2, Search(iterations=4, perturbation=4.0, random_starts=16), geometric=False),
+    Stage(2, Search(iterations=2, perturbation=1.0)),
+    Stage(1, Search(iterations=2, perturbation=1.0)),
+    Stage(0, Search(iterations=1, perturbation=0.5)),
 )
 
 
@@ -96,8 +96,7 @@ def depth_maps(
     """A depth map for every view, in order. A view that overlaps with no other comes back without any depth.
 
     The result depends on the arguments only, not on the number of threads. `pause` is called several times a second;
-    it may raise to abandon the work, and OutOfTime
-    to end it: after NEEDED_STAGES, depth is as fine as it is by then.
+    it may raise to abandon the work, and OutOfTime to end it: after NEEDED_STAGES, depth is as fine as it is by then.
     """
     known_points = list(sparse) if sparse is not None else [None] * len(views)
     if len(known_points) != len(views):
