@@ -236,6 +236,25 @@ def test_windows():
     assert pairs["windows"]["beyond"] == 0 and windows["beyond"] == 1
 
 
+def test_windows_again():
+    found = raw("windows_again")["summary"]["splatnode"]["all"]
+    says(f"{found['right']} right, {found['right_part']} right in part, {found['between']} between")
+    says(f"{found['wrong']} wrong, {found['refused']} refused")
+
+
+def test_growth():
+    rows = raw("growth")["rows"]
+    assert [row["views"] for row in rows] == [3, 6, 12, 24, 48]
+
+    def listed_seconds(values: list[float]) -> str:
+        return ", ".join(f"{value:.0f}" if value >= 10 else f"{value:.1f}" for value in values)
+
+    says(f"all takes {listed_seconds([row['seconds']['total'] for row in rows])} seconds")
+    says(f"verification take {listed_seconds([row['seconds']['poses'] for row in rows])}.")
+    says(f"after {listed_seconds([row['first_scene_s'] for row in rows])} seconds")
+    says(f"Peak memory is {', '.join(f'{row["peak_rss_mb"] / 1e3:.2f}' for row in rows)} GB")
+
+
 def test_trust():
     poses = raw("poses")
     total, rows = poses["summary"], poses["rows"]
