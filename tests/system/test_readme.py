@@ -252,7 +252,8 @@ def test_growth():
     says(f"all takes {listed_seconds([row['seconds']['total'] for row in rows])} seconds")
     says(f"verification take {listed_seconds([row['seconds']['poses'] for row in rows])}.")
     says(f"after {listed_seconds([row['first_scene_s'] for row in rows])} seconds")
-    says(f"Peak memory is {', '.join(f'{row["peak_rss_mb"] / 1e3:.2f}' for row in rows)} GB")
+    gigabytes = [f"{row['peak_rss_mb'] / 1e3:.2f}" for row in rows]
+    says(f"Peak memory is {', '.join(gigabytes)} GB")
 
 
 def test_trust():
