@@ -98,7 +98,7 @@ inline int32_t index_of(int32_t packed) { return 0xffff - (packed & 0xffff); }
 inline int32_t score_of(int32_t packed) { return packed >> 16; }
 
 struct Result {
-    int32_t *nearest, *score, *second_score, *back, *back_score;
+    int32_t *nearest, *score, *second_score, *back;
 };
 
 // The rows [begin, end) of the first set against all of the second. `column_best` is this thread's best row a column.
@@ -160,10 +160,10 @@ void match_rows(const uint8_t* first, const int32_t* half_norms, int begin, int 
 using namespace core;
 
 // For each of num1 descriptors the nearest of num2 (`nearest`), its score and that of the second nearest; for each of
-// num2 the nearest of num1 (`back`, with its score). score = 16320 - |b|^2 / 2 + a . b, so that |a - b|^2 = |a|^2 + 2 * (16320 - score)
+// num2 the nearest of num1 (`back`). score = 16320 - |b|^2 / 2 + a . b, so that |a - b|^2 = |a|^2 + 2 * (16320 - score)
 // but for rounding. At most 65535 descriptors, each of bytes below 128 and norm at most 181.
 CORE_API void core_match(const uint8_t* first, int num1, const uint8_t* second, int num2, int32_t* nearest,
-                         int32_t* score, int32_t* second_score, int32_t* back, int32_t* back_score) {
+                         int32_t* score, int32_t* second_score, int32_t* back) {
     const Panels panels(second, num2);
     std::vector<int32_t> half_norms(num1);
     for (int i = 0; i < num1; ++i) {
@@ -171,7 +171,7 @@ CORE_API void core_match(const uint8_t* first, int num1, const uint8_t* second, 
         for (int k = 0; k < kSize; ++k) squared += first[size_t(i) * kSize + k] * first[size_t(i) * kSize + k];
         half_norms[i] = squared / 2;
     }
-    const Result result = {nearest, score, second_score, back, back_score};
+    const Result result = {nearest, score, second_score, back};
     std::vector<std::vector<IntVec>> column_best(num_threads(), std::vector<IntVec>(panels.num_panels, IntVec{}));
     run_ranges(num1, kRowsPerTask, [&](int begin, int end, int thread) {
         match_rows(first, half_norms.data(), begin, end, panels, column_best[thread].data(), result);
@@ -180,6 +180,5 @@ CORE_API void core_match(const uint8_t* first, int num1, const uint8_t* second, 
         int32_t winner = 0;
         for (const auto& mine : column_best) winner = std::max(winner, mine[column / kLanes][column % kLanes]);
         back[column] = index_of(winner);
-        back_score[column] = score_of(winner);
     }
 }

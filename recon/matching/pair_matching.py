@@ -23,10 +23,6 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     nearest_neighbours: nearest_neighbours.Config = nearest_neighbours.Config()
     two_view: two_view.Config = two_view.Config()
     max_static_px: float = 1.0  # median motion, pixels at REFERENCE_SIDE, below which matches may show the robot itself
-    # Of many features the strongest are matched first, and the others only where the pair is not firm by these. Of the
-    # pairs of 30 photographs of a castle and of a fox 87 % need no more, and the cameras are no less exact.
-    strongest: int = 4000
-    ample_matches: int = 150  # verified matches of the strongest features that make a pair firm
     min_moving: int = 60  # matches that move by more, for a geometry of these alone
 
 
@@ -46,19 +42,9 @@ def glance(keyframe1: Keyframe, keyframe2: Keyframe, num_features: int, config: 
 
 
 def match_plain(keyframe1: Keyframe, keyframe2: Keyframe, config: Config) -> MatchedPair:
-    """Matches the features of both images as they are: the strongest ones first, and all unless that is ample."""
-    features1, features2 = (keyframe.features.of_tilt(PLAIN) for keyframe in (keyframe1, keyframe2))
-    both = features1.descriptors, features2.descriptors
-    strongest = nearest_neighbours.nearest(*(descriptors[: config.strongest] for descriptors in both))
-    matches = nearest_neighbours.distinct(strongest, both[0][: config.strongest], config.nearest_neighbours)
-    ample = config.ample_matches if max(map(len, both)) > config.strongest else 0
-    if len(matches) >= ample:
-        found = _verified(keyframe1, keyframe2, _points(features1, features2, matches), config)
-        if not ample or (found.geometry is not None and len(found.geometry.matches) >= ample):
-            return found
-    every = nearest_neighbours.extended(strongest, *both)
-    matches = nearest_neighbours.distinct(every, both[0], config.nearest_neighbours)
-    return _verified(keyframe1, keyframe2, _points(features1, features2, matches), config)
+    """Matches the features of both images as they are."""
+    matches = _match(keyframe1.features, keyframe2.features, (PLAIN, PLAIN), config.nearest_neighbours)
+    return _verified(keyframe1, keyframe2, matches, config)
 
 
 def match_tilted(
@@ -107,12 +93,8 @@ def _match(
 ) -> Index:
     """(M, 2) point numbers that match by the descriptors of these tilts, the most distinct match first."""
     first, second = (features.of_tilt(tilt) for features, tilt in zip((features1, features2), tilts, strict=True))
-    return _points(first, second, nearest_neighbours.match(first.descriptors, second.descriptors, config))
-
-
-def _points(features1: Features, features2: Features, matches: Index) -> Index:
-    """(M, 2) the numbers of the points that the matched descriptors describe."""
-    return np.stack([features1.point_of[matches[:, 0]], features2.point_of[matches[:, 1]]], 1)
+    match = nearest_neighbours.match(first.descriptors, second.descriptors, config)
+    return np.stack([first.point_of[match[:, 0]], second.point_of[match[:, 1]]], 1)
 
 
 def _verified(keyframe1: Keyframe, keyframe2: Keyframe, matches: Index, config: Config) -> MatchedPair:

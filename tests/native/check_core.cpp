@@ -24,7 +24,7 @@ void core_set_threads(int);
 void core_photometric_moments(const float*, int, int, float*, float*);
 double core_photometric(const float*, const float*, const float*, const float*, const float*, double, double, int, int,
                         float*);
-void core_match(const uint8_t*, int, const uint8_t*, int, int32_t*, int32_t*, int32_t*, int32_t*, int32_t*);
+void core_match(const uint8_t*, int, const uint8_t*, int, int32_t*, int32_t*, int32_t*, int32_t*);
 }
 
 namespace {
@@ -236,10 +236,9 @@ void check_matches() {
         std::vector<uint8_t> first(size_t(counts.first) * kSize), second(size_t(counts.second) * kSize);
         for (auto* set : {&first, &second})
             for (uint8_t& value : *set) value = uint8_t(noise() * 23);  // of norm 143 in the mean
-        std::vector<int32_t> nearest(counts.first), score(counts.first), runner_up(counts.first);
-        std::vector<int32_t> back(counts.second), back_score(counts.second);
+        std::vector<int32_t> nearest(counts.first), score(counts.first), runner_up(counts.first), back(counts.second);
         core_match(first.data(), counts.first, second.data(), counts.second, nearest.data(), score.data(),
-                   runner_up.data(), back.data(), back_score.data());
+                   runner_up.data(), back.data());
         for (int i = 0; i < counts.first; ++i) {
             int best = 0, best_score = -1;
             for (int j = 0; j < counts.second; ++j) {
