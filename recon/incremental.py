@@ -25,7 +25,7 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.memory import Key, Memory
 from splatnode.recon.modelling import Shown, begin_scene, refined, shown, snapshot
 from splatnode.recon.optimize import refinement
-from splatnode.recon.preparation import load_device, load_prior, prepare
+from splatnode.recon.preparation import check_device, load_prior, prepare
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import growth, warping
@@ -71,7 +71,7 @@ class IncrementalReconstruction:
         self.clock = Clock()
         self.numbers: Iterator[int] = itertools.count(1)  # of the snapshots
         self.dropped: list[DroppedFrame] = []
-        load_device(config)
+        check_device(config)
         self._prior = load_prior(config)
         empty = ViewGraph(config.matching)
         self._known = known or Known(empty, empty)

@@ -116,9 +116,10 @@ def snapshot(
         evidence=estimate.evidence_record,
     )
     log.info(
-        "snapshot %d: %s, %d cameras, %d Gaussians, %d iterations, %.1f s",
+        "snapshot %d: %s%s, %d cameras, %d Gaussians, %d iterations, %.1f s",
         sequence,
         verdict.code.value,
+        ", coarse so far" if scene and not scene.iterations else "",
         len(made.cameras),
         len(made.gaussians),
         made.iterations,

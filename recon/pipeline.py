@@ -21,7 +21,7 @@ from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.ladder.ladder import climbed
 from splatnode.recon.matching.match import match
 from splatnode.recon.modelling import begin_scene, looked_at_first, refined, shown, snapshot
-from splatnode.recon.preparation import load_device, load_prior, prepare
+from splatnode.recon.preparation import check_device, load_prior, prepare
 from splatnode.recon.priors.prior import Prior
 from splatnode.recon.result.snapshot import Snapshot
 
@@ -35,7 +35,7 @@ def reconstruct(frames: Iterable[Frame | DroppedFrame], config: Config) -> Itera
     Raises ValueError where the intrinsics of a frame cannot be used.
     """
     clock, numbers = Clock(), itertools.count(1)
-    load_device(config)
+    check_device(config)
     prior = load_prior(config)
     estimate, dropped = _estimate_cameras(frames, prior, config, clock)
     look = looked_at_first(estimate, config)
@@ -50,7 +50,7 @@ def estimate_frames(
     frames: Iterable[Frame | DroppedFrame], config: Config, clock: Clock
 ) -> tuple[Estimate, list[DroppedFrame]]:
     """Cameras, verdict and depth of all frames that show something new, and which frames were left out."""
-    load_device(config)
+    check_device(config)
     prior = load_prior(config)
     estimate, dropped = _estimate_cameras(frames, prior, config, clock)
     return _with_depth(estimate, prior, config, clock), dropped

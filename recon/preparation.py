@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import msgspec
-import torch
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.config import Config
@@ -23,15 +23,11 @@ def load_prior(config: Config) -> Prior:
     return config.prior.module.load(msgspec.structs.replace(config.prior.config, seed=config.seed))
 
 
-def load_device(config: Config) -> torch.device:
-    """The device that scenes will be refined on, which the log tells where it was left open.
-
-    Raises DeviceUnavailable: before the work begins, that is.
-    """
+def check_device(config: Config) -> None:
+    """Before the work begins: raises DeviceUnavailable; the log tells the device where it was left open."""
     device = chosen(config.device)
     if config.device != "cpu":
         log.info("%s", in_words(config.device, device))
-    return device
 
 
 def prepare(frame: Frame, config: Config, found: Features | None = None) -> Keyframe:
@@ -39,6 +35,6 @@ def prepare(frame: Frame, config: Config, found: Features | None = None) -> Keyf
 
     No other frame is needed. Raises ValueError where the given intrinsics cannot be used.
     """
-    frame = undistorted(frame)
+    frame = replace(undistorted(frame), encoded=None)  # recordings alone want the file as it came
     found = found or features.extract(frame.image, config.matching.features)
     return Keyframe(frame, modelled_image(frame.image, config.size), found)

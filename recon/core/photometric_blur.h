@@ -34,12 +34,6 @@ struct Kernel {
 };
 const Kernel kKernel;
 
-inline Vec load_unaligned(const float* from) {
-    Vec value;
-    __builtin_memcpy(&value, from, sizeof value);
-    return value;
-}
-
 // The first `valid` of kLanes floats, and zeros.
 inline Vec load_part(const float* from, int valid) {
     if (valid >= kLanes) return load_unaligned(from);
@@ -49,7 +43,7 @@ inline Vec load_part(const float* from, int valid) {
 }
 inline void store_part(float* to, Vec value, int valid) {
     if (valid >= kLanes) {
-        __builtin_memcpy(to, &value, sizeof value);
+        store_unaligned(to, value);
         return;
     }
     alignas(64) float values[kLanes];

@@ -63,19 +63,12 @@ std::vector<Keypoint> find_keypoints(const Octave& octave, int number, float con
 // 128 bytes of the keypoint: RootSIFT (Arandjelovic and Zisserman, CVPR 2012), `unit` long.
 void describe(const Octave& octave, const Keypoint& keypoint, float unit, uint8_t* descriptor);
 
-inline Vec load_anywhere(const float* from) {
-    Vec value;
-    __builtin_memcpy(&value, from, sizeof value);
-    return value;
-}
-inline void store_anywhere(float* to, Vec value) { __builtin_memcpy(to, &value, sizeof value); }
-
 // The gradients at kLanes pixels from (x, y) on: their lengths, twice as long, and directions as shares of a turn from
 // +x towards -y, in [0, 1]. The polynomial for the arc tangent is exact to 2e-6.
 inline void gradients(const Octave& octave, int layer, int y, int x, Vec& length, Vec& turn) {
     const float* here = octave.row(layer, y) + x;
-    const Vec dx = load_anywhere(here + 1) - load_anywhere(here - 1);
-    const Vec dy = load_anywhere(here - octave.stride) - load_anywhere(here + octave.stride);
+    const Vec dx = load_unaligned(here + 1) - load_unaligned(here - 1);
+    const Vec dy = load_unaligned(here - octave.stride) - load_unaligned(here + octave.stride);
     const Vec ax = absolute(dx), ay = absolute(dy), zero = splat(0.0f);
     length = square_root(dx * dx + dy * dy);
     const Vec t = minimum(ax, ay) / maximum(maximum(ax, ay), splat(1e-20f)), s = t * t;

@@ -65,7 +65,7 @@ struct Histogram {
             for (int x = first; x <= last; x += kLanes) {
                 Vec length, turn;
                 gradients(octave, keypoint.layer, y, x, length, turn);
-                store(shares + (x - first), length * across * load_anywhere(weights.at(x - column)));
+                store(shares + (x - first), length * across * load_unaligned(weights.at(x - column)));
                 const IntVec place = nearest_int(turn * kDirections);
                 std::memcpy(places + (x - first), &place, sizeof place);
             }
@@ -200,7 +200,7 @@ void describe(const Octave& octave, const Keypoint& keypoint, float unit, uint8_
             Vec length, turn;
             gradients(octave, keypoint.layer, line + i, column + j, length, turn);
             const Vec place = lanes + float(j), x = place * cosine - i * sine, y = place * sine + i * cosine;
-            length *= weights.at(i)[0] * load_anywhere(weights.at(j));
+            length *= weights.at(i)[0] * load_unaligned(weights.at(j));
             length = keep(less(absolute(x), half), keep(less(absolute(y), half), length));
             // From the middle of the first cell on, which is one that is not kept.
             const Vec cell_x = clamp(x + half, splat(0), splat(kCells + 0.999f));

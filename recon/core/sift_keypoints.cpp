@@ -77,10 +77,10 @@ struct Rows {
             const float *below = octave.row(layer, y) + left, *above = octave.row(layer + 1, y) + left;
             to[kLanes - 1] = above[-1] - below[-1];
             for (int x = 0; x < count + kLanes; x += kLanes)
-                store(to + kLanes + x, load_anywhere(above + x) - load_anywhere(below + x));
+                store(to + kLanes + x, load_unaligned(above + x) - load_unaligned(below + x));
             for (int x = 0; x < count; x += kLanes) {
-                const Vec before = load_anywhere(to + kLanes + x - 1), here = load(to + kLanes + x);
-                const Vec behind = load_anywhere(to + kLanes + x + 1);
+                const Vec before = load_unaligned(to + kLanes + x - 1), here = load(to + kLanes + x);
+                const Vec behind = load_unaligned(to + kLanes + x + 1);
                 store(largest[y % 3][layer] + x, maximum(maximum(before, here), behind));
                 store(smallest[y % 3][layer] + x, minimum(minimum(before, here), behind));
             }

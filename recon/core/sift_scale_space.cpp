@@ -46,20 +46,20 @@ inline void weigh(const float* const* before, const float* const* behind, const 
     const Vec first = splat(kernel.weights[0]);
     for (int x = 0; x < count; x += kBlock) {
         const int x1 = x + kLanes, x2 = x + 2 * kLanes, x3 = x + 3 * kLanes;
-        Vec sum0 = first * load_anywhere(middle + x), sum1 = first * load_anywhere(middle + x1);
-        Vec sum2 = first * load_anywhere(middle + x2), sum3 = first * load_anywhere(middle + x3);
+        Vec sum0 = first * load_unaligned(middle + x), sum1 = first * load_unaligned(middle + x1);
+        Vec sum2 = first * load_unaligned(middle + x2), sum3 = first * load_unaligned(middle + x3);
         for (int i = 0; i < kernel.radius; ++i) {
             const Vec weight = splat(kernel.weights[i + 1]);
             const float *one = before[i], *other = behind[i];
-            sum0 = multiply_add(weight, load_anywhere(one + x) + load_anywhere(other + x), sum0);
-            sum1 = multiply_add(weight, load_anywhere(one + x1) + load_anywhere(other + x1), sum1);
-            sum2 = multiply_add(weight, load_anywhere(one + x2) + load_anywhere(other + x2), sum2);
-            sum3 = multiply_add(weight, load_anywhere(one + x3) + load_anywhere(other + x3), sum3);
+            sum0 = multiply_add(weight, load_unaligned(one + x) + load_unaligned(other + x), sum0);
+            sum1 = multiply_add(weight, load_unaligned(one + x1) + load_unaligned(other + x1), sum1);
+            sum2 = multiply_add(weight, load_unaligned(one + x2) + load_unaligned(other + x2), sum2);
+            sum3 = multiply_add(weight, load_unaligned(one + x3) + load_unaligned(other + x3), sum3);
         }
-        store_anywhere(to + x, sum0);
-        store_anywhere(to + x1, sum1);
-        store_anywhere(to + x2, sum2);
-        store_anywhere(to + x3, sum3);
+        store_unaligned(to + x, sum0);
+        store_unaligned(to + x1, sum1);
+        store_unaligned(to + x2, sum2);
+        store_unaligned(to + x3, sum3);
     }
 }
 

@@ -38,6 +38,13 @@ inline Vec splat(float value) { return Vec{} + value; }
 inline Vec load(const float* from) { return *reinterpret_cast<const Vec*>(from); }
 inline void store(float* to, Vec value) { *reinterpret_cast<Vec*>(to) = value; }
 
+inline Vec load_unaligned(const float* from) {
+    Vec value;
+    __builtin_memcpy(&value, from, sizeof value);
+    return value;
+}
+inline void store_unaligned(float* to, Vec value) { __builtin_memcpy(to, &value, sizeof value); }
+
 // ---- Masks: one truth value a lane -------------------------------------------------------------------------------
 #if CORE_LANES == 16
 typedef __mmask16 Mask;

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from splatnode.recon import poselib
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.frames.keyframe import PLAIN, Keyframe
 from splatnode.recon.geometry import MIN_DEPTH, project, to_camera
 from splatnode.recon.matching import features, nearest_neighbours
 from splatnode.recon.result.rendering import render_arrays
@@ -87,19 +87,18 @@ def landmarks(snapshot: Snapshot, keyframes: Sequence[Keyframe], config: Config)
     cameras = {camera.name: camera for camera in snapshot.cameras}
     known = []
     for keyframe in (keyframe for keyframe in keyframes if keyframe.name in cameras):
-        camera, found = cameras[keyframe.name], keyframe.features
+        camera, found = cameras[keyframe.name], keyframe.features.of_tilt(PLAIN)
         render = render_arrays(
             snapshot.gaussians, camera.T_world_camera, camera.K, camera.width, camera.height, channels=("depth",)
         )
-        plain = found.tilt == 1.0
-        pixels = found.points[found.point_of[plain]] * keyframe.scale
+        pixels = found.points[found.point_of] * keyframe.scale
         column, row = np.clip(pixels.astype(int), 0, [camera.width - 1, camera.height - 1]).T
         depth = render.depth[row, column].astype(np.float64)
         good = (depth > 0) & (render.alpha[row, column] >= config.min_alpha)
         rays = np.c_[pixels, np.ones(len(pixels))] @ np.linalg.inv(camera.K).T
         T_world_camera = camera.T_world_camera
         points = (rays * depth[:, None])[good] @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
-        known.append(Landmarks(keyframe.name, points, found.descriptors[plain][good]))
+        known.append(Landmarks(keyframe.name, points, found.descriptors[good]))
     return known
 
 

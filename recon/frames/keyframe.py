@@ -14,6 +14,9 @@ from splatnode.capture.frame import Frame
 REFERENCE_SIDE = 1024
 
 
+PLAIN = 1.0  # the tilt of features of the image as it is
+
+
 @dataclass(frozen=True, eq=False)
 class Features:
     """Local features of a frame at full size. A point may have several descriptors, one for each simulated tilt."""

@@ -23,9 +23,7 @@ Pair = tuple[int, int]
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     exhaustive: int = 12  # keyframes up to which all pairs are matched
-    partners: int = (
-        8  # of a keyframe, to begin with. With 8 of 29 the cameras of two real sets were as exact as with all
-    )
+    partners: int = 8  # of a keyframe, to begin with: with 8 of 29, cameras of real sets were as exact as with all
     short_list: int = 24  # keyframes with similar codes, which are matched at a glance
     glance_features: int = 500  # the strongest of each; 1000 chose no better partners
     enough_firm: int = 3  # firm partners, by which a keyframe is firmly connected
@@ -65,9 +63,8 @@ def worth_matching(
         chosen = _union([ranked[index][: depth[index]] for index in everyone])
         if not all(map(is_known, chosen)):
             return chosen
-        loose = [
-            index for index in _loose(everyone, set(filter(is_firm, chosen)), config) if depth[index] < len(ranked)
-        ]
+        loose = _loose(everyone, set(filter(is_firm, chosen)), config)
+        loose = [index for index in loose if depth[index] < num_keyframes]
         if not loose:
             return chosen
         for index in loose:

@@ -12,19 +12,18 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import Features
+from splatnode.recon.frames.keyframe import PLAIN, Features
 from splatnode.recon.matching.nearest_neighbours import DESCRIPTOR_SIZE, QUANTISED_NORM
 
 Code = npt.NDArray[np.float32]
 
 _WORDS = 64
 _MIN_NORM = 1e-9
-_PLAIN = 1.0  # the tilt of features of the image as it is
 
 
 def image_code(features: Features) -> Code:
     """(64 * 128,) the code of the plain features, of unit length; zeros where there are none."""
-    descriptors = features.descriptors[features.tilt == _PLAIN].astype(np.float32) / QUANTISED_NORM
+    descriptors = features.of_tilt(PLAIN).descriptors.astype(np.float32) / QUANTISED_NORM
     code = np.zeros((_WORDS, DESCRIPTOR_SIZE), np.float32)
     if not len(descriptors):
         return code.ravel()

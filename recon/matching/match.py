@@ -18,7 +18,7 @@ from splatnode.recon.matching.config import Config
 from splatnode.recon.matching.image_code import image_code
 from splatnode.recon.matching.pair_matching import MatchedPair
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
-from splatnode.recon.workers import in_turn
+from splatnode.recon.workers import each, in_turn
 
 FIRST_COMPARISONS = 4  # keyframes that a further one is matched with at once
 MIN_PARTNERS = 2  # verified pairs that it then needs; with fewer it is matched with all
@@ -93,22 +93,19 @@ def _glanced(graph: ViewGraph) -> Steps:
     if len(graph.keyframes) <= config.candidates.exhaustive:
         return graph
     without = [keyframe for keyframe in graph.keyframes if keyframe.name not in graph.codes]
-    codes = dict(graph.codes)
-    for keyframe, code in zip(without, in_turn(lambda k: image_code(k.features), without), strict=True):
-        codes[keyframe.name] = code
-    graph = replace(graph, codes=codes)
+    codes = each(lambda keyframe: image_code(keyframe.features), without)
+    names = [keyframe.name for keyframe in without]
+    graph = replace(graph, codes={**graph.codes, **dict(zip(names, codes, strict=True))})
     yield graph
 
     def glance(pair: Pair) -> int:
         first, second = (graph.keyframes[index] for index in graph.in_order_of_content(*pair))
         return pair_matching.glance(first, second, config.candidates.glance_features, config.pair_matching)
 
-    wanted = to_glance_at([codes[name] for name in graph.names], config.candidates)
+    wanted = to_glance_at([graph.codes[name] for name in graph.names], config.candidates)
     missing = sorted(wanted.difference(graph.glanced))
-    found = dict(graph.glanced)
-    for pair, count in zip(missing, in_turn(glance, missing), strict=True):
-        found[pair] = count
-    return replace(graph, glanced=found)
+    found = dict(zip(missing, each(glance, missing), strict=True))
+    return replace(graph, glanced={**graph.glanced, **found})
 
 
 def _matched_plain(graph: ViewGraph, pair: Pair) -> ViewGraph:

@@ -9,14 +9,12 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import Features, Keyframe, longer_side, principal_point
+from splatnode.recon.frames.keyframe import PLAIN, Features, Keyframe, longer_side, principal_point
 from splatnode.recon.matching import appearance_check, nearest_neighbours, two_view
 from splatnode.recon.matching.two_view import TwoView
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
-
-PLAIN = 1.0  # the tilt of features of the image as it is
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -136,7 +136,9 @@ class ViewGraph:
 
     def to_tilt(self) -> set[Pair]:
         """The pairs that tilted features are worth their time for, by what the plain ones say of all pairs."""
-        worth = self.worth_matching()
+        return self._to_tilt_of(self.worth_matching())
+
+    def _to_tilt_of(self, worth: set[Pair]) -> set[Pair]:
         plain = {pair: found for pair, found in self.plain.items() if _ascending(*pair) in worth}
         return pairs_to_tilt(plain, len(self.keyframes), self.config.tilting)
 
@@ -145,7 +147,8 @@ class ViewGraph:
 
         Pairs that were matched and turned out not to be worth it do not count.
         """
-        to_tilt, worth, pairs = self.to_tilt(), self.worth_matching(), dict(self.pairs)
+        worth, pairs = self.worth_matching(), dict(self.pairs)
+        to_tilt = self._to_tilt_of(worth)
         for (first, second), plain in self.plain.items():
             tilted = self.tilted.get((first, second)) if (first, second) in to_tilt else None
             geometry = (tilted.geometry if tilted else None) or plain.geometry

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.frames.keyframe import PLAIN, Features, Keyframe
 from splatnode.recon.matching import nearest_neighbours
 from splatnode.recon.workers import in_turn
 
@@ -78,7 +78,7 @@ def _gain(other: Bytes, mirrored: Bytes, plain: Bytes, config: Config) -> float:
 
 
 def _strongest(features: Features, count: int) -> Bytes:
-    return features.descriptors[features.tilt == 1.0][:count]
+    return features.of_tilt(PLAIN).descriptors[:count]
 
 
 def mirrored_descriptors(descriptors: Bytes) -> Bytes:
@@ -102,9 +102,8 @@ def _grown(gains: Array, compared: Array, first: int) -> tuple[Flags, float]:
     best = group.copy(), float(_mean(total, count))
     while 2 * (group.sum() + 1) <= len(gains):
         # A frame that joins the group takes its pairs with the group from the border, and adds those with the others.
-        totals, counts = (
-            across + (each @ ~group) - each @ group for across, each in ((total, gains), (count, compared))
-        )
+        totals = total + gains @ ~group - gains @ group
+        counts = count + compared @ ~group - compared @ group
         means = np.where(group, -np.inf, _mean(totals, counts))
         other = int(means.argmax())
         group[other], total, count = True, totals[other], counts[other]
