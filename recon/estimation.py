@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from splatnode.recon.config import Config
+from splatnode.recon.core import give_back_memory
 from splatnode.recon.deadline import pausing_until
 from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -27,6 +28,15 @@ from splatnode.recon.verification.verify import verify, verify_further
 MIN_CONFIRMED_POINTS = 50
 PROVISIONALLY_WIDER = 2.0  # factor of a provisional estimate's bounds, whose sources are quick or taken over
 PROVISIONAL = "For now: all evidence is weighed when no keyframe waits."
+
+
+@dataclass(frozen=True, eq=False)
+class Conclusion:
+    """What an estimate says of the cameras, without what it was concluded from: photographs, features and matches."""
+
+    verdict: Verdict
+    bounds: Mapping[str, Bounds]  # of the errors of each camera, by the name of its keyframe
+    evidence_record: dict[str, object] | None  # for reports; None where nothing was verified
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +77,11 @@ class Estimate:
         return record(self.evidence, weigh(self.evidence, numbers.claims, numbers.odds))
 
     @property
+    def conclusion(self) -> Conclusion:
+        """What snapshots tell of it."""
+        return Conclusion(self.verdict, self.bounds, self.evidence_record)
+
+    @property
     def placed(self) -> set[str]:
         """The keyframes that have a camera in a scene that may be published."""
         if not self.verdict.publishable or self.registration is None:
@@ -87,6 +102,7 @@ def estimate_cameras(
     registration = register(graph.keyframes, graph.pairs, config.registration, pause)
     pause()
     evidence = verify(graph, registration, config.verification, pause)
+    give_back_memory()
     return Estimate(graph, registration, evidence, decide(graph, registration, evidence, config.decision))
 
 
@@ -101,6 +117,7 @@ def estimate_depth(
         return estimate
     pause = pausing_until(until, pause) if prior.ends_early else pause
     pointmaps = prior.pointmaps(estimate.graph, estimate.registration, pause)
+    give_back_memory()
     return replace(estimate, pointmaps={pointmap.name: pointmap for pointmap in pointmaps})
 
 

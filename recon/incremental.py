@@ -291,5 +291,5 @@ class IncrementalReconstruction:
         if final and estimate.verdict.publishable:
             bound = hits(self.config, self.begun, show.scene, seconds)
         return snapshot(
-            next(self.numbers), estimate, show, seconds=seconds, dropped=left_out, budget=bound, final=final
+            next(self.numbers), estimate.conclusion, show, seconds=seconds, dropped=left_out, budget=bound, final=final
         )

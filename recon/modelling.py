@@ -11,7 +11,8 @@ import torch
 from splatnode.capture.frame import DroppedFrame
 from splatnode.recon.budget import Hit
 from splatnode.recon.config import Config
-from splatnode.recon.estimation import Estimate
+from splatnode.recon.core import give_back_memory
+from splatnode.recon.estimation import Conclusion, Estimate
 from splatnode.recon.optimize import refinement
 from splatnode.recon.optimize.watch import examine, watch
 from splatnode.recon.rasterize.device import chosen
@@ -75,8 +76,10 @@ def refined(
     scene = scene.on(chosen(config.device))
     watching = watch(scene, steps.iterations)
     limit = config.most_gaussians
+    give_back_memory()
     for later in refinement.refine(scene, steps, seed=config.seed, deadline=deadline, max_gaussians=limit):
         verdict = None
+        give_back_memory()
         if later.losses or later.iterations in config.optimize.checkpoints:
             watching, verdict = examine(watching, later)
         if verdict is not None:
@@ -88,7 +91,7 @@ def refined(
 
 def snapshot(
     sequence: int,
-    estimate: Estimate,
+    conclusion: Conclusion,
     show: Shown,
     *,
     seconds: Mapping[str, float],
@@ -96,15 +99,15 @@ def snapshot(
     budget: Collection[Hit] = (),
     final: bool = False,
 ) -> Snapshot:
-    """What the estimate and the scene are now; `seconds` by stage. Only a publishable verdict has a scene."""
-    verdict = estimate.verdict
+    """What is known of the cameras, and the scene, now; `seconds` by stage. Only a publishable verdict has a scene."""
+    verdict = conclusion.verdict
     if verdict.publishable and show.verdict is not None:
         verdict = show.verdict
     scene = show.scene if verdict.publishable else None
     made = Snapshot(
         sequence=sequence,
         verdict=verdict,
-        cameras=scene.cameras(estimate.bounds) if scene else (),
+        cameras=scene.cameras(conclusion.bounds) if scene else (),
         gaussians=scene.arrays() if scene else GaussianArrays.empty(),
         images={view.name: view.image for view in scene.views} if scene else {},
         dropped=tuple(dropped),
@@ -113,7 +116,7 @@ def snapshot(
         budget=tuple(hit.record() for hit in budget),
         final=final,
         served_by=scene.served_by if scene else {},
-        evidence=estimate.evidence_record,
+        evidence=conclusion.evidence_record,
     )
     log.info(
         "snapshot %d: %s%s, %d cameras, %d Gaussians, %d iterations, %.1f s",

@@ -15,7 +15,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.budget import hits
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import Config
-from splatnode.recon.estimation import Estimate, estimate_cameras, estimate_depth
+from splatnode.recon.estimation import Conclusion, Estimate, estimate_cameras, estimate_depth
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.ladder.ladder import climbed
@@ -24,6 +24,7 @@ from splatnode.recon.modelling import begin_scene, looked_at_first, refined, sho
 from splatnode.recon.preparation import check_device, load_prior, prepare
 from splatnode.recon.priors.prior import Prior
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.scene.scene import Scene
 
 DEPTH_SHARE = 0.4  # of the seconds that the cameras left of a budget: the refinement needs most of them
 
@@ -41,9 +42,12 @@ def reconstruct(frames: Iterable[Frame | DroppedFrame], config: Config) -> Itera
     look = looked_at_first(estimate, config)
     clock.lap("points")
     if look is not None:
-        yield snapshot(next(numbers), estimate, look, seconds=clock.booked, dropped=dropped)
+        yield snapshot(next(numbers), estimate.conclusion, look, seconds=clock.booked, dropped=dropped)
         clock.lap("wait")
-    yield from model(_with_depth(estimate, prior, config, clock), dropped, config, clock, numbers)
+    estimate = _with_depth(estimate, prior, config, clock)
+    conclusion, begun = estimate.conclusion, begin_scene(estimate, config)
+    del estimate, look  # and with them photographs, features and matches, which are not needed any more
+    yield from model(conclusion, begun, dropped, config, clock, numbers)
 
 
 def estimate_frames(
@@ -82,27 +86,27 @@ def _with_depth(estimate: Estimate, prior: Prior, config: Config, clock: Clock) 
 
 
 def model(
-    estimate: Estimate,
+    conclusion: Conclusion,
+    begun: Scene | None,
     dropped: list[DroppedFrame],
     config: Config,
     clock: Clock,
     numbers: Iterator[int] | None = None,
     show_begun: bool = True,
 ) -> Iterator[Snapshot]:
-    """The scene that begins from the estimate, refined. `numbers` are those of the snapshots."""
+    """The scene, if one was begun, refined. `numbers` are those of the snapshots."""
     numbers = numbers or itertools.count(1)
-    begun = begin_scene(estimate, config)
     show = shown(begun, config)
     clock.lap("points")
     if show_begun:
-        yield snapshot(next(numbers), estimate, show, seconds=clock.booked, dropped=dropped)
+        yield snapshot(next(numbers), conclusion, show, seconds=clock.booked, dropped=dropped)
         clock.lap("wait")
     for show in refined(begun, config, config.optimize, clock.deadline(config.budget_s)):
         clock.lap("optimise")
-        yield snapshot(next(numbers), estimate, show, seconds=clock.booked, dropped=dropped)
+        yield snapshot(next(numbers), conclusion, show, seconds=clock.booked, dropped=dropped)
         clock.lap("wait")
     bound = hits(config, begun, show.scene, clock.booked)
-    yield snapshot(next(numbers), estimate, show, seconds=clock.booked, dropped=dropped, budget=bound, final=True)
+    yield snapshot(next(numbers), conclusion, show, seconds=clock.booked, dropped=dropped, budget=bound, final=True)
 
 
 def reconstruct_stream(frames: Iterable[Frame | DroppedFrame], config: Config) -> Iterator[Snapshot]:
@@ -116,4 +120,5 @@ def reconstruct_stream(frames: Iterable[Frame | DroppedFrame], config: Config) -
         work.update()
         yield work.snapshot()
     estimate = work.estimate_with_depth()
-    yield from model(estimate, work.dropped, config, work.clock, work.numbers, show_begun=False)
+    begun = begin_scene(estimate, config)
+    yield from model(estimate.conclusion, begun, work.dropped, config, work.clock, work.numbers, show_begun=False)

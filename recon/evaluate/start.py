@@ -9,6 +9,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import Config
 from splatnode.recon.estimation import Estimate
+from splatnode.recon.modelling import begin_scene
 from splatnode.recon.pipeline import estimate_frames, model
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
@@ -55,4 +56,5 @@ def continued(start: Start, config: Config) -> Iterator[Snapshot]:
     """What `reconstruct` gives from here on with `config`; the clock goes on where it stopped."""
     clock = replace(start.clock, seconds=dict(start.clock.seconds))
     clock.resume()
-    yield from model(start.estimate, start.dropped, config, clock)
+    begun = begin_scene(start.estimate, config)
+    yield from model(start.estimate.conclusion, begun, start.dropped, config, clock)

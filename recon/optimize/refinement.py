@@ -31,7 +31,7 @@ from splatnode.recon.scene.scene import Scene
 Share = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(ge=0, le=1)]
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # of Gaussians, that are optimised
-_SCALES = (1.0, 0.5)  # of the photographs' resolution: full, and half
+_SCALES = {False: 1.0, True: 0.5}  # of the photographs' resolution, by whether it is halved
 _PROCESSOR = torch.device("cpu")  # where the cameras are, whatever the Gaussians are on
 _POSE_BETAS = (0.9, 0.99)  # of Adam for the cameras: each gets one gradient in as many steps as there are views
 
@@ -114,13 +114,14 @@ class _Fit:
         self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
         self._pose_moments = [Moments(torch.zeros(6), torch.zeros(6)) for _ in scene.views]
         shown = border.valid_masks([view.image for view in scene.views])
-        self._images = [
-            [
+        self._images = {
+            half: [
                 training_image(*each, scale, config.dssim, gaussians.means.device)
                 for each in zip(scene.views, shown, strict=True)
             ]
-            for scale in _SCALES
-        ]
+            for half, scale in _SCALES.items()
+            if config.half_resolution_share > 0 or not half
+        }
         self._regularisation = _regularisation(scene, config.regularise, seed)
         self._iterations = scene.iterations
         self.losses: list[float] = []  # photometric, of each step

@@ -16,7 +16,7 @@ class Pointmap:
     frame_id: int
     depth: npt.NDArray[np.float32]  # (h, w) z in the camera frame, 0 where unknown
     confidence: npt.NDArray[np.float32]  # (h, w) in [0, 1], 0 where unknown
-    normal: npt.NDArray[np.float32]  # (h, w, 3) camera frame, unit length, facing the camera, 0 where unknown
+    normal: npt.NDArray[np.float32]  # (h, w, 3) camera frame, unit length, facing the camera; any where depth is 0
     T_world_camera: npt.NDArray[np.float64]  # (4, 4)
     K: npt.NDArray[np.float64]  # (3, 3) at modelled size
 
@@ -26,13 +26,13 @@ class Pointmap:
         return world_points(self.depth, self.T_world_camera, self.K)
 
     def masked(self, keep: npt.NDArray[np.bool_]) -> Pointmap:
-        """The point map with depth, normal and confidence 0, which is unknown, outside the mask `keep` (h, w)."""
-        return replace(
-            self,
-            depth=self.depth * keep,
-            confidence=self.confidence * keep,
-            normal=self.normal * keep[..., None],
-        )
+        """The point map with depth and confidence 0, which is unknown, outside the mask `keep` (h, w).
+
+        It shares what the mask does not change: a hundred point maps at a time are most of the memory that is held.
+        """
+        if keep.all():
+            return self
+        return replace(self, depth=self.depth * keep, confidence=self.confidence * keep)
 
 
 def world_points(

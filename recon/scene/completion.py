@@ -71,13 +71,14 @@ def complete(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Con
         for guess in _guesses(pointmaps[j], known[j], filling, covered, occluder, config):
             guess = guess.masked(hole)
             guess = guess.masked(~_hides_known(guess, [known[i] for i in partners[j]], config.occlusion_tolerance))
+            filled = guess.depth > 0
             completed[j] = replace(
                 completed[j],
                 depth=completed[j].depth + guess.depth,
-                normal=completed[j].normal + guess.normal,
-                confidence=completed[j].confidence + np.float32(config.confidence) * (guess.depth > 0),
+                normal=np.where(filled[..., None], guess.normal, completed[j].normal),
+                confidence=completed[j].confidence + np.float32(config.confidence) * filled,
             )
-            hole &= guess.depth <= 0
+            hole &= ~filled
     return completed
 
 

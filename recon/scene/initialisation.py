@@ -57,9 +57,10 @@ def initial_scene(
     if config.pixelwise is not None:
         return Scene(views, pixelwise.pixelwise_gaussians(pointmaps, pictures, config.pixelwise, config.max_gaussians))
     usable = [each.masked(each.confidence >= config.completion.min_usable_confidence) for each in pointmaps]
-    completed = list(map(Pointmap.masked, completion.complete(usable, pictures, config.completion), valid))
     shell_limit = None if config.max_gaussians is None else config.max_gaussians // SHELL_PARTS
     shell = background.far_shell(usable, pictures, config.background, shell_limit)
+    completed = list(map(Pointmap.masked, completion.complete(usable, pictures, config.completion), valid))
+    del usable
     surfaces = seeding.initial_gaussians(completed, pictures, config.seeding)
     num_unlimited = len(surfaces) + len(shell)
     if config.max_gaussians is not None and num_unlimited > config.max_gaussians:
