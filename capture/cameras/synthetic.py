@@ -61,7 +61,7 @@ def photograph(config: Config, camera: Camera, noise_seed: int = 0) -> npt.NDArr
     """(H, W, 3) RGB as `camera` sees the place of `config`: antialiased, with sensor noise."""
     T_world_camera, K = camera
     dense = T_world_camera, np.diag([config.samples, config.samples, 1.0]) @ K
-    colours, _ = cast(_solids(config), dense, config.width * config.samples, config.height * config.samples)
+    colours, _ = cast(solids(config), dense, config.width * config.samples, config.height * config.samples)
     image = cv2.resize(colours, (config.width, config.height), interpolation=cv2.INTER_AREA)
     grain = np.random.default_rng([config.seed, noise_seed]).normal(scale=config.noise, size=image.shape)
     return np.clip(np.rint(image + grain), 0, 255).astype(np.uint8)
@@ -74,11 +74,11 @@ def depth(config: Config, index: int) -> npt.NDArray[np.float32]:
 
 def depth_map(config: Config, camera: Camera) -> npt.NDArray[np.float32]:
     """(H, W) true z in the frame of `camera`, metres, at pixel centres; inf where nothing is."""
-    return cast(_solids(config), camera, config.width, config.height)[1]
+    return cast(solids(config), camera, config.width, config.height)[1]
 
 
-def _solids(config: Config) -> tuple[Solid, ...]:
-    """The place, with about as many texels a metre as the images have samples."""
+def solids(config: Config) -> tuple[Solid, ...]:
+    """The place, with about as many texels a metre as the images have samples. Made once, which takes seconds."""
     return place(
         config.seed, density=float(np.clip(0.25 * max(config.width, config.height) * config.samples, 64, 1024))
     )

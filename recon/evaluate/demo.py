@@ -56,6 +56,7 @@ def _write(folder: Path, place: synthetic.Config, cameras: Mapping[str, syntheti
     def png(camera: synthetic.Camera, number: int) -> bytes:
         return encode_png(synthetic.photograph(place, camera, noise_seed=number))
 
+    synthetic.solids(place)  # or each thread would make it
     files = each(png, cameras.values(), range(first, first + len(cameras)))
     write_files(folder / "images", dict(zip(cameras, files, strict=True)))
 
