@@ -29,6 +29,10 @@ class Clock:
         gap = time.monotonic() - self.last
         self.started, self.last = self.started + gap, self.last + gap
 
+    def leave_out(self, seconds: float) -> None:
+        """Goes on as if these seconds since the last lap had not passed: other work was done."""
+        self.started, self.last = self.started + seconds, self.last + seconds
+
     @property
     def booked(self) -> dict[str, float]:
         """Seconds by stage, and from the start on as "total"."""

@@ -28,4 +28,5 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # keyframe would have to wait: with one every two seconds there is no time for it.
     settle_s: Annotated[float, msgspec.Meta(ge=0)] = 3.0
     lost_after: Annotated[int, msgspec.Meta(ge=3)] = 3  # so many keyframes in a row that do not fit begin a new place
+    export_every_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0  # provisional results, while the scene grows
     status_every_s: Annotated[float, msgspec.Meta(gt=0)] = 1.0

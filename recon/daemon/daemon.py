@@ -97,7 +97,7 @@ class Daemon:
         self._problems = Problems()
         self._intake = Intake(network, config.reconstruction, self._store, self._inbox, self._problems, stopping)
         self._worker = Worker(config, self._store, self._inbox, self._newest.put, stopping)
-        self._watcher = Watcher(network, config.tracking, lambda: self._worker.finished, self._problems, stopping)
+        self._watcher = Watcher(network, config.tracking, lambda: self._worker.place.finished, self._problems, stopping)
         self._numbering = Numbering()
         self._started_s = time.monotonic()
         self._shown: Published | None = None
@@ -191,9 +191,10 @@ class Daemon:
     def _status(self) -> ReconStatus:
         snapshot = self._shown.snapshot if self._shown else None
         intake, worker, motion, tracked = self._intake, self._worker, self._watcher.motion, self._watcher.tracked
+        delay_s, delay = worker.delay
         return ReconStatus(
             **self._numbering.next(),
-            state=State.FULL if intake.full else worker.state,
+            state=State.FULL if intake.full else worker.place.state,
             uptime_s=time.monotonic() - self._started_s,
             scene_id=self._store.scene_id,
             keyframe=intake.newest,
@@ -205,7 +206,10 @@ class Daemon:
             verdict=snapshot.verdict.code.value if snapshot else "",
             message=printable(snapshot.verdict.message) if snapshot else "",
             bounds=printable(bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale)) if snapshot else "",
-            keyframe_s=worker.keyframe_s,
+            keyframe_s=worker.place.keyframe_s,
+            delay_s=delay_s,
+            delay=delay,
+            unfinished=worker.unfinished,
             refused=intake.refused + self._commands.refused + self._scenes.refused,
             duplicates=intake.duplicates,
             rss_mb=resident_mb(),

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from splatnode.recon.frames.keyframe import Keyframe
 
 CAPACITY = 32  # events in memory; further keyframes wait with their sender
+BATCH = 4  # keyframes that are worked in before the scene is shown again
 WAIT_S = 0.1  # between looks at whether the daemon stops
 
 
@@ -43,6 +44,12 @@ class Inbox:
     def __len__(self) -> int:
         return len(self._events)
 
+    @property
+    def oldest_s(self) -> float | None:
+        """When the keyframe came that waits longest (monotonic); None: none waits."""
+        with self._changed:
+            return next((each.at_s for each in self._events if isinstance(each, Arrived)), None)
+
     def put(self, event: Event, stopping: threading.Event, meanwhile: Callable[[], None] = _nothing) -> None:
         """Waits where the inbox is full, until there is room or the daemon stops; calls `meanwhile` again and again."""
         with self._changed:
@@ -53,11 +60,13 @@ class Inbox:
             self._changed.notify_all()
 
     def get(self, timeout_s: float) -> list[Event]:
-        """The next event, and after a keyframe all keyframes that follow it; none where none comes in time."""
+        """The next event, after a keyframe with keyframes that follow it, BATCH at most; none if none comes in time."""
         with self._changed:
             self._changed.wait_for(lambda: self._events, timeout_s)
             events = [self._events.popleft()] if self._events else []
             while events and self._events and all(isinstance(each, Arrived) for each in (events[0], self._events[0])):
+                if len(events) == BATCH:
+                    break
                 events.append(self._events.popleft())
             self._changed.notify_all()
             return events

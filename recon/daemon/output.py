@@ -1,22 +1,26 @@
-"""The outputs of the reconstruction: snapshots for viewers, the checkpoint, and the result folder."""
+"""The outputs of the reconstruction: snapshots for viewers, the checkpoint, the result folders and their index."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from splatnode.capture.process.logs import event
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
+from splatnode.recon.daemon.places import Places, State, described
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.metric import in_metres
 from splatnode.recon.result import bounds_in_words
+from splatnode.recon.result.export import remove_result
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.write import finish
 
 log = logging.getLogger(__name__)
+
+PROVISIONAL = "-provisional"  # ends the name of a result folder whose scene is not final
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +37,7 @@ class Output:
     ) -> None:
         """`complain` is called where the disk is full: that costs a result, or time after a restart; no keyframe."""
         self._config, self._store, self._publish, self._complain = config, store, publish, complain
+        self._index = Places(config.out, store.identity)
 
     def publish(self, snapshot: Snapshot) -> None:
         self._publish(Published(snapshot, self._store.scene_id))
@@ -44,15 +49,39 @@ class Output:
         except OSError as error:
             self._complain(f"the scene cannot be saved ({error.strerror}): make room on the disk")
 
-    def export(self, snapshot: Snapshot) -> bool:
-        """Writes the result folder, all of it or nothing; returns whether it was written."""
-        recipe, folder = self._config.reconstruction, self._config.out / self._store.scene_id
+    def export(self, snapshot: Snapshot, place: Store, state: State, kept: Sequence[str]) -> bool:
+        """Writes the place's result folder, all of it or nothing; returns whether it was written.
+
+        The result of a snapshot that is not final lies in a folder of its own, named so, until a final one replaces
+        it. `kept` are the names of the place's keyframes.
+        """
+        recipe, folder = self._config.reconstruction, self._config.out / place.scene_id
+        provisional = folder.with_name(folder.name + PROVISIONAL)
+        folder = folder if snapshot.final else provisional
         try:
             measured = in_metres(snapshot, recipe.metric)
             finish(measured, folder, seed=recipe.seed, preset_name="live")
+            if snapshot.final:
+                remove_result(provisional)
+            self._index.tell(described(place.scene_id, state, folder.name, snapshot, kept, place.dropped))
         except OSError as error:
             self._complain(error.strerror or str(error))
             return False
         known = bounds_in_words.of_cameras(measured.cameras, measured.scale)
         event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians), bounds=known)
         return True
+
+    def tell(self, snapshot: Snapshot, state: State, kept: Sequence[str]) -> None:
+        """Writes into the index what is known of the present place, which has no result in a folder."""
+        place = self._store
+        self._write(lambda: self._index.tell(described(place.scene_id, state, None, snapshot, kept, place.dropped)))
+
+    def finished(self, scene_id: str) -> None:
+        """Writes into the index that the camera has left a place whose scene is final."""
+        self._write(lambda: self._index.finished(scene_id))
+
+    def _write(self, write: Callable[[], None]) -> None:
+        try:
+            write()
+        except OSError as error:
+            self._complain(error.strerror or str(error))

@@ -32,6 +32,9 @@ class ReconStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     message: Text
     bounds: Text  # the widest of the scene's cameras, in words; empty where there are none
     keyframe_s: Amount | None  # from the last keyframe's arrival until the scene showed it
+    delay_s: Amount  # that the oldest keyframe has waited which no scene shows yet; 0: none waits
+    delay: Text  # what it waits for
+    unfinished: Count  # places that were left and whose scenes are not final yet
     refused: Count  # malformed messages
     duplicates: Count  # keyframes that came again
     rss_mb: Amount

@@ -33,6 +33,8 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
             "advice": verdict.advice,
             "frames": list(verdict.frames),
             "publishable": verdict.publishable,
+            # Whether a later report of the same photographs may say otherwise, or show them better.
+            "provisional": verdict.provisional or not snapshot.final,
         },
         "bounds": None if worst is None else asdict(worst),
         "evidence": snapshot.evidence,

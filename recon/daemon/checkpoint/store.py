@@ -6,9 +6,10 @@
     judgement           the cameras that they lead to, the evidence and the verdict
     scene               cameras and Gaussians as they are shown
     pointmaps           depth maps of its views, from which it grows
+    left/<place>/       a place that the camera has left and whose scene is not final yet: a checkpoint of its own
 
-The last four are computed again where they are missing. A keyframe is acknowledged once its file is there. Every file
-is whole or not there, and has a checksum. A place is what one scene shows.
+Graph, judgement, scene and pointmaps are computed again where they are missing. A keyframe is acknowledged once its
+file is there. Every file is whole or not there, and has a checksum. A place is what one scene shows.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ import itertools
 import logging
 import re
 import threading
-import uuid
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -30,28 +30,29 @@ import msgspec
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.message_file import read_message, write_message
-from splatnode.capture.messaging.values import SessionId
-from splatnode.capture.messaging.wire import Limits, Message, WireError, decode, encode
+from splatnode.capture.messaging.wire import Message, WireError, decode, encode
 from splatnode.capture.process.durable import remove_leftovers
 from splatnode.capture.process.lock import Held, exclusive
 from splatnode.capture.process.printable import LONGEST_NAME, printable
 from splatnode.capture.process.private import own_files, private_folder
+from splatnode.recon.daemon.checkpoint import left
+from splatnode.recon.daemon.checkpoint.ledger import (
+    LIMITS,
+    VERSION,
+    CheckpointError,
+    Ledger,
+    identified,
+    write_ledger,
+)
 
 log = logging.getLogger(__name__)
 
-VERSION = 1
 MADE_ANEW = ("graph", "judgement", "scene", "pointmaps")
 REMEMBERED = 1000  # removed frames that are recognised if their sender missed the acknowledgement
-REMEMBERED_DROPPED = 100  # names and reasons
+REMEMBERED_DROPPED = 1000  # names and reasons, of a place
 FILE = "{:012d}.frame"
 _FILE = re.compile(r"[0-9]{12,18}\.frame")
 _INSTEAD = "--checkpoint (or $XDG_STATE_HOME)"
-# Of what this process wrote itself.
-LIMITS = Limits(header_bytes=64 << 20, arrays=1 << 20, total_bytes=4 << 30, own=True)
-
-
-class CheckpointError(ValueError):
-    """The checkpoint cannot be used; the text says what to do."""
 
 
 class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -63,16 +64,6 @@ class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     stamp_ns: int
     intrinsics: Intrinsics | None
-
-
-class Ledger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    version: int = VERSION
-    place: int = 1  # number of the present place, from 1
-    first: int = 0  # number of the present place's first frame
-    next: int = 0  # at least this is the number of the next frame
-    gone: tuple[tuple[str, int], ...] = ()  # session and sequence of frames that are no longer stored
-    dropped: tuple[tuple[str, str], ...] = ()  # name and reason, newest last
-    identity: SessionId | None = None  # of this checkpoint, for whoever sends keyframes to it
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +94,8 @@ class Store:
             ) from error
         remove_leftovers(directory)
         remove_leftovers(self._frames)
-        self.ledger = self._identified(self._read_ledger())
+        self.ledger = identified(directory)
+        left.remove_half_left(directory, self.ledger.place)
         self._keys: dict[int, tuple[str, int]] = {}
         self._names: dict[str, int] = {}
         self._next = self.ledger.next
@@ -187,6 +179,18 @@ class Store:
                 number = self._names[name]
                 self._leave_out({number: name}, self._keys[number], (name, reason))
 
+    def leave_place(self, first: int) -> None:
+        """Begins another place as `begin_place` does, and keeps what there is of the present one. Raises OSError.
+
+        A death in between leaves the place as it was.
+        """
+        with self._writing:
+            frames = [f"frames/{FILE.format(number)}" for number in self._names.values() if number < first]
+            made = [name for name in MADE_ANEW if (self.directory / name).exists()]
+            own = msgspec.structs.replace(self.ledger, next=first, gone=(), identity=None)
+            left.keep(self.directory, own, [*frames, *made], _INSTEAD)
+            self.begin_place(first)
+
     def begin_place(self, first: int) -> None:
         """Begins another place with frame `first`; the frames before it and their scene are removed. Raises OSError."""
         with self._writing:
@@ -250,38 +254,9 @@ class Store:
         taken = {*self._names, *(dropped for dropped, _ in self.ledger.dropped)}
         return next(each for each in names if each not in taken)
 
-    def _identified(self, ledger: Ledger) -> Ledger:
-        """The ledger with the checkpoint's identity, which it is given where it has none."""
-        if ledger.identity:
-            return ledger
-        identified = msgspec.structs.replace(ledger, identity=uuid.uuid4().hex)
-        try:
-            write_message(self.directory / "ledger", encode(identified))
-        except OSError as error:
-            log.warning("the checkpoint's identity is this process's alone: %s", error)
-        return identified
-
     def _write(self, ledger: Ledger) -> None:
-        write_message(self.directory / "ledger", encode(ledger))
+        write_ledger(self.directory, ledger)
         self.ledger = ledger
-
-    def _read_ledger(self) -> Ledger:
-        path = self.directory / "ledger"
-        try:
-            found = decode(read_message(path), Ledger, LIMITS).header
-        except FileNotFoundError:
-            return Ledger()
-        except (OSError, ValueError) as error:
-            raise CheckpointError(
-                f"the checkpoint in {self.directory} is damaged ({error}). Move the folder away to begin anew; "
-                "its keyframes are in frames/"
-            ) from error
-        if found.version != VERSION:
-            raise CheckpointError(
-                f"the checkpoint in {self.directory} is of version {found.version}, this is version {VERSION}. "
-                "Use the splatnode that wrote it, or move the folder away to begin anew"
-            )
-        return found
 
 
 def _stored(number: int, parts: Any) -> StoredFrame:

@@ -19,7 +19,7 @@ from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.export.formats.tum import encode_tum
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.prepare import viewer_safe
-from splatnode.recon.result.export.staged import json_bytes, write_files
+from splatnode.recon.result.export.staged import ResultWriteError, explanation, json_bytes, write_files
 from splatnode.recon.result.snapshot import Snapshot
 
 MANIFEST = "manifest.json"
@@ -47,6 +47,23 @@ def write_result(
     superseded = {name: digest for name, digest in previous.items() if name not in files and name != MANIFEST}
     write_files(out_dir, files | {MANIFEST: json_bytes(manifest)}, superseded)
     return out_dir / MANIFEST
+
+
+def remove_result(out_dir: Path) -> None:
+    """Removes what `write_result` wrote and nobody changed since, and the folder if it is empty then.
+
+    Raises ResultWriteError.
+    """
+    previous = _read_manifest(out_dir)
+    if not previous:
+        return
+    try:
+        own = {MANIFEST: _sha256((out_dir / MANIFEST).read_bytes())}
+    except OSError as error:
+        raise ResultWriteError(error.errno, explanation(error, out_dir)) from error
+    write_files(out_dir, {}, previous | own)
+    with contextlib.suppress(OSError):  # others' files may be in it
+        out_dir.rmdir()
 
 
 def _scene_files(snapshot: Snapshot, preview: bytes | None) -> dict[str, bytes]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import threading
@@ -83,6 +84,14 @@ def running(config: Config) -> Iterator[None]:
         stopping.set()
         thread.join(PATIENCE_S)
     assert not thread.is_alive() and not errors, errors
+
+
+def index(config: Config) -> list[dict]:
+    return json.loads((config.out / "places.json").read_text())["places"]
+
+
+def report(folder: Path) -> dict:
+    return json.loads((folder / "report.json").read_text())
 
 
 class Peer:
@@ -199,7 +208,10 @@ def test_a_scene_that_its_refinement_ruined_is_neither_shown_nor_kept(config, pe
             ruined = peer.wait(lambda scene: scene.snapshot.verdict.code is Code.DIVERGED, "a refinement gone wrong")
             assert not ruined.snapshot.verdict.publishable and not len(ruined.snapshot.gaussians)
             peer.wait_for_acknowledgements()
-    assert not config.out.exists()
+    assert [path.name for path in config.out.iterdir()] == ["places.json"]
+    (place,) = index(config)
+    assert place["verdict"] == "DIVERGED" and not place["publishable"] and place["folder"] is None
+    assert {"name": photographs()[0].name, "reason": "there is no scene: DIVERGED"} in place["frames_dropped"]
 
 
 def test_two_daemons_do_not_export_into_one_folder(config, tmp_path):
@@ -251,6 +263,7 @@ def test_another_place_begins_another_scene_and_the_old_one_is_exported(config, 
         other = peer.wait(lambda scene: scene.scene_id == "scene-0002", "another place")
         assert {camera.name for camera in other.snapshot.cameras} <= {frame.name for frame in frames[3:]}
         peer.wait_for_acknowledgements()
+        wait_for((config.out / "scene-0001" / "manifest.json").exists, PATIENCE_S)
     kept = read_cameras(config.out / "scene-0001" / "cameras.json")
     assert {camera.name for camera in kept} == {frame.name for frame in frames[:3]}
     assert len(list((config.checkpoint / "frames").glob("*.frame"))) == 3

@@ -32,7 +32,8 @@ from splatnode.capture.messaging.wire import Limits, WireError, decode
 from splatnode.capture.preview import PreviewHeader, decode_preview
 from splatnode.capture.process.config import ConfigError, load_config
 from splatnode.capture.status import CaptureStatus, Heartbeat
-from splatnode.recon.daemon.checkpoint.store import CheckpointError, Ledger, Store
+from splatnode.recon.daemon.checkpoint.ledger import CheckpointError, Ledger
+from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config as ReconConfig
 from splatnode.recon.daemon.control import Command
 from splatnode.recon.daemon.status import ReconStatus

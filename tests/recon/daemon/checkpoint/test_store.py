@@ -10,8 +10,11 @@ import pytest
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
+from splatnode.recon.daemon.checkpoint import ledger as ledger_module
+from splatnode.recon.daemon.checkpoint import left
 from splatnode.recon.daemon.checkpoint import store as store_module
-from splatnode.recon.daemon.checkpoint.store import REMEMBERED_DROPPED, CheckpointError, Ledger, Store
+from splatnode.recon.daemon.checkpoint.ledger import CheckpointError, Ledger
+from splatnode.recon.daemon.checkpoint.store import REMEMBERED_DROPPED, Store
 from tests.support.strays import STRAYS
 
 SESSION = "0123456789abcdef" * 2
@@ -146,7 +149,8 @@ def test_a_full_disk_is_told_and_nothing_has_changed(open_store, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patched:
-        patched.setattr(store_module, "write_message", full)
+        for module in (store_module, ledger_module):
+            patched.setattr(module, "write_message", full)
         for frame in (received(1), ReceivedFrame(SESSION, 2, DroppedFrame("2.png", "blurred"))):
             with pytest.raises(OSError, match="No space"):
                 store.put(frame)
@@ -242,3 +246,38 @@ def test_a_checkpoint_is_private_whatever_the_umask_and_one_that_was_open_is_clo
         path.chmod(0o755 if path.is_dir() else 0o644)
     store = open_store()
     assert store.directory.lstat().st_mode & 0o777 == (store.directory / "frames").lstat().st_mode & 0o777 == 0o700
+
+
+def test_a_place_that_is_left_is_kept_as_a_checkpoint_of_its_own(open_store):
+    store = open_store()
+    for sequence in range(4):
+        store.put(received(sequence))
+    store.forget("1.png", "blurred")
+    store.save("graph", Ledger(), [])
+    store.leave_place(2)
+    assert store.scene_id == "scene-0002" and store.names == {"2.png", "3.png"} and not store.dropped
+    assert not (store.directory / "graph").exists()
+    (folder,) = left.folders(store.directory)
+    kept = Store(folder)
+    assert kept.scene_id == "scene-0001" and [each.frame.name for each in kept.frames()] == ["0.png"]
+    assert kept.dropped == [DroppedFrame("1.png", "blurred")] and kept.load("graph", Ledger) is not None
+    kept.close()
+
+    store = open_store()
+    assert [stored.frame.name for stored in store.frames()] == ["2.png", "3.png"]
+    assert (SESSION, 0) in store.seen and left.folders(store.directory) == [folder]
+    left.remove(folder)
+    assert left.folders(store.directory) == []
+
+
+def test_a_death_while_a_place_is_left_leaves_it_as_it_was(open_store, monkeypatch):
+    store = open_store()
+    for sequence in range(3):
+        store.put(received(sequence))
+    monkeypatch.setattr(Store, "begin_place", lambda *_: (_ for _ in ()).throw(SystemExit))
+    with pytest.raises(SystemExit):
+        store.leave_place(2)
+    assert left.folders(store.directory) != []
+    store = open_store()
+    assert [stored.frame.name for stored in store.frames()] == ["0.png", "1.png", "2.png"]
+    assert left.folders(store.directory) == [] and store.scene_id == "scene-0001"

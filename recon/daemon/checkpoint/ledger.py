@@ -1,0 +1,71 @@
+"""The ledger of a checkpoint: where its place begins, and which frames are no longer stored."""
+
+from __future__ import annotations
+
+import logging
+import uuid
+from pathlib import Path
+
+import msgspec
+
+from splatnode.capture.messaging.message_file import read_message, write_message
+from splatnode.capture.messaging.values import SessionId
+from splatnode.capture.messaging.wire import Limits, decode, encode
+
+log = logging.getLogger(__name__)
+
+VERSION = 1  # of all files of a checkpoint
+FILE = "ledger"
+# Of what this process wrote itself.
+LIMITS = Limits(header_bytes=64 << 20, arrays=1 << 20, total_bytes=4 << 30, own=True)
+
+
+class CheckpointError(ValueError):
+    """The checkpoint cannot be used; the text says what to do."""
+
+
+class Ledger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    version: int = VERSION
+    place: int = 1  # number of the present place, from 1
+    first: int = 0  # number of the present place's first frame
+    next: int = 0  # at least this is the number of the next frame
+    gone: tuple[tuple[str, int], ...] = ()  # session and sequence of frames that are no longer stored
+    dropped: tuple[tuple[str, str], ...] = ()  # name and reason, newest last
+    identity: SessionId | None = None  # of this checkpoint, for whoever sends keyframes to it
+
+
+def read_ledger(directory: Path) -> Ledger:
+    """An empty one where there is none yet. Raises CheckpointError."""
+    try:
+        found = decode(read_message(directory / FILE), Ledger, LIMITS).header
+    except FileNotFoundError:
+        return Ledger()
+    except (OSError, ValueError) as error:
+        raise CheckpointError(
+            f"the checkpoint in {directory} is damaged ({error}). Move the folder away to begin anew; "
+            "its keyframes are in frames/"
+        ) from error
+    if found.version != VERSION:
+        raise CheckpointError(
+            f"the checkpoint in {directory} is of version {found.version}, this is version {VERSION}. "
+            "Use the splatnode that wrote it, or move the folder away to begin anew"
+        )
+    return found
+
+
+def write_ledger(directory: Path, ledger: Ledger) -> None:
+    """Whole or not at all. Raises OSError."""
+    write_message(directory / FILE, encode(ledger))
+
+
+def identified(directory: Path) -> Ledger:
+    """The ledger with the checkpoint's identity, which it is given where it has none. Raises CheckpointError."""
+    ledger = read_ledger(directory)
+    if ledger.identity:
+        return ledger
+    ledger = msgspec.structs.replace(ledger, identity=uuid.uuid4().hex)
+    try:
+        write_ledger(directory, ledger)
+    except OSError as error:
+        log.warning("the checkpoint's identity is this process's alone: %s", error)
+    return ledger

@@ -1,0 +1,56 @@
+"""Places that the camera has left and whose scenes are not final yet: left/scene-NNNN, each a checkpoint of its own.
+
+A folder counts from the moment when it has a ledger, and no longer once it has none.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+from splatnode.capture.process.durable import sync_folder
+from splatnode.capture.process.private import private_folder
+from splatnode.recon.daemon.checkpoint.ledger import FILE as LEDGER
+from splatnode.recon.daemon.checkpoint.ledger import Ledger, write_ledger
+
+LEFT = "left"
+
+
+def keep(directory: Path, ledger: Ledger, files: Iterable[str], instead: str) -> None:
+    """Links `files` of the checkpoint in `directory`, which go with `ledger`, into a folder of their own there.
+
+    `files` are relative paths. Raises OSError, and NotPrivate, which names what to set `instead`.
+    """
+    folder = directory / LEFT / f"scene-{ledger.place:04d}"
+    remove(folder)
+    for each in (folder.parent, folder, folder / "frames"):
+        private_folder(each, instead, ours=True)
+    for name in files:
+        os.link(directory / name, folder / name)
+    sync_folder(folder / "frames")
+    write_ledger(folder, ledger)
+
+
+def folders(directory: Path) -> list[Path]:
+    """Of the places that were left, oldest first."""
+    return sorted((path.parent for path in (directory / LEFT).glob(f"scene-*/{LEDGER}")), key=_place)
+
+
+def remove(folder: Path) -> None:
+    """Removes the checkpoint of a place that was left. What the disk keeps of it, the next start removes."""
+    (folder / LEDGER).unlink(missing_ok=True)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def remove_half_left(directory: Path, place: int) -> None:
+    """Removes what dead processes left of places that were not left yet, `place` among them, or finished already."""
+    for folder in (directory / LEFT).glob("scene-*"):
+        if _place(folder) >= place or not (folder / LEDGER).exists():
+            remove(folder)
+
+
+def _place(folder: Path) -> int:
+    number = folder.name.removeprefix("scene-")
+    return int(number) if number.isdecimal() else 0

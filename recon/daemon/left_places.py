@@ -1,0 +1,90 @@
+"""Finishes the scenes of places that the camera has left, oldest first, from their checkpoints."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+from pathlib import Path
+
+from splatnode.capture.process.logs import event
+from splatnode.recon.config import Config
+from splatnode.recon.daemon import finishing, places
+from splatnode.recon.daemon.checkpoint import checkpoint, left
+from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.output import Output
+from splatnode.recon.incremental import IncrementalReconstruction, Pause
+from splatnode.recon.modelling import Shown
+
+log = logging.getLogger(__name__)
+
+AGAIN_S = 300.0  # after a place could not be finished
+
+
+class LeftPlaces:
+    def __init__(self, directory: Path, config: Config, output: Output) -> None:
+        """`directory` is that of the checkpoint which has left/ in it, `config` how scenes are made."""
+        self._directory, self._config, self._output = directory, config, output
+        self._work: IncrementalReconstruction | None = None  # that is being finished
+        self._not_before_s: dict[Path, float] = {}  # monotonic, for those that could not be finished
+
+    @property
+    def unfinished(self) -> int:
+        """Places that were left and are not finished."""
+        return len(left.folders(self._directory))
+
+    def leave_out(self, seconds: float) -> None:
+        """Of the seconds that the report will tell: they were spent otherwise."""
+        if self._work is not None:
+            self._work.clock.leave_out(seconds)
+
+    def finish_next(self, pause: Pause) -> bool:
+        """Finishes the oldest place and writes its result; False where there is none to be finished now.
+
+        What `pause` raises ends the work; it is begun again another time, as after a failure.
+        """
+        now = time.monotonic()
+        waiting = [each for each in left.folders(self._directory) if self._not_before_s.get(each, 0.0) <= now]
+        if not waiting:
+            return False
+        folder = waiting[0]
+        self._not_before_s[folder] = now + AGAIN_S
+        try:
+            with contextlib.closing(Store(folder)) as store:
+                finished = self._finish(store, pause)
+        finally:
+            self._work = None
+        if finished:
+            left.remove(folder)
+            del self._not_before_s[folder]
+        return True
+
+    def _finish(self, store: Store, pause: Pause) -> bool:
+        event(log, logging.INFO, "finishing", scene=store.scene_id)
+        found = checkpoint.restore(store, self._config)
+        work = self._work = found.work
+
+        def forget(name: str, reason: str) -> None:
+            store.forget(name, reason)
+            work.retract([name])
+
+        for keyframe in found.new:  # that came shortly before the place was left
+            gone = work.screen(keyframe.frame)
+            for each in gone:
+                forget(each.name, each.reason)
+            if keyframe.name not in {each.name for each in gone}:
+                work.add(keyframe, pause)
+        finishing.judge(work, forget, pause)
+        for keyframe in work.aside:
+            forget(keyframe.name, "it does not fit the scene")
+        work.show(_last(work, self._config, pause))
+        work.estimate_soon(pause)
+        snapshot = work.snapshot(store.dropped, final=True)
+        return self._output.export(snapshot, store, places.State.FINISHED, work.names)
+
+
+def _last(work: IncrementalReconstruction, config: Config, pause: Pause) -> Shown:
+    show = Shown()
+    for show in finishing.refine(work, config, pause):  # noqa: B007
+        pass
+    return show

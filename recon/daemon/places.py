@@ -1,0 +1,113 @@
+"""places.json: all places that the node has seen, what became of each, and of each photograph that was taken there."""
+
+from __future__ import annotations
+
+import enum
+import logging
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+import msgspec
+
+from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.process.foreign import foreign
+from splatnode.recon.result.export import SceneFileError, write_file
+from splatnode.recon.result.export.limits import read_json_file
+from splatnode.recon.result.export.staged import json_bytes
+from splatnode.recon.result.snapshot import Snapshot
+
+log = logging.getLogger(__name__)
+
+FILE = "places.json"
+
+
+class State(enum.Enum):
+    HERE = "here"  # the camera is there: the scene may grow
+    LEFT = "left"  # the camera went on: the scene is finished when no keyframe waits
+    FINISHED = "finished"  # the scene is final
+
+
+class Dropped(msgspec.Struct, frozen=True):
+    name: str
+    reason: str
+
+
+class Place(msgspec.Struct, frozen=True):
+    """A place, as it was when it was last looked at."""
+
+    scene_id: str
+    state: State
+    folder: str | None  # with its result, in that of places.json; None: there is none
+    verdict: str
+    message: str
+    publishable: bool
+    provisional: bool
+    num_gaussians: int
+    frames_used: tuple[str, ...]  # that have a camera in the scene
+    frames_dropped: tuple[Dropped, ...]  # all others that were taken there, and why they have none
+
+
+def described(
+    scene_id: str,
+    state: State,
+    folder: str | None,
+    snapshot: Snapshot,
+    kept: Sequence[str],
+    dropped: Collection[DroppedFrame],
+) -> Place:
+    """The place as the snapshot shows it. `kept` are the names of its keyframes; others that came were `dropped`."""
+    verdict = snapshot.verdict
+    used = tuple(camera.name for camera in snapshot.cameras)
+    why = "it has no camera in the scene" if used else f"there is no scene: {verdict.code.value}"
+    unplaced = (Dropped(name, why) for name in kept if name not in used)
+    return Place(
+        scene_id=scene_id,
+        state=state,
+        folder=folder,
+        verdict=verdict.code.value,
+        message=verdict.message,
+        publishable=verdict.publishable,
+        provisional=verdict.provisional or not snapshot.final,
+        num_gaussians=len(snapshot.gaussians),
+        frames_used=used,
+        frames_dropped=(*unplaced, *(Dropped(frame.name, frame.reason) for frame in dropped)),
+    )
+
+
+class _Index(msgspec.Struct, frozen=True):
+    checkpoint: str  # identity of the one that the places belong to
+    places: tuple[Place, ...]
+
+
+class Places:
+    """The file, and what is in it."""
+
+    def __init__(self, out: Path, checkpoint: str) -> None:
+        """Goes on with the places of an earlier process that had the same `checkpoint`.
+
+        An index that cannot be read begins anew.
+        """
+        self._path, self._checkpoint = out / FILE, checkpoint
+        self._places: dict[str, Place] = {}
+        try:
+            with foreign(SceneFileError):
+                found = msgspec.json.decode(read_json_file(self._path), type=_Index)
+            if found.checkpoint == checkpoint:
+                self._places = {place.scene_id: place for place in found.places}
+        except FileNotFoundError:
+            pass
+        except (OSError, SceneFileError) as error:
+            log.warning("the index of places begins anew: %s", error)
+
+    def finished(self, scene_id: str) -> None:
+        """Says that the camera has left a place whose scene is final. Raises ResultWriteError."""
+        if scene_id in self._places:
+            self.tell(msgspec.structs.replace(self._places[scene_id], state=State.FINISHED))
+
+    def tell(self, place: Place) -> None:
+        """Writes the index with what is known of this place now. Raises ResultWriteError."""
+        if self._places.get(place.scene_id) == place:
+            return
+        places = self._places | {place.scene_id: place}
+        write_file(self._path, json_bytes(msgspec.to_builtins(_Index(self._checkpoint, tuple(places.values())))))
+        self._places = places

@@ -1,0 +1,254 @@
+"""The place where the camera is: keyframes are worked in, the scene grows, is shown, and becomes as good as it gets."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Collection, Sequence
+from functools import partial
+
+from splatnode.capture.process.logs import event
+from splatnode.capture.process.memory_shortage import is_shortage
+from splatnode.recon.config import Config as Recipe
+from splatnode.recon.daemon import finishing, membership
+from splatnode.recon.daemon.checkpoint import checkpoint
+from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.config import Config
+from splatnode.recon.daemon.inbox import Arrived
+from splatnode.recon.daemon.output import Output
+from splatnode.recon.daemon.places import State as Place
+from splatnode.recon.daemon.status import State
+from splatnode.recon.daemon.watcher import Finished
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.modelling import Shown
+from splatnode.recon.result import bounds_in_words
+from splatnode.recon.result.snapshot import Snapshot
+
+log = logging.getLogger(__name__)
+
+PATIENCE_S = 3.0  # that a thorough judgement of a keyframe that does not fit may keep others waiting
+MOST_ASIDE = 8  # keyframes that may still find their place
+
+
+class Abandoned(Exception):
+    """Something more urgent has come."""
+
+
+class PresentPlace:
+    def __init__(
+        self, config: Config, recipe: Recipe, store: Store, output: Output, pause: Callable[[float], None]
+    ) -> None:
+        """`pause` raises Abandoned if the daemon stops, and from a time (monotonic) on if something has come."""
+        self._config, self._recipe, self._store, self._output = config, recipe, store, output
+        self._pause_until = pause
+        self._work = IncrementalReconstruction(recipe)
+        self._final: frozenset[str] = frozenset()  # the keyframes whose scene was written as final
+        self._exported_s = time.monotonic()
+        self._shown: Snapshot | None = None  # last
+        self.settled = True  # nothing can be made better before the next keyframe
+        self.under_way: list[Arrived] = []  # keyframes that are being worked in, and that no scene shows yet
+        self.owed: list[Arrived] = []  # keyframes that a step that failed did not work in
+        self.state = State.WAITING
+        self.keyframe_s: float | None = None  # from the last keyframe's arrival until the scene showed it
+        self.finished: Finished | None = None  # while no keyframe waits
+
+    def go_on(self, found: checkpoint.Restored) -> None:
+        """Goes on where an earlier process was."""
+        self._work = found.work
+        self.settled = found.final or not found.keyframes
+        self._final = frozenset(self._work.names) if found.final else frozenset()
+        if not found.keyframes:
+            return
+        event(log, logging.INFO, "restored", scene=self._store.scene_id, keyframes=found.keyframes, new=len(found.new))
+        if found.new or self._work.scene is None:
+            self.take_in([Arrived(keyframe, time.monotonic()) for keyframe in found.new])
+        else:
+            self.state = State.IDLE if self.settled else State.GROWING
+            self._show(final=self.settled)
+
+    def take_in(self, arrived: Sequence[Arrived]) -> None:
+        """Keyframes that have come, shown together."""
+        self.state, self.settled, self.finished = State.GROWING, False, None
+        arrived = self.owed = self.under_way = self._with_those_before(arrived)
+        try:
+            keyframes = self._screened([each.keyframe for each in arrived])
+            strangers = self._added(keyframes)
+            self.owed = []
+            if not strangers or len(strangers) < len(keyframes):
+                self._show_grown(arrived)
+            if strangers and self._receive(strangers):
+                self._show_grown(arrived)
+        finally:
+            self.under_way = self.owed
+        self.state = State.LOST if self._strangers() else State.GROWING
+
+    def _with_those_before(self, arrived: Sequence[Arrived]) -> list[Arrived]:
+        """Also those keyframes that a step that failed left out, and that nobody has removed since."""
+        there = {*self._work.names, *(keyframe.name for keyframe in self._work.aside)}
+        owed = [each for each in self.owed if each.keyframe.name in self._store.names - there]
+        self._work.retract([each.keyframe.name for each in owed])  # they were screened, and are screened again
+        return [*owed, *arrived]
+
+    def _show_grown(self, arrived: Sequence[Arrived]) -> None:
+        """The scene with the keyframes that have come to belong to it."""
+        self._make_room()
+        self._work.update(self._unless_stopping)
+        snapshot = self._show()
+        if arrived:
+            self.keyframe_s = time.monotonic() - arrived[0].at_s
+        event(
+            log, logging.INFO, "keyframes", names=",".join(each.keyframe.name for each in arrived),
+            verdict=snapshot.verdict.code.value, gaussians=len(snapshot.gaussians), seconds=self.keyframe_s or 0.0,
+            bounds=bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale),
+        )  # fmt: skip
+        self._output.save(self._work, final=False)
+        if time.monotonic() - self._exported_s >= self._config.export_every_s:
+            self.export_provisionally()
+
+    def _screened(self, keyframes: Sequence[Keyframe]) -> list[Keyframe]:
+        """Those of the keyframes that show something new, and sharply; what does not is given up."""
+        kept = []
+        for keyframe in keyframes:
+            gone = {each.name: each.reason for each in self._work.screen(keyframe.frame)}
+            kept = [each for each in (*kept, keyframe) if each.name not in gone]
+            for name, reason in gone.items():
+                event(log, logging.INFO, "left_out", frame=name, reason=reason)
+                self._forget(name, reason)
+        return kept
+
+    def _added(self, keyframes: list[Keyframe]) -> set[str]:
+        """Adds keyframes to the view graph; names those that do not fit at once, which are set aside."""
+        try:
+            return membership.add(self._work, keyframes, self._unless_stopping)
+        except Abandoned:
+            raise
+        except Exception as error:  # one bad frame must not keep others out
+            if is_shortage(error):
+                raise
+            self._work.retract([keyframe.name for keyframe in keyframes])
+            if len(keyframes) > 1:
+                return set().union(*(self._added([keyframe]) for keyframe in keyframes))
+            log.exception("%s cannot be worked in", keyframes[0].name)
+            self._forget(keyframes[0].name, f"cannot be worked in: {error}")
+            return set()
+
+    def _receive(self, newest: set[str]) -> bool:
+        """Whether the scene changes by keyframes that did not fit at once. Raises Abandoned.
+
+        They are judged thoroughly with all others, as long as what waits can wait; if they are too many, in any case.
+        If that does not help them, another place begins with them.
+        """
+        lost = len(self._strangers()) >= self._config.lost_after
+        pause = partial(self._pause_until, math.inf if lost else time.monotonic() + PATIENCE_S)
+        aside = [keyframe.name for keyframe in self._work.aside]
+        joined = membership.connected(self._work, pause) and (
+            membership.join(self._work, aside, pause) or (not lost and membership.join(self._work, newest, pause))
+        )
+        if self._lost(newest):
+            return True
+        for keyframe in self._work.aside[: -max(MOST_ASIDE, self._config.lost_after)]:
+            self._forget(keyframe.name, "it does not fit the scene")
+        return joined
+
+    def _lost(self, newest: Collection[str]) -> bool:
+        """Says which of the newest keyframes do not fit; where too many in a row do not, another place begins."""
+        strangers = self._strangers()
+        for keyframe in strangers:
+            if keyframe.name in newest:
+                event(log, logging.WARNING, "does_not_fit", frame=keyframe.name, scene=self._store.scene_id)
+        if len(strangers) < self._config.lost_after:
+            return False
+        self._begin_place(strangers)
+        return True
+
+    def _begin_place(self, strangers: Sequence[Keyframe]) -> None:
+        """Another scene begins with the frames that do not belong to the present one, which is finished later."""
+        self.state = State.LOST
+        before, first = self._store.scene_id, strangers[0].frame.frame_id
+        if self._final == frozenset(self._work.names):
+            self._output.finished(before)
+            self._store.begin_place(first)
+        else:
+            self._output.save(self._work, final=False)
+            self._show()
+            self.export_provisionally(Place.LEFT, {keyframe.name for keyframe in strangers})
+            self._store.leave_place(first)
+        event(log, logging.WARNING, "another_place", before=before, now=self._store.scene_id)
+        self._work, self._final, self._shown = IncrementalReconstruction(self._recipe), frozenset(), None
+        for keyframe in strangers:
+            self._work.add(keyframe, self._unless_stopping)
+
+    def export_provisionally(self, state: Place = Place.HERE, apart: Collection[str] = ()) -> None:
+        """Writes what is shown, unless it was written as final, without the keyframes that are `apart`."""
+        self._exported_s = time.monotonic()
+        if self._shown is None or self._shown.final:
+            return
+        kept = sorted(self._store.names.difference(apart))
+        if self._shown.verdict.publishable:
+            self._output.export(self._shown, self._store, state, kept)
+        else:
+            self._output.tell(self._shown, state, kept)
+
+    def _make_room(self) -> None:
+        """Gives up views that can be spared, so that there are not more than configured."""
+        while len(self._work.names) > max(self._config.max_views, membership.NEWEST):
+            name = membership.most_redundant(self._work.graph)
+            event(log, logging.INFO, "given_up", frame=name)
+            self._forget(name, "given up for newer views that show the same")
+
+    def leave_out(self, names: Sequence[str]) -> None:
+        """The checkpoint no longer has these frames; the scene forgets them, too."""
+        known = [name for name in names if name in self._work.names]
+        self._work.retract(names)
+        if known:
+            self.settled, self.finished, self.state = False, None, State.GROWING
+        self._show(final=self.settled and self._work.scene is not None)
+        if known:
+            self._output.save(self._work, final=False)
+
+    def _forget(self, name: str, reason: str) -> None:
+        self._store.forget(name, reason)
+        self._work.retract([name])
+
+    def settle(self) -> None:
+        """Makes the scene afresh from all keyframes and refines it. Raises Abandoned when something comes."""
+        self.state = State.REFINING
+        fitted = set(self._work.names)
+        finishing.judge(self._work, self._forget, self._pause)
+        self._lost(fitted)
+        refined = Shown()
+        for refined in finishing.refine(self._work, self._recipe, self._pause):
+            if refined.scene is not None and refined.scene.iterations in self._recipe.optimize.checkpoints:
+                self._work.show(refined)
+                self._show()
+        self.settled = True
+        self._work.show(refined)
+        shown = self._work.scene is not None
+        snapshot, kept = self._show(final=shown), sorted(self._store.names)
+        if shown:
+            exported = self._output.export(snapshot, self._store, Place.HERE, kept)
+            self._output.save(self._work, final=exported)  # what is kept as final is not exported after a restart
+            self._final = frozenset(self._work.names) if exported else frozenset()
+        else:
+            self._output.tell(snapshot, Place.HERE, kept)
+        self.state = State.WAITING if not shown else State.LOST if self._strangers() else State.IDLE
+
+    def _pause(self) -> None:
+        """Raises Abandoned if the daemon stops, or something has come."""
+        self._pause_until(-math.inf)
+
+    def _unless_stopping(self) -> None:
+        """Raises Abandoned if the daemon stops: what may be shown soon is not abandoned for what comes next."""
+        self._pause_until(math.inf)
+
+    def _strangers(self) -> list[Keyframe]:
+        return membership.strangers(self._work, self._unless_stopping)
+
+    def _show(self, final: bool = False) -> Snapshot:
+        self._work.estimate_soon(self._unless_stopping)
+        snapshot = self._work.snapshot(self._store.dropped, final)
+        self._output.publish(snapshot)
+        self.finished, self._shown = Finished(snapshot, self._work.graph.keyframes) if final else None, snapshot
+        return snapshot

@@ -1,0 +1,176 @@
+"""Places that the camera leaves: none is lost, none is told to be better than it is, all are finished."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import msgspec
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from splatnode.capture.frame import DroppedFrame, renamed
+from splatnode.capture.status import heartbeats
+from splatnode.recon.daemon import left_places
+from splatnode.recon.daemon.checkpoint import left
+from splatnode.recon.daemon.inbox import BATCH, Arrived, Inbox
+from splatnode.recon.daemon.left_places import LeftPlaces
+from splatnode.recon.daemon.places import Places, State, described
+from splatnode.recon.result.export import read_cameras
+from tests.capture.messaging.test_sockets import wait_for
+from tests.recon.daemon.test_daemon import (
+    PATIENCE_S,
+    config,
+    finished,
+    index,
+    offer_when_three_are_shown,
+    peer,
+    report,
+    running,
+)
+from tests.support.exported import make_snapshot
+from tests.support.synthetic import SMALL, photographs, places
+
+__all__ = ["config", "peer"]
+
+NEVER_S = 1e6
+
+
+@pytest.fixture
+def moving(config):
+    """A camera that never rests."""
+    return replace(config, settle_s=NEVER_S)
+
+
+def never(*_: object) -> bool:
+    return False
+
+
+def test_a_clean_stop_leaves_what_there_is_and_says_that_it_is_provisional(moving, peer):
+    frames = photographs()[:3]
+    with running(moving):
+        for frame in frames:
+            peer.server.offer(frame)
+        peer.wait(lambda scene: len(scene.snapshot.cameras) == 3, "three cameras")
+        peer.wait_for_acknowledgements()
+    folder = moving.out / "scene-0001-provisional"
+    assert not (moving.out / "scene-0001").exists()
+    assert [camera.name for camera in read_cameras(folder / "cameras.json")] == [frame.name for frame in frames]
+    verdict = report(folder)["verdict"]
+    assert verdict["publishable"] and verdict["provisional"]
+    (place,) = index(moving)
+    assert (place["state"], place["folder"], place["provisional"]) == ("here", folder.name, True)
+
+    with running(replace(moving, settle_s=0.2)):
+        peer.wait(finished(3), "three cameras, refined")
+        wait_for((moving.out / "scene-0001" / "manifest.json").exists, PATIENCE_S)
+    assert not report(moving.out / "scene-0001")["verdict"]["provisional"] and not folder.exists()
+    (place,) = index(moving)
+    assert (place["state"], place["folder"], place["provisional"]) == ("here", "scene-0001", False)
+
+
+def test_while_the_scene_grows_it_is_written_at_intervals(moving, peer):
+    with running(replace(moving, export_every_s=1e-3)):
+        for frame in photographs()[:3]:
+            peer.server.offer(frame)
+        wait_for(
+            lambda: peer.server.serve(0.02) or (moving.out / "scene-0001-provisional" / "manifest.json").exists(),
+            PATIENCE_S,
+        )
+
+
+def test_a_place_that_was_left_is_finished_while_the_camera_rests_in_another(config, peer):
+    frames = places(seeds=(0, 1))
+    with running(replace(config, lost_after=3)):
+        offer_when_three_are_shown(peer, frames)
+        peer.wait(lambda scene: scene.scene_id == "scene-0002" and scene.snapshot.final, "another place, finished")
+        peer.wait_for_acknowledgements()
+        wait_for(lambda: heartbeats(config.network)["recon"]["unfinished"] == 0, PATIENCE_S)
+        status = heartbeats(config.network)["recon"]
+        assert status["delay_s"] == 0 and status["delay"] == ""
+    first, second = index(config)
+    assert (first["scene_id"], first["state"], first["folder"]) == ("scene-0001", "finished", "scene-0001")
+    assert (second["scene_id"], second["state"]) == ("scene-0002", "here")
+    assert first["frames_used"] == [frame.name for frame in frames[:3]]
+    told = {name for place in (first, second) for name in place["frames_used"]}
+    told |= {dropped["name"] for place in (first, second) for dropped in place["frames_dropped"]}
+    assert told == {frame.name for frame in frames}
+    assert not report(config.out / "scene-0001")["verdict"]["provisional"]
+    assert not (config.out / "scene-0001-provisional").exists() and left.folders(config.checkpoint) == []
+
+
+def test_a_place_that_was_left_is_finished_by_the_next_process(moving, peer, monkeypatch):
+    frames = places(seeds=(0, 1))
+    with monkeypatch.context() as patch, running(replace(moving, lost_after=3)):
+        patch.setattr(LeftPlaces, "finish_next", never)
+        offer_when_three_are_shown(peer, frames)
+        peer.wait(lambda scene: scene.scene_id == "scene-0002", "another place")
+        peer.wait_for_acknowledgements()
+    assert report(moving.out / "scene-0001-provisional")["verdict"]["provisional"]
+    assert index(moving)[0]["state"] == "left" and len(left.folders(moving.checkpoint)) == 1
+
+    with running(replace(moving, settle_s=0.2, lost_after=3)):
+        wait_for((moving.out / "scene-0001" / "manifest.json").exists, PATIENCE_S)
+        wait_for(lambda: not left.folders(moving.checkpoint), PATIENCE_S)
+    kept = read_cameras(moving.out / "scene-0001" / "cameras.json")
+    assert {camera.name for camera in kept} == {frame.name for frame in frames[:3]}
+    assert report(moving.out / "scene-0001")["iterations"] == moving.reconstruction.optimize.iterations
+
+
+def test_what_comes_while_a_left_place_is_finished_is_shown_at_once(config, peer, monkeypatch):
+    begun, shown = threading.Event(), threading.Event()
+    last = left_places._last
+
+    def slow(work, recipe, pause):
+        begun.set()
+        while not shown.is_set():
+            pause()
+            time.sleep(0.01)
+        return last(work, recipe, pause)
+
+    monkeypatch.setattr(left_places, "_last", slow)
+    frames = places(msgspec.structs.replace(SMALL, views=8))
+    with running(replace(config, lost_after=3)):
+        offer_when_three_are_shown(peer, [*frames[:3], *frames[4:7]])
+        wait_for(lambda: peer.server.serve(0.02) or begun.is_set(), PATIENCE_S)
+        peer.server.offer(frames[7])
+        scene = peer.wait(lambda scene: frames[7].name in {each.name for each in scene.snapshot.cameras}, "the further")
+        assert scene.scene_id == "scene-0002" and not (config.out / "scene-0001").exists()
+        shown.set()
+        wait_for((config.out / "scene-0001" / "manifest.json").exists, PATIENCE_S)
+    assert index(config)[0]["frames_used"] == [frame.name for frame in frames[:3]]
+
+
+def test_keyframes_are_worked_in_a_few_at_a_time():
+    inbox, stopping = Inbox(), threading.Event()
+    for number in range(2 * BATCH + 1):
+        inbox.put(Arrived(None, float(number)), stopping)  # pyright: ignore[reportArgumentType]
+    assert inbox.oldest_s == 0.0
+    assert [len(inbox.get(0)) for _ in range(4)] == [BATCH, BATCH, 1, 0]
+    assert inbox.oldest_s is None
+
+
+def test_room_is_made_only_for_what_fits(moving, peer):
+    ours, others = photographs()[:4], places(seeds=(0, 1))[3:5]
+    with running(replace(moving, max_views=4)):
+        for frame in ours:
+            peer.server.offer(frame)
+        peer.wait(lambda scene: len(scene.snapshot.cameras) == 4, "four cameras")
+        for number, frame in enumerate(others):
+            peer.server.offer(renamed(frame, 4 + number, f"other{number}.png", 4 + number))
+        wait_for(lambda: peer.server.serve(0.02) or heartbeats(moving.network)["recon"]["state"] == "lost", PATIENCE_S)
+    (place,) = index(moving)
+    assert place["frames_used"] == [frame.name for frame in ours]
+
+
+def test_an_index_of_another_checkpoint_or_a_damaged_one_begins_anew(tmp_path):
+    place = described("scene-0001", State.HERE, "scene-0001", make_snapshot(), [], [DroppedFrame("a.png", "blurred")])
+    Places(tmp_path, "one").tell(place)
+    Places(tmp_path, "one").finished("scene-0001")
+    assert '"finished"' in (tmp_path / "places.json").read_text()
+    Places(tmp_path, "other").tell(described("scene-0007", State.HERE, None, make_snapshot(), [], []))
+    assert "scene-0001" not in (tmp_path / "places.json").read_text()
+    (tmp_path / "places.json").write_bytes(np.random.default_rng(0).bytes(100))
+    Places(tmp_path, "one").tell(place)
+    assert "blurred" in (tmp_path / "places.json").read_text()
