@@ -12,7 +12,6 @@ from functools import partial
 from pathlib import Path
 
 import msgspec
-import numpy as np
 from torch import Tensor
 
 from splatnode.capture.cameras import folder, synthetic
@@ -34,6 +33,7 @@ from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.rasterize import device
 from splatnode.recon.rasterize.device import Device
 from splatnode.recon.rasterize.dispatch import rasterizer
+from splatnode.recon.replay_source import source
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.size import largest_result_bytes
@@ -48,21 +48,24 @@ LOOK_EVERY = 50  # iterations between the snapshots that a viewer is shown
 
 
 def replay(args: argparse.Namespace) -> int:
-    """Reconstructs a folder of photographs."""
+    """Reconstructs a folder of photographs, or a video."""
     config = _config(args)
-    frames = list(folder.stream(folder.Config(folder=args.folder, names=_chosen(args))))
-    _check_baseline(config, [frame.name for frame in frames])
-    _check_apart(args.out, args.folder)
-    sizes = [(frame.width, frame.height) for frame in frames if isinstance(frame, Frame)]
+    _check_apart(args.out, args.source)
+    given = source(args)
+    if given.choice is not None and not args.json:
+        say(str(given.choice))
+    _check_baseline(config, [frame.name for frame in given.frames])
+    needed_bytes = largest_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
     with (
-        result_folder(args.out, largest_result_bytes(sizes, config.size, config.most_gaussians)),
+        result_folder(args.out, needed_bytes),
         viewer(args.out / "view") if args.view else contextlib.nullcontext(_shown_to_nobody) as show,
     ):
-        snapshot = run(frames, with_looks(config, LOOK_EVERY) if args.view else config, show)
+        snapshot = run(given.frames, with_looks(config, LOOK_EVERY) if args.view else config, show)
         snapshot = in_metres(snapshot, config.metric)
-        where = str(args.folder.resolve())
-        preset_name = args.preset or "balanced"
-        report = finish(snapshot, args.out, seed=config.seed, preset_name=preset_name, photographs=where)
+        told = {"photographs": str(given.keep(args.out).resolve())}
+        if given.choice is not None:
+            told["selection"] = given.choice.record()
+        report = finish(snapshot, args.out, seed=config.seed, preset_name=args.preset or "balanced", **told)
         if args.json:
             print(json.dumps(report))
         else:
@@ -208,18 +211,6 @@ def _config(args: argparse.Namespace) -> Config:
         "decision": None if args.require is None else {"require_percent": args.require},
     }
     return overlaid(config, {key: value for key, value in flags.items() if value is not None})
-
-
-def _chosen(args: argparse.Namespace) -> tuple[str, ...]:
-    """The names of the frames to use; none means all."""
-    if args.frames:
-        return args.frames
-    if not args.views:
-        return ()
-    names = folder.names_in(args.folder)
-    if args.views > len(names):
-        raise ValueError(f"--views {args.views}: the folder holds {len(names)} photographs; ask for at most as many")
-    return tuple(names[i] for i in np.linspace(0, len(names) - 1, args.views).round().astype(int))
 
 
 def _tell(snapshot: Snapshot, out: Path) -> None:

@@ -34,7 +34,13 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
 
 
 def _replay_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="photographs of one place, in any order")
+    parser.add_argument(
+        "source",
+        type=Path,
+        metavar="SOURCE",
+        help="a folder with photographs of one place, in any order, or a video; of a video, and of more than 30 "
+        "photographs, keyframes are chosen as a live camera's are",
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with what differs from the defaults")
     parser.add_argument("--preset", metavar="P", help="a named set of parameters (default: balanced)")
@@ -67,6 +73,7 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
     chosen = parser.add_mutually_exclusive_group()
     chosen.add_argument("--views", type=positive, metavar="N", help="use N frames, evenly spread")
     chosen.add_argument("--frames", type=names, metavar="A,B,C", help="use these frames, by name")
+    chosen.add_argument("--every-frame", action="store_true", help="use all frames that are sharp and no copies")
     add_json(parser)
 
 
@@ -155,7 +162,12 @@ def _weights_arguments(parser: argparse.ArgumentParser) -> None:
 
 VERBS = (
     Verb("demo", "reconstruct the built-in capture", _demo_arguments, lazily("splatnode.recon.cli", "demo")),
-    Verb("replay", "reconstruct a folder of photographs", _replay_arguments, lazily("splatnode.recon.cli", "replay")),
+    Verb(
+        "replay",
+        "reconstruct a folder of photographs, or a video",
+        _replay_arguments,
+        lazily("splatnode.recon.cli", "replay"),
+    ),
     Verb(
         "export",
         "write a scene in another format",

@@ -19,6 +19,7 @@ from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.keys import allow, create_keys, expect_server, read_keys
 from splatnode.capture.messaging.spool import Config as SpoolConfig
 from splatnode.capture.messaging.spool import Key, Spool, SpoolFull
+from splatnode.recon.daemon.checkpoint import left
 from splatnode.recon.daemon.checkpoint.store import MADE_ANEW, Store
 from splatnode.recon.result.export import export_scene
 from splatnode.recon.result.export.stored import read_gaussians
@@ -36,8 +37,8 @@ def nothing(_: Path) -> None:
 
 
 def no_leftovers(folder: Path) -> None:
-    left = [path for path in folder.rglob(".*") if path.suffix in (".tmp", ".renaming")]
-    assert not left, f"left: {left}"
+    found = [path for path in folder.rglob(".*") if path.suffix in (".tmp", ".renaming")]
+    assert not found, f"left: {found}"
 
 
 # The spool: what `put` has returned from is delivered until it is removed, byte by byte.
@@ -123,7 +124,7 @@ def _storing(disk: Path, tell: Tell) -> None:
     doing("drop 3", lambda: store.put(dropped))
     doing("put 4", lambda: store.put(ReceivedFrame(SESSION, 4, _frame(4))))
     first = store._names.get("4.png", store._next)
-    doing("place", lambda: store.begin_place(first))
+    doing("place", lambda: store.leave_place(first))
     doing("put 5", lambda: store.put(ReceivedFrame(SESSION, 5, _frame(5))))
     doing("save graph 2", lambda: store.save("graph", _Thing(2), _arrays(2)))
     store.close()
@@ -156,6 +157,7 @@ def _store_after(disk: Path, told: list[str]) -> None:
         assert 1 not in frames and ("1.png" in {each.name for each in store.dropped} or "begin place" in told)
     if "place" in told:
         assert not {0, 1, 2} & set(frames) and store.scene_id == "scene-0002"
+    _left_after(store, promised & {0, 2})
     assert not {stored.frame.name for stored in frames.values()} & {each.name for each in store.dropped}
     assert not list(disk.rglob("*.damaged")), "a whole frame was called damaged"
     for name in MADE_ANEW:
@@ -163,6 +165,16 @@ def _store_after(disk: Path, told: list[str]) -> None:
     again = store.put(ReceivedFrame(SESSION, 6, _frame(6)))
     assert again is not None and all(again.number > stored.number for stored in frames.values())
     store.close()
+
+
+def _left_after(store: Store, promised: set[int]) -> None:
+    """A place is here or in left/, whole either way."""
+    folders = left.folders(store.directory)
+    assert len(folders) == (store.scene_id == "scene-0002"), folders
+    for folder in folders:
+        with contextlib.closing(Store(folder)) as kept:
+            frames = {stored.key[1] for stored in kept.frames()}
+            assert kept.scene_id == "scene-0001" and promised <= frames, f"lost: {promised - frames}"
 
 
 def _made_anew_after(store: Store, name: str, told: list[str], another_place: bool) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatnode.recon.result.export import ResultWriteError, write_file, write_result
+from splatnode.recon.result.export import ResultWriteError, remove_result, write_file, write_result
 from splatnode.recon.result.export import staged as staged_module
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.report import build_report
@@ -59,6 +59,19 @@ def test_refused_scene_is_not_published_and_replaces_an_earlier_one(tmp_path):
     assert left == {"report.json", "manifest.json", "transforms.json"}  # what the user changed is the user's
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["verdict"]["code"], report["scene_bytes"]) == ("NO_PARALLAX", 0)
+
+
+def test_a_result_is_removed_but_not_what_others_put_beside_it(tmp_path):
+    folder = tmp_path / "result"
+    write(make_snapshot(), folder)
+    (folder / "notes.txt").write_text("mine")
+    (folder / "cameras.json").write_text("changed by hand")
+    remove_result(folder)
+    assert sorted(path.name for path in folder.rglob("*")) == ["cameras.json", "notes.txt"]
+    write(make_snapshot(), tmp_path / "other")
+    remove_result(tmp_path / "other")
+    assert not (tmp_path / "other").exists()
+    remove_result(tmp_path / "nothing there")
 
 
 def test_manifest_cannot_make_us_remove_a_file_elsewhere(tmp_path):

@@ -1,0 +1,96 @@
+"""What `splatnode replay` is given: a folder of photographs, or more than one looks at, or a video."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from splatnode.capture.cameras import folder, video
+from splatnode.capture.choosing import Choice, choose
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.image_file import encode_png
+from splatnode.capture.quality import Limits
+from splatnode.capture.selection import Config
+from splatnode.recon.result.export import write_files
+
+ALL = 30  # photographs of a folder that are all used; of more, keyframes are chosen
+MOST = 60  # keyframes of a video, or of a folder of more photographs
+IMAGES = "images"  # in the result folder: the keyframes of a video
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """The frames to reconstruct, in their order, and where they come from."""
+
+    frames: tuple[Frame | DroppedFrame, ...]
+    photographs: Path | None  # the folder that they lie in; None: they are a video's
+    choice: Choice | None  # None: all that were asked for are used
+
+    @property
+    def sizes(self) -> list[tuple[int, int]]:
+        """(width, height) of each frame."""
+        return [(frame.width, frame.height) for frame in self.frames if isinstance(frame, Frame)]
+
+    @property
+    def further_bytes(self) -> int:
+        """Bytes that `keep` writes at most."""
+        return 0 if self.photographs else sum(3 * width * height for width, height in self.sizes)
+
+    def keep(self, out: Path) -> Path:
+        """The folder that the frames lie in; those of a video are written into the result folder `out`.
+
+        Raises ResultWriteError.
+        """
+        if self.photographs:
+            return self.photographs
+        images = {frame.name: encode_png(frame.image) for frame in self.frames if isinstance(frame, Frame)}
+        write_files(out / IMAGES, images)
+        return out / IMAGES
+
+
+def source(args: argparse.Namespace) -> Source:
+    """The frames that the command line asks for.
+
+    Raises FileNotFoundError and ValueError where there is nothing that can be used.
+    """
+    if args.source.is_file():
+        if args.frames:
+            raise ValueError("--frames names photographs of a folder; of a video, give --views N or nothing")
+        return _chosen(args, video.stream(video.Config(file=args.source)), None)
+    names = _names(args)
+    if names or args.every_frame or len(folder.names_in(args.source)) <= ALL:
+        return Source(tuple(folder.stream(folder.Config(folder=args.source, names=names))), args.source, None)
+    return _chosen(args, folder.stream(folder.Config(folder=args.source)), args.source)
+
+
+def _chosen(args: argparse.Namespace, stream, photographs: Path | None) -> Source:
+    """The keyframes of a stream; with --views N so many, evenly spread."""
+    config = Config(per_second=1e9) if photographs else Config()  # photographs were not taken at any rate
+    config = msgspec.structs.replace(config, every_frame=args.every_frame)
+    choice = choose(stream, config, Limits(), max(MOST, args.views or 0))
+    frames = choice.keyframes
+    if args.views:
+        if args.views > len(frames):
+            raise ValueError(f"--views {args.views}: {choice}; ask for at most as many")
+        frames = tuple(frames[i] for i in _evenly(len(frames), args.views))
+    return Source((*frames, *choice.dropped), photographs, choice)
+
+
+def _names(args: argparse.Namespace) -> tuple[str, ...]:
+    """Of the photographs to use; none means all."""
+    if args.frames:
+        return args.frames
+    if not args.views:
+        return ()
+    names = folder.names_in(args.source)
+    if args.views > len(names):
+        raise ValueError(f"--views {args.views}: the folder holds {len(names)} photographs; ask for at most as many")
+    return tuple(names[i] for i in _evenly(len(names), args.views))
+
+
+def _evenly(count: int, wanted: int) -> list[int]:
+    return np.linspace(0, count - 1, wanted).round().astype(int).tolist()

@@ -1,0 +1,142 @@
+"""A robot that goes from place to place: `python -m tests.bench stream castle_p30 fox --per-second 0.33`.
+
+The photographs of several scenes, one scene after the other, are replayed through the real processes, without those
+that are held out: every third. When all places are finished, each is scored on its held-out photographs, as is an
+offline run on the same photographs, and what became of every photograph is counted. While the robot moves, the delay of
+the picture behind the photographs is read from recon's heartbeat.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from splatnode.capture.status import heartbeats
+from splatnode.recon.config import Config
+from splatnode.recon.evaluate.splits import Split
+from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.result.export import read_cameras, read_gaussians
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.verdict import Code, Verdict
+from tests.bench.node.live import psnr
+from tests.support.node import Node, memory_mb, running
+
+HELD_OUT = 3  # one photograph in so many
+PATIENCE_S = 1800.0  # after the last photograph
+LOOK_S = 1.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", help="names in the folder of scenes")
+    parser.add_argument("--folder", type=Path, default=Path(os.environ.get("SPLATNODE_SHARED", "../shared")) / "scenes")
+    parser.add_argument("--per-second", type=float, default=0.33, help="photographs")
+    parser.add_argument("--no-offline", action="store_true", help="do not compare with offline runs")
+    parser.add_argument("--out", type=Path, default=Path("tests/bench/results/stream.json"))
+    args = parser.parse_args()
+    scenes = {name: load_scene(args.folder / name) for name in args.scenes}
+    splits = {name: _split(scene) for name, scene in scenes.items()}
+    with tempfile.TemporaryDirectory() as folder:
+        live, places = _streamed(Path(folder), scenes, splits, args.per_second)
+    for name, scene in scenes.items():
+        for place in places:
+            if any(each.startswith(f"{name}__") for each in place["frames_used"]):
+                place["psnr"] = psnr(place.pop("snapshot"), scene, splits[name])
+        if not args.no_offline:
+            *_, offline = reconstruct(list(scene.frames(splits[name].train)), Config(max_gaussians=300_000))
+            row = {"psnr": psnr(offline, scene, splits[name]), "gaussians": len(offline.gaussians)}
+            live.setdefault("offline", {})[name] = row | {"cameras": len(offline.cameras)}
+    for place in places:
+        place.pop("snapshot", None)
+    command = shlex.join(["python", "-m", "tests.bench", "stream", *sys.argv[1:]])
+    result = {"command": command, **live, "places": places}
+    args.out.write_text(json.dumps(result, indent=1) + "\n")
+    print(json.dumps({key: value for key, value in result.items() if key != "delays_s"}))
+
+
+def _split(scene: EvaluationScene) -> Split:
+    names = sorted(scene.paths)
+    test = names[1::HELD_OUT]
+    return Split(tuple(name for name in names if name not in test), tuple(test))
+
+
+def _streamed(
+    folder: Path, scenes: dict[str, EvaluationScene], splits: dict[str, Split], per_second: float
+) -> tuple[dict, list[dict]]:
+    """What was measured while the photographs came; the places, each with its final `snapshot` as it was exported."""
+    images = folder / "images"
+    images.mkdir()
+    names = [f"{name}__{photograph}" for name in scenes for photograph in splits[name].train]
+    for name in names:
+        scene, photograph = name.split("__", 1)
+        (images / name).symlink_to(scenes[scene].paths[photograph].resolve())
+    camera = {
+        "camera": {
+            "kind": "folder", "folder": str(images), "names": names, "frames_per_second": per_second,
+            "pace": "recorded",
+        },
+        "selection": {"every_frame": True},
+    }  # fmt: skip
+    with running(Node(folder / "node", camera)) as node:
+        pid = node.start("recon").pid
+        time.sleep(5.0)
+        node.start("capture")
+        began, delays, peak_mb = time.monotonic(), [], 0.0
+        deadline = began + len(names) / per_second + PATIENCE_S
+        taken_s = finished_s = None
+        while finished_s is None and time.monotonic() < deadline:
+            time.sleep(LOOK_S)
+            found = heartbeats(node.network)
+            capture, recon = found["capture"], found["recon"]
+            peak_mb = max(peak_mb, memory_mb(pid))
+            if recon is None:
+                continue
+            delays.append(recon["delay_s"])
+            done = capture is None or (capture["state"] == "finished" and not capture["waiting"])
+            if done and taken_s is None:
+                taken_s = time.monotonic() - began
+            if done and recon["state"] == "idle" and not recon["unfinished"] and not recon["queue"]:
+                finished_s = time.monotonic() - began
+        codes = {verb: node.end(verb) for verb in ("capture", "recon")}
+        places = json.loads((node.out / "places.json").read_text())["places"]
+        for place in places:
+            place["snapshot"] = _exported(node.out / place["folder"]) if place["folder"] else None
+    told = [name for place in places for name in place["frames_used"]]
+    dropped = {each["name"]: each["reason"] for place in places for each in place["frames_dropped"]}
+    busy = [delay for delay in delays if delay > 0]
+    row = {
+        "photographs": len(names),
+        "per_second": per_second,
+        "in_a_scene": len(set(told)),
+        "left_out_by_name": dropped,
+        "in_no_list": sorted(set(names) - set(told) - set(dropped)),
+        "taken_s": taken_s,
+        "all_finished_s": finished_s,
+        "delay_s_median": float(np.median(busy)) if busy else 0.0,
+        "delay_s_most": max(delays, default=0.0),
+        "delays_s": [round(delay, 1) for delay in delays],
+        "recon_mb_most": peak_mb,
+        "exit_codes": codes,
+        "load_average": os.getloadavg()[0],
+    }
+    return row, places
+
+
+def _exported(folder: Path) -> Snapshot | None:
+    """The scene in a result folder, with the photographs' own names."""
+    if not (folder / "scene.ply").exists():
+        return None
+    gaussians, cameras = read_gaussians(folder / "scene.ply"), read_cameras(folder / "cameras.json")
+    renamed = tuple(replace(camera, name=camera.name.split("__", 1)[1]) for camera in cameras)
+    verdict = Verdict(Code.OK, "", "", publishable=True)
+    return Snapshot(0, verdict, renamed, gaussians, images={}, dropped=(), iterations=0, seconds={}, final=True)

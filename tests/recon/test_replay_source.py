@@ -1,0 +1,93 @@
+"""What replay is given: all photographs of a small folder, keyframes of a video or of a large one."""
+
+from __future__ import annotations
+
+from argparse import Namespace
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode.capture.cameras import synthetic
+from splatnode.capture.frame import Frame
+from splatnode.capture.image_file import decode_image, encode_png
+from splatnode.recon import replay_source
+from splatnode.recon.replay_source import source
+
+WALK = synthetic.Config(views=6, width=160, height=120)
+STEPS = 36
+
+
+@pytest.fixture(scope="module")
+def walk() -> list[np.ndarray]:
+    positions = np.linspace(0, WALK.views - 1, STEPS)
+    return [
+        synthetic.photograph(WALK, synthetic._camera_on_path(WALK, float(position)), i)
+        for i, position in enumerate(positions)
+    ]
+
+
+@pytest.fixture(scope="module")
+def film(walk, tmp_path_factory):
+    file = tmp_path_factory.mktemp("film") / "walk.mp4"
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"mp4v"), 8, (WALK.width, WALK.height))
+    for image in walk:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+    writer.release()
+    return file
+
+
+def asked(source, views=None, frames=(), every_frame=False) -> Namespace:
+    return Namespace(source=source, views=views, frames=frames, every_frame=every_frame)
+
+
+def folder_of(images, folder):
+    folder.mkdir()
+    for i, image in enumerate(images):
+        (folder / f"{i:03d}.png").write_bytes(encode_png(image))
+    return folder
+
+
+def test_a_folder_of_few_photographs_is_used_whole(walk, tmp_path):
+    folder = folder_of(walk[: replay_source.ALL], tmp_path / "few")
+    given = source(asked(folder))
+    assert len(given.frames) == replay_source.ALL and given.choice is None
+    assert given.keep(tmp_path / "out") == folder and given.further_bytes == 0
+
+
+def test_of_a_large_folder_keyframes_are_chosen_unless_all_are_asked_for(walk, tmp_path):
+    folder = folder_of(walk, tmp_path / "many")
+    given = source(asked(folder))
+    assert given.choice is not None and given.choice.examined == STEPS and len(given.frames) < STEPS
+    assert given.keep(tmp_path / "out") == folder
+    assert len(source(asked(folder, every_frame=True)).frames) == STEPS
+    assert [frame.name for frame in source(asked(folder, views=2)).frames] == ["000.png", "035.png"]
+
+
+def test_keyframes_of_a_video_are_kept_beside_the_result(film, tmp_path):
+    given = source(asked(film))
+    assert 2 < len(given.frames) < STEPS and given.choice is not None
+    images = given.keep(tmp_path)
+    assert sorted(path.name for path in images.iterdir()) == [frame.name for frame in given.frames]
+    for frame in given.frames:
+        assert isinstance(frame, Frame)
+        assert np.array_equal(decode_image((images / frame.name).read_bytes())[0], frame.image)
+    assert given.further_bytes >= sum(path.stat().st_size for path in images.iterdir())
+
+
+def test_so_many_views_of_a_video_are_spread_evenly(film):
+    every, few = source(asked(film)).frames, source(asked(film, views=3)).frames
+    assert [frame.name for frame in few] == [every[i].name for i in (0, round((len(every) - 1) / 2), -1)]
+    with pytest.raises(ValueError, match=r"--views 1000: \d+ of 36 frames are keyframes .* ask for at most as many"):
+        source(asked(film, views=1000))
+
+
+def test_names_are_those_of_photographs(film):
+    with pytest.raises(ValueError, match="--frames names photographs of a folder"):
+        source(asked(film, frames=("a.png",)))
+
+
+def test_a_file_that_is_no_video_is_told(tmp_path):
+    (tmp_path / "notes.txt").write_text("not a video")
+    with pytest.raises(ValueError, match="notes.txt' is no video that can be"):
+        source(asked(tmp_path / "notes.txt"))
