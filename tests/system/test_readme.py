@@ -242,6 +242,17 @@ def test_windows_again():
     says(f"{found['wrong']} wrong, {found['refused']} refused")
 
 
+def test_stream():
+    stream = raw("stream")
+    assert stream["in_a_scene"] == stream["photographs"] == 40 and not stream["in_no_list"]
+    castle, fox = (place["psnr"] for place in stream["places"])
+    offline = stream["offline"]
+    assert abs(castle - offline["castle_p30"]["psnr"]) < 0.005
+    says(f"castle {castle:.1f} dB, as offline; fox {fox:.1f} dB, offline {offline['fox']['psnr']:.1f}")
+    says(f"all finished {stream['all_finished_s'] - stream['taken_s']:.0f} s after the last photograph")
+    says(f"{stream['delay_s_median']:.0f} s behind the camera in the median, {stream['delay_s_most']:.0f} s at most")
+
+
 def test_growth():
     rows = raw("growth")["rows"]
     assert [row["views"] for row in rows] == [3, 6, 12, 24, 48]

@@ -118,6 +118,43 @@ def test_a_place_that_was_left_is_finished_by_the_next_process(moving, peer, mon
     assert report(moving.out / "scene-0001")["iterations"] == moving.reconstruction.optimize.iterations
 
 
+def test_a_place_whose_finishing_was_killed_is_finished_by_the_next_process(config, peer, monkeypatch):
+    def die(*_):
+        raise SystemExit
+
+    frames = places(seeds=(0, 1))
+    with (
+        monkeypatch.context() as patch,
+        pytest.raises(AssertionError, match="SystemExit"),
+        running(replace(config, lost_after=3)),
+    ):
+        patch.setattr(left_places, "_last", die)
+        offer_when_three_are_shown(peer, frames)
+        wait_for(lambda: peer.server.serve(0.02) or heartbeats(config.network, 0.5)["recon"] is None, PATIENCE_S)
+    assert (config.out / "scene-0001-provisional").exists() and not (config.out / "scene-0001").exists()
+
+    with running(replace(config, lost_after=3)):
+        wait_for(lambda: not left.folders(config.checkpoint), PATIENCE_S)
+    assert [(place["state"], place["provisional"]) for place in index(config)] == [("finished", False), ("here", False)]
+
+
+def test_a_place_that_cannot_be_finished_keeps_no_other_waiting(config, peer, monkeypatch):
+    def fail(*_):
+        raise ArithmeticError("for the test")
+
+    frames = places(seeds=(0, 1))
+    monkeypatch.setattr(left_places, "_last", fail)
+    with running(replace(config, lost_after=3)):
+        offer_when_three_are_shown(peer, frames)
+        wait_for(
+            lambda: peer.server.serve(0.02) or "for the test" in heartbeats(config.network)["recon"]["problem"],
+            PATIENCE_S,
+        )
+        status = heartbeats(config.network)["recon"]
+        assert status["state"] == "idle" and status["unfinished"] == 1
+    assert report(config.out / "scene-0001-provisional")["verdict"]["provisional"]
+
+
 def test_what_comes_while_a_left_place_is_finished_is_shown_at_once(config, peer, monkeypatch):
     begun, shown = threading.Event(), threading.Event()
     last = left_places._last
