@@ -100,6 +100,11 @@ def contradicting(work: IncrementalReconstruction, pause: Pause = without_pause)
     return [keyframe for keyframe in work.aside if keyframe.name not in last] if _standing(work, pause) else []
 
 
+def newest(work: IncrementalReconstruction, count: int) -> list[Keyframe]:
+    """So many keyframes of the scene, of those whose frames came last."""
+    return sorted(work.graph.keyframes, key=lambda keyframe: keyframe.frame.frame_id)[-max(count, NEWEST) :]
+
+
 def most_redundant(graph: ViewGraph) -> str:
     """The older keyframe of the pair that has most in common, the newest ones left out."""
     old = len(graph.keyframes) - NEWEST

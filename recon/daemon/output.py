@@ -64,6 +64,8 @@ class Output:
             if snapshot.final:
                 remove_result(provisional)
             self._index.tell(described(place.scene_id, state, folder.name, snapshot, kept, place.dropped))
+            if snapshot.final:
+                self._index.link(place.scene_id)
         except OSError as error:
             self._complain(error.strerror or str(error))
             return False

@@ -8,10 +8,13 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.process.foreign import foreign
-from splatnode.recon.result.export import SceneFileError, write_file
+from splatnode.recon.daemon.links import MIN_SHARED, Link, link
+from splatnode.recon.result.export import SceneFileError, read_cameras, write_file
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.snapshot import Snapshot
@@ -76,7 +79,8 @@ def described(
 
 class _Index(msgspec.Struct, frozen=True):
     checkpoint: str  # identity of the one that the places belong to
-    places: tuple[Place, ...]
+    places: tuple[Place, ...] = ()
+    links: tuple[Link, ...] = ()  # between final scenes that share photographs
 
 
 class Places:
@@ -87,13 +91,12 @@ class Places:
 
         An index that cannot be read begins anew.
         """
-        self._path, self._checkpoint = out / FILE, checkpoint
-        self._places: dict[str, Place] = {}
+        self._path, self._index = out / FILE, _Index(checkpoint)
         try:
             with foreign(SceneFileError):
                 found = msgspec.json.decode(read_json_file(self._path), type=_Index)
             if found.checkpoint == checkpoint:
-                self._places = {place.scene_id: place for place in found.places}
+                self._index = found
         except FileNotFoundError:
             pass
         except (OSError, SceneFileError) as error:
@@ -101,13 +104,40 @@ class Places:
 
     def finished(self, scene_id: str) -> None:
         """Says that the camera has left a place whose scene is final. Raises ResultWriteError."""
-        if scene_id in self._places:
-            self.tell(msgspec.structs.replace(self._places[scene_id], state=State.FINISHED))
+        for place in (place for place in self._index.places if place.scene_id == scene_id):
+            self.tell(msgspec.structs.replace(place, state=State.FINISHED))
 
     def tell(self, place: Place) -> None:
         """Writes the index with what is known of this place now. Raises ResultWriteError."""
-        if self._places.get(place.scene_id) == place:
-            return
-        places = self._places | {place.scene_id: place}
-        write_file(self._path, json_bytes(msgspec.to_builtins(_Index(self._checkpoint, tuple(places.values())))))
-        self._places = places
+        places = {each.scene_id: each for each in self._index.places} | {place.scene_id: place}
+        self._write(msgspec.structs.replace(self._index, places=tuple(places.values())))
+
+    def link(self, scene_id: str) -> None:
+        """Writes how this final scene lies to the other final ones that share photographs with it.
+
+        Raises ResultWriteError.
+        """
+        final = {place.scene_id: place for place in self._index.places if not place.provisional and place.publishable}
+        links = [each for each in self._index.links if scene_id not in (each.scene, each.other)]
+        mine = final.pop(scene_id, None)
+        if mine is not None:
+            used = set(mine.frames_used)
+            near = [place for place in final.values() if len(used.intersection(place.frames_used)) >= MIN_SHARED]
+            pairs = [sorted((mine, other), key=lambda place: place.scene_id) for other in near]
+            found = (link(a.scene_id, b.scene_id, self._cameras(a), self._cameras(b)) for a, b in pairs)
+            links += [each for each in found if each is not None]
+        self._write(msgspec.structs.replace(self._index, links=tuple(links)))
+
+    def _cameras(self, place: Place) -> dict[str, npt.NDArray[np.float64]]:
+        """T_world_camera by the names of the photographs, as they were exported; none that cannot be read."""
+        try:
+            cameras = read_cameras(self._path.parent / (place.folder or "") / "cameras.json")
+        except (OSError, SceneFileError) as error:
+            log.warning("the cameras of %s cannot be read: %s", place.scene_id, error)
+            return {}
+        return {camera.name: camera.T_world_camera for camera in cameras}
+
+    def _write(self, index: _Index) -> None:
+        if index != self._index:
+            write_file(self._path, json_bytes(msgspec.to_builtins(index)))
+            self._index = index

@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 PATIENCE_S = 3.0  # that a thorough judgement of a keyframe that does not fit may keep others waiting
 MOST_ASIDE = 8  # keyframes that may still find their place
+SHARED_PART = 3  # of the views of a scene that is full, one in so many is in the next one, too: the newest
 
 
 class Abandoned(Exception):
@@ -166,19 +167,27 @@ class PresentPlace:
     def _begin_place(self, strangers: Sequence[Keyframe]) -> None:
         """Another scene begins with the frames that do not belong to the present one, which is finished later."""
         self.state = State.LOST
-        before, first = self._store.scene_id, strangers[0].frame.frame_id
+        before = self._leave(strangers[0].frame.frame_id, apart={keyframe.name for keyframe in strangers})
+        event(log, logging.WARNING, "another_place", before=before, now=self._store.scene_id)
+        self._work = IncrementalReconstruction(self._recipe)
+        for keyframe in strangers:
+            self._work.add(keyframe, self._unless_stopping)
+
+    def _leave(self, first: int, apart: Collection[str] = (), shared: Collection[str] = ()) -> str:
+        """Begins another scene with frame `first`; the present one, whose id is returned, is finished later.
+
+        Of the frames from `first` on, those that are `apart` do not belong to it, those that are `shared` to both.
+        """
+        before = self._store.scene_id
         if self._final == frozenset(self._work.names):
             self._output.finished(before)
             self._store.begin_place(first)
         else:
             self._output.save(self._work, final=False)
-            self._show()
-            self.export_provisionally(Place.LEFT, {keyframe.name for keyframe in strangers})
-            self._store.leave_place(first)
-        event(log, logging.WARNING, "another_place", before=before, now=self._store.scene_id)
-        self._work, self._final, self._shown = IncrementalReconstruction(self._recipe), frozenset(), None
-        for keyframe in strangers:
-            self._work.add(keyframe, self._unless_stopping)
+            self.export_provisionally(Place.LEFT, apart)
+            self._store.leave_place(first, shared)
+        self._final, self._shown = frozenset(), None
+        return before
 
     def export_provisionally(self, state: Place = Place.HERE, apart: Collection[str] = ()) -> None:
         """Writes what is shown, unless it was written as final, without the keyframes that are `apart`."""
@@ -191,8 +200,25 @@ class PresentPlace:
         else:
             self._output.tell(self._shown, state, kept)
 
+    def _go_on_with_newest(self) -> None:
+        """Begins the next scene of the same place with the newest views, which both scenes have; the first is left.
+
+        Not where the newest alone make no scene.
+        """
+        newest = membership.newest(self._work, self._config.max_views // SHARED_PART)
+        work = IncrementalReconstruction(self._recipe, self._work.known)
+        work.retract(set(self._work.names).difference(each.name for each in newest))
+        if len(work.estimate_thoroughly(self._unless_stopping).placed) < len(newest):
+            return
+        shared = {each.name for each in newest}
+        before = self._leave(min(each.frame.frame_id for each in newest), shared=shared)
+        event(log, logging.INFO, "next_scene", before=before, now=self._store.scene_id, shared=len(newest))
+        self._work = work
+
     def _make_room(self) -> None:
-        """Gives up views that can be spared, so that there are not more than configured."""
+        """Sees to it that there are not more views than configured: goes on with the newest, else gives up others."""
+        if len(self._work.names) > self._config.max_views:
+            self._go_on_with_newest()
         while len(self._work.names) > max(self._config.max_views, membership.NEWEST):
             name = membership.most_redundant(self._work.graph)
             event(log, logging.INFO, "given_up", frame=name)

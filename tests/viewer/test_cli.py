@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -82,7 +83,7 @@ def test_a_folder_that_cannot_be_costs_the_photographs_and_not_the_scene(result)
 
 
 def test_a_refused_result_says_why(tmp_path):
-    refused = snapshot(REFUSAL)
+    refused = replace(snapshot(REFUSAL), final=True)
     write_result(refused, tmp_path, build_report(refused, seed=0, preset="fast", peak_rss_mb=None))
     there = load_result(tmp_path).snapshot
     assert there.verdict == REFUSAL and not len(there.gaussians) and not there.cameras

@@ -20,7 +20,7 @@ import logging
 import re
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -179,16 +179,17 @@ class Store:
                 number = self._names[name]
                 self._leave_out({number: name}, self._keys[number], (name, reason))
 
-    def leave_place(self, first: int) -> None:
+    def leave_place(self, first: int, shared: Collection[str] = ()) -> None:
         """Begins another place as `begin_place` does, and keeps what there is of the present one. Raises OSError.
 
-        A death in between leaves the place as it was.
+        `shared` are frames from `first` on that belong to both. A death in between leaves the place as it was.
         """
         with self._writing:
-            frames = [f"frames/{FILE.format(number)}" for number in self._names.values() if number < first]
+            own = (number for name, number in self._names.items() if number < first or name in shared)
+            frames = [f"frames/{FILE.format(number)}" for number in own]
             made = [name for name in MADE_ANEW if (self.directory / name).exists()]
-            own = msgspec.structs.replace(self.ledger, next=first, gone=(), identity=None)
-            left.keep(self.directory, own, [*frames, *made], _INSTEAD)
+            ledger = msgspec.structs.replace(self.ledger, next=self._next, gone=(), identity=None)
+            left.keep(self.directory, ledger, [*frames, *made], _INSTEAD)
             self.begin_place(first)
 
     def begin_place(self, first: int) -> None:

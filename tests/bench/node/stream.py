@@ -1,9 +1,10 @@
 """A robot that goes from place to place: `python -m tests.bench stream castle_p30 fox --per-second 0.33`.
 
 The photographs of several scenes, one scene after the other, are replayed through the real processes, without those
-that are held out: every third. When all places are finished, each is scored on its held-out photographs, as is an
-offline run on the same photographs, and what became of every photograph is counted. While the robot moves, the delay of
-the picture behind the photographs is read from recon's heartbeat.
+that are held out. When all places are finished, each is scored on its held-out photographs, as is an offline run on the
+same photographs, and what became of every photograph is counted. The cameras of a place that became several scenes are
+compared with the true ones by way of the links between its scenes. While the robot moves, the delay of the picture
+behind the photographs is read from recon's heartbeat.
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ import numpy as np
 
 from splatnode.capture.status import heartbeats
 from splatnode.recon.config import Config
+from splatnode.recon.evaluate.camera_errors import camera_errors
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.geometry import Similarity
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.snapshot import Snapshot
@@ -31,7 +34,6 @@ from splatnode.recon.result.verdict import Code, Verdict
 from tests.bench.node.live import psnr
 from tests.support.node import Node, memory_mb, running
 
-HELD_OUT = 3  # one photograph in so many
 PATIENCE_S = 1800.0  # after the last photograph
 LOOK_S = 1.0
 
@@ -41,17 +43,20 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+", help="names in the folder of scenes")
     parser.add_argument("--folder", type=Path, default=Path(os.environ.get("SPLATNODE_SHARED", "../shared")) / "scenes")
     parser.add_argument("--per-second", type=float, default=0.33, help="photographs")
+    parser.add_argument("--max-views", type=int, default=30, help="of a scene; a place with more is a chain of scenes")
+    parser.add_argument("--hold-out", type=int, default=3, help="one photograph in so many; 0: none")
     parser.add_argument("--no-offline", action="store_true", help="do not compare with offline runs")
     parser.add_argument("--out", type=Path, default=Path("tests/bench/results/stream.json"))
     args = parser.parse_args()
     scenes = {name: load_scene(args.folder / name) for name in args.scenes}
-    splits = {name: _split(scene) for name, scene in scenes.items()}
+    splits = {name: _split(scene, args.hold_out) for name, scene in scenes.items()}
     with tempfile.TemporaryDirectory() as folder:
-        live, places = _streamed(Path(folder), scenes, splits, args.per_second)
+        live, places = _streamed(Path(folder), scenes, splits, args.per_second, args.max_views)
+    live["cameras"] = {name: _camera_errors(name, scene, places, live["links"]) for name, scene in scenes.items()}
     for name, scene in scenes.items():
         for place in places:
-            if any(each.startswith(f"{name}__") for each in place["frames_used"]):
-                place["psnr"] = psnr(place.pop("snapshot"), scene, splits[name])
+            if args.hold_out and place["snapshot"] is not None and _source(place) == name:
+                place["psnr"] = psnr(place["snapshot"], scene, splits[name])
         if not args.no_offline:
             *_, offline = reconstruct(list(scene.frames(splits[name].train)), Config(max_gaussians=300_000))
             row = {"psnr": psnr(offline, scene, splits[name]), "gaussians": len(offline.gaussians)}
@@ -64,14 +69,50 @@ def main() -> None:
     print(json.dumps({key: value for key, value in result.items() if key != "delays_s"}))
 
 
-def _split(scene: EvaluationScene) -> Split:
+def _camera_errors(name: str, scene: EvaluationScene, places: list[dict], links: list[dict]) -> dict | None:
+    """Of all cameras of the place, brought into the world of its first scene by the links; None where there is none."""
+    found = {place["scene_id"]: place["snapshot"] for place in places if place["snapshot"] is not None}
+    mine = [place["scene_id"] for place in places if place["scene_id"] in found and _source(place) == name]
+    if not mine:
+        return None
+    to_first = {mine[0]: Similarity(1.0, np.eye(3), np.zeros(3))}
+    for _ in links:
+        for each in links:
+            step = Similarity(each["scale"], np.array(each["rotation"]), np.array(each["translation"]))
+            if each["scene"] in to_first and each["other"] not in to_first:
+                to_first[each["other"]] = to_first[each["scene"]].after(step)
+            elif each["other"] in to_first and each["scene"] not in to_first:
+                to_first[each["scene"]] = to_first[each["other"]].after(step.inverse())
+    cameras = {
+        camera.name: (similarity.camera(camera.T_world_camera), camera)
+        for scene_id, similarity in to_first.items()
+        for camera in found[scene_id].cameras
+    }
+    true = scene.cameras
+    names = [each for each in cameras if each in true]
+    errors = camera_errors(
+        np.stack([cameras[each][0] for each in names]),
+        np.stack([true[each].T_world_camera for each in names]),
+        np.stack([cameras[each][1].K for each in names]),
+        np.stack([true[each].K_for(cameras[each][1].width, cameras[each][1].height) for each in names]),
+    )
+    told = {"rotation_deg": errors.rotation_deg, "centre_pct": errors.centre_pct}
+    return {"scenes": len(mine), "linked": len(to_first), "cameras": len(names), **told}
+
+
+def _source(place: dict) -> str:
+    """The folder that the place's photographs come from."""
+    return place["frames_used"][0].split("__", 1)[0]
+
+
+def _split(scene: EvaluationScene, hold_out: int) -> Split:
     names = sorted(scene.paths)
-    test = names[1::HELD_OUT]
+    test = names[1::hold_out] if hold_out else []
     return Split(tuple(name for name in names if name not in test), tuple(test))
 
 
 def _streamed(
-    folder: Path, scenes: dict[str, EvaluationScene], splits: dict[str, Split], per_second: float
+    folder: Path, scenes: dict[str, EvaluationScene], splits: dict[str, Split], per_second: float, max_views: int
 ) -> tuple[dict, list[dict]]:
     """What was measured while the photographs came; the places, each with its final `snapshot` as it was exported."""
     images = folder / "images"
@@ -87,7 +128,7 @@ def _streamed(
         },
         "selection": {"every_frame": True},
     }  # fmt: skip
-    with running(Node(folder / "node", camera)) as node:
+    with running(Node(folder / "node", camera, {"max_views": max_views})) as node:
         pid = node.start("recon").pid
         time.sleep(5.0)
         node.start("capture")
@@ -108,7 +149,8 @@ def _streamed(
             if done and recon["state"] == "idle" and not recon["unfinished"] and not recon["queue"]:
                 finished_s = time.monotonic() - began
         codes = {verb: node.end(verb) for verb in ("capture", "recon")}
-        places = json.loads((node.out / "places.json").read_text())["places"]
+        index = json.loads((node.out / "places.json").read_text())
+        places = index["places"]
         for place in places:
             place["snapshot"] = _exported(node.out / place["folder"]) if place["folder"] else None
     told = [name for place in places for name in place["frames_used"]]
@@ -126,6 +168,7 @@ def _streamed(
         "delay_s_most": max(delays, default=0.0),
         "delays_s": [round(delay, 1) for delay in delays],
         "recon_mb_most": peak_mb,
+        "links": index["links"],
         "exit_codes": codes,
         "load_average": os.getloadavg()[0],
     }

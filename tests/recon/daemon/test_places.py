@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 import time
 
@@ -199,6 +200,39 @@ def test_room_is_made_only_for_what_fits(moving, peer):
         wait_for(lambda: peer.server.serve(0.02) or heartbeats(moving.network)["recon"]["state"] == "lost", PATIENCE_S)
     (place,) = index(moving)
     assert place["frames_used"] == [frame.name for frame in ours]
+
+
+def test_a_scene_that_is_full_goes_on_as_the_next_one_and_both_are_linked(config, peer):
+    frames = photographs()
+    with running(replace(config, max_views=4)):
+        for count, frame in enumerate(frames, 1):
+            peer.server.offer(frame)
+            if count >= 3:
+                peer.wait(
+                    lambda scene, frame=frame: frame.name in {each.name for each in scene.snapshot.cameras}, frame.name
+                )
+        peer.wait_for_acknowledgements()
+        wait_for(lambda: not left.folders(config.checkpoint) and final(config) == 2, PATIENCE_S)
+    first, second = index(config)
+    names = [frame.name for frame in frames]
+    assert set(first["frames_used"]) | set(second["frames_used"]) == set(names)
+    assert not first["frames_dropped"] and not second["frames_dropped"]
+    (link,) = json.loads((config.out / "places.json").read_text())["links"]
+    assert (link["scene"], link["other"]) == ("scene-0001", "scene-0002")
+    assert set(link["shared"]) == set(first["frames_used"]) & set(second["frames_used"]) and len(link["shared"]) >= 3
+    assert link["rotation_deg"] < 0.5 and link["centre_percent"] < 3
+    cameras = {
+        each: {camera.name: camera.T_world_camera[:3, 3] for camera in read_cameras(config.out / each / "cameras.json")}
+        for each in ("scene-0001", "scene-0002")
+    }
+    for name in link["shared"]:
+        there = link["scale"] * np.array(link["rotation"]) @ cameras["scene-0002"][name] + link["translation"]
+        np.testing.assert_allclose(there, cameras["scene-0001"][name], atol=0.02)
+
+
+def final(config) -> int:
+    """How many places are told to be final."""
+    return sum(not place["provisional"] for place in index(config)) if (config.out / "places.json").exists() else 0
 
 
 def test_an_index_of_another_checkpoint_or_a_damaged_one_begins_anew(tmp_path):
