@@ -253,6 +253,15 @@ def test_stream():
     says(f"{stream['delay_s_median']:.0f} s behind the camera in the median, {stream['delay_s_most']:.0f} s at most")
 
 
+def test_stream_of_a_chain():
+    chain = raw("stream_chain")
+    assert chain["in_a_scene"] == chain["photographs"] == 30 and len(chain["places"]) == 3
+    cameras = chain["cameras"]["castle_p30"]
+    assert cameras["linked"] == 3 and cameras["cameras"] == 30
+    says(f"within {cameras['rotation_deg']:.2f} degrees and {cameras['centre_pct']:.2f} % of the true ones")
+    says(f"{chain['delay_s_median']:.1f} s behind the camera in the median, {chain['delay_s_most']:.1f} s at most")
+
+
 def test_growth():
     rows = raw("growth")["rows"]
     assert [row["views"] for row in rows] == [3, 6, 12, 24, 48]
