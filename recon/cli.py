@@ -62,7 +62,7 @@ def replay(args: argparse.Namespace) -> int:
     ):
         snapshot = run(given.frames, with_looks(config, LOOK_EVERY) if args.view else config, show)
         snapshot = in_metres(snapshot, config.metric)
-        told = {"photographs": str(given.keep(args.out).resolve())}
+        told: dict[str, object] = {"photographs": str(given.keep(args.out).resolve())}
         if given.choice is not None:
             told["selection"] = given.choice.record()
         report = finish(snapshot, args.out, seed=config.seed, preset_name=args.preset or "balanced", **told)
