@@ -17,6 +17,7 @@ from torch import Tensor
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.config import read_yaml
+from splatnode.capture.process.printable import printable_name
 from splatnode.capture.process.terminal import say
 from splatnode.recon.config import Config, overlaid, preset
 from splatnode.recon.evaluate import methods
@@ -51,6 +52,8 @@ def replay(args: argparse.Namespace) -> int:
     """Reconstructs a folder of photographs, or a video."""
     config = _config(args)
     _check_apart(args.out, args.source)
+    if args.source.is_file() and not args.json:
+        say(f"choosing keyframes of {printable_name(args.source.name)}")
     given = source(args)
     if given.choice is not None and not args.json:
         say(str(given.choice))
