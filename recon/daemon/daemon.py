@@ -175,6 +175,11 @@ class Daemon:
         if isinstance(command, Seen):
             self._problems.seen()
             return Answer(True, "the problems are not told again")
+        if command.name not in self._store.names and (scene_id := self._worker.scene_of(command.name)):
+            text = (
+                f"{command.name} is of {scene_id}, which the camera has left: only keyframes of {self._store.scene_id}"
+            )
+            return Answer(False, printable(f"{text} can be taken back"))
         if command.name not in self._store.names:
             known = ", ".join(sorted(self._store.names)) or "none yet"
             return Answer(False, printable(f"no keyframe {command.name!r}; there are: {known}"))

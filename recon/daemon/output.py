@@ -78,6 +78,10 @@ class Output:
         place = self._store
         self._write(lambda: self._index.tell(described(place.scene_id, state, None, snapshot, kept, place.dropped)))
 
+    def scene_of(self, name: str) -> str | None:
+        """The id of the scene, of any place, that has a camera of this photograph."""
+        return self._index.scene_of(name)
+
     def finished(self, scene_id: str) -> None:
         """Writes into the index that the camera has left a place whose scene is final."""
         self._write(lambda: self._index.finished(scene_id))

@@ -102,6 +102,10 @@ class Places:
         except (OSError, SceneFileError) as error:
             log.warning("the index of places begins anew: %s", error)
 
+    def scene_of(self, name: str) -> str | None:
+        """The id of the first scene that has a camera of this photograph; None: no scene has."""
+        return next((place.scene_id for place in self._index.places if name in place.frames_used), None)
+
     def finished(self, scene_id: str) -> None:
         """Says that the camera has left a place whose scene is final. Raises ResultWriteError."""
         for place in (place for place in self._index.places if place.scene_id == scene_id):

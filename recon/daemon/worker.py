@@ -38,9 +38,9 @@ class Worker:
         limit = min(config.max_gaussians, config.reconstruction.max_gaussians or config.max_gaussians)
         self._recipe = msgspec.structs.replace(config.reconstruction, max_gaussians=limit, budget_s=None)
         self._config, self._store, self._inbox, self._stopping = config, store, inbox, stopping
-        output = Output(config, store, publish, self._complain)
-        self.place = PresentPlace(config, self._recipe, store, output, self._pause)
-        self._left = LeftPlaces(store.directory, self._recipe, output)
+        self._output = Output(config, store, publish, self._complain)
+        self.place = PresentPlace(config, self._recipe, store, self._output, self._pause)
+        self._left = LeftPlaces(store.directory, self._recipe, self._output)
         self._quiet_since_s = time.monotonic()  # when what came last was worked in
         self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory; monotonic
         self.problem = ""
@@ -50,6 +50,10 @@ class Worker:
     def unfinished(self) -> int:
         """Places that the camera has left and whose scenes are not final yet."""
         return self._left.unfinished
+
+    def scene_of(self, name: str) -> str | None:
+        """The id of the scene, of any place, that has a camera of this photograph; None: no scene has."""
+        return self._output.scene_of(name)
 
     @property
     def delay(self) -> tuple[float, str]:

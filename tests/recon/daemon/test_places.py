@@ -12,9 +12,12 @@ import pytest
 from msgspec.structs import replace
 
 from splatnode.capture.frame import DroppedFrame, renamed
+from splatnode.capture.messaging.commands import Answer, ask
+from splatnode.capture.messaging.services import RECON_CONTROL
 from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon import left_places
 from splatnode.recon.daemon.checkpoint import left
+from splatnode.recon.daemon.control import Retract
 from splatnode.recon.daemon.inbox import BATCH, Arrived, Inbox
 from splatnode.recon.daemon.left_places import LeftPlaces
 from splatnode.recon.daemon.places import Places, State, described
@@ -90,6 +93,8 @@ def test_a_place_that_was_left_is_finished_while_the_camera_rests_in_another(con
         wait_for(lambda: heartbeats(config.network)["recon"]["unfinished"] == 0, PATIENCE_S)
         status = heartbeats(config.network)["recon"]
         assert status["delay_s"] == 0 and status["delay"] == ""
+        answer = ask(RECON_CONTROL, config.network, Retract(frames[0].name), Answer)
+        assert not answer.done and f"{frames[0].name} is of scene-0001, which the camera has left" in answer.message
     first, second = index(config)
     assert (first["scene_id"], first["state"], first["folder"]) == ("scene-0001", "finished", "scene-0001")
     assert (second["scene_id"], second["state"]) == ("scene-0002", "here")
