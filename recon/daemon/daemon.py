@@ -176,10 +176,8 @@ class Daemon:
             self._problems.seen()
             return Answer(True, "the problems are not told again")
         if command.name not in self._store.names and (scene_id := self._worker.scene_of(command.name)):
-            text = (
-                f"{command.name} is of {scene_id}, which the camera has left: only keyframes of {self._store.scene_id}"
-            )
-            return Answer(False, printable(f"{text} can be taken back"))
+            present = f"only keyframes of {self._store.scene_id} can be taken back"
+            return Answer(False, printable(f"{command.name} is of {scene_id}, which the camera has left: {present}"))
         if command.name not in self._store.names:
             known = ", ".join(sorted(self._store.names)) or "none yet"
             return Answer(False, printable(f"no keyframe {command.name!r}; there are: {known}"))
