@@ -259,7 +259,9 @@ def test_fast_stream():
     castle, fox = (fast["cameras"][name] for name in ("castle_p30", "fox"))
     says(f"cameras within {castle['rotation_deg']:.2f} degrees and {castle['centre_pct']:.2f} % of the true ones")
     says(f"in castle, {fox['rotation_deg']:.2f} and {fox['centre_pct']:.2f} in fox")
-    says(f"picture {fast['delay_s_median']:.0f} s behind the camera in the median, {fast['delay_s_most']:.0f} s at most")
+    says(
+        f"picture {fast['delay_s_median']:.0f} s behind the camera in the median, {fast['delay_s_most']:.0f} s at most"
+    )
     says(f"all finished {fast['all_finished_s'] - fast['taken_s']:.0f} s after the last photograph")
     says(f"recon's memory at most {fast['recon_mb_most'] / 1e3:.2f} GB")
 
