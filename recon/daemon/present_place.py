@@ -167,34 +167,38 @@ class PresentPlace:
     def _begin_place(self, strangers: Sequence[Keyframe]) -> None:
         """Another scene begins with the frames that do not belong to the present one, which is finished later."""
         self.state = State.LOST
-        before = self._leave(strangers[0].frame.frame_id, apart={keyframe.name for keyframe in strangers})
+        before = self._leave(strangers[0].frame.frame_id)
         event(log, logging.WARNING, "another_place", before=before, now=self._store.scene_id)
         self._work = IncrementalReconstruction(self._recipe)
         for keyframe in strangers:
             self._work.add(keyframe, self._unless_stopping)
 
-    def _leave(self, first: int, apart: Collection[str] = (), shared: Collection[str] = ()) -> str:
+    def _leave(self, first: int, shared: Collection[str] = ()) -> str:
         """Begins another scene with frame `first`; the present one, whose id is returned, is finished later.
 
-        Of the frames from `first` on, those that are `apart` do not belong to it, those that are `shared` to both.
+        The frames before it belong to the present scene alone, those that are `shared` to both.
         """
-        before = self._store.scene_id
-        if self._final == frozenset(self._work.names):
+        before, kept = self._store.scene_id, self._store.names_before(first).union(shared)
+        if self._final == kept:
             self._output.finished(before)
             self._store.begin_place(first)
         else:
             self._output.save(self._work, final=False)
-            self.export_provisionally(Place.LEFT, apart)
+            self._export_provisionally(Place.LEFT, kept)
             self._store.leave_place(first, shared)
         self._final, self._shown = frozenset(), None
         return before
 
-    def export_provisionally(self, state: Place = Place.HERE, apart: Collection[str] = ()) -> None:
-        """Writes what is shown, unless it was written as final, without the keyframes that are `apart`."""
+    def export_provisionally(self) -> None:
+        """Writes what is shown, unless it was written as final."""
+        self._export_provisionally(Place.HERE, self._store.names)
+
+    def _export_provisionally(self, state: Place, names: Collection[str]) -> None:
+        """`names` are those of the place's keyframes."""
         self._exported_s = time.monotonic()
         if self._shown is None or self._shown.final:
             return
-        kept = sorted(self._store.names.difference(apart))
+        kept = sorted(names)
         if self._shown.verdict.publishable:
             self._output.export(self._shown, self._store, state, kept)
         else:

@@ -70,10 +70,10 @@ class Worker:
         if found is not None:
             self._guarded(lambda: self.place.go_on(found))
         while not self._stopping.is_set():
-            idle = self.place.settled or time.monotonic() < self._not_before_s
-            if not self._turn(min(IDLE_S, self._config.settle_s)) and idle:
+            worked = self._turn(min(IDLE_S, self._config.settle_s))
+            if not worked and self.place.settled and time.monotonic() >= self._not_before_s:
                 self._guarded(lambda: self._left.finish_next(self._meanwhile), present=False)
-        self.place.export_provisionally()
+        self._guarded(self.place.export_provisionally)
 
     def _turn(self, wait_s: float) -> bool:
         """Works in what has come, or makes the scene better if it is time; False where there was nothing to do."""

@@ -119,6 +119,10 @@ class Store:
         """Of the frames that are stored."""
         return set(self._names)
 
+    def names_before(self, number: int) -> set[str]:
+        """Of the stored frames that came before frame `number`."""
+        return {name for name, each in self._names.items() if each < number}
+
     @property
     def dropped(self) -> list[DroppedFrame]:
         return [DroppedFrame(*entry) for entry in self.ledger.dropped]

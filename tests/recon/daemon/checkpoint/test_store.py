@@ -253,6 +253,7 @@ def test_a_place_that_is_left_is_kept_as_a_checkpoint_of_its_own(open_store):
     for sequence in range(4):
         store.put(received(sequence))
     store.forget("1.png", "blurred")
+    assert store.names_before(2) == {"0.png"} and store.names_before(3) == {"0.png", "2.png"}
     store.save("graph", Ledger(), [])
     store.leave_place(2)
     assert store.scene_id == "scene-0002" and store.names == {"2.png", "3.png"} and not store.dropped
