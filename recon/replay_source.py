@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,7 +68,7 @@ def source(args: argparse.Namespace) -> Source:
     return _chosen(args, folder.stream(folder.Config(folder=args.source)), args.source)
 
 
-def _chosen(args: argparse.Namespace, stream, photographs: Path | None) -> Source:
+def _chosen(args: argparse.Namespace, stream: Iterable[Frame | DroppedFrame], photographs: Path | None) -> Source:
     """The keyframes of a stream; with --views N so many, evenly spread."""
     config = Config(per_second=1e9) if photographs else Config()  # photographs were not taken at any rate
     config = msgspec.structs.replace(config, every_frame=args.every_frame)
