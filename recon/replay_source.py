@@ -58,6 +58,8 @@ def source(args: argparse.Namespace) -> Source:
 
     Raises FileNotFoundError and ValueError where there is nothing that can be used.
     """
+    if not args.source.exists():
+        raise FileNotFoundError(f"{str(args.source)!r} is not there; give a folder that holds photographs, or a video")
     if args.source.is_file():
         if args.frames:
             raise ValueError("--frames names photographs of a folder; of a video, give --views N or nothing")

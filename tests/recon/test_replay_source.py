@@ -91,3 +91,5 @@ def test_a_file_that_is_no_video_is_told(tmp_path):
     (tmp_path / "notes.txt").write_text("not a video")
     with pytest.raises(ValueError, match="notes.txt' is no video that can be"):
         source(asked(tmp_path / "notes.txt"))
+    with pytest.raises(FileNotFoundError, match="nothing.mp4' is not there; give a folder .* or a video"):
+        source(asked(tmp_path / "nothing.mp4"))
