@@ -266,6 +266,15 @@ def test_fast_stream():
     says(f"recon's memory at most {fast['recon_mb_most'] / 1e3:.2f} GB")
 
 
+def test_stream_of_five_places():
+    five = raw("stream_five")
+    assert (five["photographs"], five["in_a_scene"], len(five["in_no_list"])) == (74, 72, 2)
+    assert [cameras["scenes"] for cameras in five["cameras"].values()] == [1] * 5 == [1] * len(five["places"])
+    rotation, centre = (max(each[what] for each in five["cameras"].values()) for what in ("rotation_deg", "centre_pct"))
+    says(f"cameras within {rotation:.2f} degrees and {centre:.2f} % of the true ones")
+    says(f"{five['delay_s_median']:.0f} s behind the camera in the median, {five['delay_s_most']:.0f} s at most")
+
+
 def test_stream_of_a_chain():
     chain = raw("stream_chain")
     assert chain["in_a_scene"] == chain["photographs"] == 30 and len(chain["places"]) == 3
