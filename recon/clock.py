@@ -26,8 +26,7 @@ class Clock:
 
     def resume(self) -> None:
         """Goes on as if no time had passed since the last lap: the work lay by."""
-        gap = time.monotonic() - self.last
-        self.started, self.last = self.started + gap, self.last + gap
+        self.leave_out(time.monotonic() - self.last)
 
     def leave_out(self, seconds: float) -> None:
         """Goes on as if these seconds since the last lap had not passed: other work was done."""

@@ -79,8 +79,8 @@ def refined(
     give_back_memory()
     for later in refinement.refine(scene, steps, seed=config.seed, deadline=deadline, max_gaussians=limit):
         verdict = None
-        give_back_memory()
         if later.losses or later.iterations in config.optimize.checkpoints:
+            give_back_memory()
             watching, verdict = examine(watching, later)
         if verdict is not None:
             best = shown(watching.best.on(_PROCESSOR), config).scene if verdict.publishable else None

@@ -1,19 +1,39 @@
-"""The end of a place's reconstruction: all evidence is weighed, and the scene is made afresh and refined."""
+"""What is done alike for the place where the camera is, and for one that it has left.
+
+Keyframes are screened; in the end all evidence is weighed, and the scene is made afresh and refined.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import logging
+from collections.abc import Callable, Iterable, Iterator
 
 import msgspec
 
+from splatnode.capture.process.logs import event
 from splatnode.recon.config import Config
 from splatnode.recon.daemon import membership
+from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.incremental import IncrementalReconstruction, Pause
 from splatnode.recon.modelling import Shown
+
+log = logging.getLogger(__name__)
 
 STEP = 10  # iterations between pauses
 
 Forget = Callable[[str, str], None]  # a keyframe's name, and why
+
+
+def screened(work: IncrementalReconstruction, keyframes: Iterable[Keyframe], forget: Forget) -> list[Keyframe]:
+    """Those of the keyframes that show something new, and sharply; what does not is forgotten."""
+    kept: list[Keyframe] = []
+    for keyframe in keyframes:
+        gone = {each.name: each.reason for each in work.screen(keyframe.frame)}
+        kept = [each for each in (*kept, keyframe) if each.name not in gone]
+        for name, reason in gone.items():
+            event(log, logging.INFO, "left_out", frame=name, reason=reason)
+            forget(name, reason)
+    return kept
 
 
 def judge(work: IncrementalReconstruction, forget: Forget, pause: Pause) -> None:
@@ -24,9 +44,9 @@ def judge(work: IncrementalReconstruction, forget: Forget, pause: Pause) -> None
 
 
 def refine(work: IncrementalReconstruction, config: Config, pause: Pause) -> Iterator[Shown]:
-    """The scene of all keyframes every STEP iterations, and at the end; it is not shown yet. None where it is refused.
+    """The scene of all keyframes every STEP iterations, and at the end; it is not shown yet.
 
-    `pause` is called in between, and may raise to abandon the work.
+    Yields nothing where the verdict forbids a scene. `pause` is called in between, and may raise to abandon the work.
     """
     steps = msgspec.structs.replace(config.optimize, checkpoints=tuple(range(STEP, config.optimize.iterations, STEP)))
     work.rebuild(pause)

@@ -36,6 +36,10 @@ def _nothing() -> None:
     """Nobody waits for the one that puts."""
 
 
+def _both_arrived(one: Event, other: Event) -> bool:
+    return isinstance(one, Arrived) and isinstance(other, Arrived)
+
+
 class Inbox:
     def __init__(self) -> None:
         self._events: deque[Event] = deque()
@@ -64,9 +68,7 @@ class Inbox:
         with self._changed:
             self._changed.wait_for(lambda: self._events, timeout_s)
             events = [self._events.popleft()] if self._events else []
-            while events and self._events and all(isinstance(each, Arrived) for each in (events[0], self._events[0])):
-                if len(events) == BATCH:
-                    break
+            while self._events and 0 < len(events) < BATCH and _both_arrived(events[0], self._events[0]):
                 events.append(self._events.popleft())
             self._changed.notify_all()
             return events

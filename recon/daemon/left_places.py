@@ -68,12 +68,8 @@ class LeftPlaces:
             store.forget(name, reason)
             work.retract([name])
 
-        for keyframe in found.new:  # that came shortly before the place was left
-            gone = work.screen(keyframe.frame)
-            for each in gone:
-                forget(each.name, each.reason)
-            if keyframe.name not in {each.name for each in gone}:
-                work.add(keyframe, pause)
+        for keyframe in finishing.screened(work, found.new, forget):  # that came shortly before the place was left
+            work.add(keyframe, pause)
         finishing.judge(work, forget, pause)
         for keyframe in work.aside:
             forget(keyframe.name, "it does not fit the scene")

@@ -11,13 +11,12 @@ from functools import partial
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.memory_shortage import is_shortage
 from splatnode.recon.config import Config as Recipe
-from splatnode.recon.daemon import finishing, membership
+from splatnode.recon.daemon import finishing, membership, places
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
 from splatnode.recon.daemon.inbox import Arrived
 from splatnode.recon.daemon.output import Output
-from splatnode.recon.daemon.places import State as Place
 from splatnode.recon.daemon.status import State
 from splatnode.recon.daemon.watcher import Finished
 from splatnode.recon.frames.keyframe import Keyframe
@@ -74,7 +73,7 @@ class PresentPlace:
         self.state, self.settled, self.finished = State.GROWING, False, None
         arrived = self.owed = self.under_way = self._with_those_before(arrived)
         try:
-            keyframes = self._screened([each.keyframe for each in arrived])
+            keyframes = finishing.screened(self._work, (each.keyframe for each in arrived), self._forget)
             strangers = self._added(keyframes)
             self.owed = []
             if not strangers or len(strangers) < len(keyframes):
@@ -107,17 +106,6 @@ class PresentPlace:
         self._output.save(self._work, final=False)
         if time.monotonic() - self._exported_s >= self._config.export_every_s:
             self.export_provisionally()
-
-    def _screened(self, keyframes: Sequence[Keyframe]) -> list[Keyframe]:
-        """Those of the keyframes that show something new, and sharply; what does not is given up."""
-        kept = []
-        for keyframe in keyframes:
-            gone = {each.name: each.reason for each in self._work.screen(keyframe.frame)}
-            kept = [each for each in (*kept, keyframe) if each.name not in gone]
-            for name, reason in gone.items():
-                event(log, logging.INFO, "left_out", frame=name, reason=reason)
-                self._forget(name, reason)
-        return kept
 
     def _added(self, keyframes: list[Keyframe]) -> set[str]:
         """Adds keyframes to the view graph; names those that do not fit at once, which are set aside."""
@@ -184,16 +172,16 @@ class PresentPlace:
             self._store.begin_place(first)
         else:
             self._output.save(self._work, final=False)
-            self._export_provisionally(Place.LEFT, kept)
+            self._export_provisionally(places.State.LEFT, kept)
             self._store.leave_place(first, shared)
         self._final, self._shown = frozenset(), None
         return before
 
     def export_provisionally(self) -> None:
         """Writes what is shown, unless it was written as final."""
-        self._export_provisionally(Place.HERE, self._store.names)
+        self._export_provisionally(places.State.HERE, self._store.names)
 
-    def _export_provisionally(self, state: Place, names: Collection[str]) -> None:
+    def _export_provisionally(self, state: places.State, names: Collection[str]) -> None:
         """`names` are those of the place's keyframes."""
         self._exported_s = time.monotonic()
         if self._shown is None or self._shown.final:
@@ -258,11 +246,11 @@ class PresentPlace:
         shown = self._work.scene is not None
         snapshot, kept = self._show(final=shown), sorted(self._store.names)
         if shown:
-            exported = self._output.export(snapshot, self._store, Place.HERE, kept)
+            exported = self._output.export(snapshot, self._store, places.State.HERE, kept)
             self._output.save(self._work, final=exported)  # what is kept as final is not exported after a restart
             self._final = frozenset(self._work.names) if exported else frozenset()
         else:
-            self._output.tell(snapshot, Place.HERE, kept)
+            self._output.tell(snapshot, places.State.HERE, kept)
         self.state = State.WAITING if not shown else State.LOST if self._strangers() else State.IDLE
 
     def _pause(self) -> None:

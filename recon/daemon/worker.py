@@ -58,8 +58,8 @@ class Worker:
     @property
     def delay(self) -> tuple[float, str]:
         """How long the oldest keyframe has waited that no scene shows yet, seconds, and what it waits for."""
-        under_way, waiting, oldest_s = list(self.place.under_way), len(self._inbox), self._inbox.oldest_s
-        oldest_s = under_way[0].at_s if under_way else oldest_s
+        under_way, waiting = list(self.place.under_way), len(self._inbox)
+        oldest_s = under_way[0].at_s if under_way else self._inbox.oldest_s
         if oldest_s is None:
             return 0.0, ""
         return time.monotonic() - oldest_s, f"{len(under_way)} keyframes are being worked in, {waiting} wait"

@@ -33,6 +33,11 @@ class Ledger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     dropped: tuple[tuple[str, str], ...] = ()  # name and reason, newest last
     identity: SessionId | None = None  # of this checkpoint, for whoever sends keyframes to it
 
+    @property
+    def scene_id(self) -> str:
+        """Of the present place's scene."""
+        return f"scene-{self.place:04d}"
+
 
 def read_ledger(directory: Path) -> Ledger:
     """An empty one where there is none yet. Raises CheckpointError."""

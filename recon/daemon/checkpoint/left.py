@@ -23,7 +23,7 @@ def keep(directory: Path, ledger: Ledger, files: Iterable[str], instead: str) ->
 
     `files` are relative paths. Raises OSError, and NotPrivate, which names what to set `instead`.
     """
-    folder = directory / LEFT / f"scene-{ledger.place:04d}"
+    folder = directory / LEFT / ledger.scene_id
     remove(folder)
     for each in (folder.parent, folder, folder / "frames"):
         private_folder(each, instead, ours=True)

@@ -107,7 +107,7 @@ class Store:
 
     @property
     def scene_id(self) -> str:
-        return f"scene-{self.ledger.place:04d}"
+        return self.ledger.scene_id
 
     @property
     def identity(self) -> str:

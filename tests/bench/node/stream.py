@@ -161,7 +161,7 @@ def _streamed(
         "per_second": per_second,
         "in_a_scene": len(set(told)),
         "left_out_by_name": dropped,
-        "in_no_list": sorted(set(names) - set(told) - set(dropped)),
+        "in_no_list": sorted(set(names) - set(told) - set(dropped)),  # what capture left out is among them
         "taken_s": taken_s,
         "all_finished_s": finished_s,
         "delay_s_median": float(np.median(busy)) if busy else 0.0,
