@@ -10,6 +10,7 @@ from pathlib import Path
 from splatnode.capture.process.logs import event
 from splatnode.recon.config import Config
 from splatnode.recon.daemon import finishing, places
+from splatnode.recon.daemon.atlas.atlas import Atlas
 from splatnode.recon.daemon.checkpoint import checkpoint, left
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.output import Output
@@ -22,9 +23,9 @@ AGAIN_S = 300.0  # after a place could not be finished
 
 
 class LeftPlaces:
-    def __init__(self, directory: Path, config: Config, output: Output) -> None:
+    def __init__(self, directory: Path, config: Config, output: Output, atlas: Atlas) -> None:
         """`directory` is that of the checkpoint which has left/ in it, `config` how scenes are made."""
-        self._directory, self._config, self._output = directory, config, output
+        self._directory, self._config, self._output, self._atlas = directory, config, output, atlas
         self._work: IncrementalReconstruction | None = None  # that is being finished
         self._not_before_s: dict[Path, float] = {}  # monotonic, for those that could not be finished
 
@@ -51,18 +52,44 @@ class LeftPlaces:
         self._not_before_s[folder] = now + AGAIN_S
         try:
             with contextlib.closing(Store(folder)) as store:
-                finished = self._finish(store, pause)
+                found = checkpoint.restore(store, self._config)
+                self._work = found.work
+                finished = self._finished(store, found, pause)
+                if finished:
+                    self._keep(store, found.work, pause)
+        except OSError as error:
+            self._output.complain(
+                f"{folder.name} cannot be finished ({error.strerror or error}): make room on the disk"
+            )
+            return False
         finally:
             self._work = None
         if finished:
-            left.remove(folder)
             del self._not_before_s[folder]
         return True
 
-    def _finish(self, store: Store, pause: Pause) -> bool:
+    def _finished(self, store: Store, found: checkpoint.Restored, pause: Pause) -> bool:
+        """Whether the scene of the place is final now, and its result written."""
+        if found.final and not found.new:  # as it was when the place was left
+            self._output.finished(store.scene_id)
+            return True
         event(log, logging.INFO, "finishing", scene=store.scene_id)
-        found = checkpoint.restore(store, self._config)
-        work = self._work = found.work
+        exported = self._finish(store, found, pause)
+        if exported:
+            self._output.save_in(store, found.work, final=True)
+        return exported
+
+    def _keep(self, store: Store, work: IncrementalReconstruction, pause: Pause) -> None:
+        """Compares the scene with those before it, and takes it among them; one that is refused is of no use later."""
+        if work.scene is None:
+            left.remove(store.directory)
+            return
+        self._atlas.compare(store.scene_id, work.graph, pause)
+        self._atlas.keep(store, work.graph)
+        store.finish()
+
+    def _finish(self, store: Store, found: checkpoint.Restored, pause: Pause) -> bool:
+        work = found.work
 
         def forget(name: str, reason: str) -> None:
             store.forget(name, reason)

@@ -10,7 +10,7 @@ from splatnode.capture.process.logs import event
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
-from splatnode.recon.daemon.places import Places, State, described
+from splatnode.recon.daemon.places import Place, Places, State, described
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.metric import in_metres
 from splatnode.recon.result import bounds_in_words
@@ -36,18 +36,22 @@ class Output:
         self, config: Config, store: Store, publish: Callable[[Published], None], complain: Callable[[str], None]
     ) -> None:
         """`complain` is called where the disk is full: that costs a result, or time after a restart; no keyframe."""
-        self._config, self._store, self._publish, self._complain = config, store, publish, complain
-        self._index = Places(config.out, store.identity)
+        self._config, self._store, self._publish, self.complain = config, store, publish, complain
+        self.places = Places(config.out, store.identity)
 
     def publish(self, snapshot: Snapshot) -> None:
         self._publish(Published(snapshot, self._store.scene_id))
 
     def save(self, work: IncrementalReconstruction, final: bool) -> None:
         """Writes the checkpoint's files that a restart would else have to compute again."""
+        self.save_in(self._store, work, final)
+
+    def save_in(self, place: Store, work: IncrementalReconstruction, final: bool) -> None:
+        """Writes those of the checkpoint of a place that was left."""
         try:
-            checkpoint.save(self._store, work, final)
+            checkpoint.save(place, work, final)
         except OSError as error:
-            self._complain(f"the scene cannot be saved ({error.strerror}): make room on the disk")
+            self.complain(f"the scene cannot be saved ({error.strerror}): make room on the disk")
 
     def export(self, snapshot: Snapshot, place: Store, state: State, kept: Sequence[str]) -> bool:
         """Writes the place's result folder, all of it or nothing; returns whether it was written.
@@ -63,11 +67,11 @@ class Output:
             finish(measured, folder, seed=recipe.seed, preset_name="live")
             if snapshot.final:
                 remove_result(provisional)
-            self._index.tell(described(place.scene_id, state, folder.name, snapshot, kept, place.dropped))
+            self.places.tell(_described(place, state, folder.name, snapshot, kept))
             if snapshot.final:
-                self._index.link(place.scene_id)
+                self.places.link(place.scene_id)
         except OSError as error:
-            self._complain(error.strerror or str(error))
+            self.complain(error.strerror or str(error))
             return False
         known = bounds_in_words.of_cameras(measured.cameras, measured.scale)
         event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians), bounds=known)
@@ -75,19 +79,23 @@ class Output:
 
     def tell(self, snapshot: Snapshot, state: State, kept: Sequence[str]) -> None:
         """Writes into the index what is known of the present place, which has no result in a folder."""
-        place = self._store
-        self._write(lambda: self._index.tell(described(place.scene_id, state, None, snapshot, kept, place.dropped)))
+        self._write(lambda: self.places.tell(_described(self._store, state, None, snapshot, kept)))
 
     def scene_of(self, name: str) -> str | None:
         """The id of the scene, of any place, that has a camera of this photograph."""
-        return self._index.scene_of(name)
+        return self.places.scene_of(name)
 
     def finished(self, scene_id: str) -> None:
         """Writes into the index that the camera has left a place whose scene is final."""
-        self._write(lambda: self._index.finished(scene_id))
+        self._write(lambda: self.places.finished(scene_id))
 
     def _write(self, write: Callable[[], None]) -> None:
         try:
             write()
         except OSError as error:
-            self._complain(error.strerror or str(error))
+            self.complain(error.strerror or str(error))
+
+
+def _described(place: Store, state: State, folder: str | None, snapshot: Snapshot, kept: Sequence[str]) -> Place:
+    ledger = place.ledger
+    return described(place.scene_id, state, folder, snapshot, kept, place.dropped, ledger.follows, ledger.shared)

@@ -13,7 +13,9 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.process.foreign import foreign
-from splatnode.recon.daemon.links import MIN_SHARED, Link, link
+from splatnode.recon.daemon.atlas.bridge import Bridge
+from splatnode.recon.daemon.atlas.links import Kind, Link, bridged, link
+from splatnode.recon.daemon.atlas.pose_graph import Pose, optimised
 from splatnode.recon.result.export import SceneFileError, read_cameras, write_file
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.staged import json_bytes
@@ -48,6 +50,8 @@ class Place(msgspec.Struct, frozen=True):
     num_gaussians: int
     frames_used: tuple[str, ...]  # that have a camera in the scene
     frames_dropped: tuple[Dropped, ...]  # all others that were taken there, and why they have none
+    follows: str = ""  # the scene that it goes on from; empty: it began anew
+    shared: tuple[str, ...] = ()  # the photographs that both have
 
 
 def described(
@@ -57,8 +61,13 @@ def described(
     snapshot: Snapshot,
     kept: Sequence[str],
     dropped: Collection[DroppedFrame],
+    follows: str = "",
+    shared: Sequence[str] = (),
 ) -> Place:
-    """The place as the snapshot shows it. `kept` are the names of its keyframes; others that came were `dropped`."""
+    """The place as the snapshot shows it. `kept` are the names of its keyframes; others that came were `dropped`.
+
+    It `follows` a scene, if any, with which it has the `shared` photographs in common.
+    """
     verdict = snapshot.verdict
     used = tuple(camera.name for camera in snapshot.cameras)
     why = "it has no camera in the scene" if used else f"there is no scene: {verdict.code.value}"
@@ -74,13 +83,16 @@ def described(
         num_gaussians=len(snapshot.gaussians),
         frames_used=used,
         frames_dropped=(*unplaced, *(Dropped(frame.name, frame.reason) for frame in dropped)),
+        follows=follows,
+        shared=tuple(shared),
     )
 
 
 class _Index(msgspec.Struct, frozen=True):
     checkpoint: str  # identity of the one that the places belong to
     places: tuple[Place, ...] = ()
-    links: tuple[Link, ...] = ()  # between final scenes that share photographs
+    links: tuple[Link, ...] = ()  # between final scenes
+    poses: tuple[Pose, ...] = ()  # of final scenes that may be published, by all links together
 
 
 class Places:
@@ -116,21 +128,59 @@ class Places:
         places = {each.scene_id: each for each in self._index.places} | {place.scene_id: place}
         self._write(msgspec.structs.replace(self._index, places=tuple(places.values())))
 
-    def link(self, scene_id: str) -> None:
-        """Writes how this final scene lies to the other final ones that share photographs with it.
+    @property
+    def links(self) -> tuple[Link, ...]:
+        """Between final scenes; those that are retracted say why."""
+        return self._index.links
 
-        Raises ResultWriteError.
+    @property
+    def poses(self) -> tuple[Pose, ...]:
+        """Of final scenes, in the maps that they belong to."""
+        return self._index.poses
+
+    def link(self, scene_id: str) -> None:
+        """Writes how this final scene, as it was just written, lies to those that it goes on from, and that follow it.
+
+        What was known of its place in the map is forgotten. Raises ResultWriteError.
         """
-        final = {place.scene_id: place for place in self._index.places if not place.provisional and place.publishable}
         links = [each for each in self._index.links if scene_id not in (each.scene, each.other)]
-        mine = final.pop(scene_id, None)
-        if mine is not None:
-            used = set(mine.frames_used)
-            near = [place for place in final.values() if len(used.intersection(place.frames_used)) >= MIN_SHARED]
-            pairs = [sorted((mine, other), key=lambda place: place.scene_id) for other in near]
-            found = (link(a.scene_id, b.scene_id, self._cameras(a), self._cameras(b)) for a, b in pairs)
-            links += [each for each in found if each is not None]
-        self._write(msgspec.structs.replace(self._index, links=tuple(links)))
+        final = self._final
+        for place in final.values():
+            before = final.get(place.follows)
+            if before is not None and scene_id in (place.scene_id, before.scene_id):
+                shared = [
+                    {name: T for name, T in self._cameras(each).items() if name in place.shared}
+                    for each in (before, place)
+                ]
+                found = link(before.scene_id, place.scene_id, *shared)
+                links += [] if found is None else [found]
+        self._write_links(links)
+
+    def bridged(self, scene_id: str, other: str, bridge: Bridge) -> Link | None:
+        """The link between two final scenes by the bridge, `scene_id` being its first; None where they disagree."""
+        one, two = (self._final.get(each) for each in (scene_id, other))
+        if one is None or two is None:
+            return None
+        why = f"{bridge.verified} pairs of photographs show the same, and {len(bridge.one)} + {len(bridge.other)} "
+        why += "photographs of both are one scene"
+        cameras = self._cameras(one), self._cameras(two)
+        return bridged(scene_id, other, *cameras, (bridge.one, bridge.other), why)
+
+    def add_loops(self, scene_id: str, loops: Collection[Link]) -> None:
+        """Writes these as the loops by which the scene was found to lie where others do. Raises ResultWriteError."""
+        others = [each for each in self._index.links if each.kind is not Kind.LOOP or each.other != scene_id]
+        self._write_links([*others, *loops])
+
+    @property
+    def _final(self) -> dict[str, Place]:
+        return {place.scene_id: place for place in self._index.places if not place.provisional and place.publishable}
+
+    def _write_links(self, links: Sequence[Link]) -> None:
+        graph = optimised(list(self._final), links)
+        for each in graph.links:
+            if each.retracted:
+                log.warning("the loop from %s to %s does not count: %s", each.scene, each.other, each.retracted)
+        self._write(msgspec.structs.replace(self._index, links=graph.links, poses=graph.poses))
 
     def _cameras(self, place: Place) -> dict[str, npt.NDArray[np.float64]]:
         """T_world_camera by the names of the photographs, as they were exported; none that cannot be read."""

@@ -12,6 +12,7 @@ from splatnode.capture.process.logs import event
 from splatnode.capture.process.memory_shortage import is_shortage
 from splatnode.recon.config import Config as Recipe
 from splatnode.recon.daemon import finishing, membership, places
+from splatnode.recon.daemon.atlas.atlas import Atlas
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
@@ -45,6 +46,7 @@ class PresentPlace:
         self._pause_until = pause
         self._work = IncrementalReconstruction(recipe)
         self._final: frozenset[str] = frozenset()  # the keyframes whose scene was written as final
+        self._compared: frozenset[str] = frozenset()  # those of the scene that was compared with the finished ones
         self._exported_s = time.monotonic()
         self._shown: Snapshot | None = None  # last
         self.settled = True  # nothing can be made better before the next keyframe
@@ -167,14 +169,13 @@ class PresentPlace:
         The frames before it belong to the present scene alone, those that are `shared` to both.
         """
         before, kept = self._store.scene_id, self._store.names_before(first).union(shared)
-        if self._final == kept:
-            self._output.finished(before)
-            self._store.begin_place(first)
-        else:
+        if self._final != kept:
             self._output.save(self._work, final=False)
             self._export_provisionally(places.State.LEFT, kept)
-            self._store.leave_place(first, shared)
-        self._final, self._shown = frozenset(), None
+        else:
+            self._output.finished(before)
+        self._store.leave_place(first, shared)
+        self._final, self._compared, self._shown = frozenset(), frozenset(), None
         return before
 
     def export_provisionally(self) -> None:
@@ -215,6 +216,20 @@ class PresentPlace:
             name = membership.most_redundant(self._work.graph)
             event(log, logging.INFO, "given_up", frame=name)
             self._forget(name, "given up for newer views that show the same")
+
+    def compare(self, atlas: Atlas) -> None:
+        """Links the scene with finished ones that show the same, if it is final. Raises Abandoned."""
+        names = frozenset(self._work.names)
+        if not names or self._final != names or self._compared == names:
+            return
+        try:
+            atlas.compare(self._store.scene_id, self._work.graph, self._pause)
+        except Abandoned:
+            raise
+        except Exception:
+            self._compared = names  # nothing would be different another time
+            raise
+        self._compared = names
 
     def leave_out(self, names: Sequence[str]) -> None:
         """The checkpoint no longer has these frames; the scene forgets them, too."""

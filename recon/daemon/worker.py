@@ -11,6 +11,7 @@ from collections.abc import Callable
 import msgspec
 
 from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
+from splatnode.recon.daemon.atlas.atlas import Atlas
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
@@ -40,7 +41,8 @@ class Worker:
         self._config, self._store, self._inbox, self._stopping = config, store, inbox, stopping
         self._output = Output(config, store, publish, self._complain)
         self.place = PresentPlace(config, self._recipe, store, self._output, self._pause)
-        self._left = LeftPlaces(store.directory, self._recipe, self._output)
+        self._atlas = Atlas(store.directory, self._recipe, self._output.places)
+        self._left = LeftPlaces(store.directory, self._recipe, self._output, self._atlas)
         self._quiet_since_s = time.monotonic()  # when what came last was worked in
         self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory; monotonic
         self.problem = ""
@@ -72,8 +74,13 @@ class Worker:
         while not self._stopping.is_set():
             worked = self._turn(min(IDLE_S, self._config.settle_s))
             if not worked and self.place.settled and time.monotonic() >= self._not_before_s:
-                self._guarded(lambda: self._left.finish_next(self._meanwhile), present=False)
+                self._guarded(self._rest, present=False)
         self._guarded(self.place.export_provisionally)
+
+    def _rest(self) -> None:
+        """What there is time for while nothing is to be done for the present place."""
+        if not self._left.finish_next(self._meanwhile):
+            self.place.compare(self._atlas)
 
     def _turn(self, wait_s: float) -> bool:
         """Works in what has come, or makes the scene better if it is time; False where there was nothing to do."""

@@ -58,6 +58,16 @@ def restore(store: Store, config: Config) -> Restored:
         return Restored(IncrementalReconstruction(config), len(keyframes), list(keyframes.values()), final=False)
 
 
+def graph_of(store: Store, config: Config) -> ViewGraph:
+    """The view graph that the checkpoint holds; an empty one where it holds none. Raises OSError."""
+    record = store.load("graph", saved.GraphRecord)
+    if record is None:
+        return ViewGraph(config.matching)
+    before = saved.graph_from(record)
+    keyframes = _prepared(store, [stored.frame for stored in store.frames()], config, before.features)
+    return _graph(config, [keyframe for name, keyframe in keyframes.items() if name in before.features], before)
+
+
 def _prepared(
     store: Store, frames: Sequence[Frame], config: Config, known: Mapping[str, Features]
 ) -> dict[str, Keyframe]:

@@ -32,6 +32,8 @@ class Ledger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gone: tuple[tuple[str, int], ...] = ()  # session and sequence of frames that are no longer stored
     dropped: tuple[tuple[str, str], ...] = ()  # name and reason, newest last
     identity: SessionId | None = None  # of this checkpoint, for whoever sends keyframes to it
+    follows: str = ""  # the scene that the present one goes on from; empty: it began anew
+    shared: tuple[str, ...] = ()  # names of the frames that both have
 
     @property
     def scene_id(self) -> str:

@@ -1,6 +1,7 @@
-"""Places that the camera has left and whose scenes are not final yet: left/scene-NNNN, each a checkpoint of its own.
+"""Places that the camera has left, each a checkpoint of its own: left/scene-NNNN while its scene is not final yet.
 
-A folder counts from the moment when it has a ledger, and no longer once it has none.
+A folder counts from the moment when it has a ledger, and no longer once it has none. One whose scene is final is
+finished/scene-NNNN: by what it holds a place is recognised when the camera comes back.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from splatnode.capture.process.private import private_folder
 from splatnode.recon.daemon.checkpoint.ledger import FILE as LEDGER
 from splatnode.recon.daemon.checkpoint.ledger import Ledger, write_ledger
 
-LEFT = "left"
+LEFT, FINISHED = "left", "finished"
 
 
 def keep(directory: Path, ledger: Ledger, files: Iterable[str], instead: str) -> None:
@@ -36,6 +37,28 @@ def keep(directory: Path, ledger: Ledger, files: Iterable[str], instead: str) ->
 def folders(directory: Path) -> list[Path]:
     """Of the places that were left, oldest first."""
     return sorted((path.parent for path in (directory / LEFT).glob(f"scene-*/{LEDGER}")), key=_place)
+
+
+def finished_folder(directory: Path, scene_id: str) -> Path:
+    """Where the checkpoint of a finished scene is, if there is one."""
+    return directory / FINISHED / scene_id
+
+
+def finished(directory: Path) -> list[Path]:
+    """The folders of the finished scenes, oldest first."""
+    return sorted((path.parent for path in (directory / FINISHED).glob(f"scene-*/{LEDGER}")), key=_place)
+
+
+def finish(folder: Path, instead: str) -> None:
+    """Takes the checkpoint of a place that was left among the finished ones.
+
+    Raises OSError, and NotPrivate as `keep`.
+    """
+    target = finished_folder(folder.parent.parent, folder.name)
+    private_folder(target.parent, instead, ours=True)
+    remove(target)
+    folder.rename(target)
+    sync_folder(target.parent)
 
 
 def remove(folder: Path) -> None:

@@ -7,6 +7,7 @@
     scene               cameras and Gaussians as they are shown
     pointmaps           depth maps of its views, from which it grows
     left/<place>/       a place that the camera has left and whose scene is not final yet: a checkpoint of its own
+    finished/<place>/   one whose scene is final: frames, graph and judgement, and `codes`, by which it is recognised
 
 Graph, judgement, scene and pointmaps are computed again where they are missing. A keyframe is acknowledged once its
 file is there. Every file is whole or not there, and has a checksum. A place is what one scene shows.
@@ -35,7 +36,7 @@ from splatnode.capture.process.durable import remove_leftovers
 from splatnode.capture.process.lock import Held, exclusive
 from splatnode.capture.process.printable import LONGEST_NAME, printable
 from splatnode.capture.process.private import own_files, private_folder
-from splatnode.recon.daemon.checkpoint import left
+from splatnode.recon.daemon.checkpoint import left, made_anew
 from splatnode.recon.daemon.checkpoint.ledger import (
     LIMITS,
     VERSION,
@@ -44,10 +45,10 @@ from splatnode.recon.daemon.checkpoint.ledger import (
     identified,
     write_ledger,
 )
+from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
 
 log = logging.getLogger(__name__)
 
-MADE_ANEW = ("graph", "judgement", "scene", "pointmaps")
 REMEMBERED = 1000  # removed frames that are recognised if their sender missed the acknowledgement
 REMEMBERED_DROPPED = 1000  # names and reasons, of a place
 FILE = "{:012d}.frame"
@@ -194,33 +195,42 @@ class Store:
             made = [name for name in MADE_ANEW if (self.directory / name).exists()]
             ledger = msgspec.structs.replace(self.ledger, next=self._next, gone=(), identity=None)
             left.keep(self.directory, ledger, [*frames, *made], _INSTEAD)
-            self.begin_place(first)
+            self.begin_place(first, shared)
 
-    def begin_place(self, first: int) -> None:
-        """Begins another place with frame `first`; the frames before it and their scene are removed. Raises OSError."""
+    def begin_place(self, first: int, shared: Collection[str] = ()) -> None:
+        """Begins another place with frame `first`; the frames before it and their scene are removed. Raises OSError.
+
+        It goes on from the present one where they have `shared` frames.
+        """
         with self._writing:
-            for name in MADE_ANEW:  # first: what a death leaves of the place before can be made anew, of this one not
-                (self.directory / name).unlink(missing_ok=True)
+            # First: what a death leaves of the place before can be made anew, of this one not.
+            made_anew.remove(self.directory, *MADE_ANEW)
             before = {number: name for name, number in self._names.items() if number < first}
             gone = (*self.ledger.gone, *(self._keys[number] for number in before))
             place = self.ledger.place + 1
             began = {"place": place, "first": first, "next": self._next, "gone": gone[-REMEMBERED:], "dropped": ()}
-            self._write(msgspec.structs.replace(self.ledger, **began))
+            chain = {"follows": self.scene_id if shared else "", "shared": tuple(sorted(shared))}
+            self._write(msgspec.structs.replace(self.ledger, **began, **chain))
             self._unlink(before)
 
     def save(self, name: str, header: msgspec.Struct, arrays: list[Any]) -> None:
-        """Writes one of the files that can be computed again. Raises OSError."""
-        write_message(self.directory / name, encode(header, arrays))
+        """Writes one of the files that can be made anew. Raises OSError."""
+        made_anew.save(self.directory, name, header, arrays)
 
     def load(self, name: str, schema: Any) -> Message[Any] | None:
         """What `save` wrote under this name; None where it is missing or damaged."""
-        try:
-            return decode(read_message(self.directory / name), schema, LIMITS)
-        except FileNotFoundError:
-            return None
-        except (OSError, ValueError) as error:
-            log.warning("%s of the checkpoint is made anew: %s", name, error)
-            return None
+        return made_anew.load(self.directory, name, schema)
+
+    def remove_shown(self) -> None:
+        """Removes what only a scene that grows has need of. Raises OSError."""
+        made_anew.remove(self.directory, *made_anew.SHOWN)
+
+    def finish(self) -> None:
+        """Takes a place that was left among the finished ones. Nothing is read or written here afterwards.
+
+        Raises OSError.
+        """
+        left.finish(self.directory, _INSTEAD)
 
     def _leave_out(self, frames: dict[int, str], key: tuple[str, int], dropped: tuple[str, str]) -> None:
         ledger = self.ledger

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.daemon.links import MIN_SHARED, link
+from splatnode.recon.daemon.atlas.links import MIN_SHARED, link
 from splatnode.recon.geometry import Similarity
 from tests.support.synthetic import SMALL
 

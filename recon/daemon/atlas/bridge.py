@@ -1,0 +1,152 @@
+"""Do two scenes show one place? A few photographs of both are estimated together, as the photographs of one scene are.
+
+The bridge is taken only where that estimate may be published, and where it has the cameras of either scene as that
+scene has them. So a link between two scenes passes what a scene passes: two-view verification, the check of appearance,
+the evidence of all views; and the neighbours of the photographs that match have their say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.config import Config
+from splatnode.recon.estimation import estimate_cameras
+from splatnode.recon.frames.keyframe import Keyframe, longer_side
+from splatnode.recon.matching import pair_matching
+from splatnode.recon.matching.match import Matcher, completed
+from splatnode.recon.matching.view_graph import ViewGraph
+
+Array = npt.NDArray[np.float64]
+Pair = tuple[int, int]
+
+GLANCED = 8  # pairs of photographs, those with codes most alike, matched at a glance for each that is verified
+VERIFIED = 6  # pairs, by their matches at a glance, that are matched and verified
+MIN_VERIFIED = 2  # of these that show the same, of different photographs in both scenes
+VIEWS = 5  # of each scene that are estimated together; all their pairs are matched
+TWIN_PX = 2.0  # median motion of a pair's matches, pixels at REFERENCE_SIDE, below which both have the same camera
+MIN_VIEWS = 3  # of each scene that must have a camera then
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """One of the two scenes."""
+
+    scene_id: str
+    graph: ViewGraph
+    codes: npt.NDArray[np.floating]  # (N, C) of the keyframes' images, of unit length once what all share is taken out
+
+
+@dataclass(frozen=True, eq=False)
+class Bridge:
+    """Cameras T_world_camera (4, 4) of photographs of both scenes, in one world, by the photographs' names."""
+
+    one: Mapping[str, Array]
+    other: Mapping[str, Array]
+    verified: int  # pairs of photographs, one of each scene, that show the same
+
+
+def bridge(
+    one: Side, other: Side, config: Config, matcher: Matcher | None, pause: Callable[[], None] = lambda: None
+) -> Bridge | str:
+    """The bridge between the scenes, or why there is none. `pause` is called about once a second and may raise."""
+    pairs = verified_pairs(one, other, config, pause)
+    if len(_distinct(pairs)) < MIN_VERIFIED:
+        return f"{len(pairs)} pairs of photographs show the same"
+    chosen = [_views(side.graph, [pair[end] for pair in pairs]) for end, side in enumerate((one, other))]
+    graph = ViewGraph(config.matching)
+    for side, views in zip((one, other), chosen, strict=True):
+        graph = graph.joined(_renamed(side, views))
+    for whole in completed(graph, matcher):
+        graph = whole
+        pause()
+    twins = _twins(graph, one.scene_id)
+    estimate = estimate_cameras(graph.without(twins.keys()), (), config, pause)
+    if not estimate.publishable or estimate.registration is None:
+        return f"together they are {estimate.verdict.code.value}: {estimate.verdict.message}"
+    names = estimate.graph.names
+    found = {names[camera.index]: camera.T_world_camera for camera in estimate.registration.cameras}
+    found |= {name: found[twin] for name, twin in twins.items() if twin in found}
+    mine, theirs = (_of(side.scene_id, found) for side in (one, other))
+    if min(len(mine), len(theirs)) < MIN_VIEWS:
+        return f"together only {len(mine)} and {len(theirs)} of their photographs have cameras"
+    return Bridge(mine, theirs, len(pairs))
+
+
+def verified_pairs(one: Side, other: Side, config: Config, pause: Callable[[], None]) -> list[Pair]:
+    """The pairs, a keyframe of each scene by its position, that show the same; those with most matches first."""
+    alike = one.codes @ other.codes.T
+    order = np.argsort(-alike, axis=None, kind="stable")[: GLANCED * VERIFIED]
+    likely = [tuple(int(index) for index in np.unravel_index(each, alike.shape)) for each in order]
+
+    def both(pair: tuple[int, ...]) -> tuple[Keyframe, Keyframe]:
+        return one.graph.keyframes[pair[0]], other.graph.keyframes[pair[1]]
+
+    matching, glance_features = config.matching.pair_matching, config.matching.candidates.glance_features
+    glanced = {}
+    for pair in likely:
+        glanced[pair] = pair_matching.glance(*both(pair), glance_features, matching)
+        pause()
+    found: dict[Pair, int] = {}
+    for pair in sorted(glanced, key=lambda pair: -glanced[pair])[:VERIFIED]:
+        geometry = pair_matching.match_plain(*both(pair), matching).geometry
+        if geometry is not None:
+            found[pair[0], pair[1]] = len(geometry.matches)
+        pause()
+    return sorted(found, key=lambda pair: -found[pair])
+
+
+def _distinct(pairs: Sequence[Pair]) -> list[Pair]:
+    """Pairs that have no keyframe in common, the first ones first."""
+    taken: tuple[set[int], set[int]] = set(), set()
+    distinct = []
+    for pair in pairs:
+        if pair[0] not in taken[0] and pair[1] not in taken[1]:
+            distinct.append(pair)
+            taken[0].add(pair[0])
+            taken[1].add(pair[1])
+    return distinct
+
+
+def _twins(graph: ViewGraph, scene_id: str) -> dict[str, str]:
+    """Photographs that were taken from where one of scene `scene_id` was, with the name of that one.
+
+    They have no parallax to each other, so one camera is estimated for both.
+    """
+    twins: dict[str, str] = {}
+    for (i, j), pair in sorted(graph.pairs.items()):
+        one, other = graph.keyframes[i], graph.keyframes[j]
+        moved_px = pair_matching.median_motion_px(pair, longer_side(one.frame), longer_side(other.frame))
+        first, second = sorted((one.name, other.name), key=lambda name: not _is_of(scene_id, name))
+        if _is_of(scene_id, first) and not _is_of(scene_id, second) and moved_px < TWIN_PX:
+            twins.setdefault(second, first)
+    return twins
+
+
+def _views(graph: ViewGraph, matched: Sequence[int]) -> list[int]:
+    """VIEWS keyframes: those `matched`, then those that have most in common with them."""
+    chosen = list(dict.fromkeys(matched))[:VIEWS]
+    shared = {index: sum(graph.partners(each).get(index, 0) for each in chosen) for index in range(len(graph.names))}
+    others = sorted(shared.keys() - set(chosen), key=lambda index: (-shared[index], index))
+    return [*chosen, *others][:VIEWS]
+
+
+def _renamed(side: Side, views: Collection[int]) -> ViewGraph:
+    """The view graph of these keyframes alone, by names that no keyframe of another scene has."""
+    gone = {name for index, name in enumerate(side.graph.names) if index not in views}
+    graph = side.graph.without(gone)
+    keyframes = (
+        replace(each, frame=replace(each.frame, name=f"{side.scene_id}/{each.name}")) for each in graph.keyframes
+    )
+    return replace(graph, keyframes=tuple(keyframes), codes={}, glanced={})
+
+
+def _is_of(scene_id: str, name: str) -> bool:
+    return name.startswith(f"{scene_id}/")
+
+
+def _of(scene_id: str, cameras: Mapping[str, Array]) -> dict[str, Array]:
+    return {name.removeprefix(f"{scene_id}/"): T for name, T in cameras.items() if _is_of(scene_id, name)}

@@ -1,0 +1,130 @@
+"""How two scenes lie to each other: by cameras that both have, or by a bridge of photographs that show the same."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.geometry import Similarity, align_cameras, angles_deg, spread
+
+MIN_SHARED = 3  # cameras that two scenes must share, so that one that is wrong shows
+# What no link is surer of, however well its few cameras agree: what the scenes themselves are wrong by.
+LEAST_DEG, LEAST_RELATIVE = 0.1, 0.003  # of the rotation; of the scale, and of the position over the cameras' spread
+MOST_DEG, MOST_RELATIVE = 3.0, 0.1  # that the cameras of a bridge may differ by from those of the scenes, likewise
+
+Array = npt.NDArray[np.float64]
+Cameras = Mapping[str, Array]  # T_world_camera (4, 4) by the names of the photographs
+
+
+class Kind(enum.Enum):
+    CHAIN = "chain"  # the one scene goes on where the other was full: they have photographs in common
+    LOOP = "loop"  # the camera came back: photographs of the one show what those of the other show
+
+
+class Link(msgspec.Struct, frozen=True, kw_only=True):
+    """A point x of scene `other` lies at scale * rotation @ x + translation in `scene`."""
+
+    kind: Kind = Kind.CHAIN
+    scene: str  # scene_id
+    other: str
+    scale: float
+    rotation: tuple[tuple[float, ...], ...]  # (3, 3), row by row
+    translation: tuple[float, ...]  # (3,), in the unit of `scene`
+    shared: tuple[str, ...]  # photographs that both scenes have a camera of, or that bridge them
+    rotation_deg: float  # by how much those cameras' directions differ afterwards, at most
+    centre_percent: float | None  # RMS of what their positions differ by, of their spread; None: they do not move
+    centre: tuple[float, ...] = (0.0, 0.0, 0.0)  # (3,) the mean of their positions, in `scene`
+    sigma_deg: float = LEAST_DEG  # standard deviations: of the rotation,
+    sigma_scale: float = LEAST_RELATIVE  # of the logarithm of the scale,
+    sigma_position: float = LEAST_RELATIVE  # and of the position of `centre`, in the unit of `scene`
+    why: str = ""  # it was taken
+    retracted: str | None = None  # why it does not count after all
+
+    @property
+    def similarity(self) -> Similarity:
+        """From the world of `other` to that of `scene`."""
+        return Similarity(self.scale, np.array(self.rotation), np.array(self.translation))
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """One set of cameras laid on another."""
+
+    similarity: Similarity
+    rotation_deg: float  # most that a direction differs by afterwards
+    centre_rms: float  # of what the positions differ by, in the target's unit
+    extent: float  # of the positions in the target, likewise
+    sigma_deg: float
+    sigma_relative: float  # of the logarithm of the scale; of the mean position over `extent`
+
+
+def link(scene: str, other: str, mine: Cameras, theirs: Cameras) -> Link | None:
+    """By the cameras of two scenes that both have, by their names. None where they share fewer than MIN_SHARED."""
+    shared = [name for name in mine if name in theirs]
+    if len(shared) < MIN_SHARED:
+        return None
+    target = np.stack([mine[name] for name in shared])
+    fit = _fit(np.stack([theirs[name] for name in shared]), target)
+    why = f"{len(shared)} photographs are in both"
+    return _link(Kind.CHAIN, scene, other, fit.similarity, [fit], target, shared, why)
+
+
+def bridged(
+    scene: str, other: str, mine: Cameras, theirs: Cameras, bridge: tuple[Cameras, Cameras], why: str
+) -> Link | None:
+    """By cameras of some photographs of both scenes in a world of their own: `bridge`, those of `scene` first.
+
+    None where fewer than MIN_SHARED of either have a camera in their scene, too, or have it elsewhere there.
+    """
+    names = [[name for name in ends if name in cameras] for ends, cameras in zip(bridge, (mine, theirs), strict=True)]
+    if min(map(len, names)) < MIN_SHARED:
+        return None
+    target = np.stack([mine[name] for name in names[0]])
+    to_mine = _fit(np.stack([bridge[0][name] for name in names[0]]), target)
+    to_theirs = _fit(np.stack([bridge[1][name] for name in names[1]]), np.stack([theirs[name] for name in names[1]]))
+    if any(fit.rotation_deg > MOST_DEG or fit.centre_rms > MOST_RELATIVE * fit.extent for fit in (to_mine, to_theirs)):
+        return None
+    similarity = to_mine.similarity.after(to_theirs.similarity.inverse())
+    return _link(Kind.LOOP, scene, other, similarity, [to_mine, to_theirs], target, [*names[0], *names[1]], why)
+
+
+def _fit(source: Array, target: Array) -> _Fit:
+    """Cameras `source` (C, 4, 4) laid on `target`."""
+    found = align_cameras(source, target)
+    turned = angles_deg(found.rotation @ source[:, :3, :3], target[:, :3, :3])
+    rms = float(np.sqrt(((found(source[:, :3, 3]) - target[:, :3, 3]) ** 2).sum(1).mean()))
+    extent = max(spread(target[:, :3, 3]), 1e-12)
+    root = np.sqrt(len(source))
+    relative = rms / extent / root
+    sigma_deg = max(float(np.sqrt((turned**2).mean())) / root, LEAST_DEG)
+    return _Fit(found, float(turned.max()), rms, extent, sigma_deg, max(relative, LEAST_RELATIVE))
+
+
+def _link(
+    kind: Kind, scene: str, other: str, similarity: Similarity, fits: list[_Fit], target: Array, names: list[str],
+    why: str,
+) -> Link:  # fmt: skip
+    relative = float(np.sqrt(sum(fit.sigma_relative**2 for fit in fits)))
+    moving = all(fit.extent > 1e-9 for fit in fits)
+    differ = max(fit.centre_rms / fit.extent for fit in fits)
+    return Link(
+        kind=kind,
+        scene=scene,
+        other=other,
+        scale=similarity.scale,
+        rotation=tuple(tuple(row) for row in similarity.rotation.tolist()),
+        translation=tuple(similarity.translation.tolist()),
+        shared=tuple(names),
+        rotation_deg=max(fit.rotation_deg for fit in fits),
+        centre_percent=100 * differ if moving else None,
+        centre=tuple(target[:, :3, 3].mean(0).tolist()),
+        sigma_deg=float(np.sqrt(sum(fit.sigma_deg**2 for fit in fits))),
+        sigma_scale=relative,
+        sigma_position=relative * fits[0].extent,
+        why=why,
+    )
