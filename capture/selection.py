@@ -7,6 +7,7 @@ first of these that exceeds its limit makes the frame a candidate; only candidat
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -33,6 +34,7 @@ LUCAS_KANADE = {
 HOMOGRAPHY_PX, HOMOGRAPHY_TRIALS = 1.5, 100  # of RANSAC: an inlier's error, and the number of samples at most
 MAX_COVERAGE = 0.9  # share of lost corners that is always enough, however many frames wait
 REMEMBERED_VIEWS = 64  # newest keyframes of which a new one must not be a copy
+REMEMBERED_BLURS = 8  # candidates with which blur is compared: a soft place after a crisp one is usable soon
 THUMBNAIL = 16, 12  # width and height in pixels
 MAX_THUMBNAIL_DIFFERENCE = 0.3  # mean; copies have 0.05. Others are no copies, which saves a closer comparison
 RETRY_S = 1.0  # after a keyframe that could not be kept
@@ -87,7 +89,7 @@ class Selector:
         self._start: Image | None = None  # the last keyframe, small and grey
         self._corners: Points = np.zeros((0, 1, 2), np.float32)
         self._now: Points = self._corners
-        self._sharpest_px: float | None = None
+        self._blurs_px: deque[float] = deque(maxlen=REMEMBERED_BLURS)  # of the candidates examined, newest last
         self._next_ns = 0  # nothing is examined before
 
     def decide(self, frame: Frame, waiting: int = 0) -> Decision:
@@ -133,9 +135,9 @@ class Selector:
             if why_redundant(novelty(small, view.small), self.limits):
                 return f"duplicate: it shows what {view.name} shows"
         quality = assess(frame.image)
-        fault = why_unusable(quality, self.limits, self._sharpest_px)
+        fault = why_unusable(quality, self.limits, min(self._blurs_px, default=None))
         if quality.blur_px is not None:
-            self._sharpest_px = min(quality.blur_px, self._sharpest_px or quality.blur_px)
+            self._blurs_px.append(quality.blur_px)
         return fault
 
     def _remember(self, name: str, small: Image, grey: Image) -> None:

@@ -11,7 +11,7 @@ import pytest
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import Frame
 from splatnode.capture.quality import Limits
-from splatnode.capture.selection import Config, Motion, Selector, measure, track, what_it_adds
+from splatnode.capture.selection import REMEMBERED_BLURS, Config, Motion, Selector, measure, track, what_it_adds
 from tests.support import synthetic
 
 EVERY = Config(per_second=1000.0, patience_s=0.0)
@@ -53,6 +53,19 @@ def test_a_view_that_was_taken_before_is_a_copy():
     decisions = taken([view(0, 0), view(100, 1), view(0, 2), view(101, 3)])
     assert [decision.take for decision in decisions] == [True, True, False, False]
     assert decisions[2].reason == "duplicate: it shows what 0.png shows" and decisions[2].candidate
+
+
+def test_a_soft_place_after_a_crisp_one_is_taken_after_a_few_candidates():
+    noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3)).astype(np.uint8)
+    crisp = [replace(view(0, index), image=np.roll(noise, 100 * index, axis=1)) for index in range(3)]
+    soft = [
+        replace(view(0, 3 + index), image=cv2.GaussianBlur(view(40 * index, 0, 350).image, (0, 0), 3))
+        for index in range(REMEMBERED_BLURS + 4)
+    ]
+    decisions = taken([*crisp, *soft])[len(crisp) :]
+    first = next(index for index, decision in enumerate(decisions) if decision.take)
+    assert all("sharpest" in decision.reason for decision in decisions[:first]) and 0 < first <= REMEMBERED_BLURS
+    assert all(decision.take for decision in decisions[first:])
 
 
 def test_blurred_candidates_are_waited_out():

@@ -4,8 +4,8 @@ The photographs of several scenes, one scene after the other, are replayed throu
 that are held out. When all places are finished, each is scored on its held-out photographs, as is an offline run on the
 same photographs, and what became of every photograph is counted. The cameras of a place that became several scenes are
 compared with the true ones by way of the links between its scenes. While the robot moves, the delay of the picture
-behind the photographs is read from recon's heartbeat. With --and-back the robot goes the same way back, and sees all
-photographs a second time, the last first: each place should be recognised, and none be joined with another.
+behind the photographs is read from recon's heartbeat. With --and-back the robot goes the same way back, on which the
+photographs come that were held out: each place should be recognised, and none be joined with another.
 """
 
 from __future__ import annotations
@@ -37,7 +37,6 @@ from tests.support.node import Node, memory_mb, running
 
 PATIENCE_S = 1800.0  # after the last photograph
 LOOK_S = 1.0
-BACK = "back~"  # begins the names of the photographs of the way back
 
 
 def main() -> None:
@@ -47,7 +46,7 @@ def main() -> None:
     parser.add_argument("--per-second", type=float, default=0.33, help="photographs")
     parser.add_argument("--max-views", type=int, default=30, help="of a scene; a place with more is a chain of scenes")
     parser.add_argument("--hold-out", type=int, default=3, help="one photograph in so many; 0: none")
-    parser.add_argument("--and-back", action="store_true", help="a second time, the last photograph first")
+    parser.add_argument("--and-back", action="store_true", help="with those that were held out, the last one first")
     parser.add_argument("--no-offline", action="store_true", help="do not compare with offline runs")
     parser.add_argument("--out", type=Path, default=Path("tests/bench/results/stream.json"))
     args = parser.parse_args()
@@ -55,15 +54,22 @@ def main() -> None:
     splits = {name: _split(scene, args.hold_out) for name, scene in scenes.items()}
     with tempfile.TemporaryDirectory() as folder:
         names = [f"{name}__{photograph}" for name in scenes for photograph in splits[name].train]
-        names += [name.replace("__", f"__{BACK}", 1) for name in reversed(names)] if args.and_back else []
+        back = [f"{name}__{photograph}" for name in scenes for photograph in splits[name].test]
+        names += reversed(back) if args.and_back else []
         live, places = _streamed(Path(folder), scenes, names, args.per_second, args.max_views)
     if args.and_back:
-        live["visits"] = _visits(places, live["poses"], list(scenes))
+        live["visits"] = _visits(places, live["poses"], splits)
     live["cameras"] = {name: _camera_errors(name, scene, places, live["links"]) for name, scene in scenes.items()}
     for name, scene in scenes.items():
         for place in places:
             snapshot = place["snapshot"]
-            if args.hold_out and snapshot is not None and snapshot.cameras and _source(place) == name:
+            if (
+                args.hold_out
+                and not args.and_back
+                and snapshot is not None
+                and snapshot.cameras
+                and _source(place) == name
+            ):
                 place["psnr"] = psnr(snapshot, scene, splits[name])
         if not args.no_offline:
             *_, offline = reconstruct(list(scene.frames(splits[name].train)), Config(max_gaussians=300_000))
@@ -108,23 +114,21 @@ def _camera_errors(name: str, scene: EvaluationScene, places: list[dict], links:
     return {"scenes": len(mine), "linked": len(to_first), "cameras": len(names), **told}
 
 
-def _visits(places: list[dict], poses: list[dict], scenes: list[str]) -> dict:
+def _visits(places: list[dict], poses: list[dict], splits: dict[str, Split]) -> dict:
     """Which scenes were found on the way back to be where those of the way there are; what was joined wrongly."""
     map_of = {pose["scene"]: pose["map"] for pose in poses}
-    maps: dict[str, set[tuple[str, bool]]] = {}  # the scenes in each map, and whether they are of the way back
+    maps: dict[str, set[tuple[str, bool]]] = {}  # the scenes in each map, and whether they were seen on the way back
     for place in places:
         if place["scene_id"] in map_of:
-            mine = maps.setdefault(map_of[place["scene_id"]], set())
-            mine |= {(name.split("__", 1)[0], BACK in name) for name in place["frames_used"]}
+            photographs = [name.split("__", 1) for name in place["frames_used"]]
+            mine = {(name, photograph in splits[name].test) for name, photograph in photographs}
+            maps.setdefault(map_of[place["scene_id"]], set()).update(mine)
+    found = list(maps.values())
     return {
-        "found_there": [name for name in scenes if any((name, False) in found for found in maps.values())],
-        "found_back": [name for name in scenes if any((name, True) in found for found in maps.values())],
-        "recognised": [
-            name for name in scenes if any({(name, False), (name, True)} <= found for found in maps.values())
-        ],
-        "joined": [
-            sorted({name for name, _ in found}) for found in maps.values() if len({name for name, _ in found}) > 1
-        ],
+        "found_there": [name for name in splits if any((name, False) in each for each in found)],
+        "found_back": [name for name in splits if any((name, True) in each for each in found)],
+        "recognised": [name for name in splits if any({(name, False), (name, True)} <= each for each in found)],
+        "joined": [sorted(joined) for each in found if len(joined := {name for name, _ in each}) > 1],
     }
 
 
@@ -146,7 +150,7 @@ def _streamed(
     images = folder / "images"
     images.mkdir()
     for name in names:
-        scene, photograph = name.replace(BACK, "", 1).split("__", 1)
+        scene, photograph = name.split("__", 1)
         (images / name).symlink_to(scenes[scene].paths[photograph].resolve())
     camera = {
         "camera": {
@@ -208,7 +212,6 @@ def _exported(folder: Path) -> Snapshot | None:
     if not (folder / "scene.ply").exists():
         return None
     gaussians, cameras = read_gaussians(folder / "scene.ply"), read_cameras(folder / "cameras.json")
-    there = [camera for camera in cameras if BACK not in camera.name]
-    renamed = tuple(replace(camera, name=camera.name.split("__", 1)[1]) for camera in there)
+    renamed = tuple(replace(camera, name=camera.name.split("__", 1)[1]) for camera in cameras)
     verdict = Verdict(Code.OK, "", "", publishable=True)
     return Snapshot(0, verdict, renamed, gaussians, images={}, dropped=(), iterations=0, seconds={}, final=True)

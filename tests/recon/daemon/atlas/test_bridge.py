@@ -1,0 +1,115 @@
+"""Two scenes of one place are bridged as they lie; two of different places are not; codes tell what looks alike."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from splatnode.capture.cameras import synthetic
+from splatnode.capture.frame import Frame
+from splatnode.recon.config import Config
+from splatnode.recon.daemon.atlas.bridge import Bridge, Side, bridge
+from splatnode.recon.daemon.atlas.links import Kind, bridged
+from splatnode.recon.daemon.atlas.recognition import centred, codes_from, codes_message, codes_of, in_common, likeliest
+from splatnode.recon.evaluate.camera_errors import camera_errors
+from splatnode.recon.matching.match import match
+from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.preparation import prepare
+from tests.support.synthetic import SMALL
+
+VIEWS = msgspec.structs.replace(SMALL, views=7)
+TRUE = synthetic.scene_cameras(VIEWS)
+BETWEEN = synthetic.held_out_cameras(VIEWS)
+
+
+@pytest.fixture(scope="module")
+def graphs() -> dict[str, ViewGraph]:
+    """The place, the place again from between those photographs, some of the same photographs, and another place."""
+    elsewhere = msgspec.structs.replace(VIEWS, seed=1)
+    there = [synthetic.photograph(VIEWS, camera, index) for index, camera in enumerate(TRUE[:4])]
+    again = [synthetic.photograph(VIEWS, camera, 10 + index) for index, camera in enumerate(BETWEEN[1:5])]
+    other = [synthetic.photograph(elsewhere, camera, index)[:, ::-1].copy() for index, camera in enumerate(TRUE[:4])]
+    numbers = itertools.count()
+    sets = {"scene-0001": there, "scene-0002": again, "scene-0003": other, "scene-0004": there}
+    config = Config()
+    return {
+        scene: match(
+            [prepare(Frame(next(numbers), f"{i}.png", 0, image, None), config) for i, image in enumerate(images)],
+            config.matching,
+        )
+        for scene, images in sets.items()
+    }
+
+
+@pytest.fixture(scope="module")
+def sides(graphs) -> dict[str, Side]:
+    codes = {scene: codes_of(graph.keyframes) for scene, graph in graphs.items()}
+    common = in_common(codes)
+    return {scene: Side(scene, graph, centred(codes[scene], common)) for scene, graph in graphs.items()}
+
+
+def cameras(given) -> dict[str, np.ndarray]:
+    return {f"{index}.png": T for index, (T, _) in enumerate(given)}
+
+
+def test_a_place_seen_again_is_bridged_as_it_lies(sides):
+    found = bridge(sides["scene-0001"], sides["scene-0002"], Config(), None)
+    assert isinstance(found, Bridge), found
+    names = [*(f"there {name}" for name in found.one), *(f"again {name}" for name in found.other)]
+    assert len(names) == 8
+    true = [*cameras(TRUE[:4]).values(), *cameras(BETWEEN[1:5]).values()]
+    K = np.stack([TRUE[0][1]] * len(names))
+    errors = camera_errors(np.stack([*found.one.values(), *found.other.values()]), np.stack(true), K, K)
+    assert errors.rotation_deg < 0.5 and errors.centre_pct < 3
+
+
+def test_the_link_carries_the_one_scene_onto_the_other(sides):
+    found = bridge(sides["scene-0001"], sides["scene-0002"], Config(), None)
+    assert isinstance(found, Bridge), found
+    mine, theirs = cameras(TRUE[:4]), cameras(BETWEEN[1:5])
+    link = bridged("scene-0001", "scene-0002", mine, theirs, (found.one, found.other), "for the test")
+    assert link is not None and link.kind is Kind.LOOP and link.why == "for the test"
+    assert abs(link.scale - 1) < 0.05 and np.abs(np.array(link.rotation) - np.eye(3)).max() < 0.02
+    moved = {name: T.copy() for name, T in theirs.items()}
+    moved["1.png"][:3, 3] += 0.5
+    assert bridged("scene-0001", "scene-0002", mine, moved, (found.one, found.other), "") is None
+
+
+def test_the_same_photographs_have_the_same_cameras(sides):
+    found = bridge(sides["scene-0001"], sides["scene-0004"], Config(), None)
+    assert isinstance(found, Bridge), found
+    assert found.one.keys() == found.other.keys() and len(found.one) == 4
+    for name, T_world_camera in found.one.items():
+        np.testing.assert_array_equal(found.other[name], T_world_camera)
+
+
+def test_different_places_are_not_bridged(sides):
+    found = bridge(sides["scene-0001"], sides["scene-0003"], Config(), None)
+    assert isinstance(found, str) and "show the same" in found
+
+
+def test_what_looks_most_alike_comes_first(graphs):
+    codes = {scene: codes_of(graph.keyframes) for scene, graph in graphs.items()}
+    assert likeliest("scene-0001", codes) == ["scene-0004", "scene-0002", "scene-0003"]
+
+
+def test_codes_come_back_as_they_were_kept(graphs):
+    keyframes = graphs["scene-0001"].keyframes
+    header, arrays = codes_message(keyframes, codes := codes_of(keyframes))
+    message = type("Message", (), {"header": header, "arrays": arrays})()
+    np.testing.assert_array_equal(codes_from(message), codes)
+    message.arrays = [arrays[0][:-1]]
+    with pytest.raises(ValueError, match="another version"):
+        codes_from(message)
+
+
+def test_what_pause_raises_ends_the_work(sides):
+    def end() -> None:
+        raise InterruptedError
+
+    with pytest.raises(InterruptedError):
+        bridge(sides["scene-0001"], replace(sides["scene-0002"]), Config(), None, end)

@@ -1,0 +1,105 @@
+"""A camera that is carried to another place and back: the first place is recognised, also by the next process."""
+
+from __future__ import annotations
+
+import json
+from contextlib import contextmanager
+
+import msgspec
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from splatnode.capture.cameras import synthetic
+from splatnode.capture.frame import Frame
+from splatnode.capture.status import heartbeats
+from splatnode.recon.daemon.atlas.atlas import Atlas
+from splatnode.recon.daemon.checkpoint import left
+from splatnode.recon.evaluate.camera_errors import camera_errors
+from splatnode.recon.geometry import Similarity
+from splatnode.recon.result.export import read_cameras
+from tests.capture.messaging.test_sockets import wait_for
+from tests.recon.daemon.test_daemon import PATIENCE_S, config, finished, peer, running
+from tests.support.synthetic import SMALL, places
+
+__all__ = ["config", "peer"]
+
+THERE = msgspec.structs.replace(SMALL, views=3)  # as tests/support/synthetic.py photographs each of two places
+AGAIN = synthetic.held_out_cameras(msgspec.structs.replace(SMALL, views=4))
+
+
+def walk() -> list[Frame]:
+    """Three photographs of one place, three of another, three of the first from elsewhere."""
+    photographs = [synthetic.photograph(SMALL, camera, 20 + index) for index, camera in enumerate(AGAIN)]
+    again = [Frame(6 + index, f"again_{index}.png", 0, image, None) for index, image in enumerate(photographs)]
+    return [*places(seeds=(0, 1)), *again]
+
+
+@contextmanager
+def walked(config, peer):
+    """The daemon, once it has shown all three scenes and finished the two that were left."""
+    with running(config):
+        for number, begin in enumerate((0, 3, 6), 1):
+            for frame in walk()[begin : begin + 3]:
+                peer.server.offer(frame)
+            peer.wait(
+                lambda scene, number=number: scene.scene_id == f"scene-{number:04d}" and finished(3)(scene),
+                f"scene {number}",
+            )
+        peer.wait_for_acknowledgements()
+        wait_for(lambda: heartbeats(config.network)["recon"]["unfinished"] == 0, PATIENCE_S)
+        yield
+
+
+def places_file(config) -> dict:
+    return json.loads((config.out / "places.json").read_text())
+
+
+@pytest.fixture
+def kidnapped(config):
+    return replace(config, lost_after=3)
+
+
+def test_a_place_that_the_camera_comes_back_to_is_recognised(kidnapped, peer):
+    with walked(kidnapped, peer):
+        wait_for(lambda: places_file(kidnapped)["links"], PATIENCE_S)
+    (link,) = places_file(kidnapped)["links"]
+    assert (link["kind"], link["scene"], link["other"]) == ("loop", "scene-0001", "scene-0003")
+    assert "pairs of photographs show the same" in link["why"] and link["retracted"] is None
+    poses = {pose["scene"]: pose for pose in places_file(kidnapped)["poses"]}
+    assert [poses[f"scene-000{number}"]["map"] for number in (1, 2, 3)] == ["scene-0001", "scene-0002", "scene-0001"]
+
+    cameras = {}
+    for scene in ("scene-0001", "scene-0003"):
+        pose = poses[scene]
+        there = Similarity(pose["scale"], np.array(pose["rotation"]), np.array(pose["translation"]))
+        for camera in read_cameras(kidnapped.out / scene / "cameras.json"):
+            cameras[camera.name] = there.camera(camera.T_world_camera)
+    true = [T for T, _ in (*synthetic.scene_cameras(THERE), *AGAIN)]
+    K = np.stack([AGAIN[0][1]] * len(true))
+    names = [frame.name for frame in (*walk()[:3], *walk()[6:])]
+    errors = camera_errors(np.stack([cameras[name] for name in names]), np.stack(true), K, K)
+    assert errors.rotation_deg < 1.5 and errors.centre_pct < 8, errors
+
+
+def test_it_is_recognised_by_the_next_process_where_the_first_one_was_killed(kidnapped, peer, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(Atlas, "compare", lambda *_: None)
+        with walked(kidnapped, peer):
+            pass
+    assert places_file(kidnapped)["links"] == []
+    assert [folder.name for folder in left.finished(kidnapped.checkpoint)] == ["scene-0001", "scene-0002"]
+    with running(kidnapped):
+        wait_for(lambda: places_file(kidnapped)["links"], PATIENCE_S)
+    (link,) = places_file(kidnapped)["links"]
+    assert (link["kind"], link["scene"], link["other"]) == ("loop", "scene-0001", "scene-0003")
+
+
+def test_a_finished_place_whose_files_are_damaged_is_not_recognised_and_stops_nothing(kidnapped, peer):
+    with walked(kidnapped, peer):
+        wait_for(lambda: places_file(kidnapped)["links"], PATIENCE_S)
+    graph = left.finished_folder(kidnapped.checkpoint, "scene-0001") / "graph"
+    graph.write_bytes(graph.read_bytes()[:-100])
+    with running(kidnapped):
+        wait_for(lambda: places_file(kidnapped)["links"] == [], PATIENCE_S)
+        assert heartbeats(kidnapped.network)["recon"]["problem"] == ""
