@@ -175,21 +175,25 @@ class Daemon:
         if isinstance(command, Seen):
             self._problems.seen()
             return Answer(True, "the problems are not told again")
-        if command.name not in self._store.names and (scene_id := self._worker.scene_of(command.name)):
-            present = f"only keyframes of {self._store.scene_id} can be taken back"
-            return Answer(False, printable(f"{command.name} is of {scene_id}, which the camera has left: {present}"))
-        if command.name not in self._store.names:
+        left, here = self._worker.scenes_left_with(command.name), command.name in self._store.names
+        if not left and not here:
             known = ", ".join(sorted(self._store.names)) or "none yet"
             return Answer(False, printable(f"no keyframe {command.name!r}; there are: {known}"))
         try:
-            self._store.forget(command.name, "retracted")
+            if left:
+                self._store.retract_elsewhere(command.name, left)
+            if here:
+                self._store.forget(command.name, "retracted")
         except OSError as error:
             return Answer(
                 False, printable(f"{command.name} cannot be removed ({error.strerror}): make room on the disk")
             )
-        self._inbox.put(LeftOut(command.name), self._stopping)
-        event(log, logging.INFO, "retracted", frame=command.name)
-        return Answer(True, f"{command.name} is removed; the scene is built anew without it")
+        if here:
+            self._inbox.put(LeftOut(command.name), self._stopping)
+        event(log, logging.INFO, "retracted", frame=command.name, left=",".join(left))
+        those = f"{', '.join(left)}, which the camera has left, is built anew without it when no keyframe waits"
+        told = [*(["the scene is built anew without it"] if here else []), *([those] if left else [])]
+        return Answer(True, printable(f"{command.name} is removed; {'; '.join(told)}"))
 
     def _status(self) -> ReconStatus:
         snapshot = self._shown.snapshot if self._shown else None
@@ -213,6 +217,7 @@ class Daemon:
             delay_s=delay_s,
             delay=delay,
             unfinished=worker.unfinished,
+            **worker.known,
             refused=intake.refused + self._commands.refused + self._scenes.refused,
             duplicates=intake.duplicates,
             rss_mb=resident_mb(),

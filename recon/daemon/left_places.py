@@ -23,9 +23,10 @@ AGAIN_S = 300.0  # after a place could not be finished
 
 
 class LeftPlaces:
-    def __init__(self, directory: Path, config: Config, output: Output, atlas: Atlas) -> None:
-        """`directory` is that of the checkpoint which has left/ in it, `config` how scenes are made."""
-        self._directory, self._config, self._output, self._atlas = directory, config, output, atlas
+    def __init__(self, here: Store, config: Config, output: Output, atlas: Atlas) -> None:
+        """`here` is the checkpoint which has left/ in it, `config` how scenes are made."""
+        self._here, self._config, self._output, self._atlas = here, config, output, atlas
+        self._directory = here.directory
         self._work: IncrementalReconstruction | None = None  # that is being finished
         self._not_before_s: dict[Path, float] = {}  # monotonic, for those that could not be finished
 
@@ -44,6 +45,7 @@ class LeftPlaces:
 
         What `pause` raises ends the work; it is begun again another time, as after a failure.
         """
+        self._retract()
         now = time.monotonic()
         waiting = [each for each in left.folders(self._directory) if self._not_before_s.get(each, 0.0) <= now]
         if not waiting:
@@ -67,6 +69,17 @@ class LeftPlaces:
         if finished:
             del self._not_before_s[folder]
         return True
+
+    def _retract(self) -> None:
+        """Takes out of the places that were left what they are to lose; their scenes are not final then."""
+        for scene, name in self._here.ledger.retracted:
+            folder = left.reopen(self._directory, scene)
+            if folder is not None:
+                self._atlas.forget(scene)
+                with contextlib.closing(Store(folder)) as store:
+                    store.forget(name, "retracted")
+                self._not_before_s.pop(folder, None)
+            self._here.was_retracted(scene, name)
 
     def _finished(self, store: Store, found: checkpoint.Restored, pause: Pause) -> bool:
         """Whether the scene of the place is final now, and its result written."""

@@ -81,10 +81,6 @@ class Output:
         """Writes into the index what is known of the present place, which has no result in a folder."""
         self._write(lambda: self.places.tell(_described(self._store, state, None, snapshot, kept)))
 
-    def scene_of(self, name: str) -> str | None:
-        """The id of the scene, of any place, that has a camera of this photograph."""
-        return self.places.scene_of(name)
-
     def finished(self, scene_id: str) -> None:
         """Writes into the index that the camera has left a place whose scene is final."""
         self._write(lambda: self.places.finished(scene_id))

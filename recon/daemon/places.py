@@ -114,9 +114,9 @@ class Places:
         except (OSError, SceneFileError) as error:
             log.warning("the index of places begins anew: %s", error)
 
-    def scene_of(self, name: str) -> str | None:
-        """The id of the first scene that has a camera of this photograph; None: no scene has."""
-        return next((place.scene_id for place in self._index.places if name in place.frames_used), None)
+    def scenes_of(self, name: str) -> list[str]:
+        """The ids of the scenes that have a camera of this photograph."""
+        return [place.scene_id for place in self._index.places if name in place.frames_used]
 
     def finished(self, scene_id: str) -> None:
         """Says that the camera has left a place whose scene is final. Raises ResultWriteError."""

@@ -12,6 +12,7 @@ import msgspec
 
 from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
 from splatnode.recon.daemon.atlas.atlas import Atlas
+from splatnode.recon.daemon.atlas.links import Kind
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
@@ -42,7 +43,7 @@ class Worker:
         self._output = Output(config, store, publish, self._complain)
         self.place = PresentPlace(config, self._recipe, store, self._output, self._pause)
         self._atlas = Atlas(store.directory, self._recipe, self._output.places)
-        self._left = LeftPlaces(store.directory, self._recipe, self._output, self._atlas)
+        self._left = LeftPlaces(store, self._recipe, self._output, self._atlas)
         self._quiet_since_s = time.monotonic()  # when what came last was worked in
         self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory; monotonic
         self.problem = ""
@@ -53,9 +54,16 @@ class Worker:
         """Places that the camera has left and whose scenes are not final yet."""
         return self._left.unfinished
 
-    def scene_of(self, name: str) -> str | None:
-        """The id of the scene, of any place, that has a camera of this photograph; None: no scene has."""
-        return self._output.scene_of(name)
+    @property
+    def known(self) -> dict[str, int]:
+        """How many final scenes there are, for the heartbeat: and into how many maps how many loops join them."""
+        poses, links = self._output.places.poses, self._output.places.links
+        loops = sum(link.kind is Kind.LOOP and link.retracted is None for link in links)
+        return {"scenes": len(poses), "maps": len({pose.map for pose in poses}), "loops": loops}
+
+    def scenes_left_with(self, name: str) -> list[str]:
+        """The ids of the scenes, of places that the camera has left, that have a camera of this photograph."""
+        return [scene for scene in self._output.places.scenes_of(name) if scene != self._store.scene_id]
 
     @property
     def delay(self) -> tuple[float, str]:

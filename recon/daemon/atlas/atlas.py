@@ -54,6 +54,10 @@ class Atlas:
         store.remove_shown()
         self._codes[store.scene_id] = codes
 
+    def forget(self, scene: str) -> None:
+        """The scene is not final any more."""
+        self._codes.pop(scene, None)
+
     def compare(self, scene: str, graph: ViewGraph, pause: Callable[[], None]) -> None:
         """Links a final scene with those before it that show the same. What `pause` raises ends the work.
 

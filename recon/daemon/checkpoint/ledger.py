@@ -34,6 +34,7 @@ class Ledger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     identity: SessionId | None = None  # of this checkpoint, for whoever sends keyframes to it
     follows: str = ""  # the scene that the present one goes on from; empty: it began anew
     shared: tuple[str, ...] = ()  # names of the frames that both have
+    retracted: tuple[tuple[str, str], ...] = ()  # scene and name of frames that places that were left are to lose
 
     @property
     def scene_id(self) -> str:

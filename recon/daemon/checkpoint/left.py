@@ -61,6 +61,18 @@ def finish(folder: Path, instead: str) -> None:
     sync_folder(target.parent)
 
 
+def reopen(directory: Path, scene_id: str) -> Path | None:
+    """The folder of a place that was left, taken back from the finished ones if it is there; None where there is none.
+
+    Raises OSError.
+    """
+    folder, target = finished_folder(directory, scene_id), directory / LEFT / scene_id
+    if (folder / LEDGER).exists() and not (target / LEDGER).exists():
+        folder.rename(target)
+        sync_folder(target.parent)
+    return target if (target / LEDGER).exists() else None
+
+
 def remove(folder: Path) -> None:
     """Removes the checkpoint of a place that was left. What the disk keeps of it, the next start removes."""
     (folder / LEDGER).unlink(missing_ok=True)

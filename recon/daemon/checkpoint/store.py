@@ -21,7 +21,7 @@ import logging
 import re
 import threading
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -184,6 +184,18 @@ class Store:
                 number = self._names[name]
                 self._leave_out({number: name}, self._keys[number], (name, reason))
 
+    def retract_elsewhere(self, name: str, scenes: Iterable[str]) -> None:
+        """Records that these scenes, whose places were left, are to lose a frame. Raises OSError."""
+        with self._writing:
+            retracted = dict.fromkeys((*self.ledger.retracted, *((scene, name) for scene in scenes)))
+            self._write(msgspec.structs.replace(self.ledger, retracted=tuple(retracted)))
+
+    def was_retracted(self, scene: str, name: str) -> None:
+        """Records that the scene has lost the frame. Raises OSError."""
+        with self._writing:
+            retracted = tuple(each for each in self.ledger.retracted if each != (scene, name))
+            self._write(msgspec.structs.replace(self.ledger, retracted=retracted))
+
     def leave_place(self, first: int, shared: Collection[str] = ()) -> None:
         """Begins another place as `begin_place` does, and keeps what there is of the present one. Raises OSError.
 
@@ -193,7 +205,7 @@ class Store:
             own = (number for name, number in self._names.items() if number < first or name in shared)
             frames = [f"frames/{FILE.format(number)}" for number in own]
             made = [name for name in MADE_ANEW if (self.directory / name).exists()]
-            ledger = msgspec.structs.replace(self.ledger, next=self._next, gone=(), identity=None)
+            ledger = msgspec.structs.replace(self.ledger, next=self._next, gone=(), identity=None, retracted=())
             left.keep(self.directory, ledger, [*frames, *made], _INSTEAD)
             self.begin_place(first, shared)
 

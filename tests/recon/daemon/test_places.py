@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from splatnode.capture.frame import DroppedFrame, renamed
+from splatnode.capture.frame import DroppedFrame, Frame, renamed
 from splatnode.capture.messaging.commands import Answer, ask
 from splatnode.capture.messaging.services import RECON_CONTROL
 from splatnode.capture.status import heartbeats
@@ -93,8 +93,6 @@ def test_a_place_that_was_left_is_finished_while_the_camera_rests_in_another(con
         wait_for(lambda: heartbeats(config.network)["recon"]["unfinished"] == 0, PATIENCE_S)
         status = heartbeats(config.network)["recon"]
         assert status["delay_s"] == 0 and status["delay"] == ""
-        answer = ask(RECON_CONTROL, config.network, Retract(frames[0].name), Answer)
-        assert not answer.done and f"{frames[0].name} is of scene-0001, which the camera has left" in answer.message
     first, second = index(config)
     assert (first["scene_id"], first["state"], first["folder"]) == ("scene-0001", "finished", "scene-0001")
     assert (second["scene_id"], second["state"]) == ("scene-0002", "here")
@@ -104,6 +102,37 @@ def test_a_place_that_was_left_is_finished_while_the_camera_rests_in_another(con
     assert told == {frame.name for frame in frames}
     assert not report(config.out / "scene-0001")["verdict"]["provisional"]
     assert not (config.out / "scene-0001-provisional").exists() and left.folders(config.checkpoint) == []
+
+
+def test_a_keyframe_is_taken_out_of_a_place_that_was_left(config, peer):
+    here, there = photographs(), photographs(msgspec.structs.replace(SMALL, seed=1))
+    mirrored = [replace_image(frame, index) for index, frame in enumerate(there[:3])]
+    with running(replace(config, lost_after=3)):
+        for frame in here[:4]:
+            peer.server.offer(frame)
+        peer.wait(finished(4), "four cameras, refined")
+        for frame in mirrored:
+            peer.server.offer(frame)
+        peer.wait(lambda scene: scene.scene_id == "scene-0002" and finished(3)(scene), "another place, finished")
+        wait_for(lambda: left.finished(config.checkpoint), PATIENCE_S)
+        name = here[3].name
+        answer = ask(RECON_CONTROL, config.network, Retract(name), Answer)
+        assert answer.done and "scene-0001, which the camera has left" in answer.message
+        wait_for(lambda: name not in index(config)[0]["frames_used"], PATIENCE_S)
+        wait_for(lambda: heartbeats(config.network)["recon"]["unfinished"] == 0, PATIENCE_S)
+        assert not ask(RECON_CONTROL, config.network, Retract("nothing.png"), Answer).done
+    first, second = index(config)
+    assert {each["name"]: each["reason"] for each in first["frames_dropped"]} == {name: "retracted"}
+    assert first["state"] == "finished" and not first["provisional"] and second["state"] == "here"
+    kept = [camera.name for camera in read_cameras(config.out / "scene-0001" / "cameras.json")]
+    assert kept == [frame.name for frame in here[:3]]
+    assert left.folders(config.checkpoint) == [] and len(left.finished(config.checkpoint)) == 1
+
+
+def replace_image(frame, index):
+    """The frame seen in a mirror, by a name of its own."""
+    image = np.ascontiguousarray(frame.image[:, ::-1])
+    return Frame(10 + index, f"there_{index}.png", frame.stamp_ns, image, None)
 
 
 def test_a_place_that_was_left_is_finished_by_the_next_process(moving, peer, monkeypatch):

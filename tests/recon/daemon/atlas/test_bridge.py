@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -100,7 +101,7 @@ def test_what_looks_most_alike_comes_first(graphs):
 def test_codes_come_back_as_they_were_kept(graphs):
     keyframes = graphs["scene-0001"].keyframes
     header, arrays = codes_message(keyframes, codes := codes_of(keyframes))
-    message = type("Message", (), {"header": header, "arrays": arrays})()
+    message = SimpleNamespace(header=header, arrays=arrays)
     np.testing.assert_array_equal(codes_from(message), codes)
     message.arrays = [arrays[0][:-1]]
     with pytest.raises(ValueError, match="another version"):

@@ -63,6 +63,9 @@ def kidnapped(config):
 def test_a_place_that_the_camera_comes_back_to_is_recognised(kidnapped, peer):
     with walked(kidnapped, peer):
         wait_for(lambda: places_file(kidnapped)["links"], PATIENCE_S)
+        wait_for(lambda: heartbeats(kidnapped.network)["recon"]["loops"] == 1, PATIENCE_S)
+        status = heartbeats(kidnapped.network)["recon"]
+        assert (status["scenes"], status["maps"]) == (3, 2)
     (link,) = places_file(kidnapped)["links"]
     assert (link["kind"], link["scene"], link["other"]) == ("loop", "scene-0001", "scene-0003")
     assert "pairs of photographs show the same" in link["why"] and link["retracted"] is None
