@@ -27,9 +27,12 @@ class Light:
     sky_samples: int = 36
 
 
-def lit(solids: Sequence[Solid], light: Light, rng: np.random.Generator) -> list[Solid]:
-    """The solids with the light of their place multiplied into their skins."""
-    return [replace(solid, skins=_lit_skins(solid, solids, light, rng)) for solid in solids]
+def lit(
+    solids: Sequence[Solid], light: Light, rng: np.random.Generator, occluders: Sequence[Solid] | None = None
+) -> list[Solid]:
+    """The solids with the light of their place multiplied into their skins. `occluders`: those that cast shadows."""
+    shading = solids if occluders is None else occluders
+    return [replace(solid, skins=_lit_skins(solid, shading, light, rng)) for solid in solids]
 
 
 def _lit_skins(solid: Solid, solids: Sequence[Solid], light: Light, rng: np.random.Generator):
