@@ -8,7 +8,14 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.diorama.solids import Array, Solid, ray_interval, surface_coordinates
+from splatnode.capture.diorama.solids import (
+    Array,
+    Shape,
+    Solid,
+    box_face_coordinates,
+    ray_interval,
+    surface_coordinates,
+)
 
 Matrix = npt.NDArray[np.float64]
 Camera = tuple[Matrix, Matrix]  # T_world_camera (4, 4); K (3, 3), centre of the top-left pixel at (0.5, 0.5)
@@ -28,17 +35,25 @@ def cast(
 
 
 def trace(
-    solids: Sequence[Solid], camera: Camera, width: int, height: int, beyond: Array | float = NEAR
+    solids: Sequence[Solid],
+    camera: Camera,
+    width: int,
+    height: int,
+    beyond: Array | float = NEAR,
+    columns: Sequence[slice] | None = None,
 ) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int32]]:
     """(H, W) z of the nearest surfaces, camera frame, inf for nothing; (H, W) whose they are, -1 for nothing.
 
     Rays begin at the z of `beyond`, one for all or (H, W); where that is inf, they meet nothing.
+    `columns`: of the image, by solid, those in which it can be seen.
     """
     z = np.full((height, width), np.inf, np.float32)
     nearest = np.full((height, width), -1, np.int32)
     start = np.broadcast_to(np.asarray(beyond, np.float32), z.shape)
     for index, solid in enumerate(solids):
         window = _window(solid, camera, width, height)
+        if window is not None and columns is not None:
+            window = _within(window, columns[index])
         if window is None:
             continue
         near, far = ray_interval(solid.shape, *_local_rays(solid, camera, window))
@@ -105,8 +120,17 @@ def _window(solid: Solid, camera: Camera, width: int, height: int) -> Window | N
     return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
 
 
+def _within(window: Window, columns: slice) -> Window | None:
+    rows, own = window
+    left, right = max(own.start, columns.start), min(own.stop, columns.stop)
+    return (rows, slice(left, right)) if left < right else None
+
+
 def _skin_colours(solid: Solid, points: Array) -> npt.NDArray[np.float32]:
     """(M, 3) bilinear colours of the skins at points (M, 3) in the solid's own frame."""
+    painted = [index for index, skin in enumerate(solid.skins) if skin.shape[:2] != (1, 1)]
+    if solid.shape is Shape.BOX and len(painted) == 1:
+        return _bilinear(solid.skins[painted[0]], box_face_coordinates(painted[0], points))
     face, uv = surface_coordinates(solid.shape, points)
     colours = np.empty((len(points), 3), np.float32)
     for index, skin in enumerate(solid.skins):

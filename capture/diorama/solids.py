@@ -106,16 +106,24 @@ def surface_coordinates(shape: Shape, points: Array) -> tuple[npt.NDArray[np.int
     return face, np.where((face == 0)[:, None], side, cap)
 
 
-def _box_coordinates(points: Array) -> tuple[npt.NDArray[np.intp], Array]:
-    by_axis = points.astype(np.float64).T
-    axis = np.abs(points).argmax(1)
-    face = 2 * axis + (by_axis[axis, np.arange(len(points))] > 0)
+def box_face_coordinates(face: int, points: Array) -> Array:
+    """Points (M, 3) on a face of the unit box -> texture coordinates (M, 2)."""
     uv = np.empty((len(points), 2))
-    for index, (_, right, up) in enumerate(_BOX_FACES):
+    _, right, up = _BOX_FACES[face]
+    for column, direction in enumerate((right, -up)):
+        along = int(np.abs(direction).argmax())
+        uv[:, column] = (1 + direction[along] * points[:, along].astype(np.float64)) / 2
+    return uv
+
+
+def _box_coordinates(points: Array) -> tuple[npt.NDArray[np.intp], Array]:
+    axis = np.abs(points).argmax(1)
+    face = 2 * axis + (points[np.arange(len(points)), axis] > 0)
+    uv = np.empty((len(points), 2))
+    for index in range(len(_BOX_FACES)):
         chosen = np.flatnonzero(face == index)
-        for column, direction in enumerate((right, -up)) if len(chosen) else ():
-            along = int(np.abs(direction).argmax())
-            uv[chosen, column] = (1 + direction[along] * by_axis[along, chosen]) / 2
+        if len(chosen):
+            uv[chosen] = box_face_coordinates(index, points[chosen])
     return face, uv
 
 
