@@ -57,7 +57,7 @@ def _irradiance(solid: Solid, face: int, others: Sequence[Solid], light: Light, 
     points, normals = points.reshape(-1, 3), normals.reshape(-1, 3)
     in_front = [other for other in others if ((other.corners @ normals.T) > (points * normals).sum(1)).any()]
     irradiance = gathered(points, normals, in_front, light, rng)
-    return cv2.GaussianBlur(irradiance.reshape(shape).astype(np.float32), (0, 0), 0.7)
+    return cv2.GaussianBlur(irradiance.reshape(shape).astype(np.float32), (0, 0), 0.7).astype(np.float32)
 
 
 def gathered(

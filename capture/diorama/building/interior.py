@@ -59,7 +59,7 @@ def interior(seed: int, density: float, number: int) -> Interior:
     above = Builder(100 * seed + 20 + number, density)
     cover_above(above, zone, papers.tiles([(186, 182, 172), (198, 194, 184)], 0.6))
     rng = np.random.default_rng([seed, 30, number])
-    light = Light((0.5, 0.35, 1.5), texels_per_metre=6.0, sun_samples=3, sky_samples=12)
+    light = Light((0.5, 0.35, 1.5), texels_per_metre=min(6.0, density / 16), sun_samples=3, sky_samples=12)
     chairs = tuple(lit_together(chair, [*solids, *chair], light, rng) for chair in _chairs(seed, density, number))
     index = None if mirror is None else len(shell.solids) + mirror
     return Interior((*lit_together(solids, solids, light, rng), *above.solids), index, chairs)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.diorama.building.plan import BLANK_FROM, DOORS, LENGTH, ZONES
+from splatnode.capture.diorama.building.plan import DOORS, LENGTH, ZONES
 
 Array = npt.NDArray[np.float64]
 
@@ -17,7 +17,7 @@ TURNING = 0.30  # the same of the window that smooths where the camera looks
 RADII = (1.3, 1.1)  # metres, of the tour of a room, along x and y
 INWARDS = 62.0  # degrees that the camera is turned from the way to the room's middle
 BLANK_END = -1  # in place of a room: the walk goes to the corridor's blank end and turns round
-FIRST_ROOMS = (0, 3, 0, 2, 4, 3, BLANK_END, 1, 5, 0, 2, 1, BLANK_END, 4, 5, 3)  # then as the seed says
+FIRST_ROOMS = (0, 3, 0, 2, 4, 3, BLANK_END, 1, 5, 2, 4, 1, 0, 5, BLANK_END, 3)  # then as the seed says
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Line:
 def rooms_of(seed: int, legs: int) -> list[int]:
     """Which room is toured on each leg."""
     rng = np.random.default_rng([seed, 51])
-    rooms = list(FIRST_ROOMS)
+    rooms: list[int] = [*FIRST_ROOMS]
     while len(rooms) < legs:
         follower = int(rng.integers(-1, len(DOORS)))
         if follower != rooms[-1]:
@@ -85,7 +85,7 @@ def _turned(room: int, way: Array, counterclockwise: bool) -> Array:
 
 def _blank_end() -> Array:
     """(P, 2) along one side of the corridor to its blank end, a half circle, and back along the other side."""
-    x = (BLANK_FROM + LENGTH) / 2 - 0.1
+    x = LENGTH - 1.3
     angles = np.radians(np.linspace(-90, 90, 19))
     turn = np.stack([x + 0.42 * np.cos(angles), 0.42 * np.sin(angles)], 1)
     return np.concatenate([[[x - 1.5, -0.42]], turn, [[x - 1.5, 0.42]]])

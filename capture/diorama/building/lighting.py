@@ -26,7 +26,9 @@ def lit_together(
     skins, first = {id(solid): list(solid.skins) for solid in solids}, 0
     for (solid, face), (on_face, _) in zip(faces, grids, strict=True):
         count = on_face.shape[0] * on_face.shape[1]
-        arrived = cv2.GaussianBlur(irradiance[first : first + count].reshape(on_face.shape), (0, 0), 0.7)
+        arrived = cv2.GaussianBlur(irradiance[first : first + count].reshape(on_face.shape), (0, 0), 0.7).astype(
+            np.float32
+        )
         skins[id(solid)][face] = under_light(solid.skins[face], arrived)
         first += count
     return tuple(replace(solid, skins=tuple(skins[id(solid)])) for solid in solids)

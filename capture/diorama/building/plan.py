@@ -12,8 +12,7 @@ HALF_CORRIDOR = 1.15
 WALL = 0.12  # between corridor and rooms
 DOOR_WIDTH, DOOR_HEIGHT = 1.15, 2.1
 ROOM = (5.2, 4.7)  # along x and y
-LENGTH = 17.0  # of the corridor; its last metres, beyond the rooms, are blank
-BLANK_FROM = 15.4  # x
+LENGTH = 17.0  # of the corridor; the wall at its east end is blank
 CORRIDOR = 6  # its number among the zones
 
 

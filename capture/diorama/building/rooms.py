@@ -1,4 +1,4 @@
-"""What stands and hangs in each zone. Rooms 2 and 4 are look-alikes: the same paper and kinds of things, dealt anew."""
+"""What stands and hangs in each zone. Rooms 1 and 2 are look-alikes: the same paper and kinds of things, dealt anew."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from splatnode.capture.diorama import papers, prints
 from splatnode.capture.diorama import textures as paint
 from splatnode.capture.diorama.builder import CREAM, INK, PALETTES, PAPER, Builder, Palette, scaled
 from splatnode.capture.diorama.building import pieces
-from splatnode.capture.diorama.building.plan import BLANK_FROM, HEIGHT, Zone
+from splatnode.capture.diorama.building.plan import HEIGHT, Zone
 from splatnode.capture.diorama.building.shell import Cover, openings, stretches
 from splatnode.capture.diorama.building.spot import Spot, walls
 from splatnode.capture.diorama.furniture import cartons, plant, table
 
 Piece = Callable[[Builder, Palette, Spot], None]
-LOOK_ALIKES = (2, 4)
-CHAIR_ROOM, MIRROR_ROOM = 0, 1
+LOOK_ALIKES = (1, 2)
+CHAIR_ROOM, MIRROR_ROOM = 0, 4
 MIRROR_SIZE = (1.3, 1.5)  # metres, width and height
 _TALL = (pieces.bookcase, pieces.rack)  # no print fits above them
 
@@ -60,7 +60,7 @@ def style(number: int) -> Style:
     if number == 0:
         cover = Cover(paint.plaster(first.wall), paint.planks(first.floor), papers.drawers((176, 150, 120), 1, 24))
         return Style(first, cover, (side, case, side, sofa, case, desk, side), _dining_table)
-    if number == 1:
+    if number == 4:
         cover = Cover(papers.wallpaper(second.wall, [second.accents[0], second.accents[2], INK]), _stone(second))
         return Style(second, cover, (desk, case, desk, case, side, rack, _arm_chair), pieces.low_table)
     if number == 3:
@@ -103,8 +103,8 @@ def furnish(builder: Builder, zone: Zone, room: Style) -> int | None:
     corners = [(zone.x0 + 0.35, zone.y1 - 0.35), (zone.x1 - 0.35, zone.y1 - 0.35)]
     corners = corners if zone.y0 > 0 else [(x, zone.y0 + 0.35) for x, _ in corners]
     first, second = (corners[i] for i in rng.permutation(2))
-    plant(builder, palette, *first)
-    pieces.lamp(builder, palette, Spot(*second, 0.0))
+    plant(builder, palette, first[0], first[1])
+    pieces.lamp(builder, palette, Spot(second[0], second[1], 0.0))
     return mirror
 
 
@@ -137,30 +137,23 @@ def furnish_corridor(builder: Builder, zone: Zone) -> None:
     for side in ("north", "south"):
         spot, length = walls(zone)[side]
         for left, right in stretches(length, openings(zone, side)):
-            _line(builder, palette, spot, (left + 0.35, right - 0.35), side)
+            _line(builder, palette, spot, (left + 0.35, right - 0.35))
     west = walls(zone)["west"][0]
     pieces.sideboard(builder, palette, west)
     pieces.picture(builder, palette, west, 1.6, 1.1, 0.8)
+    east, length = walls(zone)["east"]
     blank = paint.plain((216, 212, 204), 0.004)
-    width = zone.x1 - BLANK_FROM
-    for side in ("north", "south", "east"):
-        spot, length = walls(zone)[side]
-        x, along = (
-            (spot.beside(0.0), length) if side == "east" else (Spot(zone.x1 - width / 2, spot.y, spot.yaw_deg), width)
-        )
-        builder.box(x.at(0, 0.03, HEIGHT / 2), (along, 0.06, HEIGHT), blank, spot.yaw_deg)
+    builder.box(east.at(0, 0.03, HEIGHT / 2), (length, 0.06, HEIGHT), blank, east.yaw_deg)
 
 
-def _line(builder: Builder, palette: Palette, spot: Spot, ends: tuple[float, float], side: str) -> None:
+def _line(builder: Builder, palette: Palette, spot: Spot, ends: tuple[float, float]) -> None:
     """Prints and now and then a piece of furniture along a stretch of the corridor's wall."""
     rng, x = builder.rng, ends[0] + 0.25
     furniture: Sequence[Piece] = (pieces.sideboard, pieces.lamp, _narrow_stack)
     while x < ends[1]:
         place = spot.beside(x)
-        if place.x > BLANK_FROM - 0.3:
-            break
         pieces.picture(builder, palette, place, rng.uniform(1.5, 1.66), rng.uniform(0.45, 0.7), rng.uniform(0.5, 0.85))
-        if rng.random() < 0.4 and ends[0] + 0.6 < x < ends[1] - 0.5 and place.x < BLANK_FROM - 1.2:
+        if rng.random() < 0.4 and ends[0] + 0.6 < x < ends[1] - 0.5:
             chosen = furniture[int(rng.integers(len(furniture)))]
             chosen(builder, palette, place if chosen is pieces.sideboard else place.beside(0.42, 0.24))
         x += rng.uniform(0.85, 1.15)
