@@ -26,7 +26,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.pace import FramesPerSecond, Pace, paced
 
 SAME_PLACE = 0.3  # of what two keyframes show: as much in common, and they show the same place
-LONGEST_KIDNAP = 160  # keyframes that a kidnapped robot is carried on by at most
+LONGEST_KIDNAP = 400  # keyframes of the walk that a kidnapped robot may miss; the next tour of another room is nearer
 
 Count = Annotated[int, msgspec.Meta(ge=1, le=100_000)]
 Side = Annotated[int, msgspec.Meta(ge=16, le=4096)]
@@ -136,8 +136,8 @@ def _carried(config: Config) -> float:
     for visit in _walk(config).visits:
         middle = (visit.first + visit.last) / 2
         if middle > config.kidnap_at and (here is None or visit.room != here.room):
-            return min(round(middle - config.kidnap_at), LONGEST_KIDNAP)
-    raise ValueError(f"no room is left to carry the robot to after keyframe {config.kidnap_at}; take an earlier one")
+            return round(middle - config.kidnap_at)
+    raise ValueError(f"no other room is toured after keyframe {config.kidnap_at}; kidnap the robot earlier")
 
 
 @lru_cache(maxsize=4096)
