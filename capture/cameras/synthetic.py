@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from splatnode.capture.diorama.cast import Camera, Matrix, cast
 from splatnode.capture.diorama.layout import place
+from splatnode.capture.diorama.look_at import look_at
 from splatnode.capture.diorama.solids import Solid
 from splatnode.capture.frame import Frame
 from splatnode.capture.pace import FramesPerSecond
@@ -101,19 +102,6 @@ def _camera_on_path(config: Config, position: float) -> Camera:
     centre = np.array([TARGET[0] + distance * np.cos(azimuth), TARGET[1] + distance * np.sin(azimuth), height])
     target = TARGET + 0.07 * sway[3:6]
     return look_at(centre, target, roll_deg=2.5 * sway[4]), intrinsic_matrix(config, focal)
-
-
-def look_at(centre: Matrix, target: Matrix, roll_deg: float = 0.0) -> Matrix:
-    """T_world_camera (4, 4) at `centre`, its z axis towards `target`, upright in a world whose z is up, then rolled."""
-    forward = (target - centre) / np.linalg.norm(target - centre)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
-    cosine, sine = np.cos(np.radians(roll_deg)), np.sin(np.radians(roll_deg))
-    T_world_camera = np.eye(4)
-    T_world_camera[:3, :3] = np.stack([cosine * right + sine * down, cosine * down - sine * right, forward], 1)
-    T_world_camera[:3, 3] = centre
-    return T_world_camera
 
 
 def intrinsic_matrix(config: Config, focal: float) -> Matrix:

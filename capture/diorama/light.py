@@ -40,28 +40,40 @@ def _lit_skins(solid: Solid, solids: Sequence[Solid], light: Light, rng: np.rand
             skins.append(skin)
             continue
         irradiance = _irradiance(solid, face, others, light, rng)
-        smooth = cv2.resize(irradiance, (skin.shape[1], skin.shape[0]), interpolation=cv2.INTER_LINEAR)
-        skins.append(to_srgb(from_srgb(skin) * smooth))
+        skins.append(under_light(skin, irradiance))
     return tuple(skins)
+
+
+def under_light(skin: npt.NDArray[np.uint8], irradiance: Array) -> npt.NDArray[np.uint8]:
+    """A skin (h, w, 3) under the light of a coarser grid (m, n, 3), linear RGB."""
+    smooth = cv2.resize(irradiance, (skin.shape[1], skin.shape[0]), interpolation=cv2.INTER_LINEAR)
+    return to_srgb(from_srgb(skin) * smooth)
 
 
 def _irradiance(solid: Solid, face: int, others: Sequence[Solid], light: Light, rng: np.random.Generator) -> Array:
     """(h, w, 3) linear RGB on a coarse grid of the face."""
-    points, normals = _grid(solid, face, light.texels_per_metre)
+    points, normals = grid(solid, face, light.texels_per_metre)
     shape = points.shape
     points, normals = points.reshape(-1, 3), normals.reshape(-1, 3)
     in_front = [other for other in others if ((other.corners @ normals.T) > (points * normals).sum(1)).any()]
+    irradiance = gathered(points, normals, in_front, light, rng)
+    return cv2.GaussianBlur(irradiance.reshape(shape).astype(np.float32), (0, 0), 0.7).astype(np.float32)
+
+
+def gathered(
+    points: Array, normals: Array, occluders: Sequence[Solid], light: Light, rng: np.random.Generator
+) -> Array:
+    """(P, 3) linear RGB that arrives at points (P, 3) just above surfaces with unit normals (P, 3)."""
     towards_sun = np.array(light.towards_sun) / np.linalg.norm(light.towards_sun)
     to_sun = towards_sun + light.sun_radius * rng.normal(size=(len(points), light.sun_samples, 3)) / 1.7
     to_sky = _cosine_directions(normals, light.sky_samples, rng)
-    is_open = _unblocked(points, np.concatenate([to_sun, to_sky], axis=1), in_front)
+    is_open = _unblocked(points, np.concatenate([to_sun, to_sky], axis=1), occluders)
     sunlit = np.maximum(normals @ towards_sun, 0) * is_open[:, : light.sun_samples].mean(1)
     open_sky = is_open[:, light.sun_samples :].mean(1)[:, None]
-    irradiance = sunlit[:, None] * light.sun + open_sky * light.sky + (1 - open_sky) * light.bounced
-    return cv2.GaussianBlur(irradiance.reshape(shape).astype(np.float32), (0, 0), 0.7)
+    return sunlit[:, None] * light.sun + open_sky * light.sky + (1 - open_sky) * light.bounced
 
 
-def _grid(solid: Solid, face: int, texels_per_metre: float) -> tuple[Array, Array]:
+def grid(solid: Solid, face: int, texels_per_metre: float) -> tuple[Array, Array]:
     """Points (h, w, 3) just above a face, in the world, and their unit normals (h, w, 3)."""
     sides = face_size(solid.shape, solid.axes, face)
     columns, rows = (int(np.clip(np.ceil(side * texels_per_metre), 3, 130)) for side in sides)

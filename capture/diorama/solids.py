@@ -95,18 +95,36 @@ _BOX_FACES = np.array(
 
 def surface_coordinates(shape: Shape, points: Array) -> tuple[npt.NDArray[np.intp], Array]:
     """Points (M, 3) on a unit shape -> face (M,) and texture coordinates (M, 2) in [0, 1]: right, and down."""
+    if shape is Shape.BOX:
+        return _box_coordinates(points)
     x, y, z = points.T
     around = np.arctan2(y, x) / (2 * np.pi) + 0.5
     if shape is Shape.ELLIPSOID:
         return np.zeros(len(points), np.intp), np.stack([around, np.arccos(np.clip(z, -1, 1)) / np.pi], 1)
-    if shape is Shape.CYLINDER:
-        face = np.where(np.abs(z) < np.hypot(x, y), 0, np.where(z < 0, 1, 2))
-        side, cap = np.stack([around, (1 - z) / 2], 1), np.stack([(1 + x) / 2, (1 - y) / 2], 1)
-        return face, np.where((face == 0)[:, None], side, cap)
+    face = np.where(np.abs(z) < np.hypot(x, y), 0, np.where(z < 0, 1, 2))
+    side, cap = np.stack([around, (1 - z) / 2], 1), np.stack([(1 + x) / 2, (1 - y) / 2], 1)
+    return face, np.where((face == 0)[:, None], side, cap)
+
+
+def box_face_coordinates(face: int, points: Array) -> Array:
+    """Points (M, 3) on a face of the unit box -> texture coordinates (M, 2)."""
+    uv = np.empty((len(points), 2))
+    _, right, up = _BOX_FACES[face]
+    for column, direction in enumerate((right, -up)):
+        along = int(np.abs(direction).argmax())
+        uv[:, column] = (1 + direction[along] * points[:, along].astype(np.float64)) / 2
+    return uv
+
+
+def _box_coordinates(points: Array) -> tuple[npt.NDArray[np.intp], Array]:
     axis = np.abs(points).argmax(1)
-    face = 2 * axis + (np.take_along_axis(points, axis[:, None], 1)[:, 0] > 0)
-    _, right, up = np.moveaxis(_BOX_FACES[face], 1, 0)
-    return face, np.stack([(1 + (points * right).sum(1)) / 2, (1 - (points * up).sum(1)) / 2], 1)
+    face = 2 * axis + (points[np.arange(len(points)), axis] > 0)
+    uv = np.empty((len(points), 2))
+    for index in range(len(_BOX_FACES)):
+        chosen = np.flatnonzero(face == index)
+        if len(chosen):
+            uv[chosen] = box_face_coordinates(index, points[chosen])
+    return face, uv
 
 
 def face_points(shape: Shape, face: int, u: Array, v: Array) -> tuple[Array, Array]:

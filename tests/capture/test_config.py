@@ -34,7 +34,7 @@ def test_the_commented_calibration_can_be_used(tmp_path):
 
 
 @pytest.mark.parametrize("rate", [0, 1e-300, float("inf")])
-@pytest.mark.parametrize("kind", ["depthai", "synthetic", "v4l2"])
+@pytest.mark.parametrize("kind", ["building", "depthai", "synthetic", "v4l2"])
 def test_a_rate_that_no_camera_has_is_refused(kind, rate):
     with pytest.raises(ConfigError, match="camera.frames_per_second: expected float"):
         typed({"camera": {"kind": kind, "frames_per_second": rate}}, CaptureConfig)

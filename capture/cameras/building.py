@@ -1,0 +1,145 @@
+"""The built-in building: a robot's keyframes of a long walk through rooms and a corridor, made one by one.
+
+The walk comes back to its rooms, walks the corridor both ways, and passes a mirror, two rooms that look alike, a chair
+that is moved between two visits, and a few keyframes of blank wall. The photographs carry no intrinsics, as those of an
+unknown camera do. What is known is for tests and benchmarks: scene_camera, held_out_camera, depth and shared_surface.
+The place is made by splatnode.capture.diorama.building; this file photographs it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.diorama.building import view
+from splatnode.capture.diorama.building.overlap import Seen, seen, shared
+from splatnode.capture.diorama.building.rooms import CHAIR_ROOM
+from splatnode.capture.diorama.building.walk import Walk, walk
+from splatnode.capture.diorama.cast import Camera
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.pace import FramesPerSecond, Pace, paced
+
+SAME_PLACE = 0.3  # of what two keyframes show: as much in common, and they show the same place
+LONGEST_KIDNAP = 400  # keyframes of the walk that a kidnapped robot may miss; the next tour of another room is nearer
+
+Count = Annotated[int, msgspec.Meta(ge=1, le=100_000)]
+Side = Annotated[int, msgspec.Meta(ge=16, le=4096)]
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    keyframes: Count = 1000
+    width: Side = 480
+    height: Side = 360
+    seed: Annotated[int, msgspec.Meta(ge=0, le=1_000_000)] = 0  # of the building and of the walk
+    noise: float = 1.0  # standard deviation of the sensor noise, grey levels
+    samples: Annotated[int, msgspec.Meta(ge=1, le=4)] = 2  # rays a pixel in each direction
+    kidnap_at: Annotated[int, msgspec.Meta(ge=0, le=100_000)] = 0  # the keyframe taken in another room; 0: none is
+    frames_per_second: FramesPerSecond = 2.0
+    pace: Pace = "fastest"
+
+
+def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
+    """The photographs in the order of the walk, each made when it is asked for."""
+    return paced(_frames(config), config.pace)
+
+
+def _frames(config: Config) -> Iterator[Frame]:
+    for index in range(config.keyframes):
+        stamp_ns = round(index / config.frames_per_second * 1e9)
+        yield Frame(index, frame_name(index), stamp_ns, photograph(config, index), intrinsics=None)
+
+
+def frame_name(index: int) -> str:
+    return f"keyframe_{index:05d}.png"
+
+
+def frame_index(name: str) -> int:
+    """Inverse of frame_name, of what begins with it, too."""
+    return int(name.removeprefix("keyframe_")[:5])
+
+
+def scene_camera(config: Config, index: float) -> Camera:
+    """T_world_camera and K of a keyframe; world axes as in splatnode.capture.diorama.building.plan, metres."""
+    return _walk(config).T_world_camera(_position(config, index)), intrinsic_matrix(config)
+
+
+def held_out_camera(config: Config, index: int) -> Camera:
+    """A camera for testing: midway on the walk from keyframe `index` to the next."""
+    return scene_camera(config, index + 0.5)
+
+
+def photograph(config: Config, index: float) -> npt.NDArray[np.uint8]:
+    """(H, W, 3) RGB as the camera of keyframe `index` (held out where it ends with .5) sees the building of then."""
+    T_world_camera, K = scene_camera(config, index)
+    dense = T_world_camera, np.diag([config.samples, config.samples, 1.0]) @ K
+    colours = view.view(state(config, index), dense, config.width * config.samples, config.height * config.samples)
+    image = cv2.resize(colours, (config.width, config.height), interpolation=cv2.INTER_AREA)
+    grain = np.random.default_rng([config.seed, round(2 * index)]).standard_normal(image.shape, dtype=np.float32)
+    return np.clip(np.rint(image + np.float32(config.noise) * grain), 0, 255).astype(np.uint8)
+
+
+def depth(config: Config, index: float) -> npt.NDArray[np.float32]:
+    """(H, W) true z in the keyframe's camera frame, metres, at pixel centres; of the mirror, that of its glass."""
+    return view.depth(state(config, index), scene_camera(config, index), config.width, config.height)
+
+
+def shared_surface(config: Config, first: int, second: int) -> float:
+    """0 to 1: how much of the surface that one keyframe shows the other shows, too; of both ways the lesser."""
+    return shared(_seen(config, first), _seen(config, second))
+
+
+def same_place(config: Config, first: int, second: int) -> bool:
+    """Whether two keyframes show the same place. A chair that was moved in between makes no other place of it."""
+    return shared_surface(config, first, second) >= SAME_PLACE
+
+
+def state(config: Config, index: float) -> view.State:
+    """The building when a keyframe is taken: the chair is moved whenever its room has been left."""
+    position = _position(config, index)
+    left = sum(visit.room == CHAIR_ROOM and visit.last < position for visit in _walk(config).visits)
+    density = float(np.clip(0.28 * max(config.width, config.height), 48, 512))
+    return view.State(config.seed, density, left % 2)
+
+
+def room(config: Config, index: float) -> int | None:
+    """The room that is toured at a keyframe; None on the way between two."""
+    visit = _walk(config).visit_at(_position(config, index))
+    return None if visit is None else visit.room
+
+
+def intrinsic_matrix(config: Config) -> npt.NDArray[np.float64]:
+    """(3, 3); 71 degrees from left to right."""
+    focal = 0.7 * config.width
+    return np.array([[focal, 0.0, config.width / 2], [0.0, focal, config.height / 2], [0.0, 0.0, 1.0]])
+
+
+def _walk(config: Config) -> Walk:
+    return walk(config.seed, config.keyframes + LONGEST_KIDNAP)
+
+
+def _position(config: Config, index: float) -> float:
+    if not config.kidnap_at or index < config.kidnap_at:
+        return index
+    return index + _carried(config)
+
+
+@lru_cache(maxsize=8)
+def _carried(config: Config) -> float:
+    """Keyframes that the kidnapped robot misses: it goes on in the middle of the next tour of another room."""
+    here = _walk(config).visit_at(config.kidnap_at)
+    for visit in _walk(config).visits:
+        middle = (visit.first + visit.last) / 2
+        if middle > config.kidnap_at and (here is None or visit.room != here.room):
+            return round(middle - config.kidnap_at)
+    raise ValueError(f"no other room is toured after keyframe {config.kidnap_at}; kidnap the robot earlier")
+
+
+@lru_cache(maxsize=4096)
+def _seen(config: Config, index: int) -> Seen:
+    return seen(state(config, index), scene_camera(config, index), config.width, config.height)

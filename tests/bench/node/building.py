@@ -1,0 +1,205 @@
+"""A long walk through the built-in building: `python -m tests.bench building --keyframes 1000 --per-second 0.5`.
+
+Capture's camera is `kind: building`; capture and recon run as they do on a robot. While the robot walks, recon's
+heartbeat, memory and processor time are sampled. When all scenes are finished, they are compared with what is known of
+the walk: how far the cameras of each map are from the true ones, which of the revisits were recognised, and which links
+between scenes are wrong. The scene of the first room is scored on photographs that were held out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+
+from splatnode.capture.cameras import building
+from splatnode.capture.image_file import encode_png
+from splatnode.capture.status import heartbeats
+from splatnode.recon.evaluate.splits import Split
+from splatnode.recon.evaluate.true_cameras import TrueCamera
+from splatnode.recon.evaluate.truth import EvaluationScene
+from splatnode.recon.result.export import read_cameras, read_gaussians
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.verdict import Code, Verdict
+from tests.bench.node.building_cost import Sample, cost_row, folder_mb
+from tests.bench.node.building_score import camera_rows, loop_row, maps
+from tests.bench.node.live import psnr
+from tests.support.node import Node, memory_mb, processor_s, running
+
+LOOK_S = 1.0
+ALONE_S = 5.0  # of recon, before the camera starts: it loads torch
+HELD_OUT = 6  # photographs of the first room's scene
+FARTHEST_M = 6.0  # cameras farther apart are not asked whether they show the same place
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--keyframes", type=int, default=1000)
+    parser.add_argument("--per-second", type=float, default=0.5, help="keyframes")
+    parser.add_argument("--size", type=int, default=480, help="pixels, the photographs' width")
+    parser.add_argument("--seed", type=int, default=0, help="of the building and of the walk")
+    parser.add_argument(
+        "--kidnap-at", type=int, default=0, help="keyframe at which the robot is carried away; 0: never"
+    )
+    parser.add_argument(
+        "--patience-s", type=float, default=1800.0, help="after the last keyframe, until all is finished"
+    )
+    parser.add_argument("--max-views", type=int, help="of a scene; default: recon's")
+    parser.add_argument("--out", type=Path, default=Path("tests/bench/results/building.json"))
+    args = parser.parse_args()
+    config = building.Config(
+        keyframes=args.keyframes, width=args.size, height=args.size * 3 // 4, seed=args.seed, kidnap_at=args.kidnap_at,
+        frames_per_second=args.per_second, pace="recorded",
+    )  # fmt: skip
+    recon = {} if args.max_views is None else {"max_views": args.max_views}
+    with tempfile.TemporaryDirectory() as folder:
+        row, out = walked(Path(folder), config, recon, args.patience_s)
+        row |= scored(config, out, Path(folder))
+    result = {"command": shlex.join(["python", "-m", "tests.bench", "building", *sys.argv[1:]]), **row}
+    args.out.write_text(json.dumps(result, indent=1) + "\n")
+    brief = {key: value for key, value in result.items() if key not in ("cost", "places")}
+    print(json.dumps(brief | {"cost": {key: value for key, value in row["cost"].items() if key != "samples"}}))
+
+
+def walked(folder: Path, config: building.Config, recon: dict, patience_s: float) -> tuple[dict, Path]:
+    """What was measured while the robot walked, and the folder of the results."""
+    camera = {key: getattr(config, key) for key in config.__struct_fields__}
+    capture = {
+        "camera": {"kind": "building", **camera},
+        "selection": {"every_frame": True},
+        "spool": {"directory": str(folder / "node"), "max_frames": config.keyframes + 10, "max_mb": 20_000},
+    }
+    with running(Node(folder / "node", capture, recon)) as node:
+        pid = node.start("recon").pid
+        time.sleep(ALONE_S)
+        node.start("capture")
+        began, samples = time.monotonic(), []
+        taken_s = finished_s = None
+        last_s = config.keyframes / config.frames_per_second
+        while finished_s is None and time.monotonic() - began < last_s + patience_s:
+            time.sleep(LOOK_S)
+            if node.processes["recon"].poll() is not None:
+                break  # its exit code tells
+            found = heartbeats(node.network)
+            capture_status, recon_status = found["capture"], found["recon"]
+            if recon_status is None:
+                continue
+            samples.append(_sample(node, pid, time.monotonic() - began, recon_status))
+            done = capture_status is None or (capture_status["state"] == "finished" and not capture_status["waiting"])
+            if done and taken_s is None:
+                taken_s = time.monotonic() - began
+            if (
+                done
+                and recon_status["state"] == "idle"
+                and not recon_status["unfinished"]
+                and not recon_status["queue"]
+            ):
+                finished_s = time.monotonic() - began
+        codes = {verb: node.end(verb) for verb in ("capture", "recon")}
+        row = {
+            "keyframes": config.keyframes, "per_second": config.frames_per_second, "width": config.width,
+            "taken_s": taken_s, "all_finished_s": finished_s, "exit_codes": codes, "cost": cost_row(samples),
+            "load_average": os.getloadavg()[0],
+        }  # fmt: skip
+        return row, node.out
+
+
+def _sample(node: Node, pid: int, second: float, status: Mapping) -> Sample:
+    taken = status["keyframe"] + 1
+    checkpoint = Path(node.configs["recon"]["checkpoint"])
+    return Sample(
+        second=second, acknowledged=taken, done=taken - status["queue"], processor_s=processor_s(pid),
+        rss_mb=memory_mb(pid), delay_s=status["delay_s"], checkpoint_mb=folder_mb(checkpoint),
+    )  # fmt: skip
+
+
+def scored(config: building.Config, out: Path, folder: Path) -> dict:
+    """The scenes in `out` against the truth."""
+    index = json.loads((out / "places.json").read_text())
+    folders = {place["scene_id"]: out / place["folder"] for place in index["places"] if place["folder"]}
+    found = {
+        scene: {
+            building.frame_index(camera.name): camera.T_world_camera for camera in read_cameras(path / "cameras.json")
+        }
+        for scene, path in folders.items()
+        if (path / "cameras.json").exists()
+    }
+
+    @cache
+    def truth(keyframe: int) -> np.ndarray:
+        return building.scene_camera(config, keyframe)[0]
+
+    @cache
+    def same_place(first: int, second: int) -> bool:
+        a, b = truth(first), truth(second)
+        near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < FARTHEST_M and a[:3, 2] @ b[:3, 2] > 0
+        return bool(near) and building.same_place(config, first, second)
+
+    joined = maps(index, list(found))
+    in_a_scene = {keyframe for cameras in found.values() for keyframe in cameras}
+    rows = camera_rows(found, joined, truth)
+    return {
+        "scenes": len(found),
+        "maps": len({name for name, _ in joined.of.values()}),
+        "in_a_scene": len(in_a_scene),
+        "in_a_scene_percent": 100 * len(in_a_scene) / config.keyframes,
+        "in_no_scene": sorted(set(range(config.keyframes)) - in_a_scene),
+        "cameras_by_map": rows,
+        "cameras": _over_all(rows),
+        "loops": loop_row(found, joined, index["links"], truth, same_place),
+        "first_room_psnr": _first_room_psnr(config, folders, found, folder),
+        "places": index["places"],
+    }
+
+
+def _over_all(rows: list[dict]) -> dict:
+    """The errors of all maps: of positions in the mean by keyframes, of rotations the worst."""
+    weights = [row["keyframes"] for row in rows]
+    if not rows:
+        return {}
+    return {
+        "position_percent_of_path": float(
+            np.average([row["position_percent_of_path"] for row in rows], weights=weights)
+        ),
+        "rotation_deg_most": max(row["rotation_deg_most"] for row in rows),
+        "path_m": sum(row["path_m"] for row in rows),
+    }
+
+
+def _first_room_psnr(
+    config: building.Config, folders: Mapping[str, Path], found: Mapping[str, Mapping], folder: Path
+) -> float | None:
+    """Of the scene that has most keyframes of the first tour, on photographs midway between them."""
+    tour = [
+        index for index in range(min(config.keyframes, 60)) if building.room(config, index) == building.room(config, 0)
+    ]
+    counts = {scene: len(set(cameras) & set(tour)) for scene, cameras in found.items()}
+    scene = max(counts, key=lambda each: counts[each], default=None)
+    if scene is None or not (folders[scene] / "scene.ply").exists():
+        return None
+    inside = [each for each in tour if each in found[scene] and each + 1 in found[scene]]
+    chosen = inside[1 :: max(1, len(inside) // HELD_OUT)][:HELD_OUT]
+    paths, true = {}, {}
+    for keyframe in chosen:
+        name = f"held_out_{keyframe:05d}.png"
+        paths[name] = folder / name
+        paths[name].write_bytes(encode_png(building.photograph(config, keyframe + 0.5)))
+        true[name] = TrueCamera(*building.held_out_camera(config, keyframe), config.width, config.height)
+    cameras = read_cameras(folders[scene] / "cameras.json")
+    for camera in cameras:
+        known = building.scene_camera(config, building.frame_index(camera.name))
+        true[camera.name] = TrueCamera(*known, config.width, config.height)
+    verdict = Verdict(Code.OK, "", "", publishable=True)
+    gaussians = read_gaussians(folders[scene] / "scene.ply")
+    snapshot = Snapshot(0, verdict, cameras, gaussians, images={}, dropped=(), iterations=0, seconds={}, final=True)
+    split = Split(tuple(camera.name for camera in cameras), tuple(paths))
+    return psnr(snapshot, EvaluationScene("building", paths, true), split)
