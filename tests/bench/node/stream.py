@@ -56,10 +56,11 @@ def main() -> None:
         names = [f"{name}__{photograph}" for name in scenes for photograph in splits[name].train]
         back = [f"{name}__{photograph}" for name in scenes for photograph in splits[name].test]
         names += reversed(back) if args.and_back else []
+        names = [f"{number:04d}__{name}" for number, name in enumerate(names)]  # they come in the order of their names
         live, places = _streamed(Path(folder), scenes, names, args.per_second, args.max_views)
     if args.and_back:
         live["visits"] = _visits(places, live["poses"], splits)
-    live["cameras"] = {name: _camera_errors(name, scene, places, live["links"]) for name, scene in scenes.items()}
+    live["cameras"] = {name: _camera_errors(name, scene, places, live["poses"]) for name, scene in scenes.items()}
     for name, scene in scenes.items():
         for place in places:
             snapshot = place["snapshot"]
@@ -83,23 +84,23 @@ def main() -> None:
     print(json.dumps({key: value for key, value in result.items() if key != "delays_s"}))
 
 
-def _camera_errors(name: str, scene: EvaluationScene, places: list[dict], links: list[dict]) -> dict | None:
-    """Of all cameras of the place, brought into the world of its first scene by the links; None where there is none."""
+def _camera_errors(name: str, scene: EvaluationScene, places: list[dict], poses: list[dict]) -> dict | None:
+    """Of all cameras of the place, in the map of its first scene; None where there is none."""
     found = {place["scene_id"]: place["snapshot"] for place in places if place["snapshot"] is not None}
     mine = [place["scene_id"] for place in places if place["scene_id"] in found and _source(place) == name]
     if not mine:
         return None
-    to_first = {mine[0]: Similarity(1.0, np.eye(3), np.zeros(3))}
-    for _ in links:
-        for each in links:
-            step = Similarity(each["scale"], np.array(each["rotation"]), np.array(each["translation"]))
-            if each["scene"] in to_first and each["other"] not in to_first:
-                to_first[each["other"]] = to_first[each["scene"]].after(step)
-            elif each["other"] in to_first and each["scene"] not in to_first:
-                to_first[each["scene"]] = to_first[each["other"]].after(step.inverse())
+    poses = {pose["scene"]: pose for pose in poses}
+    to_map = {
+        scene: Similarity(
+            poses[scene]["scale"], np.array(poses[scene]["rotation"]), np.array(poses[scene]["translation"])
+        )
+        for scene in mine
+        if scene in poses and poses[scene]["map"] == poses[mine[0]]["map"]
+    }
     cameras = {
         camera.name: (similarity.camera(camera.T_world_camera), camera)
-        for scene_id, similarity in to_first.items()
+        for scene_id, similarity in to_map.items()
         for camera in found[scene_id].cameras
     }
     true = scene.cameras
@@ -111,7 +112,7 @@ def _camera_errors(name: str, scene: EvaluationScene, places: list[dict], links:
         np.stack([true[each].K_for(cameras[each][1].width, cameras[each][1].height) for each in names]),
     )
     told = {"rotation_deg": errors.rotation_deg, "centre_pct": errors.centre_pct}
-    return {"scenes": len(mine), "linked": len(to_first), "cameras": len(names), **told}
+    return {"scenes": len(mine), "linked": len(to_map), "cameras": len(names), **told}
 
 
 def _visits(places: list[dict], poses: list[dict], splits: dict[str, Split]) -> dict:
@@ -120,7 +121,7 @@ def _visits(places: list[dict], poses: list[dict], splits: dict[str, Split]) -> 
     maps: dict[str, set[tuple[str, bool]]] = {}  # the scenes in each map, and whether they were seen on the way back
     for place in places:
         if place["scene_id"] in map_of:
-            photographs = [name.split("__", 1) for name in place["frames_used"]]
+            photographs = map(_parts, place["frames_used"])
             mine = {(name, photograph in splits[name].test) for name, photograph in photographs}
             maps.setdefault(map_of[place["scene_id"]], set()).update(mine)
     found = list(maps.values())
@@ -134,7 +135,13 @@ def _visits(places: list[dict], poses: list[dict], splits: dict[str, Split]) -> 
 
 def _source(place: dict) -> str:
     """The folder that the place's photographs come from."""
-    return place["frames_used"][0].split("__", 1)[0]
+    return _parts(place["frames_used"][0])[0]
+
+
+def _parts(name: str) -> tuple[str, str]:
+    """The scene and the photograph that a streamed photograph is."""
+    _, scene, photograph = name.split("__", 2)
+    return scene, photograph
 
 
 def _split(scene: EvaluationScene, hold_out: int) -> Split:
@@ -150,7 +157,7 @@ def _streamed(
     images = folder / "images"
     images.mkdir()
     for name in names:
-        scene, photograph = name.split("__", 1)
+        scene, photograph = _parts(name)
         (images / name).symlink_to(scenes[scene].paths[photograph].resolve())
     camera = {
         "camera": {
@@ -212,6 +219,6 @@ def _exported(folder: Path) -> Snapshot | None:
     if not (folder / "scene.ply").exists():
         return None
     gaussians, cameras = read_gaussians(folder / "scene.ply"), read_cameras(folder / "cameras.json")
-    renamed = tuple(replace(camera, name=camera.name.split("__", 1)[1]) for camera in cameras)
+    renamed = tuple(replace(camera, name=_parts(camera.name)[1]) for camera in cameras)
     verdict = Verdict(Code.OK, "", "", publishable=True)
     return Snapshot(0, verdict, renamed, gaussians, images={}, dropped=(), iterations=0, seconds={}, final=True)
