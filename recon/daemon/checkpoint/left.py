@@ -11,7 +11,7 @@ import shutil
 from collections.abc import Iterable
 from pathlib import Path
 
-from splatnode.capture.process.durable import sync_folder
+from splatnode.capture.process.durable import remove_leftovers, sync_folder
 from splatnode.capture.process.private import private_folder
 from splatnode.recon.daemon.checkpoint.ledger import FILE as LEDGER
 from splatnode.recon.daemon.checkpoint.ledger import Ledger, write_ledger
@@ -80,10 +80,12 @@ def remove(folder: Path) -> None:
 
 
 def remove_half_left(directory: Path, place: int) -> None:
-    """Removes what dead processes left of places that were not left yet, `place` among them, or finished already."""
+    """Removes half-written files, and folders of places that were not left yet, `place` among them, or removed."""
     for folder in (directory / LEFT).glob("scene-*"):
         if _place(folder) >= place or not (folder / LEDGER).exists():
             remove(folder)
+    for folder in (*folders(directory), *finished(directory)):
+        remove_leftovers(folder)
 
 
 def _place(folder: Path) -> int:

@@ -127,7 +127,29 @@ def _storing(disk: Path, tell: Tell) -> None:
     doing("place", lambda: store.leave_place(first))
     doing("put 5", lambda: store.put(ReceivedFrame(SESSION, 5, _frame(5))))
     doing("save graph 2", lambda: store.save("graph", _Thing(2), _arrays(2)))
+    doing("finish", lambda: _finishing(store))
+    doing("retract 0", lambda: store.retract_elsewhere("0.png", ["scene-0001"]))
+    doing("retracting 0", lambda: _retracting(store))
     store.close()
+
+
+def _finishing(store: Store) -> None:
+    """Takes the place that was left among the finished ones, as the daemon does once its scene is final."""
+    for folder in left.folders(store.directory):
+        with contextlib.closing(Store(folder)) as kept:
+            kept.save("codes", _Thing(3), _arrays(3))
+            kept.remove_shown()
+            kept.finish()
+
+
+def _retracting(store: Store) -> None:
+    """Takes a finished place back among those that were left, and a frame out of it."""
+    for scene, name in store.ledger.retracted:
+        folder = left.reopen(store.directory, scene)
+        if folder is not None:
+            with contextlib.closing(Store(folder)) as kept:
+                kept.forget(name, "retracted")
+        store.was_retracted(scene, name)
 
 
 def _doing(tell: Tell, what: str, work: Callable[[], object]) -> None:
@@ -157,7 +179,7 @@ def _store_after(disk: Path, told: list[str]) -> None:
         assert 1 not in frames and ("1.png" in {each.name for each in store.dropped} or "begin place" in told)
     if "place" in told:
         assert not {0, 1, 2} & set(frames) and store.scene_id == "scene-0002"
-    _left_after(store, promised & {0, 2})
+    _left_after(store, promised & {0, 2}, told)
     assert not {stored.frame.name for stored in frames.values()} & {each.name for each in store.dropped}
     assert not list(disk.rglob("*.damaged")), "a whole frame was called damaged"
     for name in MADE_ANEW:
@@ -167,10 +189,16 @@ def _store_after(disk: Path, told: list[str]) -> None:
     store.close()
 
 
-def _left_after(store: Store, promised: set[int]) -> None:
-    """A place is here or in left/, whole either way."""
-    folders = left.folders(store.directory)
+def _left_after(store: Store, promised: set[int], told: list[str]) -> None:
+    """A place is here, in left/ or in finished/, whole each way."""
+    folders = [*left.folders(store.directory), *left.finished(store.directory)]
     assert len(folders) == (store.scene_id == "scene-0002"), folders
+    if "retract 0" in told and folders:
+        _retracting(store)
+        promised = promised - {0}
+    elif "begin retract 0" in told:
+        promised = promised - {0}
+    folders = [*left.folders(store.directory), *left.finished(store.directory)]
     for folder in folders:
         with contextlib.closing(Store(folder)) as kept:
             frames = {stored.key[1] for stored in kept.frames()}

@@ -271,6 +271,48 @@ def test_a_place_that_is_left_is_kept_as_a_checkpoint_of_its_own(open_store):
     assert left.folders(store.directory) == []
 
 
+def test_a_place_goes_on_from_the_one_that_it_shares_frames_with(open_store):
+    store = open_store()
+    for sequence in range(4):
+        store.put(received(sequence))
+    store.leave_place(2, shared=("2.png", "3.png"))
+    (folder,) = left.folders(store.directory)
+    kept = Store(folder)
+    assert (kept.ledger.follows, kept.ledger.shared) == ("", ()) and kept.names == {f"{i}.png" for i in range(4)}
+    kept.close()
+    store = open_store()
+    assert (store.ledger.follows, store.ledger.shared) == ("scene-0001", ("2.png", "3.png"))
+    store.leave_place(4)
+    assert (store.ledger.follows, store.ledger.shared) == ("", ())
+
+
+def test_a_finished_place_is_kept_and_taken_back(open_store):
+    store = open_store()
+    for sequence in range(3):
+        store.put(received(sequence))
+    store.save("scene", Ledger(), [])
+    store.leave_place(2)
+    (folder,) = left.folders(store.directory)
+    kept = Store(folder)
+    kept.remove_shown()
+    kept.finish()
+    kept.close()
+    assert left.folders(store.directory) == [] and left.finished(store.directory)[0].name == "scene-0001"
+    assert not (left.finished_folder(store.directory, "scene-0001") / "scene").exists()
+
+    store = open_store()
+    store.retract_elsewhere("0.png", ["scene-0001"])
+    store.retract_elsewhere("0.png", ["scene-0001"])
+    store = open_store()
+    assert store.ledger.retracted == (("scene-0001", "0.png"),)
+    assert left.reopen(store.directory, "scene-0007") is None
+    again = left.reopen(store.directory, "scene-0001")
+    assert again == folder and left.reopen(store.directory, "scene-0001") == folder
+    assert left.finished(store.directory) == [] and left.folders(store.directory) == [folder]
+    store.was_retracted("scene-0001", "0.png")
+    assert open_store().ledger.retracted == ()
+
+
 def test_a_death_while_a_place_is_left_leaves_it_as_it_was(open_store, monkeypatch):
     store = open_store()
     for sequence in range(3):
