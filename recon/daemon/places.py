@@ -149,7 +149,7 @@ class Places:
             before = final.get(place.follows)
             if before is not None and scene_id in (place.scene_id, before.scene_id):
                 shared = [
-                    {name: T for name, T in self._cameras(each).items() if name in place.shared}
+                    {name: T for name, T in self.cameras(each.scene_id).items() if name in place.shared}
                     for each in (before, place)
                 ]
                 found = link(before.scene_id, place.scene_id, *shared)
@@ -158,12 +158,11 @@ class Places:
 
     def bridged(self, scene_id: str, other: str, bridge: Bridge) -> Link | None:
         """The link between two final scenes by the bridge, `scene_id` being its first; None where they disagree."""
-        one, two = (self._final.get(each) for each in (scene_id, other))
-        if one is None or two is None:
+        if not {scene_id, other} <= self._final.keys():
             return None
         why = f"{bridge.verified} pairs of photographs show the same, and {len(bridge.one)} + {len(bridge.other)} "
         why += "photographs of both are one scene"
-        cameras = self._cameras(one), self._cameras(two)
+        cameras = self.cameras(scene_id), self.cameras(other)
         return bridged(scene_id, other, *cameras, (bridge.one, bridge.other), why)
 
     def add_loops(self, scene_id: str, loops: Collection[Link]) -> None:
@@ -182,12 +181,15 @@ class Places:
                 log.warning("the loop from %s to %s does not count: %s", each.scene, each.other, each.retracted)
         self._write(msgspec.structs.replace(self._index, links=graph.links, poses=graph.poses))
 
-    def _cameras(self, place: Place) -> dict[str, npt.NDArray[np.float64]]:
-        """T_world_camera by the names of the photographs, as they were exported; none that cannot be read."""
+    def cameras(self, scene_id: str) -> dict[str, npt.NDArray[np.float64]]:
+        """T_world_camera (4, 4) by the names of the photographs, as the scene was written; none that cannot be read."""
+        place = next((each for each in self._index.places if each.scene_id == scene_id), None)
+        if place is None or place.folder is None:
+            return {}
         try:
-            cameras = read_cameras(self._path.parent / (place.folder or "") / "cameras.json")
+            cameras = read_cameras(self._path.parent / place.folder / "cameras.json")
         except (OSError, SceneFileError) as error:
-            log.warning("the cameras of %s cannot be read: %s", place.scene_id, error)
+            log.warning("the cameras of %s cannot be read: %s", scene_id, error)
             return {}
         return {camera.name: camera.T_world_camera for camera in cameras}
 

@@ -222,6 +222,7 @@ class PresentPlace:
         names = frozenset(self._work.names)
         if not names or self._final != names or self._compared == names:
             return
+        state, self.state = self.state, State.REFINING
         try:
             atlas.compare(self._store.scene_id, self._work.graph, self._pause)
         except Abandoned:
@@ -229,6 +230,8 @@ class PresentPlace:
         except Exception:
             self._compared = names  # nothing would be different another time
             raise
+        finally:
+            self.state = state
         self._compared = names
 
     def leave_out(self, names: Sequence[str]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from splatnode.capture.process.logs import event
@@ -70,11 +70,14 @@ class Atlas:
         loops: list[Link] = []
         for other in [each for each in likeliest(scene, codes) if each not in near][:TRIED]:
             pause()
-            link = self._bridged(other, Side(scene, graph, centred(codes[scene], in_common(codes))), codes, pause)
+            link = self._bridged(other, self._side(scene, graph, codes), codes, pause)
             loops += [] if link is None else [link]
             if len(loops) == MOST_LOOPS:
                 break
         self._places.add_loops(scene, loops)
+
+    def _side(self, scene: str, graph: ViewGraph, codes: Mapping[str, Codes]) -> Side:
+        return Side(scene, graph, self._places.cameras(scene), centred(codes[scene], in_common(codes)))
 
     def _bridged(self, other: str, side: Side, codes: dict[str, Codes], pause: Callable[[], None]) -> Link | None:
         folder = left.finished_folder(self._directory, other)
@@ -84,8 +87,7 @@ class Atlas:
             theirs = checkpoint.graph_of(store, self._config)
         if len(theirs.keyframes) != len(codes[other]):
             return None  # a frame is damaged
-        known = Side(other, theirs, centred(codes[other], in_common(codes)))
-        found = bridge(known, side, self._config, self._matcher, pause)
+        found = bridge(self._side(other, theirs, codes), side, self._config, self._matcher, pause)
         if not isinstance(found, Bridge):
             event(log, logging.INFO, "no_loop", scene=side.scene_id, other=other, why=found)
             return None

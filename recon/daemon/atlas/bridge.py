@@ -28,6 +28,7 @@ VERIFIED = 6  # pairs, by their matches at a glance, that are matched and verifi
 MIN_VERIFIED = 2  # of these that show the same, of different photographs in both scenes
 VIEWS = 5  # of each scene that are estimated together; all their pairs are matched
 TWIN_PX = 2.0  # median motion of a pair's matches, pixels at REFERENCE_SIDE, below which both have the same camera
+MIN_COMMON = 100  # matches of a photograph with one that is among them already
 MIN_VIEWS = 3  # of each scene that must have a camera then
 
 
@@ -37,6 +38,7 @@ class Side:
 
     scene_id: str
     graph: ViewGraph
+    cameras: Mapping[str, Array]  # T_world_camera (4, 4) of those keyframes that have one, by name
     codes: npt.NDArray[np.floating]  # (N, C) of the keyframes' images, of unit length once what all share is taken out
 
 
@@ -56,7 +58,7 @@ def bridge(
     pairs = verified_pairs(one, other, config, pause)
     if len(_distinct(pairs)) < MIN_VERIFIED:
         return f"{len(pairs)} pairs of photographs show the same"
-    chosen = [_views(side.graph, [pair[end] for pair in pairs]) for end, side in enumerate((one, other))]
+    chosen = [views_to_bridge(side, [pair[end] for pair in pairs]) for end, side in enumerate((one, other))]
     graph = ViewGraph(config.matching)
     for side, views in zip((one, other), chosen, strict=True):
         graph = graph.joined(_renamed(side, views))
@@ -126,12 +128,33 @@ def _twins(graph: ViewGraph, scene_id: str) -> dict[str, str]:
     return twins
 
 
-def _views(graph: ViewGraph, matched: Sequence[int]) -> list[int]:
-    """VIEWS keyframes: those `matched`, then those that have most in common with them."""
-    chosen = list(dict.fromkeys(matched))[:VIEWS]
-    shared = {index: sum(graph.partners(each).get(index, 0) for each in chosen) for index in range(len(graph.names))}
-    others = sorted(shared.keys() - set(chosen), key=lambda index: (-shared[index], index))
-    return [*chosen, *others][:VIEWS]
+def views_to_bridge(side: Side, matched: Sequence[int]) -> list[int]:
+    """VIEWS keyframes that have a camera: two of those `matched`, then such as have enough in common with these.
+
+    Each is as far as can be from those before it: cameras close together say little about scale and position.
+    """
+    centres = {index: side.cameras[name][:3, 3] for index, name in enumerate(side.graph.names) if name in side.cameras}
+    chosen: list[int] = []
+
+    def farthest(among: Collection[int]) -> int:
+        return max(among, key=lambda index: (_distance(centres[index], [centres[each] for each in chosen]), -index))
+
+    first = [index for index in dict.fromkeys(matched) if index in centres]
+    chosen += first[:1]
+    if len(first) > 1:
+        chosen.append(farthest(first[1:]))
+    while 0 < len(chosen) < VIEWS:
+        common = {index: max(side.graph.partners(each).get(index, 0) for each in chosen) for index in centres}
+        rest = {index: count for index, count in common.items() if index not in chosen}
+        near = [index for index, count in rest.items() if count >= MIN_COMMON]
+        if not rest:
+            break
+        chosen.append(farthest(near) if near else max(rest, key=lambda index: (rest[index], -index)))
+    return chosen
+
+
+def _distance(centre: Array, others: Sequence[Array]) -> float:
+    return min(float(np.linalg.norm(centre - each)) for each in others)
 
 
 def _renamed(side: Side, views: Collection[int]) -> ViewGraph:

@@ -37,6 +37,7 @@ from tests.support.node import Node, memory_mb, running
 
 PATIENCE_S = 1800.0  # after the last photograph
 LOOK_S = 1.0
+RESTS = 5  # looks in a row at which recon has nothing to do: then it is done
 
 
 def main() -> None:
@@ -172,7 +173,7 @@ def _streamed(
         node.start("capture")
         began, delays, peak_mb = time.monotonic(), [], 0.0
         deadline = began + len(names) / per_second + PATIENCE_S
-        taken_s = finished_s = None
+        taken_s, finished_s, resting = None, None, 0
         while finished_s is None and time.monotonic() < deadline:
             time.sleep(LOOK_S)
             found = heartbeats(node.network)
@@ -184,7 +185,9 @@ def _streamed(
             done = capture is None or (capture["state"] == "finished" and not capture["waiting"])
             if done and taken_s is None:
                 taken_s = time.monotonic() - began
-            if done and recon["state"] == "idle" and not recon["unfinished"] and not recon["queue"]:
+            rests = done and recon["state"] == "idle" and not recon["unfinished"] and not recon["queue"]
+            resting = resting + 1 if rests else 0
+            if resting == RESTS:
                 finished_s = time.monotonic() - began
         codes = {verb: node.end(verb) for verb in ("capture", "recon")}
         index = json.loads((node.out / "places.json").read_text())
