@@ -9,6 +9,7 @@ The place is made by splatnode.capture.diorama.building; this file photographs i
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 from typing import Annotated
 
@@ -26,6 +27,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.pace import FramesPerSecond, Pace, paced
 
 SAME_PLACE = 0.3  # of what two keyframes show: as much in common, and they show the same place
+BARE = 16.0  # texels a metre, where only surfaces matter: they are the same at every density, and soon made
 LONGEST_KIDNAP = 400  # keyframes of the walk that a kidnapped robot may miss; the next tour of another room is nearer
 
 Count = Annotated[int, msgspec.Meta(ge=1, le=100_000)]
@@ -142,4 +144,5 @@ def _carried(config: Config) -> float:
 
 @lru_cache(maxsize=4096)
 def _seen(config: Config, index: int) -> Seen:
-    return seen(state(config, index), scene_camera(config, index), config.width, config.height)
+    bare = replace(state(config, index), density=BARE)
+    return seen(bare, scene_camera(config, index), config.width, config.height)
