@@ -59,7 +59,7 @@ def _shell(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Confi
     """Gaussians `config.spacing_deg` apart, with the colours that the images have there, or suggest."""
     centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps])
     centre = centres.mean(0)
-    farthest = max(float(pointmap.depth.max()) for pointmap in pointmaps)
+    farthest = max(1e-9, *(float(pointmap.depth.max()) for pointmap in pointmaps))  # no depth may be known anywhere
     spread = float(np.linalg.norm(centres - centre, axis=1).max())
     radius = config.distance * max(farthest, spread)
     directions = _fibonacci_sphere(config.spacing_deg)

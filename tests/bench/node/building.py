@@ -37,6 +37,7 @@ from tests.bench.node.live import psnr
 from tests.support.node import Node, memory_mb, processor_s, running
 
 LOOK_S = 1.0
+RESTS = 5  # looks in a row at which recon has nothing to do: then it is done
 ALONE_S = 5.0  # of recon, before the camera starts: it loads torch
 HELD_OUT = 4  # photographs of the first room's scene
 FARTHEST_M = 6.0  # cameras farther apart are not asked whether they show the same place
@@ -90,7 +91,7 @@ def walked(folder: Path, config: building.Config, recon: dict, patience_s: float
         time.sleep(ALONE_S)
         node.start("capture")
         began, samples = time.monotonic(), []
-        taken_s = finished_s = None
+        taken_s, finished_s, resting = None, None, 0
         last_s = config.keyframes / config.frames_per_second
         while finished_s is None and time.monotonic() - began < last_s + patience_s:
             time.sleep(LOOK_S)
@@ -104,12 +105,14 @@ def walked(folder: Path, config: building.Config, recon: dict, patience_s: float
             done = capture_status is None or (capture_status["state"] == "finished" and not capture_status["waiting"])
             if done and taken_s is None:
                 taken_s = time.monotonic() - began
-            if (
+            rests = (
                 done
                 and recon_status["state"] == "idle"
                 and not recon_status["unfinished"]
                 and not recon_status["queue"]
-            ):
+            )
+            resting = resting + 1 if rests else 0
+            if resting == RESTS:
                 finished_s = time.monotonic() - began
         codes = {verb: node.end(verb) for verb in ("capture", "recon")}
         row = {

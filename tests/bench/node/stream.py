@@ -91,13 +91,11 @@ def _camera_errors(name: str, scene: EvaluationScene, places: list[dict], poses:
     mine = [place["scene_id"] for place in places if place["scene_id"] in found and _source(place) == name]
     if not mine:
         return None
-    poses = {pose["scene"]: pose for pose in poses}
+    map_of = {pose["scene"]: pose["map"] for pose in poses}
     to_map = {
-        scene: Similarity(
-            poses[scene]["scale"], np.array(poses[scene]["rotation"]), np.array(poses[scene]["translation"])
-        )
-        for scene in mine
-        if scene in poses and poses[scene]["map"] == poses[mine[0]]["map"]
+        pose["scene"]: Similarity(pose["scale"], np.array(pose["rotation"]), np.array(pose["translation"]))
+        for pose in poses
+        if pose["scene"] in mine and pose["map"] == map_of.get(mine[0])
     }
     cameras = {
         camera.name: (similarity.camera(camera.T_world_camera), camera)
