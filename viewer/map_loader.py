@@ -29,10 +29,10 @@ class _Known:
     centre: Array  # (3,)
     reach: float
 
-    def extent(self, eye: Array) -> Extent:
-        """As it is from the eye."""
+    def extent(self, eye: Array, order: float) -> Extent:
+        """As it is from the eye; `order` is when it is served."""
         away = float(np.linalg.norm(eye - self.centre)) - self.reach
-        return Extent(max(0.0, away), self.counts, self.sides)
+        return Extent(max(0.0, away), order, self.counts, self.sides)
 
 
 class MapLoader:
@@ -85,7 +85,8 @@ class MapLoader:
         return min(missing, key=lambda piece: _away(piece, eye), default=None)
 
     def _levels(self, eye: Array) -> dict[str, Level]:
-        extents = {scene_id: known.extent(eye) for scene_id, known in self._known.items()}
+        order = {piece.scene_id: _away(piece, eye) for piece in self._pieces.pieces}
+        extents = {scene_id: known.extent(eye, order[scene_id]) for scene_id, known in self._known.items()}
         return dict(zip(extents, chosen_levels(list(extents.values()), self._budget), strict=True))
 
     def _settle(self, eye: Array) -> bool:

@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.result.export import SceneFileError
-from splatnode.recon.result.pieces import Pieces, pieces_of
+from splatnode.recon.result.pieces import Pieces, has_scene, pieces_of
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
-from splatnode.recon.result.whole import Whole, read_whole
+from splatnode.recon.result.whole import Whole, WholeMap, read_whole
 from splatnode.viewer.graph import NOTHING, Array, Graph, GraphEdge, GraphNode
 from splatnode.viewer.map_loader import MapLoader
 from splatnode.viewer.moment import Moment
@@ -41,7 +41,7 @@ class MapView:
 
     def __init__(self, maps: Maps, whole: Whole, which: int) -> None:
         self._whole, self._which, self._photographs = whole, which, maps.photographs
-        self._of = whole.maps[which]
+        self._number, self._of = len(_shown_maps(whole)), _shown_maps(whole)[which]
         self._pieces: Pieces = pieces_of(whole, self._of, maps.folder)
         self._loader = MapLoader(self._pieces, maps.budget)
         self._images: dict[str, npt.NDArray[np.uint8]] = {}
@@ -76,7 +76,8 @@ class MapView:
             if piece.cameras
         }
         nodes = []
-        for scene_id in self._of.placements:
+        without = [scene_id for scene_id, place in self._whole.places.items() if not has_scene(place)]
+        for scene_id in dict.fromkeys([*self._of.placements, *without]):
             place = self._whole.places[scene_id]
             level, count = self._loader.shown.get(scene_id, (NOTHING, 0))
             good = any(piece.scene_id == scene_id for piece in self._pieces.pieces)
@@ -91,7 +92,7 @@ class MapView:
             for link in self._whole.links
             if link.scene in centres and link.other in centres
         )  # fmt: skip
-        return Graph(tuple(nodes), edges, self._which, len(self._whole.maps), self._pieces.merged)
+        return Graph(tuple(nodes), edges, self._which, self._number, self._pieces.merged)
 
 
 def map_moment(maps: Maps, which: int = 0) -> Moment:
@@ -105,9 +106,14 @@ def map_moment(maps: Maps, which: int = 0) -> Moment:
 def _whole(maps: Maps) -> Whole:
     """Raises SceneFileError where nothing has come yet, besides what `read_whole` raises."""
     whole = read_whole(maps.folder)
-    if not whole.maps:
-        raise SceneFileError(f"{maps.folder} holds no scene yet: its places.json lists none")
+    if not _shown_maps(whole):
+        raise SceneFileError(f"{maps.folder} holds no scene yet: its places.json lists none with a result")
     return whole
+
+
+def _shown_maps(whole: Whole) -> list[WholeMap]:
+    """Those with a scene to show."""
+    return [each for each in whole.maps if any(has_scene(whole.places[scene_id]) for scene_id in each.placements)]
 
 
 class MapSource:
@@ -138,7 +144,7 @@ class MapSource:
 
     def look_from(self, eye: Array, which: int) -> None:
         """Where the person looks from now, and at which map: any number, they follow each other in a circle."""
-        which %= len(self._whole.maps)
+        which %= len(_shown_maps(self._whole))
         with self._changed:
             if which != self._which or float(np.linalg.norm(eye - self._eye)) > _STEP:
                 self._eye, self._moved = np.array(eye), True

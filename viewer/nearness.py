@@ -15,6 +15,7 @@ class Extent:
     """How large the detail of a piece is, and how far it is from the eye."""
 
     away: float  # distance from the eye to the nearest of it, world units; 0: the eye is in it
+    order: float  # the lower, the earlier it is served: the distance to the nearest of its cameras
     counts: tuple[int, ...]  # Gaussians at FULL detail, at level 1 and so on
     sides: tuple[float, ...]  # of the voxels of level 1 and so on, world units
 
@@ -25,7 +26,7 @@ def chosen_levels(extents: Sequence[Extent], budget: int) -> tuple[int, ...]:
     A piece wants the coarsest level whose voxels are below a pixel from where the eye is. The nearest is served first:
     it gets what it wants as far as the farther ones still have something coarse, if that is possible at all.
     """
-    nearest_first = sorted(range(len(extents)), key=lambda index: extents[index].away)
+    nearest_first = sorted(range(len(extents)), key=lambda index: extents[index].order)
     chosen = [NOTHING] * len(extents)
     left = budget
     for index in nearest_first:  # the coarsest of each, as many as there is room for

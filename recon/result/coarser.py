@@ -26,6 +26,7 @@ _LARGE = 16.0  # times the median extent
 _STEP = 2**0.5  # by which voxels grow until a level has few enough Gaussians
 _MOST_STEPS = 60
 _MOST_OPAQUE = 0.99
+_COVERING = 0.8  # standard deviation over a voxel's side with which neighbours cover a surface without gaps
 _LEAST_OPAQUE = 1e-3
 
 
@@ -82,7 +83,7 @@ def coarser(gaussians: GaussianArrays, side: float) -> GaussianArrays:
     if not len(merged):
         return gaussians
     _, group = np.unique(voxel[~alone], return_inverse=True)
-    return joined([take(gaussians, stays), _moments(take(gaussians, merged), group.reshape(-1))])
+    return joined([take(gaussians, stays), _moments(take(gaussians, merged), group.reshape(-1), side)])
 
 
 def joined(parts: Iterable[GaussianArrays]) -> GaussianArrays:
@@ -99,8 +100,12 @@ def _first_side(gaussians: GaussianArrays) -> float:
     return float(np.median(gaussians.scales.max(1))) if len(gaussians) else 1.0
 
 
-def _moments(gaussians: GaussianArrays, group: npt.NDArray[np.intp]) -> GaussianArrays:
-    """One Gaussian for each group 0, 1 ... with the moments of those in it."""
+def _moments(gaussians: GaussianArrays, group: npt.NDArray[np.intp], side: float) -> GaussianArrays:
+    """One Gaussian for each group 0, 1 ... with the moments of those in it.
+
+    One that would have to be more than opaque to have their mass is wider instead, as far as it still is one of a
+    voxel: many small ones that cover a surface, one beside the other, would else become one with gaps around it.
+    """
     count = int(group.max()) + 1
     areas = _areas(gaussians.scales.astype(np.float64))
     mass = gaussians.opacities * areas
@@ -120,6 +125,9 @@ def _moments(gaussians: GaussianArrays, group: npt.NDArray[np.intp]) -> Gaussian
     variances, directions = np.linalg.eigh(covariances)
     directions[:, :, 0] *= np.sign(np.linalg.det(directions))[:, None]
     scales = np.sqrt(np.maximum(variances, 1e-18))
+    surplus = np.sqrt(np.maximum(total / (_MOST_OPAQUE * _areas(scales)), 1.0))
+    wider = np.minimum(surplus[:, None] * scales, np.maximum(_COVERING * side, scales))
+    scales[:, 1:] = wider[:, 1:]  # of rising variances, the first is the thickness
     return GaussianArrays(
         means=centres.astype(np.float32),
         quats=quats_from_matrices(directions).astype(np.float32),

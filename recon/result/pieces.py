@@ -16,7 +16,7 @@ from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.stored import read_cameras, read_gaussians
 from splatnode.recon.result.placement import IDENTITY, Placement
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
-from splatnode.recon.result.whole import Whole, WholeMap
+from splatnode.recon.result.whole import ScenePlace, Whole, WholeMap
 
 SHELL_PIECE = "far-shell"
 
@@ -66,7 +66,7 @@ def piece_name(scene_id: str) -> str:
 
 def pieces_of(whole: Whole, of: WholeMap, out: Path) -> Pieces:
     """The pieces of a map whose merged result may be in `out`. Raises SceneFileError, OSError."""
-    shown = {name: place for name, place in of.placements.items() if _is_shown(whole, name)}
+    shown = {name: placement for name, placement in of.placements.items() if has_scene(whole.places[name])}
     folder = merged_folder(out, of)
     if all((folder / piece_name(name)).is_file() for name in (*shown, SHELL_PIECE)) and shown:
         cameras = {each.name: each for each in decode_cameras(read_json_file(folder / "cameras.json"), str(folder))}
@@ -77,8 +77,8 @@ def pieces_of(whole: Whole, of: WholeMap, out: Path) -> Pieces:
     return Pieces(tuple(_scene(whole, shown)), merged=False)
 
 
-def _is_shown(whole: Whole, scene_id: str) -> bool:
-    place = whole.places[scene_id]
+def has_scene(place: ScenePlace) -> bool:
+    """Whether the place has a result that may be shown."""
     return place.folder is not None and place.publishable and (place.folder / "scene.ply").is_file()
 
 
@@ -86,7 +86,7 @@ def _scene(whole: Whole, placements: Mapping[str, Placement]) -> list[Piece]:
     found = []
     for scene_id, placement in placements.items():
         folder = whole.places[scene_id].folder
-        assert folder is not None  # `_is_shown` has seen to it
+        assert folder is not None  # `has_scene` has seen to it
         cameras = tuple(placement.camera(camera) for camera in read_cameras(folder / "cameras.json"))
         found.append(Piece(scene_id, folder / "scene.ply", placement, cameras))
     return found

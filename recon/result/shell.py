@@ -1,7 +1,7 @@
 """Which Gaussians of a finished scene are its far shell (`recon.scene.background`): files do not say.
 
 They are told by what the shell is: Gaussians on a sphere around the cameras that see as much of the sky each, thin
-across it, behind all that the scene has.
+across it.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ EXTENT, THICKNESS = 0.7, 0.1  # as splatnode.recon.scene.background has them, wh
 _SPACING_DEG = 4.0, 25.0  # of the shell's Gaussians: 5, and more where a limit on their number bound it
 _THINNER = 2.0  # largest factor between the thickness of a shell's Gaussian, which was refined, and what it began with
 _FEWEST = 24  # Gaussians of a shell; fewer that look like it are none
-_ONE_RADIUS = 0.1  # by how much of the shell's radius its Gaussians may be nearer than their median
+_SMALLER = 1.5  # by which refinement may have made the extent of one smaller
+_SAME_RADIUS = 0.03  # by how much of the radius those may be off it that no longer look like the shell
+_ONE_RADIUS = 0.1  # by how much of the shell's radius its Gaussians may be off their median
 
 
 def far_shell(gaussians: GaussianArrays, cameras: Sequence[CameraEstimate]) -> npt.NDArray[np.bool_]:
-    """(N,) which Gaussians are the shell, or lie as far away; none where there is no shell."""
+    """(N,) which Gaussians are the shell; none where there is no shell."""
     nowhere = np.zeros(len(gaussians), bool)
     if not cameras or not len(gaussians):
         return nowhere
@@ -42,7 +44,9 @@ def far_shell(gaussians: GaussianArrays, cameras: Sequence[CameraEstimate]) -> n
     if counts[fullest] < _FEWEST:
         return nowhere
     there = candidates[(candidates >= edges[fullest]) & (candidates <= edges[fullest + 1])]
-    return distances >= (1.0 - _ONE_RADIUS) * float(np.median(there))
+    radius = float(np.median(there))
+    off, large = np.abs(distances - radius) / radius, second / apart >= least / _SMALLER
+    return (alike & (off <= _ONE_RADIUS)) | (large & (off <= _SAME_RADIUS))
 
 
 def _bins(distances: npt.NDArray[np.floating]) -> int:
