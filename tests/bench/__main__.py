@@ -7,7 +7,20 @@ import sys
 
 # Folder -> its benchmarks; its other files are parts of theirs.
 BENCHMARKS = {
-    "node": ("queue", "live", "stream", "faults", "writes", "soak", "siege", "fuzz", "adversary", "guided", "capture"),
+    "node": (
+        "queue",
+        "live",
+        "stream",
+        "merge",
+        "faults",
+        "writes",
+        "soak",
+        "siege",
+        "fuzz",
+        "adversary",
+        "guided",
+        "capture",
+    ),
     "quality": ("poses", "windows", "fit", "priors", "parsimony", "budgets", "spz"),
     "speed": ("rasterize", "stereo", "growth"),
     "viewer": ("viewer", "drive", "beside"),
