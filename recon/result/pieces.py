@@ -68,13 +68,19 @@ def pieces_of(whole: Whole, of: WholeMap, out: Path) -> Pieces:
     """The pieces of a map whose merged result may be in `out`. Raises SceneFileError, OSError."""
     shown = {name: placement for name, placement in of.placements.items() if has_scene(whole.places[name])}
     folder = merged_folder(out, of)
-    if all((folder / piece_name(name)).is_file() for name in (*shown, SHELL_PIECE)) and shown:
+    if shown and (folder / piece_name(SHELL_PIECE)).is_file() and all(_is_merged(whole, n, folder) for n in shown):
         cameras = {each.name: each for each in decode_cameras(read_json_file(folder / "cameras.json"), str(folder))}
         used = {name: whole.places[name].frames_used for name in shown}
         known = {name: tuple(cameras[each] for each in names if each in cameras) for name, names in used.items()}
         pieces = [Piece(name, folder / piece_name(name), IDENTITY, known[name]) for name in shown]
         return Pieces((*pieces, Piece(SHELL_PIECE, folder / piece_name(SHELL_PIECE), IDENTITY, ())), merged=True)
     return Pieces(tuple(_scene(whole, shown)), merged=False)
+
+
+def _is_merged(whole: Whole, scene_id: str, folder: Path) -> bool:
+    """Whether a merged result has the scene as it is now."""
+    piece, scene = folder / piece_name(scene_id), whole.places[scene_id].folder
+    return piece.is_file() and (scene is None or (scene / "scene.ply").stat().st_mtime <= piece.stat().st_mtime)
 
 
 def has_scene(place: ScenePlace) -> bool:

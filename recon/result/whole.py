@@ -7,7 +7,7 @@ are placed by their links.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -158,11 +158,16 @@ def _placement(found: _Sim3, of: str, path: Path) -> Placement:
 
 
 def _link(link: _Link, path: Path) -> SceneLink:
+    if not is_printable(link.kind) or not is_printable(link.retracted or ""):
+        raise SceneFileError(f"{path}: its texts must be printable")
     placement = _placement(link, f"the link {link.scene!a} to {link.other!a}", path)
     return SceneLink(link.scene, link.other, placement, link.kind, link.retracted)
 
 
-def _posed(poses: Iterable[_Pose], places: Mapping[str, ScenePlace], path: Path) -> dict[str, tuple[str, Placement]]:
+def _posed(poses: Sequence[_Pose], places: Mapping[str, ScenePlace], path: Path) -> dict[str, tuple[str, Placement]]:
+    unknown = sorted({pose.map for pose in poses} - set(places))
+    if unknown:  # folders are named after maps
+        raise SceneFileError(f"{path}: a map must be named after one of its scenes, not {unknown[0][:60]!a}")
     return {
         pose.scene: (pose.map, _placement(pose, f"the pose of {pose.scene!a}", path))
         for pose in poses

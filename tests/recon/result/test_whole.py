@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import torch
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.rasterize.reference import sh_basis
 from splatnode.recon.result.export import SceneFileError
+from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.pieces import SHELL_PIECE, has_scene, pieces_of
 from splatnode.recon.result.placement import Placement
 from splatnode.recon.result.rendering import render_arrays
@@ -109,6 +111,8 @@ HOSTILE = {
     "a folder elsewhere": lambda index: index["places"][0].update(folder="../secrets"),
     "an id elsewhere": lambda index: index["places"][0].update(scene_id="a/../../b"),
     "a terminal's command": lambda index: index["places"][0].update(message="\x1b[2J"),
+    "a map elsewhere": lambda index: index["poses"][1].update(map="../../secrets"),
+    "a link that rings": lambda index: index["links"][0].update(retracted="\a"),
     "no list": lambda index: index.update(places={}),
 }
 
@@ -139,3 +143,10 @@ def test_pieces_are_the_scenes_until_all_of_them_were_merged(tmp_path):
     for name in ("scene-0001", SHELL_PIECE):
         (folder / f"{name}.ply").touch()
     assert not pieces_of(whole, only, tmp_path).merged  # the second scene came since
+    (folder / "scene-0002.ply").touch()
+    (folder.parent / "cameras.json").write_bytes(encode_cameras(raw.cameras[1:]))
+    merged = pieces_of(whole, only, tmp_path)
+    assert merged.merged and [camera.name for camera in merged.cameras] == [f"{n}.png" for n in range(1, 6)]
+    later = (folder / "scene-0002.ply").stat().st_mtime + 10
+    os.utime(tmp_path / "scene-0002" / "scene.ply", (later, later))
+    assert not pieces_of(whole, only, tmp_path).merged  # it was made anew since
