@@ -12,7 +12,6 @@ import argparse
 import json
 import os
 import shlex
-import sys
 import tempfile
 import time
 from dataclasses import replace
@@ -57,7 +56,13 @@ def main() -> None:
             node.mkdir(parents=True, exist_ok=True)
             _streamed(node, {args.scene: scene}, {args.scene: split}, args.per_second, args.max_views)
         rows = _rows(node / "node" / "out", Path(scratch), scene, split, args.limits, args.renders)
-    command = shlex.join(["python", "-m", "tests.bench", "merge", *sys.argv[1:]])
+    # Folders are left out: they change nothing of what is measured.
+    options = {"--per-second": args.per_second, "--max-views": args.max_views, "--hold-out": args.hold_out}
+    words = [
+        args.scene,
+        *(f"{word:g}" if isinstance(word, float) else str(word) for pair in options.items() for word in pair),
+    ]
+    command = shlex.join(["python", "-m", "tests.bench", "merge", *words, "--limits", *map(str, args.limits)])
     args.out.write_text(json.dumps({"command": command, "maps": rows}, indent=1) + "\n")
     print(json.dumps(rows))
 
