@@ -94,6 +94,14 @@ def _export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="PATH", help="default: beside the scene")
 
 
+def _merge_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("folder", type=Path, metavar="OUT_FOLDER", help="that a node writes its scenes into")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where the merged scenes go (default: OUT_FOLDER)")
+    parser.add_argument("--max-gaussians", type=positive, metavar="N", help="at most so many Gaussians in each")
+    parser.add_argument("--max-mb", type=megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes")
+    add_json(parser)
+
+
 def _bench_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scenes", type=Path, nargs="*", metavar="SCENE", help="folders with images and true cameras")
     parser.add_argument(
@@ -173,6 +181,12 @@ VERBS = (
         "write a scene in another format",
         _export_arguments,
         lazily("splatnode.recon.result.export.command", "export"),
+    ),
+    Verb(
+        "merge",
+        "make one scene of the scenes of a long walk",
+        _merge_arguments,
+        lazily("splatnode.recon.merging.command", "merge"),
     ),
     Verb(
         "recon", "reconstruct what comes, for ever", _recon_arguments, lazily("splatnode.recon.daemon.daemon", "recon")

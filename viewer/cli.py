@@ -13,11 +13,13 @@ from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import read_yaml, typed
 from splatnode.capture.process.terminal import say
 from splatnode.recon.result.rendering import use_threads
+from splatnode.recon.result.whole import is_whole
+from splatnode.viewer.map_source import BUDGET, Maps, MapSource, map_moment
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.pictures import keep_picture, write_movie, write_series
 from splatnode.viewer.probe import Probe, open3d_installed, probe_window
 from splatnode.viewer.session import Session
-from splatnode.viewer.sources import Finished, Live, Source, load_result
+from splatnode.viewer.sources import Finished, Live, Source, found_photographs, load_result
 from splatnode.viewer.state import State
 
 EXIT_GOOD, EXIT_UNAVAILABLE = 0, 69
@@ -38,7 +40,7 @@ def view(args: argparse.Namespace) -> int:
         raise ValueError("--export needs a finished result and a file that ends with .mp4")
     width, height = args.size or _PICTURE
     if args.export is not None and finished is not None:
-        say(write_movie(finished, args.export, width, height, args.pictures))
+        say(write_movie(_moment(finished), args.export, width, height, args.pictures))
         return EXIT_GOOD
     window = None if args.headless else _window()
     if window is None and not args.headless:
@@ -52,7 +54,7 @@ def view(args: argparse.Namespace) -> int:
         session, size = Session(source, State()), args.size or window.size
         show(session, software=window.software, screenshots=folder, opened=background, size=size)
     elif finished is not None:
-        say(write_series(finished, folder, width, height, args.pictures))
+        say(write_series(_moment(finished), folder, width, height, args.pictures))
     else:
         source = _source(finished, network)
         _give_way()
@@ -61,15 +63,22 @@ def view(args: argparse.Namespace) -> int:
     return EXIT_GOOD
 
 
-def _finished(args: argparse.Namespace) -> Moment | None:
-    """The result that is named; None where it is a running node."""
+def _finished(args: argparse.Namespace) -> Moment | Maps | None:
+    """The result, or the folder of many, that is named; None where it is a running node."""
     if args.photographs is not None and not args.photographs.is_dir():
         raise FileNotFoundError(
             f"--photographs must be the folder of a result's photographs; {args.photographs} is none"
         )
     if args.what is None or _is_configuration(args.what):
         return None
+    if is_whole(args.what):
+        folder = args.photographs or args.what / "images"
+        return Maps(args.what, lambda cameras: found_photographs(cameras, [folder]), args.max_gaussians or BUDGET)
     return load_result(args.what, args.photographs)
+
+
+def _moment(finished: Moment | Maps) -> Moment:
+    return finished if isinstance(finished, Moment) else map_moment(finished)
 
 
 def _network(args: argparse.Namespace) -> Network:
@@ -93,8 +102,10 @@ def _window() -> Probe | None:
     return probe
 
 
-def _source(finished: Moment | None, network: Network) -> Source:
-    return Finished(finished) if finished is not None else Live(network)
+def _source(finished: Moment | Maps | None, network: Network) -> Source:
+    if finished is None:
+        return Live(network)
+    return Finished(finished) if isinstance(finished, Moment) else MapSource(finished)
 
 
 def _give_way() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.viewer.graph import Graph
 
 MEMORY_BYTES = 256_000_000  # of a history: some fifty moments of 30 000 Gaussians and 12 cameras
 _SMALLEST = 16  # pixels: a photograph that is drawn smaller is a spot
@@ -22,6 +23,7 @@ class Moment:
     snapshot: Snapshot
     received_s: float  # monotonic clock of the viewer
     scene_id: str = ""  # another one is another place: a viewpoint does not carry over
+    graph: Graph | None = None  # of a map of several scenes, of which this is what is loaded; None: of one scene
 
     @cached_property
     def photographs(self) -> dict[str, tuple[npt.NDArray[np.uint8], ...]]:
@@ -42,8 +44,10 @@ def remembered(history: History, moment: Moment, memory_bytes: int = MEMORY_BYTE
     """The history with `moment` as its newest, thinned until it fits into `memory_bytes`.
 
     What goes first is the moment whose neighbours are closest together in time, so that the whole time axis stays
-    covered. The first and the newest moment always stay.
+    covered. The first and the newest moment always stay. Of a map only the newest does: the others had parts of it.
     """
+    if moment.graph is not None:
+        return (moment,)
     kept = [*history, moment]
     while len(kept) > 2 and sum(one.num_bytes for one in kept) > memory_bytes:
         gaps = [after.received_s - before.received_s for before, after in zip(kept, kept[2:], strict=False)]

@@ -25,6 +25,7 @@ _SWITCHES = (
     ("tracked", "tracked camera (5)"),
     ("advice", "next view (6)"),
     ("uncertainty", "uncertainty (7)"),
+    ("graph", "graph (8)"),
 )
 _BUTTONS = (("Pause", "space"), ("Follow", "f"), ("Overview", "r"), ("Save", "s"), ("Help", "h"))
 _TOGGLES = {"space": "paused", "f": "follow", "h": "help"}  # key -> the field of the state that it switches on and off
@@ -66,7 +67,7 @@ class Panel:
         )
         self._blend.set_limits(0.0, 1.0)
         self._time = self._slider("time", gui.Slider.INT, lambda s, past, value: go_to_moment(s, past, int(value)))
-        for name in ("notice", "verdict", "advice", "bounds", "counts", "dropped"):
+        for name in ("notice", "verdict", "advice", "bounds", "places", "counts", "dropped"):
             self._add_label(name)
 
     def show(self, session: Session, seconds: float | None, notice: str) -> None:
@@ -92,6 +93,7 @@ class Panel:
         self._set("verdict", words.verdict_lines(moment))
         self._set("advice", ["Next view: " + words.advice_line(analysis.advice if analysis else None, moment)])
         self._set("bounds", words.bounds_lines(moment, session.camera()))
+        self._set("places", words.place_lines(moment))
         self._set("counts", [*words.count_lines(moment), *rate, feed + (", paused" if state.paused else "")])
         self._set("dropped", words.dropped_lines(moment))
         self._set("time", [words.time_line(state, session.history)])

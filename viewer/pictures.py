@@ -82,7 +82,12 @@ def overview_picture(analysis: Analysis, width: int, height: int) -> Image:
     view: Viewpoint = overview(moment, analysis.advice.arrow or ())
     image = paint(moment.snapshot.gaussians, shapes(moment, state, analysis.advice), view, state, width, height)
     said = [*words.verdict_lines(moment), f"Next view: {words.advice_line(analysis.advice, moment)}"]
-    said += [*words.bounds_lines(moment), *words.count_lines(moment), *words.dropped_lines(moment)]
+    said += [
+        *words.bounds_lines(moment),
+        *words.place_lines(moment),
+        *words.count_lines(moment),
+        *words.dropped_lines(moment),
+    ]
     return caption(image, said)
 
 

@@ -13,7 +13,7 @@ from splatnode.viewer.colours import coloured
 from splatnode.viewer.moment import History, Moment, remembered
 from splatnode.viewer.paint import blended, paint_gaussians, with_shapes
 from splatnode.viewer.shapes import Photograph, Shapes, live_camera, shapes
-from splatnode.viewer.sources import Source
+from splatnode.viewer.sources import Roaming, Source
 from splatnode.viewer.state import Colouring, State, go_to_camera, press, shown_moment
 from splatnode.viewer.support import Support
 from splatnode.viewer.viewpoint import Viewpoint, at_camera, overview, scene_pivot
@@ -43,6 +43,9 @@ class Session:
 
     def receive(self) -> bool:
         """Takes what the source has; whether that was something."""
+        view = self.viewpoint()
+        if isinstance(self.source, Roaming) and view is not None:
+            self.source.look_from(view.T_world_camera[:3, 3], self.state.which_map)
         moment, before = self.source.take(), self._tracked
         self._tracked = self.source.tracked
         if moment is None:
@@ -62,8 +65,8 @@ class Session:
     def analysis(self) -> Analysis | None:
         """The analysis of the shown moment, or of one with the same cameras; None while there is none."""
         moment = self.moment
-        if moment is None:
-            return None
+        if moment is None or moment.graph is not None:
+            return None  # of a map only a part is there: what is advised from it would be wrong
         known = self._analysis
         usable = known is not None and _same_cameras(known.moment, moment)
         if usable and not self._needs_support():

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.viewer.advice import Advice
 from splatnode.viewer.colours import source_colour
+from splatnode.viewer.graph import Graph, edge_lines, node_marks
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.state import State
 
@@ -20,6 +21,10 @@ Colour = tuple[float, float, float]
 PATH_COLOUR: Colour = (0.95, 0.95, 0.95)
 TRACKED_COLOUR: Colour = (0.2, 1.0, 0.3)
 ADVICE_COLOUR: Colour = (1.0, 0.85, 0.1)
+CHAIN_COLOUR: Colour = (0.2, 0.7, 1.0)
+LOOP_COLOUR: Colour = (1.0, 0.25, 0.85)
+RETRACTED_COLOUR: Colour = (0.5, 0.5, 0.5)
+MARK_COLOURS: dict[bool, Colour] = {True: (0.4, 1.0, 0.5), False: (1.0, 0.45, 0.2)}  # by whether a scene is shown
 _FRUSTUM = 0.12  # depth of a frustum in parts of the scene's depth, which is 1
 _AT_THE_EYE = 2.0  # times the depth of a frustum
 _MIN_SIZE = 0.002  # of its distance from the eye: a smaller ellipsoid would be a dot in the window
@@ -72,6 +77,8 @@ def shapes(
             lines.append(Lines(frustum(camera.T_world_camera, corners), source_colour(index), 2))
             if state.photographs and camera.name in moment.photographs:
                 photographs.append(Photograph(camera.name, corners, moment.photographs[camera.name]))
+    if state.graph and moment.graph is not None:
+        lines += _graph(moment.graph)
     if state.uncertainty:
         for index, camera, axes in _uncertain(snapshot.cameras, eye):
             lines.append(Lines(ellipsoid(camera, axes), source_colour(index), 1))
@@ -81,6 +88,17 @@ def shapes(
     if state.advice and advice is not None and advice.arrow is not None and advice.target is not None:
         lines.append(Lines(arrow(*advice.arrow, advice.target), ADVICE_COLOUR, 3))
     return Shapes(tuple(lines), tuple(photographs))
+
+
+def _graph(graph: Graph) -> list[Lines]:
+    """The scenes' marks, and lines between those that are linked; what no longer counts is dashed and grey."""
+    kinds = [
+        Lines(edge_lines(graph.edges, loop=loop, retracted=retracted), RETRACTED_COLOUR if retracted else colour, width)
+        for loop, colour, width in ((False, CHAIN_COLOUR, 3), (True, LOOP_COLOUR, 4))
+        for retracted in (False, True)
+    ]
+    marks = [Lines(node_marks(graph.nodes, good=good), colour, 3) for good, colour in MARK_COLOURS.items()]
+    return [lines for lines in (*kinds, *marks) if len(lines.ends)]
 
 
 def live_camera(moment: Moment, tracked: CameraEstimate | None) -> CameraEstimate | None:

@@ -6,9 +6,10 @@ import logging
 import math
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Protocol
+from typing import Annotated, Protocol, runtime_checkable
 
 import cv2
 import msgspec
@@ -53,6 +54,14 @@ class Source(Protocol):
         """Where the live camera is just now in the newest scene; None: not known."""
 
     def close(self) -> None: ...
+
+
+@runtime_checkable
+class Roaming(Protocol):
+    """A source that has more than fits into memory, and gives what is near."""
+
+    def look_from(self, eye: npt.NDArray[np.float64], which: int) -> None:
+        """Where the person looks from now (3,), and at which of its maps. Never waits."""
 
 
 class Finished:
@@ -160,7 +169,7 @@ def load_result(place: Path, photographs: Path | None = None) -> Moment:
         verdict=report.verdict,
         cameras=cameras,
         gaussians=gaussians,
-        images=_photographs(cameras, [photographs] if photographs else reported + beside),
+        images=found_photographs(cameras, [photographs] if photographs else reported + beside),
         dropped=report.frames_dropped,
         iterations=report.iterations,
         seconds=report.seconds,
@@ -206,7 +215,8 @@ def _report(path: Path) -> _Report | None:
         return report
 
 
-def _photographs(cameras: tuple[CameraEstimate, ...], folders: list[Path]) -> dict[str, npt.NDArray[np.uint8]]:
+def found_photographs(cameras: tuple[CameraEstimate, ...], folders: Sequence[Path]) -> dict[str, npt.NDArray[np.uint8]]:
+    """By camera, its photograph in the first of the `folders` that has one, as large as a window needs it."""
     found = {}
     for camera in cameras:
         for folder in folders:

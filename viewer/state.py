@@ -40,6 +40,8 @@ class State:
     tracked: bool = True
     advice: bool = True
     uncertainty: bool = True
+    graph: bool = True
+    which_map: int = 0  # of a folder with several
     help: bool = False
     paused: bool = False
     follow: bool = False  # the viewpoint is that of the live camera
@@ -151,6 +153,10 @@ def _time(step: int) -> Change:
     return lambda state, history: go_to_moment(state, history, moment_index(state, history) + step)
 
 
+def _next_map(state: State, _history: History) -> State:
+    return replace(state, which_map=state.which_map + 1, camera=None, follow=False, held=None, paused=False)
+
+
 def _leave(state: State, _history: History) -> State:
     return replace(state, camera=None, follow=False, help=False)
 
@@ -169,6 +175,8 @@ BINDINGS = (
     Binding("5", "show or hide the tracked camera", _toggle("tracked")),
     Binding("6", "show or hide the advice for the next view", _toggle("advice")),
     Binding("7", "show or hide where the cameras may be, with 95 %", _toggle("uncertainty")),
+    Binding("8", "show or hide the graph of a map's scenes", _toggle("graph")),
+    Binding("m", "the next map, where there are several", _next_map),
     Binding("n", "go to the next camera", _camera(1)),
     Binding("p", "go to the previous camera", _camera(-1)),
     Binding(".", "more of its photograph over the render", _blend(BLEND_STEP)),

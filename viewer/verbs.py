@@ -15,9 +15,16 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="?",
         metavar="SCENE|DIR|CONFIG",
-        help="a scene file, a result's folder, or a node's configuration (.yaml); default: the node on this machine",
+        help="a scene file, a result's folder, the folder of all scenes of a node, or a node's configuration (.yaml); "
+        "default: the node on this machine",
     )
     parser.add_argument("--photographs", type=Path, metavar="DIR", help="where a finished result's photographs are")
+    parser.add_argument(
+        "--max-gaussians",
+        type=positive,
+        metavar="N",
+        help="of a map of several scenes, loaded at once: the near in full, the far coarsely (default: 1500000)",
+    )
     parser.add_argument("--headless", action="store_true", help="write pictures instead of opening a window")
     parser.add_argument("--export", type=Path, metavar="FILE.mp4", help="write a turntable, without a window")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where pictures go (default: view, beside the scene)")

@@ -15,6 +15,7 @@ from splatnode.viewer.moment import Moment
 Array = npt.NDArray[np.float64]
 
 _STEEPEST = math.radians(85.0)  # of a viewing direction, from the horizontal
+_SLANT = math.radians(50.0)  # at which a map is looked down on
 _NEAREST = 1e-3  # world units, of the pivot
 # The turntable: an ellipse this much wider than where the cameras were, within these half axes.
 _TOUR_MARGIN = 1.1
@@ -96,6 +97,8 @@ def at_camera(view: Viewpoint, camera: CameraEstimate) -> Viewpoint:
 def overview(moment: Moment, also: Sequence[Array] = ()) -> Viewpoint:
     """From behind and above the cameras, at the middle of what they see; the points (3,) `also` are in the picture."""
     cameras = moment.snapshot.cameras
+    if moment.graph is not None and cameras:
+        return _map_overview(cameras)
     up, pivot = scene_up(cameras), scene_pivot(moment)
     if not cameras:
         spread = scene_spread(moment, pivot)
@@ -114,6 +117,24 @@ def overview(moment: Moment, also: Sequence[Array] = ()) -> Viewpoint:
         if (np.abs(local[:, :2]) < 0.93 * slope * local[:, 2:]).all():
             break
     return view
+
+
+def _map_overview(cameras: tuple[CameraEstimate, ...]) -> Viewpoint:
+    """From above at a slant, along the shorter side of where the cameras were, with all of them in the picture."""
+    up = scene_up(cameras)
+    centres = np.array([camera.T_world_camera[:3, 3] for camera in cameras])
+    pivot = (centres.max(0) + centres.min(0)) / 2.0
+    flat = (centres - centres.mean(0)) @ (np.eye(3) - np.outer(up, up))
+    shorter = np.cross(up, np.linalg.svd(flat, full_matrices=False)[2][0])
+    length = float(np.linalg.norm(shorter))
+    away = shorter / length if length > 1e-6 else -cameras[0].T_world_camera[:3, 2]
+    reach = max(float(np.linalg.norm(centres - pivot, axis=1).max()), 0.5)
+    middle = cameras[len(cameras) // 2]
+    lens = middle.K, float(middle.width), float(middle.height)
+    slope = min(middle.width / middle.K[0, 0], middle.height / middle.K[1, 1]) / 2.0
+    distance = reach * math.hypot(1.0, 1.0 / slope)
+    centre = pivot + distance * (math.sin(_SLANT) * up + math.cos(_SLANT) * away)
+    return Viewpoint(look_at(centre, pivot, up), distance, up, lens)
 
 
 def scene_up(cameras: tuple[CameraEstimate, ...]) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from splatnode.recon.result.bounds_in_words import of_camera, of_cameras
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.viewer.advice import Advice
+from splatnode.viewer.graph import place_lines as graph_lines
 from splatnode.viewer.moment import History, Moment
 from splatnode.viewer.state import State, moment_index
 
@@ -41,6 +42,11 @@ def count_lines(moment: Moment) -> list[str]:
     return lines
 
 
+def place_lines(moment: Moment) -> list[str]:
+    """The places of a map, the nearest first; none for a single scene."""
+    return [] if moment.graph is None else graph_lines(moment.graph)
+
+
 def bounds_lines(moment: Moment, camera: CameraEstimate | None = None) -> list[str]:
     """How well `camera` is known, or where there is none, or one without bounds: how well all are at least."""
     snapshot = moment.snapshot
@@ -64,6 +70,8 @@ def advice_line(advice: Advice | None, moment: Moment) -> str:
         return "not known, because the file tells of no cameras."
     if not moment.snapshot.cameras or not moment.snapshot.verdict.publishable:
         return moment.snapshot.verdict.advice or "Take photographs that overlap, with a step to the side."
+    if moment.graph is not None:
+        return "not worked out for a map of several scenes."
     return "looking for the best next view" if advice is None else advice.sentence
 
 

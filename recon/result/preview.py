@@ -31,12 +31,17 @@ def render_camera(gaussians: GaussianArrays, camera: CameraEstimate) -> Image:
 
 
 def contact_sheet(snapshot: Snapshot, max_views: int = 4, height: int = 240) -> bytes:
-    """A PNG: photographs above, the Gaussians seen from the same cameras below; cameras from the first to the last."""
+    """A PNG: photographs above, the Gaussians seen from the same cameras below; cameras from the first to the last.
+
+    Without photographs where the snapshot does not have one of each camera.
+    """
     count = len(snapshot.cameras)
+    photographed = all(camera.name in snapshot.images for camera in snapshot.cameras)
     shown = np.linspace(0, count - 1, min(count, max_views)).round().astype(int)
     columns = []
     for camera in (snapshot.cameras[index] for index in shown):
-        pair = [snapshot.images[camera.name], render_camera(snapshot.gaussians, camera)]
+        above = [snapshot.images[camera.name]] if photographed else []
+        pair = [*above, render_camera(snapshot.gaussians, camera)]
         size = (round(camera.width * height / camera.height), height)
         columns.append(np.vstack([cv2.resize(image, size, interpolation=cv2.INTER_AREA) for image in pair]))
     return encode_png(np.hstack(columns))

@@ -12,6 +12,7 @@ BENCHMARKS = {
         "live",
         "stream",
         "building",
+        "merge",
         "faults",
         "writes",
         "soak",

@@ -157,6 +157,22 @@ def test_how_the_rivals_are_cut_down():
     says(f"CF-3DGS to {film.alone} iterations a frame, {film.motion} a motion and {film.final} at the end")
 
 
+def test_merging():
+    (one,) = raw("merge")["maps"]
+    free, bounded = one["merged"]
+    first, second = (
+        tuple(mean(scores[scene].values()) for scores in (one["alone"], free["held_out"], bounded["held_out"]))
+        for scene in ("scene-0001", "scene-0002")
+    )
+    given, kept = (f"{count:,}".replace(",", " ") for count in (free["gaussians_given"], free["num_gaussians"]))
+    size = f"{free['bytes'] / 1e6:.1f} MB"
+    says(
+        f"{given} Gaussians became {kept} ({size}) in {free['seconds']:.0f} s",
+        f"{first[0]:.1f} dB in the first scene alone and {first[1]:.1f} merged, {second[0]:.1f} and {second[1]:.1f}",
+        f"with 20 000 Gaussians {first[2]:.1f} and {second[2]:.1f}",
+    )
+
+
 SIZES = {
     "a quarter": "x0.25",
     "half": "x0.5",

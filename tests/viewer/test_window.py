@@ -13,6 +13,7 @@ import pytest
 
 from splatnode.viewer.probe import probe_window
 from tests.conftest import ROOT
+from tests.support.walk import write_walk
 
 DRIVE = """
 import os, signal, sys
@@ -71,5 +72,42 @@ def test_a_window_survives_every_key_and_every_size_and_closes_when_told(display
     if not probe.window:
         pytest.skip(f"needs a window: {probe.detail}")
     command = [sys.executable, "-c", DRIVE, str(tmp_path)]
+    driven = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert driven.returncode == 0 and "closed with 0" in driven.stdout, driven.stderr[-2000:]
+
+
+WALK = """
+import os, signal, sys, time
+from dataclasses import replace
+from pathlib import Path
+from splatnode.viewer.map_source import Maps, MapSource
+from splatnode.viewer.session import Session
+from splatnode.viewer.state import State
+from splatnode.viewer.window import show
+
+class Driver(Session):
+    ticks = 0
+    def receive(self):
+        self.ticks += 1
+        if self.moment is not None and self.ticks % 3 == 0:
+            self.press("8" if self.ticks % 2 else "n")
+        if self.moment is not None and all(node.level == 0 for node in self.moment.graph.nodes) and self.ticks > 20:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return super().receive()
+
+source = MapSource(Maps(Path(sys.argv[1]), lambda cameras: {}))
+try:
+    show(Driver(source, State()), software=True, screenshots=Path(sys.argv[1]), size=(400, 300))
+except SystemExit as stopped:
+    print("closed with", stopped.code, flush=True)
+"""
+
+
+def test_a_map_of_several_scenes_is_walked_through_in_a_window(display, tmp_path, monkeypatch):
+    monkeypatch.setenv("DISPLAY", display)
+    probe = probe_window()
+    if not probe.window:
+        pytest.skip(f"needs a window: {probe.detail}")
+    command = [sys.executable, "-c", WALK, str(write_walk(tmp_path / "out"))]
     driven = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert driven.returncode == 0 and "closed with 0" in driven.stdout, driven.stderr[-2000:]

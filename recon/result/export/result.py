@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import msgspec
 
@@ -26,9 +27,16 @@ MANIFEST = "manifest.json"
 
 
 def write_result(
-    snapshot: Snapshot, out_dir: Path, report: Mapping[str, object], *, preview: bytes | None = None
+    snapshot: Snapshot,
+    out_dir: Path,
+    report: Mapping[str, object],
+    *,
+    preview: bytes | None = None,
+    further: Mapping[str, bytes] = MappingProxyType({}),
 ) -> Path:
     """Writes scene.ply, the cameras in four formats, preview.png, report.json and manifest.json; returns its path.
+
+    `further` are other files of the scene, by name in the folder.
 
     A scene that its verdict does not let be published leaves report.json and manifest.json only. The folder holds one
     result: files that an earlier manifest lists, that are unchanged since, and that this result does not have are
@@ -37,7 +45,7 @@ def write_result(
     """
     files = {"report.json": json_bytes(report)}
     if snapshot.verdict.publishable:
-        files = _scene_files(snapshot, preview) | files
+        files = _scene_files(snapshot, preview) | dict(further) | files
     previous = _read_manifest(out_dir)
     manifest = {
         **snapshot.scale.record(),

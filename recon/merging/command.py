@@ -1,0 +1,124 @@
+"""The verb merge."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from splatnode.capture.process.terminal import say
+from splatnode.recon.merging.merge import Merged, merged
+from splatnode.recon.merging.submap import Submap, Submaps, load_submaps
+from splatnode.recon.result.coarser import Level, levels
+from splatnode.recon.result.export import write_result
+from splatnode.recon.result.export.formats.ply import encode_ply, most_in_ply
+from splatnode.recon.result.export.prepare import take, viewer_safe
+from splatnode.recon.result.export.staged import json_bytes
+from splatnode.recon.result.export.stored import StoredResult
+from splatnode.recon.result.folder import result_folder
+from splatnode.recon.result.levels_file import LEVELS_FILE, levels_record
+from splatnode.recon.result.pieces import SHELL_PIECE, merged_folder, piece_name
+from splatnode.recon.result.preview import contact_sheet
+from splatnode.recon.result.report import build_report, peak_rss_mb
+from splatnode.recon.result.scale import Scale
+from splatnode.recon.result.size import result_bytes
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.recon.result.whole import Whole, WholeMap, read_whole
+from splatnode.recon.scene.background import SHELL
+
+EXIT_GOOD, EXIT_REFUSED = 0, 65
+_LEVELS_BYTES = 0.5  # of a result, for its coarser levels
+
+
+def merge(args: argparse.Namespace) -> int:
+    """Writes map-NAME for each map of the node's results; what cannot be merged is told."""
+    whole = read_whole(args.folder)
+    out = args.folder if args.out is None else args.out
+    reports = {}
+    for each in whole.maps:
+        found = load_submaps(whole, each)
+        if not found.used:
+            reasons = "; ".join(f"{scene_id}: {why}" for scene_id, why in found.left_out.items())
+            if not args.json:
+                say(f"{each.name}: nothing to merge ({reasons})")
+            continue
+        folder = merged_folder(out, each)
+        reports[folder.name] = write_map(whole, each, found, folder, _most(args, found.used))
+        if not args.json:
+            _tell(reports[folder.name], folder)
+    if args.json:
+        print(json.dumps(reports))
+    return EXIT_GOOD if reports else EXIT_REFUSED
+
+
+def write_map(whole: Whole, of: WholeMap, found: Submaps, folder: Path, most: int | None) -> dict[str, object]:
+    """Writes the merged result of one map, whole or not at all; returns its report. Raises ResultWriteError."""
+    given = sum(len(each.gaussians) for each in found.used)
+    with result_folder(folder, round((1 + _LEVELS_BYTES) * result_bytes(given if most is None else min(given, most)))):
+        one = merged(found.used, most)
+        snapshot = _snapshot(one, found, _scale(whole, of))
+        coarse = levels(one.gaussians)
+        report = _report(snapshot, one, found, coarse, given)
+        write_result(snapshot, folder, report, preview=contact_sheet(snapshot), further=_further(snapshot, one, coarse))
+    return report
+
+
+def _most(args: argparse.Namespace, submaps: Sequence[Submap]) -> int | None:
+    """How many Gaussians a merged scene may have by both limits; None: there is none."""
+    bases = max(each.gaussians.sh.shape[1] for each in submaps)
+    by_size = None if args.max_mb is None else most_in_ply(round(args.max_mb * 1e6), bases)
+    return min((limit for limit in (args.max_gaussians, by_size) if limit is not None), default=None)
+
+
+def _scale(whole: Whole, of: WholeMap) -> Scale:
+    """The unit of the scene that the map is named after."""
+    place = whole.places.get(of.name)
+    return Scale() if place is None or place.folder is None else StoredResult.at(place.folder).scale()
+
+
+def _snapshot(one: Merged, found: Submaps, scale: Scale) -> Snapshot:
+    rough = [each.verdict for each in found.used if each.verdict != Code.OK.value]
+    names = ", ".join(each.scene_id for each in found.used)
+    message = f"One scene of {len(found.used)}: {names}."
+    if rough:
+        message += f" {len(rough)} of them known less well: {', '.join(sorted(set(rough)))}."
+    verdict = Verdict(Code.OK_ROUGH if rough else Code.OK, message, "", publishable=True)
+    return Snapshot(0, verdict, one.cameras, one.gaussians, {}, (), 0, dict(one.seconds), final=True, scale=scale)
+
+
+def _report(snapshot: Snapshot, one: Merged, found: Submaps, coarse: Sequence[Level], given: int) -> dict[str, object]:
+    report = build_report(snapshot, seed=0, preset="merge", peak_rss_mb=peak_rss_mb())
+    return report | {
+        "scenes": [share.record() for share in one.shares],
+        "scenes_left_out": [{"scene": scene_id, "reason": why} for scene_id, why in found.left_out.items()],
+        "gaussians_given": given,
+        "far_shell": one.shell,
+        **levels_record(coarse, snapshot.cameras),
+    }
+
+
+def _further(snapshot: Snapshot, one: Merged, coarse: Sequence[Level]) -> dict[str, bytes]:
+    """levels/1.ply and so on, levels.json, which tells from how far away each suffices, and each submap's piece."""
+    parts = {f"levels/{number}.ply": viewer_safe(each.gaussians) for number, each in enumerate(coarse, 1)}
+    source = one.gaussians.source_frame
+    numbers = {each.scene_id: number for number, each in enumerate(one.shares)} | {SHELL_PIECE: SHELL}
+    parts |= {piece_name(each): take(one.gaussians, source == number) for each, number in numbers.items()}
+    levels_file = json_bytes(snapshot.scale.record() | levels_record(coarse, snapshot.cameras))
+    return {name: encode_ply(part, snapshot.scale) for name, part in parts.items()} | {LEVELS_FILE: levels_file}
+
+
+def _tell(report: dict[str, object], folder: Path) -> None:
+    verdict, scenes = report["verdict"], report["scenes"]
+    assert isinstance(verdict, dict) and isinstance(scenes, list)
+    say(f"{verdict['code']}: {verdict['message']}")
+    for each in scenes:
+        say(f"{each['scene']}: {each['kept']} of {each['gaussians']} Gaussians kept")
+    left_out = report["scenes_left_out"]
+    assert isinstance(left_out, list)
+    for each in left_out:
+        say(f"left out: {each['scene']}: {each['reason']}")
+    shell = f"{report['far_shell']} of them the far shell"
+    say(f"{report['num_gaussians']} of {report['gaussians_given']} Gaussians ({shell})")
+    say(f"results: {folder}/ (scene.ply, levels/, cameras.json, preview.png, report.json)")

@@ -1,0 +1,82 @@
+"""A submap: one finished scene, in the world of the map that it is part of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.result.export import SceneFileError
+from splatnode.recon.result.export.stored import StoredResult
+from splatnode.recon.result.placement import Placement
+from splatnode.recon.result.shell import far_shell
+from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+from splatnode.recon.result.whole import ScenePlace, Whole, WholeMap
+
+
+@dataclass(frozen=True, eq=False)
+class Submap:
+    """A scene's Gaussians and cameras in the map's world and unit."""
+
+    scene_id: str
+    verdict: str
+    gaussians: GaussianArrays
+    cameras: tuple[CameraEstimate, ...]
+    shell: npt.NDArray[np.bool_]  # (N,) which of the Gaussians are its far shell
+
+
+@dataclass(frozen=True, eq=False)
+class Submaps:
+    """What of a map can be merged, and why the rest cannot."""
+
+    used: tuple[Submap, ...]
+    left_out: dict[str, str]  # scene_id: why
+
+
+def load_submaps(whole: Whole, of: WholeMap) -> Submaps:
+    """The scenes of a map that are final and published, in the order of places.json.
+
+    Raises SceneFileError where a result is damaged, OSError where it cannot be read.
+    """
+    used, left_out = [], {}
+    for scene_id, placement in of.placements.items():
+        place = whole.places[scene_id]
+        why = _why_not(place)
+        if why:
+            left_out[scene_id] = why
+        else:
+            used.append(_load(place, placement))
+    return Submaps(tuple(used), left_out)
+
+
+def submap(
+    scene_id: str,
+    verdict: str,
+    gaussians: GaussianArrays,
+    cameras: tuple[CameraEstimate, ...],
+    placement: Placement,
+) -> Submap:
+    """The scene, given in its own world, where `placement` puts it."""
+    shell = far_shell(gaussians, cameras)
+    moved = tuple(placement.camera(camera) for camera in cameras)
+    return Submap(scene_id, verdict, placement.gaussians(gaussians), moved, shell)
+
+
+def _why_not(place: ScenePlace) -> str:
+    if place.folder is None or not place.publishable:
+        return f"it has no result: {place.verdict}"
+    if place.provisional:
+        return "its scene is not final yet"
+    if not (place.folder / "scene.ply").is_file():
+        return f"{place.folder.name}/scene.ply is not there"
+    return ""
+
+
+def _load(place: ScenePlace, placement: Placement) -> Submap:
+    assert place.folder is not None  # `_why_not` has seen to it
+    result = StoredResult.at(place.folder)
+    try:
+        return submap(place.scene_id, place.verdict, result.gaussians(), result.cameras(), placement)
+    except SceneFileError as error:
+        raise SceneFileError(f"{place.folder}: {error}") from error

@@ -1,0 +1,57 @@
+"""Colours that depend on the direction, when the world is turned.
+
+`recon.rasterize.reference` has the same basis for torch.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+_DIRECTIONS = 64  # of the fit; a band of degree 3 needs 7
+
+
+def basis(directions: Array, bases: int) -> Array:
+    """(M, B) real spherical harmonics of unit vectors (M, 3), in the order and with the signs of 3DGS; B up to 16."""
+    x, y, z = directions.T
+    every = (
+        np.full_like(x, 0.28209479177387814),
+        -0.4886025119029199 * y,
+        0.4886025119029199 * z,
+        -0.4886025119029199 * x,
+        1.0925484305920792 * x * y,
+        -1.0925484305920792 * y * z,
+        0.31539156525252005 * (2 * z * z - x * x - y * y),
+        -1.0925484305920792 * x * z,
+        0.5462742152960396 * (x * x - y * y),
+        -0.5900435899266435 * y * (3 * x * x - y * y),
+        2.890611442640554 * x * y * z,
+        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+        1.445305721320277 * z * (x * x - y * y),
+        -0.5900435899266435 * x * (x * x - 3 * y * y),
+    )
+    return np.stack(every[:bases], 1)
+
+
+def turned(sh: npt.NDArray[np.float32], rotation: Array) -> npt.NDArray[np.float32]:
+    """(N, B, 3) the coefficients of the same colours after the world was turned by `rotation` (3, 3).
+
+    What was seen along d is seen along rotation @ d. A rotation mixes the coefficients of one degree only, so each
+    degree's matrix is found from a few directions, exactly but for rounding. B must be 1, 4, 9 or 16.
+    """
+    bases = sh.shape[1]
+    if bases not in (1, 4, 9, 16):
+        raise ValueError(f"sh must be (N, B, 3) with B = 1, 4, 9 or 16, got {sh.shape}")
+    directions = np.random.default_rng(0).normal(size=(_DIRECTIONS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    before, after = basis(directions @ rotation, bases), basis(directions, bases)
+    result = sh.copy()
+    for degree in range(1, round(bases**0.5)):
+        band = slice(degree**2, (degree + 1) ** 2)
+        matrix = np.linalg.lstsq(after[:, band], before[:, band], rcond=None)[0]
+        result[:, band] = np.einsum("ab,nbc->nac", matrix, sh[:, band])
+    return result

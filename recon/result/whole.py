@@ -1,0 +1,206 @@
+"""places.json, read as the whole that it tells of: the scenes, how they are linked, and which lie in one world.
+
+This is the reader of those who show or merge what a node has written; `recon.daemon.places` writes it. It is lenient
+with what an older node did not write: a link without a kind is one of a chain, and without `poses` the scenes of a map
+are placed by their links.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, is_printable
+from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.export.limits import read_json_file
+from splatnode.recon.result.placement import IDENTITY, Placement
+
+FILE = "places.json"
+MOST_SCENES = 10_000
+_TURNED = 1e-3  # largest difference of a rotation times its transpose from the identity
+
+Finite = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
+Factor = Annotated[float, msgspec.Meta(ge=1e-6, le=1e6)]
+Name = Annotated[str, msgspec.Meta(min_length=1, max_length=LONGEST_NAME)]
+Text = Annotated[str, msgspec.Meta(max_length=LONGEST_TEXT)]
+Row = tuple[Finite, Finite, Finite]
+Rotation = tuple[Row, Row, Row]
+
+
+@dataclass(frozen=True)
+class ScenePlace:
+    """A scene as places.json tells of it."""
+
+    scene_id: str
+    folder: Path | None  # with its result; None: there is none
+    verdict: str
+    message: str
+    publishable: bool
+    provisional: bool
+    frames_used: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class SceneLink:
+    """That two scenes were found to lie beside or on each other."""
+
+    scene: str
+    other: str
+    placement: Placement  # of `other` in the world of `scene`
+    kind: str  # "chain": the next scene of one walk; "loop": a place that was found again
+    retracted: str | None  # why it no longer counts; None: it does
+
+
+@dataclass(frozen=True)
+class WholeMap:
+    """Scenes that lie in one world: that of the scene `name`, whose unit is that scene's."""
+
+    name: str
+    placements: Mapping[str, Placement]  # by scene_id, from the scene's world to the map's, in the order of the file
+
+
+@dataclass(frozen=True)
+class Whole:
+    """All that a node has made. Every scene is in exactly one map; one that is linked to none is a map of its own."""
+
+    places: Mapping[str, ScenePlace]  # by scene_id
+    links: tuple[SceneLink, ...]
+    maps: tuple[WholeMap, ...]
+
+
+def is_whole(path: Path) -> bool:
+    """Whether `path` is the folder of a node's results: scenes and their places.json, no scene itself."""
+    return path.is_dir() and (path / FILE).is_file() and not (path / "scene.ply").exists()
+
+
+def read_whole(folder: Path) -> Whole:
+    """What places.json in `folder` tells. Raises FileNotFoundError, SceneFileError (it names the file), OSError."""
+    path = folder / FILE
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"{path} is not there. Give the folder that a node writes its scenes into (out of splatnode recon)"
+        )
+    data = read_json_file(path)
+    with foreign(SceneFileError, str(path)):
+        try:
+            found = msgspec.json.decode(data, type=_File)
+        except msgspec.MsgspecError as error:
+            raise SceneFileError(f"{path} is not a places.json of splatnode, or is damaged: {error}") from error
+        places = {place.scene_id: _place(place, folder, path) for place in found.places}
+        links = tuple(_link(link, path) for link in found.links if link.scene in places and link.other in places)
+        placed = _posed(found.poses, places, path) if found.poses is not None else _chained(places, links)
+        return Whole(places, links, _maps(places, placed))
+
+
+class _Place(msgspec.Struct, frozen=True):
+    scene_id: Name
+    folder: Name | None = None
+    verdict: Text = ""
+    message: Text = ""
+    publishable: bool = False
+    provisional: bool = False
+    frames_used: Annotated[tuple[Name, ...], msgspec.Meta(max_length=MOST_SCENES)] = ()
+
+
+class _Sim3(msgspec.Struct, frozen=True, kw_only=True):
+    scale: Factor
+    rotation: Rotation
+    translation: Row
+
+
+class _Link(_Sim3, frozen=True, kw_only=True):
+    scene: Name
+    other: Name
+    kind: Text = "chain"
+    retracted: Text | None = None
+
+
+class _Pose(_Sim3, frozen=True, kw_only=True):
+    scene: Name
+    map: Name
+
+
+class _File(msgspec.Struct, frozen=True):
+    places: Annotated[tuple[_Place, ...], msgspec.Meta(max_length=MOST_SCENES)]
+    links: Annotated[tuple[_Link, ...], msgspec.Meta(max_length=10 * MOST_SCENES)] = ()
+    poses: Annotated[tuple[_Pose, ...], msgspec.Meta(max_length=MOST_SCENES)] | None = None
+
+
+def _place(place: _Place, folder: Path, path: Path) -> ScenePlace:
+    texts = (place.scene_id, place.verdict, place.message, *place.frames_used)
+    if not all(is_printable(text) for text in texts):
+        raise SceneFileError(f"{path}: its texts must be printable")
+    names = [place.scene_id] if place.folder is None else [place.scene_id, place.folder]
+    if any("/" in name or "\0" in name or name in (".", "..") for name in names):
+        raise SceneFileError(f"{path}: {place.scene_id!a} must name a folder beside the file, not {place.folder!a}")
+    return ScenePlace(
+        place.scene_id,
+        None if place.folder is None else folder / place.folder,
+        place.verdict,
+        place.message,
+        place.publishable,
+        place.provisional,
+        place.frames_used,
+    )
+
+
+def _placement(found: _Sim3, of: str, path: Path) -> Placement:
+    rotation = np.array(found.rotation)
+    if np.abs(rotation @ rotation.T - np.eye(3)).max() > _TURNED or np.linalg.det(rotation) < 0:
+        raise SceneFileError(f"{path}: the rotation of {of} must be one")
+    return Placement(found.scale, rotation, np.array(found.translation))
+
+
+def _link(link: _Link, path: Path) -> SceneLink:
+    if not is_printable(link.kind) or not is_printable(link.retracted or ""):
+        raise SceneFileError(f"{path}: its texts must be printable")
+    placement = _placement(link, f"the link {link.scene!a} to {link.other!a}", path)
+    return SceneLink(link.scene, link.other, placement, link.kind, link.retracted)
+
+
+def _posed(poses: Sequence[_Pose], places: Mapping[str, ScenePlace], path: Path) -> dict[str, tuple[str, Placement]]:
+    unknown = sorted({pose.map for pose in poses} - set(places))
+    if unknown:  # folders are named after maps
+        raise SceneFileError(f"{path}: a map must be named after one of its scenes, not {unknown[0][:60]!a}")
+    return {
+        pose.scene: (pose.map, _placement(pose, f"the pose of {pose.scene!a}", path))
+        for pose in poses
+        if pose.scene in places
+    }
+
+
+def _chained(places: Mapping[str, ScenePlace], links: Iterable[SceneLink]) -> dict[str, tuple[str, Placement]]:
+    """By scene, the map and the place in it: each further scene is placed by the first link that reaches it."""
+    steps: dict[str, list[tuple[str, Placement]]] = {}
+    for link in links:
+        if link.retracted is None:
+            steps.setdefault(link.scene, []).append((link.other, link.placement))
+            steps.setdefault(link.other, []).append((link.scene, link.placement.inverse()))
+    placed: dict[str, tuple[str, Placement]] = {}
+    for first in places:
+        if first in placed:
+            continue
+        placed[first] = first, IDENTITY
+        waiting = [first]
+        while waiting:
+            here = waiting.pop(0)
+            for there, step in steps.get(here, []):
+                if there not in placed:
+                    placed[there] = first, placed[here][1].after(step)
+                    waiting.append(there)
+    return placed
+
+
+def _maps(places: Mapping[str, ScenePlace], placed: Mapping[str, tuple[str, Placement]]) -> tuple[WholeMap, ...]:
+    """In the order of their first scenes. A scene that has no place in a map is one of its own."""
+    maps: dict[str, dict[str, Placement]] = {}
+    for scene_id in places:
+        name, placement = placed.get(scene_id, (scene_id, IDENTITY))
+        maps.setdefault(name, {})[scene_id] = placement
+    return tuple(WholeMap(name, placements) for name, placements in maps.items())
