@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import msgspec
+import numpy as np
+import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.match import Matcher
@@ -61,13 +63,13 @@ class ClassicalPrior(Prior):
     ) -> tuple[Pointmap, ...]:
         views, sparse = self._views(graph, registration)
         keyframes = _keyframes(graph, registration)
-        depths = {i: known[keyframe.name].depth for i, keyframe in enumerate(keyframes) if keyframe.name in known}
+        depths = {i: _to_compare(known[each.name]) for i, each in enumerate(keyframes) if each.name in known}
         found = []
         for i in (i for i, keyframe in enumerate(keyframes) if keyframe.name not in known):
             depth_map = stereo.further_depth_map(
                 views, i, depths, self._config.stereo, seed=self._config.seed, sparse=sparse[i]
             )
-            depths[i] = depth_map.depth
+            depths[i] = depth_map.unchecked.astype(np.float32)
             found.append(_pointmap(keyframes[i], views[i], depth_map))
         return tuple(found)
 
@@ -99,7 +101,13 @@ def _pointmap(keyframe: Keyframe, view: stereo.StereoView, depth_map: DepthMap) 
         normal=depth_map.normal,
         T_world_camera=view.T_world_camera,
         K=view.K,
+        unchecked=depth_map.unchecked,
     )
+
+
+def _to_compare(pointmap: Pointmap) -> npt.NDArray[np.float32]:
+    """(h, w) the depth that further views are compared with."""
+    return pointmap.depth if pointmap.unchecked is None else pointmap.unchecked.astype(np.float32)
 
 
 def load(config: Config) -> ClassicalPrior:

@@ -54,6 +54,7 @@ class DepthMap:
     normal: Float32  # (h, w, 3) camera frame, unit length, facing the camera, 0 where unknown
     confidence: Float32  # (h, w) about the probability that the depth is within 1 %, 0 where unknown
     num_consistent: npt.NDArray[np.uint8]  # (h, w) how many other views agree
+    unchecked: npt.NDArray[np.float16]  # (h, w) z before the check, 0 where unknown: what further views are checked by
 
 
 class _Other(ctypes.Structure):
@@ -138,7 +139,14 @@ def depth_map(view: Level, planes: Planes, agreement: Agreement, matching: Match
         normal * known[..., None],
         np.where(known, probability, np.float32(0)),
         np.where(known, agreement.num_consistent, 0).astype(np.uint8),
+        _unchecked(planes),
     )
+
+
+def _unchecked(planes: Planes) -> npt.NDArray[np.float16]:
+    inverse_depth = planes.values[..., 0]
+    depth = np.divide(1.0, inverse_depth, out=np.zeros(inverse_depth.shape, np.float32), where=inverse_depth > 0)
+    return np.where(depth < np.finfo(np.float16).max, depth, 0).astype(np.float16)
 
 
 def supported(

@@ -19,6 +19,8 @@ class Pointmap:
     normal: npt.NDArray[np.float32]  # (h, w, 3) camera frame, unit length, facing the camera; any where depth is 0
     T_world_camera: npt.NDArray[np.float64]  # (4, 4)
     K: npt.NDArray[np.float64]  # (3, 3) at modelled size
+    # (h, w) z that other views have not confirmed or denied yet, 0 where unknown: what further views are compared with
+    unchecked: npt.NDArray[np.float16] | None = None
 
     @property
     def points(self) -> npt.NDArray[np.float32]:

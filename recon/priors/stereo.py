@@ -154,7 +154,8 @@ def further_depth_map(
     """The depth map of view `index` alone, beside those that have one already.
 
     `depths` holds the depth maps (h, w), 0 where unknown, of other views by their index. They stay as they are, and
-    the new map is checked against them.
+    the new map is checked against them. They should be `DepthMap.unchecked`: where a depth is unknown for want of
+    views, no further view would ever find one.
     """
     partners = rank_partners(views, index, config, sparse)
     sources = compared_with(partners, config)

@@ -59,9 +59,11 @@ def updated_pointmaps(
         if keyframe.name not in pointmaps:
             continue
         before = pointmaps[keyframe.name]
+        ratio = np.float32(_depth_ratio(before, registration, camera, keyframe))
         updated[keyframe.name] = replace(
             before,
-            depth=before.depth * np.float32(_depth_ratio(before, registration, camera, keyframe)),
+            depth=before.depth * ratio,
+            unchecked=None if before.unchecked is None else (before.unchecked * ratio).astype(np.float16),
             T_world_camera=camera.T_world_camera,
             K=modelled_K(graph, camera),
         )

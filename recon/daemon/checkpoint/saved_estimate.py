@@ -21,7 +21,7 @@ from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.verification.evidence import Evidence
 
 OF_REGISTRATION = ("points", "observed_by", "observed_point", "observed_pixels")
-OF_POINTMAP = ("depth", "confidence", "normal", "T_world_camera", "K")
+OF_POINTMAP = ("depth", "confidence", "normal", "T_world_camera", "K", "unchecked")
 
 
 class EstimateRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -37,7 +37,10 @@ class EstimateRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class PointmapsRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Arrays: OF_POINTMAP for each; depths as half floats, confidence and normals in 256 steps."""
+    """Arrays: OF_POINTMAP for each; depths as half floats, confidence and normals in 256 steps.
+
+    `unchecked` is empty where there is none.
+    """
 
     names: list[str]
 
@@ -81,7 +84,8 @@ def pointmaps_message(pointmaps: Mapping[str, Pointmap]) -> tuple[PointmapsRecor
         depth = pointmap.depth.astype(np.float16).view(np.uint16)
         confidence = np.rint(255 * pointmap.confidence).astype(np.uint8)
         normal = np.rint(127 * pointmap.normal + 128).astype(np.uint8)
-        arrays += [depth, confidence, normal, pointmap.T_world_camera, pointmap.K]
+        unchecked = np.zeros((0, 0), np.float16) if pointmap.unchecked is None else pointmap.unchecked
+        arrays += [depth, confidence, normal, pointmap.T_world_camera, pointmap.K, unchecked.view(np.uint16)]
     return PointmapsRecord(list(pointmaps)), arrays
 
 
@@ -94,7 +98,7 @@ def pointmaps_from(message: Message[PointmapsRecord], keyframes: Mapping[str, Ke
     for index, name in enumerate(names):
         if name not in keyframes:
             continue
-        depth, confidence, normal, T_world_camera, K = arrays[len(OF_POINTMAP) * index :][: len(OF_POINTMAP)]
+        depth, confidence, normal, T_world_camera, K, unchecked = arrays[len(OF_POINTMAP) * index :][: len(OF_POINTMAP)]
         found[name] = Pointmap(
             name=name,
             frame_id=keyframes[name].frame.frame_id,
@@ -103,5 +107,6 @@ def pointmaps_from(message: Message[PointmapsRecord], keyframes: Mapping[str, Ke
             normal=np.asarray((normal - 128.0) / 127, np.float32),
             T_world_camera=np.array(T_world_camera),
             K=np.array(K),
+            unchecked=np.array(unchecked).view(np.float16) if unchecked.size else None,
         )
     return found

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import msgspec
+import numpy as np
 import pytest
 
 from splatnode.capture.process.config import ConfigError, typed
@@ -52,6 +55,24 @@ def test_it_keeps_the_interface(kind):
     known = {pointmap.name: pointmap for pointmap in pointmaps[:2]}
     (further,) = prior.further_pointmaps(graph, registration, known)
     assert further.name == pointmaps[2].name and SMALL.width == graph.keyframes[2].frame.width
+
+
+def test_a_further_view_finds_depth_where_those_before_it_were_not_confirmed():
+    """A camera that goes on sees what those before it saw at their edges, where no other view had confirmed it."""
+    prior = loaded("classical")
+    graph = view_graph(photographs()[:4], None)
+    registration = register.register(graph.keyframes, graph.pairs, register.Config())
+    assert registration is not None
+    known = {}
+    for pointmap in prior.pointmaps(graph, registration)[:3]:
+        assert pointmap.unchecked is not None and (pointmap.unchecked > 0).mean() > 0.95
+        confirmed = np.zeros(pointmap.depth.shape, bool)
+        confirmed[:, : confirmed.shape[1] // 4] = True
+        known[pointmap.name] = pointmap.masked(confirmed)
+    (further,) = prior.further_pointmaps(graph, registration, known)
+    blind = {name: replace(pointmap, unchecked=None) for name, pointmap in known.items()}
+    (without,) = prior.further_pointmaps(graph, registration, blind)
+    assert (further.depth > 0).mean() > max(0.5, 1.3 * (without.depth > 0).mean())
 
 
 def test_another_prior_starts_from_its_own_defaults():
