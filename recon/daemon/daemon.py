@@ -199,6 +199,7 @@ class Daemon:
         snapshot = self._shown.snapshot if self._shown else None
         intake, worker, motion, tracked = self._intake, self._worker, self._watcher.motion, self._watcher.tracked
         delay_s, delay = worker.delay
+        scenes, maps, loops = worker.known
         return ReconStatus(
             **self._numbering.next(),
             state=State.FULL if intake.full else worker.place.state,
@@ -217,7 +218,9 @@ class Daemon:
             delay_s=delay_s,
             delay=delay,
             unfinished=worker.unfinished,
-            **worker.known,
+            scenes=scenes,
+            maps=maps,
+            loops=loops,
             refused=intake.refused + self._commands.refused + self._scenes.refused,
             duplicates=intake.duplicates,
             rss_mb=resident_mb(),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import time
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from splatnode.recon.config import Config
 from splatnode.recon.daemon import finishing, places
 from splatnode.recon.daemon.atlas.atlas import Atlas
 from splatnode.recon.daemon.checkpoint import checkpoint, left
+from splatnode.recon.daemon.checkpoint.ledger import CheckpointError
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.output import Output
 from splatnode.recon.incremental import IncrementalReconstruction, Pause
@@ -26,14 +28,14 @@ class LeftPlaces:
     def __init__(self, here: Store, config: Config, output: Output, atlas: Atlas) -> None:
         """`here` is the checkpoint which has left/ in it, `config` how scenes are made."""
         self._here, self._config, self._output, self._atlas = here, config, output, atlas
-        self._directory = here.directory
         self._work: IncrementalReconstruction | None = None  # that is being finished
         self._not_before_s: dict[Path, float] = {}  # monotonic, for those that could not be finished
+        self._retract_after_s = -math.inf  # monotonic: a keyframe could not be taken out before
 
     @property
     def unfinished(self) -> int:
         """Places that were left and are not finished."""
-        return len(left.folders(self._directory))
+        return len(left.folders(self._here.directory))
 
     def leave_out(self, seconds: float) -> None:
         """Of the seconds that the report will tell: they were spent otherwise."""
@@ -43,11 +45,12 @@ class LeftPlaces:
     def finish_next(self, pause: Pause) -> bool:
         """Finishes the oldest place and writes its result; False where there is none to be finished now.
 
-        What `pause` raises ends the work; it is begun again another time, as after a failure.
+        What places that were left are to lose is taken out of them first. What `pause` raises ends the work; it is
+        begun again another time, as after a failure.
         """
         self._retract()
         now = time.monotonic()
-        waiting = [each for each in left.folders(self._directory) if self._not_before_s.get(each, 0.0) <= now]
+        waiting = [each for each in left.folders(self._here.directory) if self._not_before_s.get(each, 0.0) <= now]
         if not waiting:
             return False
         folder = waiting[0]
@@ -72,14 +75,30 @@ class LeftPlaces:
 
     def _retract(self) -> None:
         """Takes out of the places that were left what they are to lose; their scenes are not final then."""
+        if time.monotonic() < self._retract_after_s:
+            return
         for scene, name in self._here.ledger.retracted:
-            folder = left.reopen(self._directory, scene)
-            if folder is not None:
-                self._atlas.forget(scene)
+            try:
+                self._take_out(scene, name)
+            except OSError as error:
+                self._output.complain(
+                    f"{name} cannot be taken out of {scene} ({error.strerror}): make room on the disk"
+                )
+                self._retract_after_s = time.monotonic() + AGAIN_S
+                return
+
+    def _take_out(self, scene: str, name: str) -> None:
+        """Raises OSError."""
+        folder = left.reopen(self._here.directory, scene)
+        if folder is not None:
+            self._atlas.forget(scene)
+            self._not_before_s.pop(folder, None)
+            try:
                 with contextlib.closing(Store(folder)) as store:
                     store.forget(name, "retracted")
-                self._not_before_s.pop(folder, None)
-            self._here.was_retracted(scene, name)
+            except CheckpointError as error:
+                self._output.complain(f"{name} cannot be taken out of {scene}: {error}")
+        self._here.was_retracted(scene, name)
 
     def _finished(self, store: Store, found: checkpoint.Restored, pause: Pause) -> bool:
         """Whether the scene of the place is final now, and its result written."""

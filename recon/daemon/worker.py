@@ -55,11 +55,11 @@ class Worker:
         return self._left.unfinished
 
     @property
-    def known(self) -> dict[str, int]:
-        """How many final scenes there are, for the heartbeat: and into how many maps how many loops join them."""
+    def known(self) -> tuple[int, int, int]:
+        """How many final scenes there are, how many maps they are, and how many loops count."""
         poses, links = self._output.places.poses, self._output.places.links
         loops = sum(link.kind is Kind.LOOP and link.retracted is None for link in links)
-        return {"scenes": len(poses), "maps": len({pose.map for pose in poses}), "loops": loops}
+        return len(poses), len({pose.map for pose in poses}), loops
 
     def scenes_left_with(self, name: str) -> list[str]:
         """The ids of the scenes, of places that the camera has left, that have a camera of this photograph."""

@@ -67,6 +67,7 @@ def test_what_was_estimated_and_measured_comes_back_and_is_not_made_anew(store, 
         known = pointmap.depth > 0
         assert np.array_equal(again.known.pointmaps[name].depth > 0, known)
         assert np.abs(again.known.pointmaps[name].depth[known] / pointmap.depth[known] - 1).max() < 1e-3
+        assert np.array_equal(again.known.pointmaps[name].unchecked, pointmap.unchecked)
         assert np.abs(again.known.pointmaps[name].confidence - pointmap.confidence).max() < 0.01
         assert np.abs(again.known.pointmaps[name].normal - pointmap.normal).max() < 0.01
     further = photographs()[3]
