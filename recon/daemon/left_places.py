@@ -10,6 +10,7 @@ from pathlib import Path
 
 from splatnode.capture.process.logs import event
 from splatnode.recon.config import Config
+from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon import finishing, places
 from splatnode.recon.daemon.atlas.atlas import Atlas
 from splatnode.recon.daemon.checkpoint import checkpoint, left
@@ -69,6 +70,7 @@ class LeftPlaces:
             return False
         finally:
             self._work = None
+            give_back_memory()
         if finished:
             del self._not_before_s[folder]
         return True

@@ -11,6 +11,7 @@ from functools import partial
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.memory_shortage import is_shortage
 from splatnode.recon.config import Config as Recipe
+from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon import finishing, membership, places
 from splatnode.recon.daemon.atlas.atlas import Atlas
 from splatnode.recon.daemon.checkpoint import checkpoint
@@ -108,6 +109,7 @@ class PresentPlace:
         self._output.save(self._work, final=False)
         if time.monotonic() - self._exported_s >= self._config.export_every_s:
             self.export_provisionally()
+        give_back_memory()
 
     def _added(self, keyframes: list[Keyframe]) -> set[str]:
         """Adds keyframes to the view graph; names those that do not fit at once, which are set aside."""
@@ -270,6 +272,7 @@ class PresentPlace:
         else:
             self._output.tell(snapshot, places.State.HERE, kept)
         self.state = State.WAITING if not shown else State.LOST if self._strangers() else State.IDLE
+        give_back_memory()
 
     def _pause(self) -> None:
         """Raises Abandoned if the daemon stops, or something has come."""

@@ -78,7 +78,7 @@ def _hanging(gaussians: GaussianArrays, which: Mask, views: Sequence[DepthView])
     steps = np.take_along_axis(steps[None], np.argsort(np.argsort(-part.scales, 1), 1)[:, None], 2)  # (M, 9, 3)
     body = part.means[:, None] + steps @ axes.transpose(0, 2, 1)
     found = np.zeros(len(gaussians), bool)
-    found[chosen] = (sight(views, body.reshape(-1, 3)).before > 0).reshape(len(chosen), -1).any(1)
+    found[chosen] = (sight(views, body.reshape(-1, 3)).before > 0).reshape(len(chosen), len(_BODY) ** 2).any(1)
     return found
 
 
