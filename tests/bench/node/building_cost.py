@@ -37,7 +37,7 @@ def cost_row(samples: Sequence[Sample]) -> dict:
             "percentile_95_from_50": _of(lambda values: np.percentile(values, 95), late),
             "slope_of_median_per_100": slope_per_100(numbers, seconds),
         }
-    late = [sample for sample in samples if sample.done >= FROM]
+    late = [sample for sample in samples if FROM <= sample.done < told["keyframes"]]  # while the robot walked
     told["rss_mb"] = {
         "most": max((sample.rss_mb for sample in samples), default=None),
         "growth_per_keyframe": _growth(late, "rss_mb"),

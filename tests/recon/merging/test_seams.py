@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,14 @@ def test_a_shell_does_not_hang_before_what_another_scene_sees():
     before = parts[0].gaussians.means[parts[0].shell]
     assert (sight(views, before).before > 0).any()  # it does to begin with
     assert not (sight(views, first[first_shell]).before > 0).any()
+
+
+def test_a_scene_without_a_shell_is_merged_too():
+    parts = [replace(each, shell=np.zeros(len(each.gaussians), bool)) for each in submaps()]
+    assert [mask.shape for mask in kept(parts)] == [(len(each.gaussians),) for each in parts]
+    bare = [replace(each, gaussians=take(each.gaussians, ~part.shell), shell=each.shell[~part.shell])
+            for each, part in zip(parts, submaps(), strict=True)]  # fmt: skip
+    assert all(mask.any() for mask in kept(bare))
 
 
 def test_nothing_goes_where_the_better_scene_has_a_hole():
