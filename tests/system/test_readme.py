@@ -291,6 +291,24 @@ def test_stream_of_five_places():
     says(f"{five['delay_s_median']:.0f} s behind the camera in the median, {five['delay_s_most']:.0f} s at most")
 
 
+def test_a_walk_through_the_building():
+    walk = raw("building")
+    cameras, loops, cost = walk["cameras"], walk["loops"], walk["cost"]
+    says(f"a walk of {walk['keyframes']} keyframes, {cameras['path_m']:.0f} m, through the built-in building")
+    assert walk["in_a_scene"] == walk["keyframes"] and walk["all_finished_s"] is None
+    says(f"all in a scene, in {walk['scenes']} scenes")
+    of_the_way, most = cameras["position_percent_of_path"], cameras["rotation_deg_most"]
+    says(f"cameras within {of_the_way:.3f} % of the way and {most:.2f} degrees of the true ones")
+    assert loops["linked_or_in_one_map"] == loops["revisits"] and not loops["wrong_loop_links"]
+    says(f"all {loops['revisits']} revisits in one map; of {loops['loop_links']} loops none wrong")
+    seconds, delay = cost["second"], cost["delay_s"]
+    says(f"{seconds['median']:.1f} s a keyframe in the median, {seconds['percentile_95']:.1f} in the 95th percentile")
+    says(f"picture {delay['median']:.0f} s behind the camera in the median, {delay['most']:.0f} s at most")
+    says(f"{cost['checkpoint_mb']['growth_per_keyframe']:.1f} MB of disk a keyframe")
+    walked = max(sample["rss_mb"] for sample in cost["samples"] if sample["done"] < walk["keyframes"]) / 1e3
+    says(f"at most {walked:.2f} GB on the way, {cost['rss_mb']['most'] / 1e3:.2f} GB while scenes were finished")
+
+
 def test_stream_of_a_chain():
     chain = raw("stream_chain")
     assert chain["in_a_scene"] == chain["photographs"] == 30 and len(chain["places"]) == 3
