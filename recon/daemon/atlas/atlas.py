@@ -22,6 +22,7 @@ from splatnode.recon.daemon.atlas.recognition import (
     likeliest,
 )
 from splatnode.recon.daemon.checkpoint import checkpoint, left, made_anew
+from splatnode.recon.daemon.checkpoint.ledger import CheckpointError
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.places import Places
 from splatnode.recon.matching.match import Matcher
@@ -42,8 +43,11 @@ class Atlas:
         self._matcher: Matcher | None = None
         self._codes: dict[str, Codes] = {}
         for folder in left.finished(directory):
-            if (found := made_anew.load(folder, "codes", CodesRecord)) is not None:
-                self._codes[folder.name] = codes_from(found)
+            try:
+                found = made_anew.load(folder, "codes", CodesRecord)
+                self._codes |= {} if found is None else {folder.name: codes_from(found)}
+            except ValueError as error:
+                log.warning("%s is not recognised again: %s", folder.name, error)
 
     def keep(self, store: Store, graph: ViewGraph) -> None:
         """Writes into the checkpoint of a scene that is finished what it is recognised by later. Raises OSError."""
@@ -76,17 +80,25 @@ class Atlas:
                 break
         self._places.add_loops(scene, loops)
 
+    def _graph(self, scene: str) -> ViewGraph:
+        """Of a finished scene; an empty one where it cannot be read."""
+        folder = left.finished_folder(self._directory, scene)
+        if folder.exists():
+            try:
+                with contextlib.closing(Store(folder)) as store:
+                    return checkpoint.graph_of(store, self._config)
+            except (CheckpointError, OSError, ValueError) as error:
+                log.warning("%s is not recognised again: %s", scene, error)
+                self.forget(scene)
+        return ViewGraph(self._config.matching)
+
     def _side(self, scene: str, graph: ViewGraph, codes: Mapping[str, Codes]) -> Side:
         return Side(scene, graph, self._places.cameras(scene), centred(codes[scene], in_common(codes)))
 
     def _bridged(self, other: str, side: Side, codes: dict[str, Codes], pause: Callable[[], None]) -> Link | None:
-        folder = left.finished_folder(self._directory, other)
-        if not folder.exists():
-            return None
-        with contextlib.closing(Store(folder)) as store:
-            theirs = checkpoint.graph_of(store, self._config)
+        theirs = self._graph(other)
         if len(theirs.keyframes) != len(codes[other]):
-            return None  # a frame is damaged
+            return None  # something of it is damaged
         found = bridge(self._side(other, theirs, codes), side, self._config, self._matcher, pause)
         if not isinstance(found, Bridge):
             event(log, logging.INFO, "no_loop", scene=side.scene_id, other=other, why=found)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 import msgspec
 import numpy as np
@@ -12,15 +12,22 @@ from msgspec.structs import replace
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
+from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.status import heartbeats
+from splatnode.recon.daemon.atlas import atlas as module
 from splatnode.recon.daemon.atlas.atlas import Atlas
-from splatnode.recon.daemon.checkpoint import left
+from splatnode.recon.daemon.atlas.recognition import codes_message, codes_of
+from splatnode.recon.daemon.checkpoint import checkpoint, left
+from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.places import Places
 from splatnode.recon.evaluate.camera_errors import camera_errors
 from splatnode.recon.geometry import Similarity
+from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.preparation import prepare
 from splatnode.recon.result.export import read_cameras
 from tests.capture.messaging.test_sockets import wait_for
 from tests.recon.daemon.test_daemon import PATIENCE_S, config, finished, peer, running
-from tests.support.synthetic import SMALL, places
+from tests.support.synthetic import SMALL, photographs, places
 
 __all__ = ["config", "peer"]
 
@@ -98,11 +105,27 @@ def test_it_is_recognised_by_the_next_process_where_the_first_one_was_killed(kid
     assert (link["kind"], link["scene"], link["other"]) == ("loop", "scene-0001", "scene-0003")
 
 
-def test_a_finished_place_whose_files_are_damaged_is_not_recognised_and_stops_nothing(kidnapped, peer):
-    with walked(kidnapped, peer):
-        wait_for(lambda: places_file(kidnapped)["links"], PATIENCE_S)
-    graph = left.finished_folder(kidnapped.checkpoint, "scene-0001") / "graph"
-    graph.write_bytes(graph.read_bytes()[:-100])
-    with running(kidnapped):
-        wait_for(lambda: places_file(kidnapped)["links"] == [], PATIENCE_S)
-        assert heartbeats(kidnapped.network)["recon"]["problem"] == ""
+@pytest.mark.parametrize("file", ["graph", "ledger", "codes"])
+def test_a_finished_place_whose_files_are_damaged_is_not_recognised_and_stops_nothing(kidnapped, tmp_path, file):
+    """Other places are recognised: here one with the same photographs."""
+    config = msgspec.structs.replace(kidnapped.reconstruction)
+    frames = list(photographs())[:4]
+    for place in ("scene-0001", "scene-0002"):
+        with closing(Store(tmp_path / "checkpoint" / "left" / place)) as store:
+            work = IncrementalReconstruction(config)
+            for number, frame in enumerate(frames):
+                store.put(ReceivedFrame("0" * 32, number, frame))
+                work.add(prepare(frame, config))
+            work.complete()
+            checkpoint.save(store, work, final=False)
+            store.save("codes", *codes_message(work.graph.keyframes, codes_of(work.graph.keyframes)))
+            store.finish()
+    damaged = left.finished_folder(tmp_path / "checkpoint", "scene-0001") / file
+    damaged.write_bytes(damaged.read_bytes()[:-100])
+    index = Places(tmp_path, "0" * 32)
+    atlas = Atlas(tmp_path / "checkpoint", config, index)
+    seen = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "bridge", lambda one, *_: seen.append(one.scene_id) or "for the test")
+        atlas.compare("scene-0003", work.graph, lambda: None)
+    assert seen == ["scene-0002"] and index.links == ()
