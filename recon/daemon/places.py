@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.memory import resident_mb
 from splatnode.recon.daemon.atlas.bridge import Bridge
 from splatnode.recon.daemon.atlas.links import Kind, Link, bridged, link
 from splatnode.recon.daemon.atlas.pose_graph import Pose, optimised
@@ -52,6 +53,8 @@ class Place(msgspec.Struct, frozen=True):
     frames_dropped: tuple[Dropped, ...]  # all others that were taken there, and why they have none
     follows: str = ""  # the scene that it goes on from; empty: it began anew
     shared: tuple[str, ...] = ()  # the photographs that both have
+    seconds: float = 0.0  # that were worked on it, by the process that wrote this
+    rss_mb: float = 0.0  # memory of that process then
 
 
 def described(
@@ -85,6 +88,8 @@ def described(
         frames_dropped=(*unplaced, *(Dropped(frame.name, frame.reason) for frame in dropped)),
         follows=follows,
         shared=tuple(shared),
+        seconds=round(sum(snapshot.seconds[stage] for stage in snapshot.seconds.keys() - {"wait", "total"}), 1),
+        rss_mb=round(resident_mb()),
     )
 
 

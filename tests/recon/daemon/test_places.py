@@ -65,6 +65,7 @@ def test_a_clean_stop_leaves_what_there_is_and_says_that_it_is_provisional(movin
     assert verdict["publishable"] and verdict["provisional"]
     (place,) = index(moving)
     assert (place["state"], place["folder"], place["provisional"]) == ("here", folder.name, True)
+    assert 0.1 < place["seconds"] < PATIENCE_S and place["rss_mb"] > 100
 
     with running(replace(moving, settle_s=0.2)):
         peer.wait(finished(3), "three cameras, refined")
