@@ -291,6 +291,18 @@ def test_stream_of_five_places():
     says(f"{five['delay_s_median']:.0f} s behind the camera in the median, {five['delay_s_most']:.0f} s at most")
 
 
+def test_stream_there_and_back():
+    back = raw("stream_back")
+    visits, cameras = back["visits"], back["cameras"]
+    assert back["photographs"] == back["in_a_scene"] == 72 and visits["joined"] == []
+    says(f"{len(visits['recognised'])} of the {len(visits['found_there'])} places recognised on the way back")
+    known = [cameras[name] for name in visits["recognised"]]
+    rotation, centre = (max(each[what] for each in known) for what in ("rotation_deg", "centre_pct"))
+    says(f"within {rotation:.2f} degrees and {centre:.2f} % of the true ones; all finished")
+    says(f"all finished {back['all_finished_s'] - back['taken_s']:.0f} s after the last photograph")
+    says(f"recon's memory at most {back['recon_mb_most'] / 1e3:.2f} GB")
+
+
 def test_a_walk_through_the_building():
     walk = raw("building")
     cameras, loops, cost = walk["cameras"], walk["loops"], walk["cost"]
