@@ -110,7 +110,7 @@ class LeftPlaces:
         event(log, logging.INFO, "finishing", scene=store.scene_id)
         exported = self._finish(store, found, pause)
         if exported:
-            self._output.save_in(store, found.work, final=True)
+            self._output.save(store, found.work, final=True)
         return exported
 
     def _keep(self, store: Store, work: IncrementalReconstruction, pause: Pause) -> None:
@@ -118,8 +118,8 @@ class LeftPlaces:
         if work.scene is None:
             left.remove(store.directory)
             return
-        self._atlas.compare(store.scene_id, work.graph, pause)
-        self._atlas.keep(store, work.graph)
+        codes = self._atlas.compare(store.scene_id, work.graph, pause)
+        self._atlas.keep(store, work.graph, codes)
         store.finish()
 
     def _finish(self, store: Store, found: checkpoint.Restored, pause: Pause) -> bool:

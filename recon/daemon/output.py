@@ -42,12 +42,8 @@ class Output:
     def publish(self, snapshot: Snapshot) -> None:
         self._publish(Published(snapshot, self._store.scene_id))
 
-    def save(self, work: IncrementalReconstruction, final: bool) -> None:
-        """Writes the checkpoint's files that a restart would else have to compute again."""
-        self.save_in(self._store, work, final)
-
-    def save_in(self, place: Store, work: IncrementalReconstruction, final: bool) -> None:
-        """Writes those of the checkpoint of a place that was left."""
+    def save(self, place: Store, work: IncrementalReconstruction, final: bool) -> None:
+        """Writes the files of the place's checkpoint that a restart would else have to compute again."""
         try:
             checkpoint.save(place, work, final)
         except OSError as error:

@@ -14,8 +14,7 @@ import numpy.typing as npt
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.memory import resident_mb
-from splatnode.recon.daemon.atlas.bridge import Bridge
-from splatnode.recon.daemon.atlas.links import Kind, Link, bridged, link
+from splatnode.recon.daemon.atlas.links import Kind, Link, link
 from splatnode.recon.daemon.atlas.pose_graph import Pose, optimised
 from splatnode.recon.result.export import SceneFileError, read_cameras, write_file
 from splatnode.recon.result.export.limits import read_json_file
@@ -161,15 +160,6 @@ class Places:
                 links += [] if found is None else [found]
         self._write_links(links)
 
-    def bridged(self, scene_id: str, other: str, bridge: Bridge) -> Link | None:
-        """The link between two final scenes by the bridge, `scene_id` being its first; None where they disagree."""
-        if not {scene_id, other} <= self._final.keys():
-            return None
-        why = f"{bridge.verified} pairs of photographs show the same, and {len(bridge.one)} + {len(bridge.other)} "
-        why += "photographs of both are one scene"
-        cameras = self.cameras(scene_id), self.cameras(other)
-        return bridged(scene_id, other, *cameras, (bridge.one, bridge.other), why)
-
     def add_loops(self, scene_id: str, loops: Collection[Link]) -> None:
         """Writes these as the loops by which the scene was found to lie where others do. Raises ResultWriteError."""
         others = [each for each in self._index.links if each.kind is not Kind.LOOP or each.other != scene_id]
@@ -180,7 +170,9 @@ class Places:
         return {place.scene_id: place for place in self._index.places if not place.provisional and place.publishable}
 
     def _write_links(self, links: Sequence[Link]) -> None:
-        graph = optimised(list(self._final), links)
+        """Those between final scenes: a place that was final may have become a draft again."""
+        final = self._final
+        graph = optimised(list(final), [each for each in links if {each.scene, each.other} <= final.keys()])
         for each in graph.links:
             if each.retracted:
                 log.warning("the loop from %s to %s does not count: %s", each.scene, each.other, each.retracted)

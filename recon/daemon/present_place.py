@@ -106,7 +106,7 @@ class PresentPlace:
             verdict=snapshot.verdict.code.value, gaussians=len(snapshot.gaussians), seconds=self.keyframe_s or 0.0,
             bounds=bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale),
         )  # fmt: skip
-        self._output.save(self._work, final=False)
+        self._output.save(self._store, self._work, final=False)
         if time.monotonic() - self._exported_s >= self._config.export_every_s:
             self.export_provisionally()
         give_back_memory()
@@ -172,7 +172,7 @@ class PresentPlace:
         """
         before, kept = self._store.scene_id, self._store.names_before(first).union(shared)
         if self._final != kept:
-            self._output.save(self._work, final=False)
+            self._output.save(self._store, self._work, final=False)
             self._export_provisionally(places.State.LEFT, kept)
         else:
             self._output.finished(before)
@@ -224,17 +224,14 @@ class PresentPlace:
         names = frozenset(self._work.names)
         if not names or self._final != names or self._compared == names:
             return
-        state, self.state = self.state, State.REFINING
+        state, self.state, self._compared = self.state, State.REFINING, names
         try:
             atlas.compare(self._store.scene_id, self._work.graph, self._pause)
         except Abandoned:
-            raise
-        except Exception:
-            self._compared = names  # nothing would be different another time
+            self._compared = frozenset()  # only this is worth another time
             raise
         finally:
             self.state = state
-        self._compared = names
 
     def leave_out(self, names: Sequence[str]) -> None:
         """The checkpoint no longer has these frames; the scene forgets them, too."""
@@ -244,7 +241,7 @@ class PresentPlace:
             self.settled, self.finished, self.state = False, None, State.GROWING
         self._show(final=self.settled and self._work.scene is not None)
         if known:
-            self._output.save(self._work, final=False)
+            self._output.save(self._store, self._work, final=False)
 
     def _forget(self, name: str, reason: str) -> None:
         self._store.forget(name, reason)
@@ -267,7 +264,8 @@ class PresentPlace:
         snapshot, kept = self._show(final=shown), sorted(self._store.names)
         if shown:
             exported = self._output.export(snapshot, self._store, places.State.HERE, kept)
-            self._output.save(self._work, final=exported)  # what is kept as final is not exported after a restart
+            # What is kept as final is not exported after a restart.
+            self._output.save(self._store, self._work, final=exported)
             self._final = frozenset(self._work.names) if exported else frozenset()
         else:
             self._output.tell(snapshot, places.State.HERE, kept)

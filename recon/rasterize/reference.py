@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.rasterize.render import Render
+from splatnode.recon.result.spherical_harmonics import terms
 
 CHANNELS = ("rgb", "depth", "normal", "alpha")
 LOW_PASS = 0.3  # px^2, added to the variance of every splat: none is thinner than a pixel
@@ -162,28 +163,7 @@ def colours(sh: Tensor, directions: Tensor) -> Tensor:
 def sh_basis(directions: Tensor, bases: int) -> Tensor:
     """(N, B) real spherical harmonics of unit vectors (N, 3), in the order and with the signs of 3DGS."""
     x, y, z = directions.unbind(1)
-    basis = [torch.full_like(x, 0.28209479177387814)]
-    if bases > 1:
-        basis += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
-    if bases > 4:
-        basis += [
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2 * z * z - x * x - y * y),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (x * x - y * y),
-        ]
-    if bases > 9:
-        basis += [
-            -0.5900435899266435 * y * (3 * x * x - y * y),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
-            0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
-            -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
-            1.445305721320277 * z * (x * x - y * y),
-            -0.5900435899266435 * x * (x * x - 3 * y * y),
-        ]
-    return torch.stack(basis, 1)
+    return torch.stack(terms(x, y, z, bases), 1)
 
 
 def normals(axes: Tensor, scales: Tensor, means_camera: Tensor) -> Tensor:

@@ -1,9 +1,8 @@
-"""Colours that depend on the direction, when the world is turned.
-
-`recon.rasterize.reference` has the same basis for torch.
-"""
+"""Colours that depend on the direction: the basis of their coefficients, and these when the world is turned."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,28 +12,39 @@ Array = npt.NDArray[np.float64]
 _DIRECTIONS = 64  # of the fit; a band of degree 3 needs 7
 
 
+def terms(x: Any, y: Any, z: Any, bases: int) -> list[Any]:
+    """The first `bases` real spherical harmonics of unit vectors, in the order and with the signs of 3DGS; at most 16.
+
+    The vectors' coordinates are arrays of NumPy or of torch, and so are the terms, of the same shape.
+    """
+    found = [0.0 * x + 0.28209479177387814]
+    if bases > 1:
+        found += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
+    if bases > 4:
+        found += [
+            1.0925484305920792 * x * y,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (2 * z * z - x * x - y * y),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * (x * x - y * y),
+        ]
+    if bases > 9:
+        found += [
+            -0.5900435899266435 * y * (3 * x * x - y * y),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
+            0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
+            1.445305721320277 * z * (x * x - y * y),
+            -0.5900435899266435 * x * (x * x - 3 * y * y),
+        ]
+    return found
+
+
 def basis(directions: Array, bases: int) -> Array:
-    """(M, B) real spherical harmonics of unit vectors (M, 3), in the order and with the signs of 3DGS; B up to 16."""
+    """(M, B) `terms` of unit vectors (M, 3)."""
     x, y, z = directions.T
-    every = (
-        np.full_like(x, 0.28209479177387814),
-        -0.4886025119029199 * y,
-        0.4886025119029199 * z,
-        -0.4886025119029199 * x,
-        1.0925484305920792 * x * y,
-        -1.0925484305920792 * y * z,
-        0.31539156525252005 * (2 * z * z - x * x - y * y),
-        -1.0925484305920792 * x * z,
-        0.5462742152960396 * (x * x - y * y),
-        -0.5900435899266435 * y * (3 * x * x - y * y),
-        2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
-        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
-        -0.4570457994644658 * x * (4 * z * z - x * x - y * y),
-        1.445305721320277 * z * (x * x - y * y),
-        -0.5900435899266435 * x * (x * x - 3 * y * y),
-    )
-    return np.stack(every[:bases], 1)
+    return np.stack(terms(x, y, z, bases), 1)
 
 
 def turned(sh: npt.NDArray[np.float32], rotation: Array) -> npt.NDArray[np.float32]:

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -139,6 +139,16 @@ class Viewer:
             if scene is not None and until(scene):
                 return scene
         return None
+
+
+def taken(capture: Mapping[str, Any] | None) -> bool:
+    """Whether the camera has shown all, and recon has it, by capture's heartbeat; None: it has ended."""
+    return capture is None or (capture["state"] == "finished" and not capture["waiting"])
+
+
+def at_rest(recon: Mapping[str, Any]) -> bool:
+    """Whether there is nothing to do for recon, by its heartbeat."""
+    return recon["state"] == "idle" and not recon["unfinished"] and not recon["queue"]
 
 
 def processor_s(pid: int) -> float:

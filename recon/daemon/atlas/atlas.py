@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
 
 from splatnode.capture.process.logs import event
 from splatnode.recon.config import Config
 from splatnode.recon.daemon.atlas.bridge import Bridge, Side, bridge
-from splatnode.recon.daemon.atlas.links import Kind, Link
+from splatnode.recon.daemon.atlas.links import Kind, Link, bridged
 from splatnode.recon.daemon.atlas.recognition import (
     Codes,
     CodesRecord,
@@ -49,11 +52,11 @@ class Atlas:
             except ValueError as error:
                 log.warning("%s is not recognised again: %s", folder.name, error)
 
-    def keep(self, store: Store, graph: ViewGraph) -> None:
-        """Writes into the checkpoint of a scene that is finished what it is recognised by later. Raises OSError."""
-        codes = self._codes.get(store.scene_id)
-        if codes is None or len(codes) != len(graph.keyframes):
-            codes = codes_of(graph.keyframes)
+    def keep(self, store: Store, graph: ViewGraph, codes: Codes) -> None:
+        """Writes into the checkpoint of a scene that is finished what it is recognised by later: `codes` of its images.
+
+        Raises OSError.
+        """
         store.save("codes", *codes_message(graph.keyframes, codes))
         store.remove_shown()
         self._codes[store.scene_id] = codes
@@ -62,23 +65,25 @@ class Atlas:
         """The scene is not final any more."""
         self._codes.pop(scene, None)
 
-    def compare(self, scene: str, graph: ViewGraph, pause: Callable[[], None]) -> None:
-        """Links a final scene with those before it that show the same. What `pause` raises ends the work.
+    def compare(self, scene: str, graph: ViewGraph, pause: Callable[[], None]) -> Codes:
+        """Links a final scene with those before it that show the same; returns the codes of its images.
 
-        Raises ResultWriteError.
+        What `pause` raises ends the work. Raises ResultWriteError.
         """
         if self._matcher is None:
             self._matcher = load_prior(self._config).matcher
         codes = {**self._codes, scene: codes_of(graph.keyframes)}
-        near = _near(scene, self._places.links)
+        common, near = in_common(codes), _near(scene, self._places.links)
+        mine = Side(scene, graph, self._places.cameras(scene), centred(codes[scene], common))
         loops: list[Link] = []
         for other in [each for each in likeliest(scene, codes) if each not in near][:TRIED]:
             pause()
-            link = self._bridged(other, self._side(scene, graph, codes), codes, pause)
+            link = self._bridged(other, mine, common, pause)
             loops += [] if link is None else [link]
             if len(loops) == MOST_LOOPS:
                 break
         self._places.add_loops(scene, loops)
+        return codes[scene]
 
     def _graph(self, scene: str) -> ViewGraph:
         """Of a finished scene; an empty one where it cannot be read."""
@@ -92,20 +97,19 @@ class Atlas:
                 self.forget(scene)
         return ViewGraph(self._config.matching)
 
-    def _side(self, scene: str, graph: ViewGraph, codes: Mapping[str, Codes]) -> Side:
-        return Side(scene, graph, self._places.cameras(scene), centred(codes[scene], in_common(codes)))
-
-    def _bridged(self, other: str, side: Side, codes: dict[str, Codes], pause: Callable[[], None]) -> Link | None:
-        theirs = self._graph(other)
-        if len(theirs.keyframes) != len(codes[other]):
+    def _bridged(
+        self, other: str, mine: Side, common: npt.NDArray[np.float32], pause: Callable[[], None]
+    ) -> Link | None:
+        graph, codes = self._graph(other), self._codes.get(other)
+        if codes is None or len(graph.keyframes) != len(codes):
             return None  # something of it is damaged
-        found = bridge(self._side(other, theirs, codes), side, self._config, self._matcher, pause)
-        if not isinstance(found, Bridge):
-            event(log, logging.INFO, "no_loop", scene=side.scene_id, other=other, why=found)
-            return None
-        link = self._places.bridged(other, side.scene_id, found)
-        if link is not None:
-            event(log, logging.INFO, "loop", scene=side.scene_id, other=other, why=link.why)
+        theirs = Side(other, graph, self._places.cameras(other), centred(codes, common))
+        found, link = bridge(theirs, mine, self._config, self._matcher, pause), None
+        if isinstance(found, Bridge):
+            ends = found.one, found.other
+            link = bridged(other, mine.scene_id, theirs.cameras, mine.cameras, ends, found.why)
+        why = found if isinstance(found, str) else "together, their cameras lie otherwise" if link is None else link.why
+        event(log, logging.INFO, "no_loop" if link is None else "loop", scene=mine.scene_id, other=other, why=why)
         return link
 
 

@@ -50,6 +50,11 @@ class Bridge:
     other: Mapping[str, Array]
     verified: int  # pairs of photographs, one of each scene, that show the same
 
+    @property
+    def why(self) -> str:
+        photographs = f"{len(self.one)} + {len(self.other)} photographs of both are one scene"
+        return f"{self.verified} pairs of photographs show the same, and {photographs}"
+
 
 def bridge(
     one: Side, other: Side, config: Config, matcher: Matcher | None, pause: Callable[[], None] = lambda: None

@@ -34,7 +34,7 @@ from splatnode.recon.result.verdict import Code, Verdict
 from tests.bench.node.building_cost import Sample, cost_row, folder_mb
 from tests.bench.node.building_score import camera_rows, loop_row, maps
 from tests.bench.node.live import psnr
-from tests.support.node import Node, memory_mb, processor_s, running
+from tests.support.node import Node, at_rest, memory_mb, processor_s, running, taken
 
 LOOK_S = 1.0
 RESTS = 5  # looks in a row at which recon has nothing to do: then it is done
@@ -102,16 +102,10 @@ def walked(folder: Path, config: building.Config, recon: dict, patience_s: float
             if recon_status is None:
                 continue
             samples.append(_sample(node, pid, time.monotonic() - began, recon_status))
-            done = capture_status is None or (capture_status["state"] == "finished" and not capture_status["waiting"])
+            done = taken(capture_status)
             if done and taken_s is None:
                 taken_s = time.monotonic() - began
-            rests = (
-                done
-                and recon_status["state"] == "idle"
-                and not recon_status["unfinished"]
-                and not recon_status["queue"]
-            )
-            resting = resting + 1 if rests else 0
+            resting = resting + 1 if done and at_rest(recon_status) else 0
             if resting == RESTS:
                 finished_s = time.monotonic() - began
         codes = {verb: node.end(verb) for verb in ("capture", "recon")}
@@ -124,10 +118,10 @@ def walked(folder: Path, config: building.Config, recon: dict, patience_s: float
 
 
 def _sample(node: Node, pid: int, second: float, status: Mapping) -> Sample:
-    taken = status["keyframe"] + 1
+    acknowledged = status["keyframe"] + 1
     checkpoint = Path(node.configs["recon"]["checkpoint"])
     return Sample(
-        second=second, acknowledged=taken, done=taken - status["queue"], processor_s=processor_s(pid),
+        second=second, acknowledged=acknowledged, done=acknowledged - status["queue"], processor_s=processor_s(pid),
         rss_mb=memory_mb(pid), delay_s=status["delay_s"], checkpoint_mb=folder_mb(checkpoint),
     )  # fmt: skip
 

@@ -33,7 +33,7 @@ from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 from tests.bench.node.live import psnr
-from tests.support.node import Node, memory_mb, running
+from tests.support.node import Node, at_rest, memory_mb, running, taken
 
 PATIENCE_S = 1800.0  # after the last photograph
 LOOK_S = 1.0
@@ -180,11 +180,10 @@ def _streamed(
             if recon is None:
                 continue
             delays.append(recon["delay_s"])
-            done = capture is None or (capture["state"] == "finished" and not capture["waiting"])
+            done = taken(capture)
             if done and taken_s is None:
                 taken_s = time.monotonic() - began
-            rests = done and recon["state"] == "idle" and not recon["unfinished"] and not recon["queue"]
-            resting = resting + 1 if rests else 0
+            resting = resting + 1 if done and at_rest(recon) else 0
             if resting == RESTS:
                 finished_s = time.monotonic() - began
         codes = {verb: node.end(verb) for verb in ("capture", "recon")}

@@ -10,14 +10,13 @@ import pytest
 import torch
 
 from splatnode.recon.geometry import Similarity
-from splatnode.recon.rasterize.reference import sh_basis
 from splatnode.recon.result.export import SceneFileError
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.pieces import SHELL_PIECE, has_scene, pieces_of
 from splatnode.recon.result.placement import Placement
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
-from splatnode.recon.result.spherical_harmonics import basis, turned
+from splatnode.recon.result.spherical_harmonics import basis, terms, turned
 from splatnode.recon.result.whole import is_whole, read_whole
 from tests.support.exported import make_camera, make_gaussians
 from tests.support.walk import SECOND, TURN, place, record, write_walk
@@ -58,10 +57,15 @@ def test_placements_are_similarities():
     assert np.allclose(moved.bounds.axes, 1.7 * np.array(camera.bounds.axes) @ TILTED.rotation.T)
 
 
-def test_the_basis_is_that_of_the_rasteriser_and_turns_with_the_world():
-    directions = np.random.default_rng(1).normal(size=(20, 3))
+def test_the_basis_is_orthonormal_and_turns_with_the_world():
+    directions = np.random.default_rng(1).normal(size=(400_000, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    assert np.allclose(basis(directions, 16), sh_basis(torch.from_numpy(directions), 16).numpy(), atol=1e-6)
+    found = basis(directions, 16)
+    assert np.allclose(4 * np.pi * found.T @ found / len(found), np.eye(16), atol=0.02)
+    directions = directions[:20]
+    x, y, z = torch.from_numpy(directions).unbind(1)
+    torchs = torch.stack(terms(x, y, z, 16), 1)
+    assert np.allclose(found[:20], torchs.numpy())
     sh = random_gaussians(4).sh
     seen = np.einsum("db,nbc->ndc", basis(directions, 16), sh)
     after = np.einsum("db,nbc->ndc", basis(directions @ TILTED.rotation.T, 16), turned(sh, TILTED.rotation))

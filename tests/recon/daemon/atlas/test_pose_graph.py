@@ -7,11 +7,14 @@ import itertools
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.daemon.atlas.links import LEAST_DEG, LEAST_RELATIVE, Kind, Link
 from splatnode.recon.daemon.atlas.pose_graph import optimised
+from splatnode.recon.daemon.places import Places, State, described
 from splatnode.recon.geometry import Similarity
+from tests.support.exported import make_snapshot
 
 NUM = 12  # scenes on a circle
 SCENES = [f"scene-{index:04d}" for index in range(1, NUM + 1)]
@@ -110,3 +113,19 @@ def test_scenes_that_no_link_joins_are_maps_of_their_own():
     poses = optimised(SCENES[:5], [link(at, 1, 0), link(at, 3, 2, Kind.LOOP)]).poses
     assert [pose.map for pose in poses] == [SCENES[0], SCENES[0], SCENES[2], SCENES[2], SCENES[4]]
     assert poses[4].scale == 1.0 and poses[4].translation == (0.0, 0.0, 0.0)
+
+
+def test_a_link_to_a_scene_that_is_a_draft_again_is_forgotten_and_stops_nothing(tmp_path):
+    index, at = Places(tmp_path, "one"), worlds()
+    final = [
+        replace(described(scene, State.FINISHED, None, make_snapshot(), [], []), publishable=True, provisional=False)
+        for scene in SCENES[:3]
+    ]
+    for place in final:
+        index.tell(place)
+    index.add_loops(SCENES[1], [link(at, 0, 1, Kind.LOOP)])
+    assert [pose.map for pose in index.poses] == [SCENES[0], SCENES[0], SCENES[2]]
+    index.tell(replace(final[1], provisional=True))
+    index.add_loops(SCENES[2], [link(at, 0, 2, Kind.LOOP)])
+    assert [(each.scene, each.other) for each in index.links] == [(SCENES[0], SCENES[2])]
+    assert [(pose.scene, pose.map) for pose in index.poses] == [(SCENES[0], SCENES[0]), (SCENES[2], SCENES[0])]
