@@ -26,7 +26,7 @@ Pair = tuple[int, int]
 GLANCED = 8  # pairs of photographs, those with codes most alike, matched at a glance for each that is verified
 VERIFIED = 6  # pairs, by their matches at a glance, that are matched and verified
 MIN_VERIFIED = 2  # of these that show the same, of different photographs in both scenes
-VIEWS = 5  # of each scene that are estimated together; all their pairs are matched
+VIEWS = (5, 7)  # of each scene that are estimated together; all their pairs are matched. More, where those are too few
 TWIN_PX = 2.0  # median motion of a pair's matches, pixels at REFERENCE_SIDE, below which both have the same camera
 MIN_COMMON = 100  # matches of a photograph with one that is among them already
 MIN_VIEWS = 3  # of each scene that must have a camera then
@@ -63,7 +63,20 @@ def bridge(
     pairs = verified_pairs(one, other, config, pause)
     if len(_distinct(pairs)) < MIN_VERIFIED:
         return f"{len(pairs)} pairs of photographs show the same"
-    chosen = [views_to_bridge(side, [pair[end] for pair in pairs]) for end, side in enumerate((one, other))]
+    found: Bridge | str = ""
+    for most in VIEWS:
+        found = _bridge_of(one, other, pairs, most, config, matcher, pause)
+        if isinstance(found, Bridge):
+            break
+    return found
+
+
+def _bridge_of(
+    one: Side, other: Side, pairs: Sequence[Pair], most: int, config: Config, matcher: Matcher | None,
+    pause: Callable[[], None],
+) -> Bridge | str:  # fmt: skip
+    """By `most` photographs of each scene."""
+    chosen = [views_to_bridge(side, [pair[end] for pair in pairs], most) for end, side in enumerate((one, other))]
     graph = ViewGraph(config.matching)
     for side, views in zip((one, other), chosen, strict=True):
         graph = graph.joined(_renamed(side, views))
@@ -133,8 +146,8 @@ def _twins(graph: ViewGraph, scene_id: str) -> dict[str, str]:
     return twins
 
 
-def views_to_bridge(side: Side, matched: Sequence[int]) -> list[int]:
-    """VIEWS keyframes that have a camera: two of those `matched`, then such as have enough in common with these.
+def views_to_bridge(side: Side, matched: Sequence[int], most: int) -> list[int]:
+    """At most so many keyframes with a camera: two of those `matched`, then such as have enough in common with these.
 
     Each is as far as can be from those before it: cameras close together say little about scale and position.
     """
@@ -148,7 +161,7 @@ def views_to_bridge(side: Side, matched: Sequence[int]) -> list[int]:
     chosen += first[:1]
     if len(first) > 1:
         chosen.append(farthest(first[1:]))
-    while 0 < len(chosen) < VIEWS:
+    while 0 < len(chosen) < most:
         common = {index: max(side.graph.partners(each).get(index, 0) for each in chosen) for index in centres}
         rest = {index: count for index, count in common.items() if index not in chosen}
         near = [index for index, count in rest.items() if count >= MIN_COMMON]

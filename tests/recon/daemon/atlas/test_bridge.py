@@ -13,9 +13,11 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.recon.config import Config
+from splatnode.recon.daemon.atlas import bridge as module
 from splatnode.recon.daemon.atlas.bridge import Bridge, Side, bridge
 from splatnode.recon.daemon.atlas.links import Kind, bridged
 from splatnode.recon.daemon.atlas.recognition import centred, codes_from, codes_message, codes_of, in_common, likeliest
+from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.evaluate.camera_errors import camera_errors
 from splatnode.recon.matching.match import match
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -118,3 +120,18 @@ def test_what_pause_raises_ends_the_work(sides):
 
     with pytest.raises(InterruptedError):
         bridge(sides["scene-0001"], replace(sides["scene-0002"]), Config(), None, end)
+
+
+def test_where_a_few_photographs_do_not_suffice_more_are_asked(sides, monkeypatch):
+    asked: list[int] = []
+
+    def refused_at_first(graph, *rest):
+        estimate = estimate_cameras(graph, *rest)
+        asked.append(len(graph.keyframes))
+        return estimate if len(asked) > 1 else SimpleNamespace(publishable=False, verdict=estimate.verdict)
+
+    monkeypatch.setattr(module, "VIEWS", (3, 4))
+    monkeypatch.setattr(module, "estimate_cameras", refused_at_first)
+    found = bridge(sides["scene-0001"], sides["scene-0002"], Config(), None)
+    assert isinstance(found, Bridge), found
+    assert asked == [6, 8]
