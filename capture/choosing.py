@@ -17,7 +17,8 @@ THINNED = "thinned out"  # why a keyframe was given up again
 class Choice:
     """The keyframes of a recording, in its order, and what became of its other frames."""
 
-    keyframes: tuple[Frame, ...]
+    names: tuple[str, ...]  # of the keyframes
+    keyframes: tuple[Frame, ...]  # none where all that there are were asked for
     dropped: tuple[DroppedFrame, ...]  # what the recording could not give
     examined: int  # frames
     taken: Mapping[str, int]  # of the keyframes, by what they add: "coverage", "parallax", ...
@@ -26,24 +27,24 @@ class Choice:
     def record(self) -> dict[str, object]:
         """For report.json."""
         counts = {"taken": dict(self.taken), "left_out": dict(self.left_out)}
-        return {"frames": self.examined, "keyframes": len(self.keyframes), **counts}
+        return {"frames": self.examined, "keyframes": len(self.names), **counts}
 
     def __str__(self) -> str:
         """For people: how many, and why."""
         taken = ", ".join(f"{count} {reason}" for reason, count in self.taken.items())
         others = ", ".join(f"{count} {reason}" for reason, count in self.left_out.items())
-        told = f"{len(self.keyframes)} of {self.examined} frames are keyframes ({taken})"
+        told = f"{len(self.names)} of {self.examined} frames are keyframes ({taken})"
         return f"{told}; the others: {others}" if others else told
 
 
-def choose(recording: Iterable[Frame | DroppedFrame], config: Config, limits: Limits, most: int) -> Choice:
-    """At most `most` keyframes, evenly along the way; only they are held in memory.
+def choose(recording: Iterable[Frame | DroppedFrame], config: Config, limits: Limits, most: int | None) -> Choice:
+    """At most `most` keyframes, evenly along the way; only they are held in memory. None: the names of all.
 
     When there are more, every second one is given up, and from then on every second one is taken: so the camera's way
     stays covered whatever its length.
     """
     selector = Selector(config, limits)
-    kept: list[tuple[Frame, str]] = []
+    kept: list[tuple[str, Frame | None, str]] = []
     dropped: list[DroppedFrame] = []
     left_out: Counter[str] = Counter()
     examined = found = 0
@@ -59,12 +60,14 @@ def choose(recording: Iterable[Frame | DroppedFrame], config: Config, limits: Li
             left_out[reason] += 1
             continue
         if found % step == 0:
-            kept.append((frame, reason))
+            kept.append((frame.name, None if most is None else frame, reason))
         else:
             left_out[THINNED] += 1
         found += 1
-        if len(kept) > most:
+        if most is not None and len(kept) > most:
             left_out[THINNED] += len(kept) // 2
             kept, step = kept[::2], 2 * step
-    taken = Counter(reason for _, reason in kept)
-    return Choice(tuple(frame for frame, _ in kept), tuple(dropped), examined, taken, left_out)
+    taken = Counter(reason for *_, reason in kept)
+    names = tuple(name for name, *_ in kept)
+    frames = tuple(frame for _, frame, _ in kept if frame is not None)
+    return Choice(names, frames, tuple(dropped), examined, taken, left_out)

@@ -29,6 +29,7 @@ from splatnode.recon.evaluate.records import merged, read_bench
 from splatnode.recon.evaluate.report import redraw
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.mapping.command import replay_map
 from splatnode.recon.metric import in_metres
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.rasterize import device
@@ -52,6 +53,8 @@ def replay(args: argparse.Namespace) -> int:
     """Reconstructs a folder of photographs, or a video."""
     config = _config(args)
     _check_apart(args.out, args.source)
+    if args.map:
+        return replay_map(args, config)
     if args.source.is_file() and not args.json:
         say(f"choosing keyframes of {printable_name(args.source.name)}")
     given = source(args)

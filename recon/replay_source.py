@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable
+import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.quality import Limits
 from splatnode.capture.selection import Config
+from splatnode.recon.config import Config as Reconstruction
 from splatnode.recon.result.export import write_files
 
 ALL = 30  # photographs of a folder that are all used; of more, keyframes are chosen
@@ -53,28 +55,67 @@ class Source:
         return out / IMAGES
 
 
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """All keyframes of a recording, which are read again when they are needed."""
+
+    path: Path
+    choice: Choice
+
+    @property
+    def is_video(self) -> bool:
+        return self.path.is_file()
+
+    def identity(self, config: Reconstruction) -> str:
+        """32 hexadecimal digits that tell it, reconstructed in this way, from others."""
+        known = [str(self.path.resolve()), self.path.stat().st_mtime_ns, self.choice.names, config]
+        return hashlib.sha256(msgspec.json.encode(known)).hexdigest()[:32]
+
+    def frames(self) -> Iterator[Frame | DroppedFrame]:
+        """The keyframes in their order, and what the recording could not give."""
+        names = set(self.choice.names)
+        return (each for each in _stream(self.path) if isinstance(each, DroppedFrame) or each.name in names)
+
+
+def recording(args: argparse.Namespace) -> Recording:
+    """As `source`, without a limit to the number of keyframes."""
+    _check_there(args.source)
+    return Recording(args.source, choose(_stream(args.source), _selection(args), Limits(), None))
+
+
 def source(args: argparse.Namespace) -> Source:
     """The frames that the command line asks for.
 
     Raises FileNotFoundError and ValueError where there is nothing that can be used.
     """
-    if not args.source.exists():
-        raise FileNotFoundError(f"{str(args.source)!r} is not there; give a folder that holds photographs, or a video")
+    _check_there(args.source)
     if args.source.is_file():
         if args.frames:
             raise ValueError("--frames names photographs of a folder; of a video, give --views N or nothing")
-        return _chosen(args, video.stream(video.Config(file=args.source)), None)
+        return _chosen(args, None)
     names = _names(args)
     if names or args.every_frame or len(folder.names_in(args.source)) <= ALL:
         return Source(tuple(folder.stream(folder.Config(folder=args.source, names=names))), args.source, None)
-    return _chosen(args, folder.stream(folder.Config(folder=args.source)), args.source)
+    return _chosen(args, args.source)
 
 
-def _chosen(args: argparse.Namespace, stream: Iterable[Frame | DroppedFrame], photographs: Path | None) -> Source:
-    """The keyframes of a stream; with --views N so many, evenly spread."""
-    config = Config(per_second=1e9) if photographs else Config()  # photographs were not taken at any rate
-    config = msgspec.structs.replace(config, every_frame=args.every_frame)
-    choice = choose(stream, config, Limits(), max(MOST, args.views or 0))
+def _check_there(path: Path) -> None:
+    if not path.exists():
+        raise FileNotFoundError(f"{str(path)!r} is not there; give a folder that holds photographs, or a video")
+
+
+def _stream(path: Path) -> Iterator[Frame | DroppedFrame]:
+    return video.stream(video.Config(file=path)) if path.is_file() else folder.stream(folder.Config(folder=path))
+
+
+def _selection(args: argparse.Namespace) -> Config:
+    config = Config() if args.source.is_file() else Config(per_second=1e9)  # photographs were not taken at any rate
+    return msgspec.structs.replace(config, every_frame=args.every_frame)
+
+
+def _chosen(args: argparse.Namespace, photographs: Path | None) -> Source:
+    """The keyframes of a recording; with --views N so many, evenly spread."""
+    choice = choose(_stream(args.source), _selection(args), Limits(), max(MOST, args.views or 0))
     frames = choice.keyframes
     if args.views:
         if args.views > len(frames):

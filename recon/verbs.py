@@ -74,6 +74,11 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
     chosen.add_argument("--views", type=positive, metavar="N", help="use N frames, evenly spread")
     chosen.add_argument("--frames", type=names, metavar="A,B,C", help="use these frames, by name")
     chosen.add_argument("--every-frame", action="store_true", help="use all frames that are sharp and no copies")
+    parser.add_argument(
+        "--map",
+        action="store_true",
+        help="of a long recording: use all keyframes, however many; they become linked scenes, and one merged map",
+    )
     add_json(parser)
 
 

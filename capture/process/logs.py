@@ -48,6 +48,12 @@ class _Event:
     def __str__(self) -> str:
         return " ".join(f"{key}={_value(value)}" for key, value in {"event": self.what, **self.fields}.items())
 
+    @property
+    def in_words(self) -> str:
+        """`another place: before scene-0001, now scene-0002`; fields that say nothing are left out."""
+        told = [f"{key} {_short(value)}" for key, value in self.fields.items() if value not in ("", None)]
+        return ": ".join(filter(None, (self.what.replace("_", " "), ", ".join(told))))
+
 
 class StructuredLines(logging.Formatter):
     def __init__(self, journal: bool) -> None:
@@ -65,7 +71,10 @@ class StructuredLines(logging.Formatter):
 
 
 class PlainLines(logging.Formatter):
-    """The message; lines after its first one are set in, so that none passes for a message of its own."""
+    """The message, an event in words; lines after its first one are set in, so that none passes for a message."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        return record.msg.in_words if isinstance(record.msg, _Event) else super().formatMessage(record)
 
     def format(self, record: logging.LogRecord) -> str:
         return printable_lines(super().format(record))
@@ -73,11 +82,14 @@ class PlainLines(logging.Formatter):
 
 def _value(value: object) -> str:
     """One word, or a quoted text on one line."""
-    text = f"{value:.4g}" if isinstance(value, float) else str(value)
-    if len(text) > _LONGEST_VALUE:
-        text = text[: _LONGEST_VALUE - 1] + "…"
+    text = _short(value)
     plain = text and not any(letter.isspace() or letter in "\"'=" or not letter.isprintable() for letter in text)
     return text if plain else _quoted(text)
+
+
+def _short(value: object) -> str:
+    text = f"{value:.4g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= _LONGEST_VALUE else text[: _LONGEST_VALUE - 1] + "…"
 
 
 def _quoted(text: str) -> str:

@@ -219,11 +219,14 @@ class PresentPlace:
             event(log, logging.INFO, "given_up", frame=name)
             self._forget(name, "given up for newer views that show the same")
 
-    def compare(self, atlas: Atlas) -> None:
-        """Links the scene with finished ones that show the same, if it is final. Raises Abandoned."""
+    def compare(self, atlas: Atlas) -> bool:
+        """Links the scene with finished ones that show the same, if it is final and was not compared before.
+
+        False where there was nothing to compare. Raises Abandoned.
+        """
         names = frozenset(self._work.names)
         if not names or self._final != names or self._compared == names:
-            return
+            return False
         state, self.state, self._compared = self.state, State.REFINING, names
         try:
             atlas.compare(self._store.scene_id, self._work.graph, self._pause)
@@ -232,6 +235,7 @@ class PresentPlace:
             raise
         finally:
             self.state = state
+        return True
 
     def leave_out(self, names: Sequence[str]) -> None:
         """The checkpoint no longer has these frames; the scene forgets them, too."""

@@ -48,6 +48,7 @@ class Worker:
         self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory; monotonic
         self.problem = ""
         self.moved_s = time.monotonic()  # when the work last got on
+        self.rests = 0  # how often there was nothing to do
 
     @property
     def unfinished(self) -> int:
@@ -87,8 +88,8 @@ class Worker:
 
     def _rest(self) -> None:
         """What there is time for while nothing is to be done for the present place."""
-        if not self._left.finish_next(self._meanwhile):
-            self.place.compare(self._atlas)
+        if not self._left.finish_next(self._meanwhile) and not self.place.compare(self._atlas):
+            self.rests += 1
 
     def _turn(self, wait_s: float) -> bool:
         """Works in what has come, or makes the scene better if it is time; False where there was nothing to do."""

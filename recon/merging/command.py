@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 from splatnode.capture.process.terminal import say
@@ -29,28 +30,38 @@ from splatnode.recon.result.whole import Whole, WholeMap, read_whole
 from splatnode.recon.scene.background import SHELL
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
+Reports = dict[str, dict[str, object]]
 _LEVELS_BYTES = 0.5  # of a result, for its coarser levels
 
 
 def merge(args: argparse.Namespace) -> int:
     """Writes map-NAME for each map of the node's results; what cannot be merged is told."""
-    whole = read_whole(args.folder)
-    out = args.folder if args.out is None else args.out
+    reports = write_maps(args.folder, args.out or args.folder, partial(most, args), quiet=args.json)
+    if args.json:
+        print(json.dumps(reports))
+    return EXIT_GOOD if reports else EXIT_REFUSED
+
+
+def write_maps(folder: Path, out: Path, most: Callable[[Sequence[Submap]], int | None], quiet: bool) -> Reports:
+    """Writes the merged result of each map of the scenes in `folder` into `out`; their reports by their folders.
+
+    `most` says how many Gaussians the map of these submaps may have. Raises FileNotFoundError, SceneFileError,
+    ResultWriteError.
+    """
+    whole = read_whole(folder)
     reports = {}
     for each in whole.maps:
         found = load_submaps(whole, each)
         if not found.used:
             reasons = "; ".join(f"{scene_id}: {why}" for scene_id, why in found.left_out.items())
-            if not args.json:
+            if not quiet:
                 say(f"{each.name}: nothing to merge ({reasons})")
             continue
-        folder = merged_folder(out, each)
-        reports[folder.name] = write_map(whole, each, found, folder, _most(args, found.used))
-        if not args.json:
-            _tell(reports[folder.name], folder)
-    if args.json:
-        print(json.dumps(reports))
-    return EXIT_GOOD if reports else EXIT_REFUSED
+        merged_into = merged_folder(out, each)
+        reports[merged_into.name] = write_map(whole, each, found, merged_into, most(found.used))
+        if not quiet:
+            _tell(reports[merged_into.name], merged_into)
+    return reports
 
 
 def write_map(whole: Whole, of: WholeMap, found: Submaps, folder: Path, most: int | None) -> dict[str, object]:
@@ -65,7 +76,7 @@ def write_map(whole: Whole, of: WholeMap, found: Submaps, folder: Path, most: in
     return report
 
 
-def _most(args: argparse.Namespace, submaps: Sequence[Submap]) -> int | None:
+def most(args: argparse.Namespace, submaps: Sequence[Submap]) -> int | None:
     """How many Gaussians a merged scene may have by both limits; None: there is none."""
     bases = max(each.gaussians.sh.shape[1] for each in submaps)
     by_size = None if args.max_mb is None else most_in_ply(round(args.max_mb * 1e6), bases)

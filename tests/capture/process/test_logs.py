@@ -95,3 +95,10 @@ def test_a_message_that_begins_like_an_event_is_a_message():
 def test_an_endless_text_has_an_end():
     (record,) = records_of(lambda log: raised(log, "x" * 10**6))
     assert len(StructuredLines(journal=True).format(record)) < 50_000
+
+
+def test_a_person_reads_an_event_in_words():
+    (record,) = records_of(
+        lambda log: event(log, logging.INFO, "another_place", before="a", now="b\nb", seconds=1.23456, bounds="")
+    )
+    assert PlainLines().format(record) == "another place: before a, now b\n  b, seconds 1.235"

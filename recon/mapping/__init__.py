@@ -1,0 +1,1 @@
+"""A map of a long recording, offline: the scenes that a node would make of it, merged."""

@@ -1,0 +1,121 @@
+"""`splatnode replay --map`: all keyframes of a long recording in one map; in several where nothing joins its parts."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.image_file import encode_png
+from splatnode.capture.process.printable import printable_name
+from splatnode.capture.process.terminal import progress, say
+from splatnode.recon.config import Config
+from splatnode.recon.mapping.scenes import (
+    KEYFRAME_BYTES,
+    Progress,
+    check_begun,
+    make_scenes,
+    node_config,
+    remove_checkpoint,
+)
+from splatnode.recon.merging.command import Reports, most, write_maps
+from splatnode.recon.replay_source import IMAGES, Recording, recording
+from splatnode.recon.result.export import read_cameras, write_file
+from splatnode.recon.result.export.limits import read_json_file
+from splatnode.recon.result.export.staged import json_bytes
+from splatnode.recon.result.folder import result_folder
+from splatnode.recon.result.whole import FILE
+
+EXIT_GOOD, EXIT_REFUSED = 0, 65
+_OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline")
+
+
+def replay_map(args: argparse.Namespace, config: Config) -> int:
+    """Writes the scenes, their places.json, a merged result for each map, and a report.json about all."""
+    given = [f"--{name.replace('_', '-')}" for name in _OF_ONE_SCENE if getattr(args, name)]
+    if given:
+        raise ValueError(f"--map makes many scenes and does not go with what is about one: {', '.join(given)}")
+    check_begun(args.out)
+    if not args.json:
+        say(f"choosing keyframes of {printable_name(args.source.name)}")
+    source = recording(args)
+    if not args.json:
+        say(str(source.choice))
+    began_s = time.monotonic()
+    with result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):
+        frames = _kept(source, args.out) if source.is_video else source.frames()
+        logging.getLogger("splatnode").setLevel(logging.WARNING)  # what is told of each step would be too much
+        told = _Told(args.json, len(source.choice.names))
+        make_scenes(frames, source.identity(config), node_config(config, args.out), told)
+        progress("")
+        reports = write_maps(args.out, args.out, partial(most, args), quiet=args.json)
+        report = _report(source, args.out, reports, time.monotonic() - began_s)
+        write_file(args.out / "report.json", json_bytes(report))
+        remove_checkpoint(args.out)
+    if args.json:
+        print(json.dumps(report))
+    else:
+        _tell(report, args.out)
+    return EXIT_GOOD if reports else EXIT_REFUSED
+
+
+class _Told:
+    """Says how far the work is: on a terminal again and again, else whenever a scene is final."""
+
+    def __init__(self, quiet: bool, keyframes: int) -> None:
+        self._quiet, self._keyframes, self._last = quiet, keyframes, (0, 0)
+
+    def __call__(self, now: Progress) -> None:
+        if self._quiet:
+            return
+        line = f"{now} ({self._keyframes} keyframes in all)"
+        progress(f"{line}   ")
+        if (now.final, now.maps) != self._last:
+            self._last = now.final, now.maps
+            say(line)
+
+
+def _kept(source: Recording, out: Path) -> Iterator[Frame | DroppedFrame]:
+    """The frames of a video, each of which is written into out/images, too."""
+    for frame in source.frames():
+        path = out / IMAGES / frame.name
+        if isinstance(frame, Frame) and not path.exists():
+            path.parent.mkdir(exist_ok=True)
+            write_file(path, encode_png(frame.image))
+        yield frame
+
+
+def _report(source: Recording, out: Path, reports: Reports, seconds: float) -> dict[str, object]:
+    places = msgspec.json.decode(read_json_file(out / FILE))["places"]
+    why = {each["name"]: each["reason"] for place in places for each in place["frames_dropped"]}
+    why |= {name: f"{place['scene_id']}: {place['message']}" for place in places for name in place["frames_used"]}
+    placed = {camera.name for name in reports for camera in read_cameras(out / name / "cameras.json")}
+    left_out = [name for name in source.choice.names if name not in placed]
+    return {
+        "photographs": str(out / IMAGES if source.is_video else source.path),
+        "selection": source.choice.record(),
+        "keyframes_in_a_map": len(placed),
+        "left_out": [{"name": name, "reason": why.get(name, "it is in no scene")} for name in left_out],
+        "scenes": len(places),
+        "maps": {
+            name: {key: report[key] for key in ("verdict", "num_gaussians", "scenes")}
+            for name, report in reports.items()
+        },
+        "seconds": seconds,
+    }
+
+
+def _tell(report: dict[str, Any], out: Path) -> None:
+    for each in report["left_out"]:
+        say(f"left out: {each['name']}: {each['reason']}")
+    say(f"{report['keyframes_in_a_map']} of {report['selection']['keyframes']} keyframes are in a map")
+    say(f"{report['seconds']:.0f} s, {report['scenes']} scenes, {len(report['maps'])} maps")
+    say(f"results: {out}/ (places.json, {', '.join(f'{name}/' for name in report['maps'])}, report.json)")
