@@ -44,9 +44,9 @@ class Progress:
     loops: int
 
     def __str__(self) -> str:
-        of = f" of {self.final + self.unfinished}" if self.unfinished else ""
+        work = f" ({self.unfinished} in work)" if self.unfinished else ""
         loops = f", places found again: {self.loops}" if self.loops else ""
-        return f"keyframes: {self.taken}, scenes finished: {self.final}{of}, maps: {self.maps}{loops}"
+        return f"keyframes: {self.taken}, scenes finished: {self.final}{work}, maps: {self.maps}{loops}"
 
 
 def check_begun(out: Path) -> None:
