@@ -26,7 +26,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     completion: completion.Config = completion.Config()
     seeding: seeding.Config = seeding.Config()
     background: background.Config = background.Config()
-    pixelwise: pixelwise.Config | None = None  # in place of the three: a Gaussian a pixel that stereo knows
+    pixelwise: pixelwise.Config | None = None  # in place of seeding: a Gaussian a pixel that stereo knows
     max_gaussians: int | None = None  # None: as many as the photographs call for
 
 
@@ -43,7 +43,30 @@ def initial_scene(
     pictures = [images[pointmap.name] for pointmap in pointmaps]
     valid = border.valid_masks(pictures)
     pointmaps = tuple(map(Pointmap.masked, pointmaps, valid))
-    views = tuple(
+    if config.pixelwise is not None and config.pixelwise.surroundings == "none":
+        surfaces = pixelwise.pixelwise_gaussians(pointmaps, pictures, config.pixelwise, config.max_gaussians)
+        return Scene(_views(pointmaps, images), surfaces)
+    usable = [each.masked(each.confidence >= config.completion.min_usable_confidence) for each in pointmaps]
+    shell_limit = None if config.max_gaussians is None else config.max_gaussians // SHELL_PARTS
+    shell = background.far_shell(usable, pictures, config.background, shell_limit)
+    limit = None if config.max_gaussians is None else config.max_gaussians - len(shell)
+    if config.pixelwise is not None and config.pixelwise.surroundings == "shell":
+        surfaces = pixelwise.pixelwise_gaussians(pointmaps, pictures, config.pixelwise, limit)
+        return Scene(_views(pointmaps, images), concatenate([surfaces, shell]))
+    completed = list(map(Pointmap.masked, completion.complete(usable, pictures, config.completion), valid))
+    del usable
+    if config.pixelwise is not None:
+        surfaces = pixelwise.pixelwise_gaussians(completed, pictures, config.pixelwise, limit)
+        return Scene(_views(completed, images), concatenate([surfaces, shell]))
+    surfaces = seeding.initial_gaussians(completed, pictures, config.seeding)
+    num_unlimited = len(surfaces) + len(shell)
+    if limit is not None and len(surfaces) > limit:
+        surfaces = seeding.initial_gaussians(completed, pictures, config.seeding, limit)
+    return Scene(_views(pointmaps, images), concatenate([surfaces, shell]), num_unlimited=num_unlimited)
+
+
+def _views(pointmaps: Sequence[Pointmap], images: Mapping[str, Image]) -> tuple[TrainingView, ...]:
+    return tuple(
         TrainingView(
             name=pointmap.name,
             frame_id=pointmap.frame_id,
@@ -54,16 +77,3 @@ def initial_scene(
         )
         for pointmap in pointmaps
     )
-    if config.pixelwise is not None:
-        return Scene(views, pixelwise.pixelwise_gaussians(pointmaps, pictures, config.pixelwise, config.max_gaussians))
-    usable = [each.masked(each.confidence >= config.completion.min_usable_confidence) for each in pointmaps]
-    shell_limit = None if config.max_gaussians is None else config.max_gaussians // SHELL_PARTS
-    shell = background.far_shell(usable, pictures, config.background, shell_limit)
-    completed = list(map(Pointmap.masked, completion.complete(usable, pictures, config.completion), valid))
-    del usable
-    surfaces = seeding.initial_gaussians(completed, pictures, config.seeding)
-    num_unlimited = len(surfaces) + len(shell)
-    if config.max_gaussians is not None and num_unlimited > config.max_gaussians:
-        limit = config.max_gaussians - len(shell)
-        surfaces = seeding.initial_gaussians(completed, pictures, config.seeding, limit)
-    return Scene(views, concatenate([surfaces, shell]), num_unlimited=num_unlimited)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -20,6 +21,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_confidence: float = 0.05  # of stereo, in [0, 1]: pixels below get no Gaussian
     opacity: float = 0.1  # of a new Gaussian, as in 3DGS
     neighbours: int = NUM_NEIGHBOURS  # whose mean squared distance is a new Gaussian's variance
+    # What lies behind: nothing, as published; our far shell; our filled depths and the shell (MASt3R's have no holes).
+    surroundings: Literal["none", "shell", "fill"] = "none"
 
 
 def pixelwise_gaussians(

@@ -36,13 +36,24 @@ def test_the_papers_schedule_and_weights():
 def test_sets_are_spelt_out_once():
     assert chosen(["fast", "presets", "paper"]) == ("fast", *(name for name in PRESETS if name != "fast"), "paper")
     assert chosen(["rivals"]) == RIVALS
-    with pytest.raises(ValueError, match="and the sets presets, rivals, ablation"):
+    with pytest.raises(ValueError, match="and the sets presets, rivals, surrounded, ablation"):
         chosen(["paper", "instantsplat"])
 
 
 def test_methods_share_a_start_unless_they_look_at_other_sizes_or_find_their_own():
     assert start_of("paper") == start_of("instantsplat-s") == start_of("balanced") != start_of("preview")
     assert all(start_of(name) is None for name in RIVALS)
+
+
+def test_a_start_with_surroundings_differs_in_nothing_else():
+    for name in chosen(["surrounded"]):
+        plain, around = name.split("+")
+        without = msgspec.structs.replace(CONFIGS[name].pixelwise, surroundings="none")
+        losses = msgspec.structs.replace(CONFIGS[name].optimize.regularise, min_confidence=0.3)
+        optimize = msgspec.structs.replace(CONFIGS[name].optimize, regularise=losses)
+        assert msgspec.structs.replace(CONFIGS[name], pixelwise=without, optimize=optimize) == CONFIGS[plain]
+        assert CONFIGS[name].pixelwise.surroundings == around
+        assert start_of(name) == start_of(plain) and not ablation.is_variant(name)
 
 
 def test_the_ablation_changes_one_part_at_a_time():

@@ -103,3 +103,20 @@ def test_what_is_published_is_activated_and_a_copy():
     means, centre = scene.gaussians.means.clone(), scene.views[1].T_world_camera.clone()
     arrays.means[:], cameras[1].T_world_camera[:] = 0, 0
     assert torch.equal(scene.gaussians.means, means) and torch.equal(scene.views[1].T_world_camera, centre)
+
+
+def test_a_gaussian_a_pixel_may_begin_with_our_surroundings():
+    """A stripe that stereo does not know: empty as published, before the shell, or filled and before the shell."""
+    pointmaps = tuple(plane_pointmap(np.eye(4), confidence=c, frame_id=i) for i, c in enumerate((0.9, 0.8)))
+    for pointmap in pointmaps:
+        pointmap.confidence[:4] = 0.01
+    begun = {each: scene_of(pointmaps, None, pixelwise.Config(surroundings=each)) for each in ("none", "shell", "fill")}
+    shell = {each: int((scene.gaussians.source_frame == background.SHELL).sum()) for each, scene in begun.items()}
+    surfaces = {each: len(scene.gaussians) - shell[each] for each, scene in begun.items()}
+    assert shell["none"] == 0 and shell["shell"] == shell["fill"] > 10
+    assert surfaces["none"] == surfaces["shell"] == 20 * WIDTH
+    assert surfaces["fill"] == 24 * WIDTH
+    filled = begun["fill"].views[0].pointmap
+    assert filled is not None and (filled.depth[:4] > 0).all() and (filled.confidence[:4] > 0.05).all()
+    limited = scene_of(pointmaps, 200, pixelwise.Config(surroundings="fill"))
+    assert len(limited.gaussians) <= 200
