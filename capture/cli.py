@@ -90,7 +90,7 @@ def find(args: argparse.Namespace) -> int:
             name = json.dumps(device["device"], ensure_ascii=False)  # with the escapes of `say` it is YAML's text, too
             say(f"camera: {{kind: {kind}, device: {name}}}  # {device['description']}")
     if not any(found.values()):
-        say("no camera is connected; folders and videos need none: see configs/replay.yaml")
+        say("no camera is connected; folders and videos need none: see replay.yaml (splatnode config --write configs)")
     return EXIT_GOOD
 
 

@@ -10,9 +10,17 @@ from splatnode.capture.process.verb import Verb, lazily
 
 
 def _camera_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML that names the camera; see configs/")
+    parser.add_argument(
+        "config", type=Path, metavar="CONFIG", help="YAML that names the camera (examples: splatnode config)"
+    )
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="a change to it, such as camera.loops=2"
+    )
+
+
+def _config_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--write", type=Path, metavar="DIR", help="write them into this folder, which must be new or empty"
     )
 
 
@@ -39,6 +47,12 @@ VERBS = (
     Verb("capture", "run the camera's process", _camera_arguments, lazily("splatnode.capture.cli", "capture")),
     Verb(
         "record", "write what a camera sees into a folder", _record_arguments, lazily("splatnode.capture.cli", "record")
+    ),
+    Verb(
+        "config",
+        "list the example configurations, or write them into a folder",
+        _config_arguments,
+        lazily("splatnode.capture.examples", "config"),
     ),
     Verb("find", "list the cameras that are connected", add_json, lazily("splatnode.capture.cli", "find")),
     Verb(

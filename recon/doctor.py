@@ -150,7 +150,10 @@ def _oak_rights() -> list[Finding]:
     rules = [path for path in _UDEV_RULES.glob("*.rules") if "03e7" in path.read_text(errors="replace")]
     if rules or os.geteuid() == 0:
         return [Finding("oak rights", "ok", str(rules[0]) if rules else "this user may open every device")]
-    advice = "no udev rule for OAK cameras; copy configs/udev/80-splatnode-oak.rules to /etc/udev/rules.d"
+    advice = (
+        "no udev rule for OAK cameras; run splatnode config --write configs, "
+        "then copy configs/udev/80-splatnode-oak.rules to /etc/udev/rules.d"
+    )
     return [Finding("oak rights", "optional", advice)]
 
 

@@ -9,6 +9,8 @@ import pytest
 from splatnode import command_line
 from splatnode.capture.config import CaptureConfig
 from splatnode.capture.process.config import ConfigError, load_config, read_yaml, typed
+from splatnode.recon.config import Config as Reconstruction
+from splatnode.recon.daemon.config import Config as Daemon
 from tests.conftest import ROOT
 
 CAMERAS = [path for path in sorted((ROOT / "configs").glob("*.yaml")) if "camera" in read_yaml(path)]
@@ -17,6 +19,17 @@ SERVICES = sorted((ROOT / "configs" / "systemd").glob("*.service"))
 
 def test_there_is_one_for_each_way_to_begin():
     assert {"oak.yaml", "remote.yaml", "replay.yaml", "webcam.yaml"} <= {path.name for path in CAMERAS}
+
+
+def test_those_of_the_reconstruction_can_be_read():
+    configs = ROOT / "configs"
+    assert load_config(configs / "small_robot.yaml", Reconstruction).max_gaussians == 20000
+    assert load_config(configs / "recon.yaml", Daemon) == Daemon()  # it shows the defaults
+    assert {path.name for path in configs.glob("*.yaml")} == {
+        *(path.name for path in CAMERAS),
+        "recon.yaml",
+        "small_robot.yaml",
+    }
 
 
 @pytest.mark.parametrize("path", CAMERAS, ids=lambda path: path.name)

@@ -40,7 +40,8 @@ def test_the_wheel_installs_and_its_core_loads(project, tmp_path):
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {path.name for path in compile.compile_core()} <= {Path(name).name for name in names}
     assert {"splatnode/__main__.py", "splatnode/capture/frame.py", "splatnode/recon/core/threads.cpp"} <= names
-    assert {"splatnode/configs/webcam.yaml", "splatnode/configs/systemd/splatnode-recon.service"} <= names
+    configs = {path.relative_to(ROOT).as_posix() for path in (ROOT / "configs").rglob("*.*")}
+    assert {f"splatnode/{name}" for name in configs} <= names and "configs/udev/80-splatnode-oak.rules" in configs
     assert not [name for name in names if not name.startswith(("splatnode/", "splatnode-"))]
 
     site = tmp_path / "site"
@@ -51,6 +52,10 @@ def test_the_wheel_installs_and_its_core_loads(project, tmp_path):
         [sys.executable, "-c", code], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(site)}, text=True
     )
     assert Path(loaded.strip()).is_relative_to(site)
+
+    write = [sys.executable, "-m", "splatnode", "config", "--write", "mine"]
+    subprocess.run(write, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(site)}, check=True)
+    assert {f"configs/{path.relative_to(tmp_path / 'mine')}" for path in (tmp_path / "mine").rglob("*.*")} == configs
 
 
 @pytest.mark.parametrize(
