@@ -21,13 +21,13 @@ class Camera(Plugin):
 
 
 class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    camera: Camera
-    quality: Limits = Limits()
+    camera: Camera  # where frames come from: the kinds have options of their own, below
+    quality: Limits = Limits()  # which frames are usable, and no copies
     selection: selection.Config = selection.Config()
     reader: reader.Config = reader.Config()
     preview: preview.Config = preview.Config()
     spool: spool.Config = spool.Config()
-    network: Network = Network()
+    network: Network = Network()  # how the processes reach each other
 
 
 def open_stream(camera: Camera) -> Iterator[Frame | DroppedFrame]:

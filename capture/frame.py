@@ -28,14 +28,14 @@ class Intrinsics:
     "given" or "calibration" (trusted), "estimated" (by the reconstruction).
     """
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    source: str
-    distortion: tuple[float, ...] = ()
+    width: int  # of the images that were calibrated, pixels
+    height: int  # likewise, pixels
+    fx: float  # focal length across, pixels
+    fy: float  # focal length down, pixels
+    cx: float  # principal point from the left border, pixels: OpenCV's plus 0.5
+    cy: float  # principal point from the upper border, pixels: OpenCV's plus 0.5
+    source: str  # calibration or given: the lens is trusted; exif: it is right to a few per cent
+    distortion: tuple[float, ...] = ()  # OpenCV's coefficients k1 k2 p1 p2 k3 ...; none: the images have no distortion
 
     def __post_init__(self) -> None:
         lens = (self.fx, self.fy, self.cx, self.cy, *self.distortion)

@@ -18,11 +18,10 @@ _LARGEST_SIDE = 4096  # of what is decoded: a JPEG of a few bytes may ask for gi
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    per_second: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # 0: none
-    longer_side: Annotated[int, msgspec.Meta(ge=16, le=2048)] = (
-        480  # pixels at least; below twice as many, since images are reduced by whole factors
-    )
-    jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 75
+    per_second: Annotated[float, msgspec.Meta(ge=0)] = 30.0  # previews that are sent; 0: none
+    # At least so many, pixels; less than twice as many, since images are reduced by whole factors
+    longer_side: Annotated[int, msgspec.Meta(ge=16, le=2048)] = 480
+    jpeg_quality: Annotated[int, msgspec.Meta(ge=1, le=100)] = 75  # of the JPEG: 100 is best and largest
 
 
 class PreviewHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -28,11 +28,12 @@ MIN_COMPARED_SHARE = 0.05  # of the pixels: with fewer that are unsaturated in b
 
 
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    blur_px: float = 8.0  # real sharp photographs reach 7, of smooth objects
-    relative_blur: float = 3.0  # times the sharpest of the stream
+    blur_px: float = 8.0  # widest edges of a usable frame, pixels at 640; sharp photographs of smooth objects reach 7
+    relative_blur: float = 3.0  # a frame is unusable when its edges are so many times as wide as the sharpest frame's
     exposed: float = 0.03  # least share of pixels that are neither black nor white; dark backgrounds are common
-    contrast: float = 3.0  # grey levels; noise leaves up to 2, real photographs have 20
-    novelty: float = 0.05  # half a pixel of motion, at 640 pixels
+    contrast: float = 3.0  # least standard deviation, grey levels; noise leaves up to 2, real photographs have 20
+    # A frame is a copy when it differs by less from another; 0.05 is half a pixel of motion, at 640 pixels
+    novelty: float = 0.05
 
 
 @dataclass(frozen=True)

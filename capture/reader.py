@@ -26,10 +26,11 @@ Seconds = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    silence_s: Seconds = 5.0  # without a frame, a live camera counts as lost
+    silence_s: Seconds = 5.0  # so long without a frame, a live camera counts as lost
     first_pause_s: Seconds = 1.0  # before it is opened again; doubled at each failure
-    longest_pause_s: Seconds = 15.0
-    give_up_s: Seconds = 300.0  # then the process ends with 69, and the service manager decides
+    longest_pause_s: Seconds = 15.0  # to which that pause grows
+    # After so long without a frame the process ends with 69, and the service manager decides
+    give_up_s: Seconds = 300.0
 
 
 class State(Enum):

@@ -45,13 +45,18 @@ Points = npt.NDArray  # (P, 1, 2) float32, as OpenCV has them
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    every_frame: bool = False  # photographs: each was taken on purpose, and only unusable ones and copies are left out
-    coverage: Share = 0.25  # share of the last keyframe's corners that have left the image
-    motion: Share = 0.08  # median displacement of the corners, in longer sides of the image
-    parallax: Share = 0.01  # median residual after the best homography, in longer sides of the image
-    per_second: Annotated[float, msgspec.Meta(gt=0)] = 8.0  # frames examined; the others become no keyframes
-    patience_s: Annotated[float, msgspec.Meta(ge=0)] = 0.3  # between examinations of candidates that were unusable
-    backlog: Annotated[int, msgspec.Meta(ge=1)] = 8  # with so many frames waiting for recon, limits are twice as high
+    # Take all but unusable frames and copies: for photographs, each of which was taken on purpose
+    every_frame: bool = False
+    coverage: Share = 0.25  # take a frame when this share of the last keyframe's corners has left the image
+    motion: Share = 0.08  # or when they have moved so far in the median, in longer sides of the image
+    # Or when no homography explains so much of their motion, in longer sides of the image (median)
+    parallax: Share = 0.01
+    # Frames that are examined; the others become no keyframes. Higher: more work, finer choice
+    per_second: Annotated[float, msgspec.Meta(gt=0)] = 8.0
+    # Until the next frame is examined, after one that would have been taken but is unusable
+    patience_s: Annotated[float, msgspec.Meta(ge=0)] = 0.3
+    # With so many keyframes waiting for recon, the three limits are twice as high, with more even higher
+    backlog: Annotated[int, msgspec.Meta(ge=1)] = 8
 
 
 @dataclass(frozen=True)

@@ -38,14 +38,16 @@ PREVIEW = refinement.Config(
 class Ladder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What is tried before photographs are refused or left out for want of matches."""
 
-    seconds: Annotated[float, Meta(ge=0)] = 4.0  # in which further work begins; what has begun is finished
+    seconds: Annotated[float, Meta(ge=0)] = 4.0  # in which further work begins, seconds; what has begun is finished
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     size: Annotated[int, Meta(ge=64)] = 512  # longer side of the modelled images, pixels
-    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0  # what generators of random numbers take
+    # Of the generators of random numbers: the same seed and photographs give the same scene
+    seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     device: Device = "cpu"  # that Gaussians are refined on; cuda was never run by us
-    quick: bool = False  # whether the first answer stands, also where it is no
+    quick: bool = False  # the first answer stands, also where it is no: nothing that takes longer is tried
+    # What gives depth, and matches that plain features miss
     prior: PriorChoice = PriorChoice("classical", classical.Config())
     screening: screening.Config = screening.Config()
     matching: matching.Config = matching.Config()
@@ -56,14 +58,17 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     completion: completion.Config = completion.Config()
     seeding: seeding.Config = seeding.Config()
     background: background.Config = background.Config()
-    pixelwise: pixelwise.Config | None = None  # in place of completion, seeding and background, for comparison
-    preview: refinement.Config = PREVIEW  # after each keyframe
-    optimize: refinement.Config = refinement.Config()  # after the last one
-    metric: metric.Config = metric.Config()  # of what is published
-    max_gaussians: Annotated[int, Meta(ge=1)] | None = None  # None: as many as the scene calls for
-    max_mb: Annotated[float, Meta(gt=0)] | None = None  # of scene.ply, in 10^6 bytes; None: as large as it gets
+    # In place of completion, seeding and background: a Gaussian a pixel, for comparison
+    pixelwise: pixelwise.Config | None = None
+    preview: refinement.Config = PREVIEW  # the refinement after each keyframe
+    optimize: refinement.Config = refinement.Config()  # the refinement after the last keyframe
+    metric: metric.Config = metric.Config()  # the scale in metres of what is published
+    # At most so many in the scene; None: as many as it calls for
+    max_gaussians: Annotated[int, Meta(ge=1)] | None = None
+    max_mb: Annotated[float, Meta(gt=0)] | None = None  # largest scene.ply, in 10^6 bytes; None: as large as it gets
     surplus: float = 2.0  # with such a limit a scene begins with this many times as many; its control leaves the best
-    budget_s: Annotated[float, Meta(gt=0)] | None = None  # for all, from the first frame; None: as many as it takes
+    # For all, from the first photograph on; None: as long as it takes. The daemon has no such limit
+    budget_s: Annotated[float, Meta(gt=0)] | None = None
 
     @property
     def most_gaussians(self) -> int | None:

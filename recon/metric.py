@@ -36,7 +36,8 @@ class Baseline(NamedTuple):
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    baseline: Baseline | None = None  # comes before the network
+    # Two photographs and the metres between their cameras; it comes before the network
+    baseline: Baseline | None = None
     network: bool = False  # ask Depth Anything V2 Metric Indoor Small, where its weights are
 
     def __post_init__(self) -> None:

@@ -35,15 +35,16 @@ Side = Annotated[int, msgspec.Meta(ge=16, le=4096)]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    keyframes: Count = 1000
-    width: Side = 480
-    height: Side = 360
+    keyframes: Count = 1000  # how many are made; the walk is as long as they need
+    width: Side = 480  # of an image, pixels
+    height: Side = 360  # of an image, pixels
     seed: Annotated[int, msgspec.Meta(ge=0, le=1_000_000)] = 0  # of the building and of the walk
     noise: float = 1.0  # standard deviation of the sensor noise, grey levels
     samples: Annotated[int, msgspec.Meta(ge=1, le=4)] = 2  # rays a pixel in each direction
-    kidnap_at: Annotated[int, msgspec.Meta(ge=0, le=100_000)] = 0  # the keyframe taken in another room; 0: none is
-    frames_per_second: FramesPerSecond = 2.0
-    pace: Pace = "fastest"
+    # The number of the keyframe from which on the robot is in another room; 0: it is never carried away
+    kidnap_at: Annotated[int, msgspec.Meta(ge=0, le=100_000)] = 0
+    frames_per_second: FramesPerSecond = 2.0  # by the stamps
+    pace: Pace = "fastest"  # recorded: at the pace of the stamps; fastest: as fast as they are made
 
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:

@@ -28,17 +28,19 @@ _MIN_FOCAL = 0.1  # in longer image sides; a device without calibration gives th
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    device: str = ""  # id, IP address or USB port, as `splatnode find` prints it; "": the only one
-    width: Annotated[int, msgspec.Meta(ge=1)] = 1280
-    height: Annotated[int, msgspec.Meta(ge=1)] = 720
-    frames_per_second: FramesPerSecond = 10.0
-    undistort: bool = True  # on the camera; otherwise its distortion goes with the intrinsics
-    lock: bool = True  # exposure and white balance, once the camera has chosen them
-    settle_s: Annotated[float, msgspec.Meta(ge=0)] = 1.5  # in which it chooses; these frames are not given
-    exposure_us: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] | None = None  # instead of what it chooses
-    iso: Annotated[int, msgspec.Meta(ge=100, le=1600)] = 400  # with exposure_us
-    focus: Annotated[int, msgspec.Meta(ge=0, le=255)] | None = None  # lens position; None: as it is at the start
-    silence_s: Annotated[float, msgspec.Meta(gt=0)] = 4.0  # without a frame, the camera counts as lost
+    device: str = ""  # as `splatnode find` prints it: id, IP address or USB port; "": the only one
+    width: Annotated[int, msgspec.Meta(ge=1)] = 1280  # of an image, pixels
+    height: Annotated[int, msgspec.Meta(ge=1)] = 720  # of an image, pixels
+    frames_per_second: FramesPerSecond = 10.0  # that the camera is asked for
+    undistort: bool = True  # take the distortion out on the camera; otherwise it goes with the intrinsics
+    lock: bool = True  # hold exposure and white balance, once the camera has chosen them
+    # After the start, in which the camera chooses them; these frames are not given
+    settle_s: Annotated[float, msgspec.Meta(ge=0)] = 1.5
+    # Instead of what the camera chooses; None: it chooses
+    exposure_us: Annotated[int, msgspec.Meta(ge=1, le=1_000_000)] | None = None
+    iso: Annotated[int, msgspec.Meta(ge=100, le=1600)] = 400  # sensitivity, with exposure_us
+    focus: Annotated[int, msgspec.Meta(ge=0, le=255)] | None = None  # position of the lens; None: as it is at the start
+    silence_s: Annotated[float, msgspec.Meta(gt=0)] = 4.0  # so long without a frame, the camera counts as lost
 
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
@@ -151,7 +153,8 @@ def _chosen(dai: ModuleType, device: str) -> Any:
     listed = ", ".join(f"{info.getDeviceId()} at {info.name}" for info in found)
     if not found:
         raise CameraUnavailable(
-            "no OAK camera is connected. Plug one in; if it is, install configs/udev/80-splatnode-oak.rules"
+            "no OAK camera is connected. Plug one in; if it is, run splatnode config --write configs "
+            "and install configs/udev/80-splatnode-oak.rules"
         )
     raise CameraUnavailable(f"camera.device must name one of: {listed}; got {device!r}")
 

@@ -22,13 +22,15 @@ FOREIGN_SUFFIXES = {".heic", ".heif", ".avif", ".jxl", ".gif", ".dng", ".cr2", "
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    folder: Path
+    folder: Path  # the folder with the photographs, or a recording of `splatnode record`
     names: tuple[str, ...] = ()  # the files to take, with or without suffix; none: all
-    intrinsics: Intrinsics | None = None  # of all images of its aspect ratio, instead of what their EXIF tells
+    # The lens, of all images of its aspect ratio, instead of what their EXIF tells
+    intrinsics: Intrinsics | None = None
     max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
-    frames_per_second: FramesPerSecond = 10.0  # of the stamps, unless they were recorded
-    pace: Pace = "fastest"
-    loops: Annotated[int, msgspec.Meta(ge=1)] = 1  # times that it is shown, each with names of its own
+    # By the stamps that the photographs get; those of a recording have their own
+    frames_per_second: FramesPerSecond = 10.0
+    pace: Pace = "fastest"  # recorded: at the pace of the stamps; fastest: as fast as they are taken
+    loops: Annotated[int, msgspec.Meta(ge=1)] = 1  # how many times all are shown, each time under other names
 
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:

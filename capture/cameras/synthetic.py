@@ -28,13 +28,13 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    views: Count = 8
-    width: Count = 640
-    height: Count = 480
+    views: Count = 8  # how many photographs are made
+    width: Count = 640  # of an image, pixels
+    height: Count = 480  # of an image, pixels
     seed: int = 0  # of the place and of the photographer's path
     noise: float = 1.0  # standard deviation of the sensor noise, grey levels
     samples: Count = 2  # rays a pixel in each direction
-    frames_per_second: FramesPerSecond = 2.0
+    frames_per_second: FramesPerSecond = 2.0  # by the stamps
 
 
 def stream(config: Config) -> Iterator[Frame]:

@@ -27,15 +27,18 @@ _BY_ID, _BY_PATH = Path("/dev/v4l/by-id"), Path("/dev/v4l/by-path")
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     device: str = ""  # as `splatnode find` prints it: a name that stays when ports and numbers change; "": the only one
-    width: Annotated[int, msgspec.Meta(ge=1)] = 1280
-    height: Annotated[int, msgspec.Meta(ge=1)] = 720
-    frames_per_second: FramesPerSecond = 30.0
-    pixels: Literal["MJPG", "YUYV"] = "MJPG"  # USB 2 carries no more than 10 frames of 1280 x 720 a second as YUYV
-    lock: bool = True  # exposure, gain, white balance and focus, once the camera has chosen them
-    settle_s: Annotated[float, msgspec.Meta(ge=0)] = 1.5  # in which it chooses; these frames are not given
-    exposure_us: Annotated[int, msgspec.Meta(ge=1)] | None = None  # instead of what it chooses
-    silence_s: Annotated[float, msgspec.Meta(gt=0)] = 3.0  # without a frame, the camera counts as lost
-    intrinsics: Intrinsics | None = None  # of a calibration at the same aspect ratio
+    width: Annotated[int, msgspec.Meta(ge=1)] = 1280  # of an image, pixels
+    height: Annotated[int, msgspec.Meta(ge=1)] = 720  # of an image, pixels
+    frames_per_second: FramesPerSecond = 30.0  # that the camera is asked for
+    # Format that the camera sends; USB 2 carries no more than 10 frames of 1280 x 720 a second as YUYV
+    pixels: Literal["MJPG", "YUYV"] = "MJPG"
+    lock: bool = True  # hold exposure, gain, white balance and focus, once the camera has chosen them
+    # After the start, in which the camera chooses them; these frames are not given
+    settle_s: Annotated[float, msgspec.Meta(ge=0)] = 1.5
+    # Instead of what the camera chooses; None: it chooses
+    exposure_us: Annotated[int, msgspec.Meta(ge=1)] | None = None
+    silence_s: Annotated[float, msgspec.Meta(gt=0)] = 3.0  # so long without a frame, the camera counts as lost
+    intrinsics: Intrinsics | None = None  # the lens, of a calibration at the same aspect ratio
 
 
 def stream(config: Config, system: System | None = None) -> Iterator[Frame | DroppedFrame]:

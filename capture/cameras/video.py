@@ -20,11 +20,11 @@ _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes b
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    file: Path
-    every: Annotated[int, msgspec.Meta(ge=1)] = 1  # 3: every third frame; the others are not decoded
-    max_pixels: MaxPixels = MAX_VIDEO_PIXELS  # of a frame; the decoder's memory is bounded accordingly
-    pace: Pace = "fastest"
-    intrinsics: Intrinsics | None = None  # of a calibration at the same aspect ratio
+    file: Path  # the video
+    every: Annotated[int, msgspec.Meta(ge=1)] = 1  # 3: every third frame is taken; the others are not decoded
+    max_pixels: MaxPixels = MAX_VIDEO_PIXELS  # of a frame, at most; the decoder's memory is bounded accordingly
+    pace: Pace = "fastest"  # recorded: at the pace of the video; fastest: as fast as frames are taken
+    intrinsics: Intrinsics | None = None  # the lens, of a calibration at the same aspect ratio
 
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:

@@ -26,13 +26,13 @@ _TEMPORARY_SUFFIXES = {".tmp", ".part", ".partial", ".crdownload", ".filepart"}
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    folder: Path
-    existing: bool = True  # what lies there at the start is taken too
-    poll_s: Annotated[float, msgspec.Meta(gt=0)] = 0.2
+    folder: Path  # the folder that is watched
+    existing: bool = True  # whether what lies there at the start is taken, too
+    poll_s: Annotated[float, msgspec.Meta(gt=0)] = 0.2  # between looks at the folder
     settle_s: Annotated[float, msgspec.Meta(ge=0)] = 0.4  # a file is whole when it has not changed for so long
-    give_up_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0  # a file that is not whole by then is left out
+    give_up_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0  # a file that is not whole after so long is left out
     max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
-    intrinsics: Intrinsics | None = None  # of all images, instead of what their EXIF tells
+    intrinsics: Intrinsics | None = None  # the lens, of all images, instead of what their EXIF tells
 
 
 @dataclass(frozen=True)

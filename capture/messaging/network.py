@@ -46,10 +46,10 @@ _LONGEST_IPC_PATH = 107  # sun_path, see unix(7)
 class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Of ipc sockets and locks. None: $RUNTIME_DIRECTORY, else $XDG_RUNTIME_DIR/splatnode, else a folder under /tmp.
     directory: Path | None = None
-    tcp: str | None = None  # the address to bind or connect to, instead of ipc; needs keys
-    keys: Path | None = None  # the folder that `splatnode keys` made
-    first_port: Annotated[int, msgspec.Meta(ge=1, le=65500)] = 47310
-    max_message_mb: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 256
+    tcp: str | None = None  # the address to bind (robot) or to connect to (other machine), in place of ipc; needs keys
+    keys: Path | None = None  # the folder that `splatnode keys` made; None: no keys, and so no tcp
+    first_port: Annotated[int, msgspec.Meta(ge=1, le=65500)] = 47310  # of the tcp ports, which follow one another
+    max_message_mb: Annotated[int, msgspec.Meta(ge=1, le=4096)] = 256  # a larger message is not taken, in 2^20 bytes
 
     @property
     def limits(self) -> wire.Limits:

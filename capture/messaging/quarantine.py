@@ -28,8 +28,8 @@ _SEEN = "seen"  # a file with the number of the newest one that somebody has see
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    max_frames: Annotated[int, msgspec.Meta(ge=1)] = 1000
-    max_mb: Annotated[int, msgspec.Meta(ge=1)] = 512
+    max_frames: Annotated[int, msgspec.Meta(ge=1)] = 1000  # keyframes that are kept; beyond, the oldest goes
+    max_mb: Annotated[int, msgspec.Meta(ge=1)] = 512  # their size, in 2^20 bytes; beyond, the oldest goes
 
 
 class SetAside(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -29,10 +29,13 @@ log = logging.getLogger(__name__)
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    directory: Path | None = None  # None: state_directory() of capture/process
+    # None: $STATE_DIRECTORY, else $XDG_STATE_HOME/splatnode, else ~/.local/state/splatnode
+    directory: Path | None = None
+    # Keyframes that wait for recon; when there are so many, no further one is taken
     max_frames: Annotated[int, msgspec.Meta(ge=1)] = 200
+    # Their size, in 2^20 bytes, at which likewise no further one is taken
     max_mb: Annotated[int, msgspec.Meta(ge=1)] = 1024
-    quarantine: quarantine.Config = quarantine.Config()
+    quarantine: quarantine.Config = quarantine.Config()  # keyframes that recon refused
 
 
 _FILE = re.compile(r"[0-9]{12,18}-[0-9a-f]{32}-[0-9]{1,18}\.frame")  # number, session, sequence

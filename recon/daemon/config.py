@@ -16,17 +16,24 @@ Positive = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    network: Network = Network()
+    network: Network = Network()  # the same as in capture's configuration
     reconstruction: Reconstruction = Reconstruction()
     tracking: Tracking = Tracking()  # of the live camera against a finished scene
-    checkpoint: Path | None = None  # None: recon/ in state_directory() of capture/process
-    out: Path = Path("out")  # the result of each place is a folder in it: scene-0001, ...
-    # Beyond, the view that has most in common with another goes.
+    # What a restart goes on from. None: the folder recon in $STATE_DIRECTORY, else in $XDG_STATE_HOME/splatnode, else
+    # in ~/.local/state/splatnode.
+    checkpoint: Path | None = None
+    out: Path = Path("out")  # folder of the results: each place is a folder in it, scene-0001 and so on
+    # Photographs in a scene, at most. When a further one fits, the next scene goes on with it and the newest third, and
+    # the full one is finished as a place that was left; where the newest alone make no scene, the photograph that has
+    # most in common with another goes. Higher: fewer, larger scenes, and more time for each keyframe.
     max_views: Annotated[int, msgspec.Meta(ge=4, le=MAX_CAMERAS)] = 30
-    max_gaussians: Positive = 300_000
-    # Without a keyframe, until the whole scene is verified and built anew. A verification takes seconds for which a
-    # keyframe would have to wait: with one every two seconds there is no time for it.
+    max_gaussians: Positive = 300_000  # of a scene, at most; `reconstruction.max_gaussians` may be lower
+    # After so long without a keyframe the whole scene is verified and made anew from all photographs. That takes
+    # seconds for which a keyframe would have to wait: with one every two seconds there is no time for it.
     settle_s: Annotated[float, msgspec.Meta(ge=0)] = 3.0
-    lost_after: Annotated[int, msgspec.Meta(ge=3)] = 3  # so many keyframes in a row that do not fit begin a new place
-    export_every_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0  # provisional results, while the scene grows
+    # So many keyframes in a row that do not fit the scene begin a scene of their own, as another place. Higher: a few
+    # poor keyframes begin none, but more keyframes of another place are taken before its scene begins.
+    lost_after: Annotated[int, msgspec.Meta(ge=3)] = 3
+    export_every_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0  # between provisional results, while the scene grows
+    # Between messages that say how the process is, which `splatnode status` shows
     status_every_s: Annotated[float, msgspec.Meta(gt=0)] = 1.0

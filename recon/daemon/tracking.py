@@ -32,15 +32,15 @@ DAMPING = 1e-9  # added to the normal matrix, which points in one line leave sin
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     every_s: float = 1.0  # between previews that are examined; 0: the camera is not tracked
-    num_features: int = 2000  # of a preview
-    longer_side: int = 800  # pixels of the preview in which they are found
+    num_features: int = 2000  # of a preview, at most
+    longer_side: int = 800  # of the preview in which features are found, pixels
     keyframes: int = 3  # with which a preview is compared: those with the most matches
-    min_alpha: float = 0.8  # rendered opacity at a keyframe's feature; below, its depth is not known well enough
+    min_alpha: float = 0.8  # least rendered opacity at a keyframe's feature; below, its depth is not known well enough
     min_inliers: int = 20  # points from which a camera is resected
-    min_share: float = 0.3  # inlier ratio; matches with another place reach 0.2
+    min_share: float = 0.3  # least inlier ratio; matches with another place reach 0.2
     max_error_px: float = 3.0  # reprojection error of an inlier, at `longer_side`
     independent: int = 50  # inliers share errors of the scene: more than so many make the position no more certain
-    certainty: float = 0.999  # that the camera has moved, to say so
+    certainty: float = 0.999  # least probability that the camera has moved, to say so
     shift_px: float = 3.0  # median shift of the points in the image, at `longer_side`; a smaller one is no motion
     confirmations: int = 2  # previews in a row that must show the motion
 

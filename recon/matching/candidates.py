@@ -23,10 +23,10 @@ Pair = tuple[int, int]
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     exhaustive: int = 12  # keyframes up to which all pairs are matched
-    partners: int = 8  # of a keyframe, to begin with: with 8 of 29, cameras of real sets were as exact as with all
-    short_list: int = 24  # keyframes with similar codes, which are matched at a glance
-    glance_features: int = 500  # the strongest of each; 1000 chose no better partners
-    enough_firm: int = 3  # firm partners, by which a keyframe is firmly connected
+    partners: int = 8  # with which a keyframe is matched first: with 8 of 29, real sets were as exact as with all
+    short_list: int = 24  # keyframes with similar codes that are matched at a glance, to choose the partners
+    glance_features: int = 500  # the strongest of each, for that; 1000 chose no better partners
+    enough_firm: int = 3  # partners with firm matches that make a keyframe firmly connected
 
 
 def to_glance_at(codes: Sequence[Code], config: Config) -> set[Pair]:

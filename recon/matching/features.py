@@ -22,11 +22,12 @@ _NO_BLUR = 0.01  # sigma, pixels, along the other side: OpenCV takes 0 for "as a
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    num_features: int = 8000
+    num_features: int = 8000  # of an image, at most: the strongest
     contrast: float = 0.01  # SIFT's contrast threshold; low, because with few views every match counts
-    max_longer_side: int = 1600  # pixels; larger images are shrunk before features are found
-    min_longer_side: int = 1000  # pixels; smaller images are enlarged: a third more matches at 640 x 480
-    snap_px: float = 1.5  # at REFERENCE_SIDE: a keypoint of a tilted image this near to a known point is that point
+    max_longer_side: int = 1600  # larger images are shrunk before features are found, pixels
+    min_longer_side: int = 1000  # smaller images are enlarged, pixels: a third more matches at 640 x 480
+    # Pixels at REFERENCE_SIDE: a keypoint of a tilted image this near to a known point is that point
+    snap_px: float = 1.5
 
 
 def extract(image: Image, config: Config) -> Features:

@@ -19,7 +19,7 @@ _SCORE_OFFSET = 16320  # `kOffset` of recon/core/match.cpp: keeps scores positiv
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    ratio: float = 0.85  # most of the nearest distance over the second nearest; loose, because geometry decides later
+    ratio: float = 0.85  # largest ratio of nearest to second-nearest distance; loose, because geometry decides later
 
 
 def quantise(descriptors: npt.NDArray[np.float32]) -> Bytes:

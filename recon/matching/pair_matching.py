@@ -20,7 +20,7 @@ Index = npt.NDArray[np.int64]
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     nearest_neighbours: nearest_neighbours.Config = nearest_neighbours.Config()
     two_view: two_view.Config = two_view.Config()
-    max_static_px: float = 1.0  # median motion, pixels at REFERENCE_SIDE, below which matches may show the robot itself
+    max_static_px: float = 1.0  # median motion below which matches may show the robot itself, pixels at REFERENCE_SIDE
     min_moving: int = 60  # matches that move by more, for a geometry of these alone
 
 

@@ -38,9 +38,10 @@ _MIN_DEPTH = 1e-3  # of a turned unit ray: what is beside or behind the camera p
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     epipolar_px: float = 1.5  # inlier threshold of the fundamental matrix, pixels at REFERENCE_SIDE
-    homography_px: float = 2.5  # of a homography and of a pure rotation, pixels at REFERENCE_SIDE
-    max_log10_nfa: float = -12.0  # log10 of the number of false alarms: unrelated images agree no more often
-    min_inliers: int = 20
+    homography_px: float = 2.5  # inlier threshold of a homography and of a pure rotation, pixels at REFERENCE_SIDE
+    # Log10 of the largest number of false alarms of a verified pair: unrelated images agree no more often
+    max_log10_nfa: float = -12.0
+    min_inliers: int = 20  # matches that a geometry must explain
 
 
 @dataclass(frozen=True, eq=False)

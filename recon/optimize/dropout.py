@@ -23,7 +23,7 @@ MAX_OPACITY = 0.9999  # of a Gaussian whose opacity makes up for those that are 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     share: float = 0.4  # probability that a Gaussian of uncertainty 1 is left out of a render; 0: no dropout
-    sure: float = 0.6  # confidence of stereo from which on the uncertainty is 0
+    sure: float = 0.6  # least confidence of stereo at which the uncertainty is 0
     until: float = 0.7  # share of the refinement after which no Gaussian is left out
 
 

@@ -39,30 +39,31 @@ _POSE_BETAS = (0.9, 0.99)  # of Adam for the cameras: each gets one gradient in 
 class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Adam's step sizes at the start. Lengths are relative to the median depth of the scene, which is 1."""
 
-    means: Rate = 8e-4
-    quats: Rate = 2e-2
-    log_scales: Rate = 1e-1
-    logit_opacities: Rate = 1e-1
-    sh: Rate = 3e-2
-    translation: Rate = 2e-4
-    rotation: Rate = 2e-4  # radians
-    final_means: Share = 0.1  # those of the means have fallen to this part at the end, exponentially
-    final: Share = 0.3  # the Gaussians' others to this
-    final_pose: Share = 0.1  # and those of the cameras to this
+    means: Rate = 8e-4  # of positions
+    quats: Rate = 2e-2  # of orientations, as quaternions
+    log_scales: Rate = 1e-1  # of the logarithms of the standard deviations
+    logit_opacities: Rate = 1e-1  # of the logits of the opacities
+    sh: Rate = 3e-2  # of colours, as spherical harmonics
+    translation: Rate = 2e-4  # of cameras' positions
+    rotation: Rate = 2e-4  # of cameras' rotations, radians
+    final_means: Share = 0.1  # part to which the rate of the means has fallen at the end, exponentially
+    final: Share = 0.3  # part to which the other rates of the Gaussians have fallen
+    final_pose: Share = 0.1  # part to which those of the cameras have fallen
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The refinement of the preset `balanced`."""
 
-    iterations: Annotated[int, Meta(ge=0)] = 500
+    iterations: Annotated[int, Meta(ge=0)] = 500  # steps of the optimiser, one view each
     checkpoints: tuple[int, ...] = (150,)  # iterations after which the scene is shown, besides the last one
-    half_resolution_share: Share = 0.0  # of the iterations, at the start
-    dssim: Share = 0.4  # lambda of (1 - lambda) L1 + lambda D-SSIM
+    half_resolution_share: Share = 0.0  # share of the iterations, at the start, on images of half the size
+    dssim: Share = 0.4  # weight of D-SSIM in the photometric loss; that of L1 is 1 minus it
     dropout: dropout.Config = dropout.Config()
-    refine_poses: bool = True
+    refine_poses: bool = True  # whether cameras are refined together with the Gaussians
     rates: Rates = Rates()
     regularise: regularise.Config = regularise.Config()  # losses beside the photometric one; none by default
-    control: ControlChoice | None = ControlChoice("prune", prune.Config())  # density control; None: N stays
+    # Density control, which adds and removes Gaussians; None: their number stays
+    control: ControlChoice | None = ControlChoice("prune", prune.Config())
 
 
 def refine(

@@ -24,11 +24,11 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     a pixel look different there.
     """
 
-    losses: Mapping[str, LossChoice] = {}  # by a name that the report uses; a weight of 0 costs nothing
-    pseudo_views: int = 12
-    off_path: float = 0.1  # their distance from the cameras' path, at most, in distances of neighbouring cameras
-    nearest_points: int = 8  # K of equation 6: points that are blended in a pixel
-    min_confidence: float = 0.3  # of the points that are rendered and of the depths that are compared
+    losses: Mapping[str, LossChoice] = {}  # by names of your own, which the report uses; a weight of 0 costs nothing
+    pseudo_views: int = 12  # how many views between the cameras are drawn for losses that need them
+    off_path: float = 0.1  # largest distance of these from the cameras' path, in distances of neighbouring cameras
+    nearest_points: int = 8  # points that are blended in a pixel (K of equation 6)
+    min_confidence: float = 0.3  # least confidence of the points that are rendered and of the depths that are compared
 
     @property
     def weighted(self) -> dict[str, LossChoice]:

@@ -22,7 +22,7 @@ from splatnode.recon.registration.register import Registration
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stereo: stereo.Config = stereo.Config()
-    seed: int = 0  # of the random planes
+    seed: int = 0  # of the random planes that stereo begins with
     # Few sparse points lie on what is far, so stereo searches this many times farther than they reach; in inverse
     # depth, in which it samples, that is a small part of the range.
     far_margin: float = 8.0

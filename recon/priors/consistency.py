@@ -28,21 +28,21 @@ class Confidence:
     and the area under the ROC curve 0.86.
     """
 
-    constant: float = -4.3
-    per_support: float = 4.95  # share of neighbours on the same plane
-    per_consistent: float = 0.17  # views that agree, up to MAX_CONSISTENT
-    per_conflicting: float = -0.67  # share of the views that look through the point
-    per_log_contrast: float = 0.7  # logarithm of the standard deviation of the window's grey levels
-    per_cosine: float = 0.9  # of the angle between line of sight and surface normal
+    constant: float = -4.3  # log-odds where all the others are 0
+    per_support: float = 4.95  # for neighbours on the same plane, as a part of all
+    per_consistent: float = 0.17  # for each view that agrees, up to MAX_CONSISTENT
+    per_conflicting: float = -0.67  # for views that look through the point, as a part of all
+    per_log_contrast: float = 0.7  # for the logarithm of the standard deviation of the window's grey levels
+    per_cosine: float = 0.9  # for the cosine of the angle between line of sight and surface normal
 
 
 @dataclass(frozen=True)
 class Config:
     max_error: float = 2.0  # forward-backward reprojection error of agreeing views, pixels
-    max_relative_difference: float = 0.01  # of the depth of agreeing views
+    max_relative_difference: float = 0.01  # largest difference of the depths of agreeing views, relative to the depth
     min_support: float = 0.12  # share of neighbours on the same plane that keeps a pixel which no other view confirms
     min_borrowed_support: float = 0.2  # the same for a neighbour's plane that fills such a pixel
-    min_confidence: float = 0.03  # below, the depth is unknown
+    min_confidence: float = 0.03  # least confidence of a depth; below, it is unknown
     confidence: Confidence = field(default_factory=Confidence)
 
 

@@ -26,9 +26,9 @@ class Matching:
     sigma_space: float = 5.0  # bilateral weight of the window, pixels
     noise_variance: float = 2.0  # grey levels squared: patches flatter than this give no evidence
     smoothness: float = 0.01  # cost per neighbour and pixel of parallax between a plane and the neighbour's point
-    smoothness_limit: float = 2.0  # pixels of parallax
+    smoothness_limit: float = 2.0  # most that counts of that parallax, pixels
     geometric: float = 0.1  # cost per pixel of forward-backward reprojection error
-    geometric_limit: float = 2.0  # pixels
+    geometric_limit: float = 2.0  # most that counts of that error, pixels
 
 
 @dataclass(frozen=True)

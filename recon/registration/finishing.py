@@ -24,14 +24,15 @@ _MIN_OBSERVATIONS = 6  # of a registered camera: three fix a pose, twice as many
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     triangulation: triangulation.Config = triangulation.Config()
     subpixel: subpixel.Config = subpixel.Config()
-    min_points: int = 15  # of a map
-    robust_range_px: tuple[float, float] = (0.15, 1.5)  # limits of the scale of the robust loss, at REFERENCE_SIDE
-    # Errors are not independent: what lens, shutter and scene do otherwise than the model moves whole regions alike.
-    # So many observations tell as much as one with an error of its own. With this number, errors of real cameras are
-    # as large as their sigmas say (tests/bench/quality/poses.py).
+    min_points: int = 15  # points that a map needs
+    # Smallest and largest scale of the robust loss, pixels at REFERENCE_SIDE
+    robust_range_px: tuple[float, float] = (0.15, 1.5)
+    # So many observations tell as much as one with an error of its own, because what lens, shutter and scene do
+    # otherwise than the model moves whole regions alike. With this number, errors of real cameras are as large as
+    # their sigmas say (tests/bench/quality/poses.py).
     correlated: float = 100.0
-    radial_sigma: float = 0.02  # of the radial coefficient of a lens that is not calibrated
-    shift_sigma: float = 0.004  # of its principal point, as a share of the longer side
+    radial_sigma: float = 0.02  # prior standard deviation of the radial coefficient of a lens that is not calibrated
+    shift_sigma: float = 0.004  # that of its principal point, as a share of the longer side
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,10 +33,11 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     resection: resection.Config = resection.Config()
     triangulation: triangulation.Config = triangulation.Config()
     robust_px: float = 1.0  # scale of the robust loss, pixels at REFERENCE_SIDE
-    min_points: int = 15  # of a map
+    min_points: int = 15  # points that a map needs
     candidates: int = 3  # views that are resected before the best of them is registered
     min_view_ratio: float = 0.6  # inlier ratio of a view's matches below which it is removed and resected again
-    pair_focal_sigma: float = 0.03  # of log focal while there are two views, which say little about it
+    # Standard deviation of log focal while there are two views, which say little about it
+    pair_focal_sigma: float = 0.03
 
 
 def grow(problem: MappingProblem, focals: list[float], first: Pair, config: Config) -> PartialMap | None:

@@ -23,13 +23,13 @@ _ROUNDING_PX = 1.0  # difference of the shorter sides of two frames of one shape
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    exif_sigma: float = 0.05  # of log focal: nominal focal lengths are rounded, and focusing changes them
+    exif_sigma: float = 0.05  # of log focal, from EXIF: nominal focal lengths are rounded, and focusing changes them
     voted_sigma: float = 0.3  # of log focal, when pairs of frames voted for it
-    # Frames of one shape and several sizes have one lens unless the log focals, adjusted for each size by itself,
-    # differ by more: then some frames are crops or zoomed. Resized frames differed by 0.007 at most, crops to 75 % by
-    # 0.114 at least, with the principal point as free as `free_shift_sigma`, a share of the longer side.
+    # Largest difference of log focals, adjusted for each size of frames of one shape by itself, with which all have one
+    # lens; beyond, some frames are crops or zoomed. Resized frames differed by 0.007 at most, crops to 75 % by
+    # 0.114 at least, with the principal point as free as `free_shift_sigma`.
     max_focal_difference: float = 0.05
-    free_shift_sigma: float = 0.1
+    free_shift_sigma: float = 0.1  # of the principal point in that comparison, as a share of the longer side
 
 
 @dataclass(frozen=True)

@@ -23,12 +23,12 @@ _UNEXPLAINED_BY_PLANE = 1.05  # less the planar share of a pair: above 1, so tha
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     incremental: incremental.Config = incremental.Config()
     finishing: finishing.Config = finishing.Config()
-    max_growing_tracks: int = 350  # a view, while views are added; more take time and change no decision
-    max_final_tracks: int = 1500  # a view, in the last adjustment
-    max_attempts: int = 6  # combinations of first pair and focal length
+    max_growing_tracks: int = 350  # tracks of a view, while views are added; more take time and change no decision
+    max_final_tracks: int = 1500  # tracks of a view, in the last adjustment
+    max_attempts: int = 6  # combinations of first pair and focal length that are tried
     score_px: float = 1.25  # error from which on a match scores 0, pixels at REFERENCE_SIDE
-    same_rotation_deg: float = 0.5  # largest rotation between the views of two attempts that found the same map,
-    same_focal: float = 0.02  # and the largest difference of their log focals
+    same_rotation_deg: float = 0.5  # largest rotation between the views of two attempts that found the same map
+    same_focal: float = 0.02  # largest difference of the log focals of two such attempts
 
 
 @dataclass(frozen=True, eq=False)

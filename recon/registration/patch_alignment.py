@@ -20,8 +20,8 @@ MAX_RADIUS = 12  # pixels; `kMaxRadius` of recon/core/align.cpp
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    radius: int = 8  # of a patch, pixels; at most MAX_RADIUS
-    max_iterations: int = 20  # of Gauss-Newton
+    radius: int = 8  # of a patch, pixels; at most 12
+    max_iterations: int = 20  # of Gauss-Newton, at most
 
 
 @dataclass(frozen=True, eq=False)

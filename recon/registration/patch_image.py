@@ -15,8 +15,8 @@ Array = npt.NDArray[np.float64]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    max_longer_side: int = 1600  # pixels; larger images are shrunk
-    blur_px: float = 0.7  # sigma, after shrinking: interpolation errs less in a smooth image
+    max_longer_side: int = 1600  # larger images are shrunk, pixels
+    blur_px: float = 0.7  # sigma of the smoothing, after shrinking: interpolation errs less in a smooth image
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,11 +34,11 @@ _MIN_SCALE_RATIO = 0.4  # share of the points that may fix the length of a trans
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    max_error_px: float = 2.5  # of an exact match, pixels at REFERENCE_SIDE
+    max_error_px: float = 2.5  # largest error of an exact match, pixels at REFERENCE_SIDE
     min_points: int = 15  # 2D-3D inliers that a proposed pose needs
     min_inlier_ratio: float = 0.2  # share of the 2D-3D correspondences that must be inliers
     ample_points: int = 40  # 2D-3D inliers from which on relative poses are not needed as proposals
-    min_scale_points: int = 5  # that must agree on the length of the translation of a relative pose
+    min_scale_points: int = 5  # points that must agree on the length of the translation of a relative pose
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,12 +29,15 @@ _MIN_ALONG_NORMAL = 1e-12  # component of a ray along a surface's normal, in pla
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     patch_alignment: patch_alignment.Config = patch_alignment.Config()
     patch_image: patch_image.Config = patch_image.Config()
-    slants_deg: tuple[float, ...] = (0.0, 50.0)  # tried, of the surface's normal from the direction to the reference
-    directions: int = 6  # tried for a slanted normal, evenly around
-    min_correlation: float = 0.8  # of an aligned patch with its reference
-    max_move_px: float = 3.0  # from the matched or predicted position, pixels at REFERENCE_SIDE
-    max_sigma_px: float = 0.2  # of a position along its worst direction, pixels: an edge alone does not fix it
-    max_angle_deg: float = 50.0  # between the rays of the reference and of a view in which the point was not matched
+    # Angles that are tried, of the surface's normal from the direction to the reference
+    slants_deg: tuple[float, ...] = (0.0, 50.0)
+    directions: int = 6  # that are tried for a slanted normal, evenly around
+    min_correlation: float = 0.8  # least correlation of an aligned patch with its reference
+    max_move_px: float = 3.0  # farthest from the matched or predicted position, pixels at REFERENCE_SIDE
+    # Largest sigma of a position in its worst direction, pixels: an edge alone does not fix it
+    max_sigma_px: float = 0.2
+    # Largest between the rays of the reference and of a view in which the point was not matched
+    max_angle_deg: float = 50.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,10 +34,10 @@ MIN_WIDENING = 1.1  # of the spacing in each attempt to have fewer Gaussians
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    spacing_deg: float = 5.0  # between neighbouring Gaussians of the shell; 0 leaves the shell out
+    spacing_deg: float = 5.0  # between neighbouring Gaussians of the shell; 0: there is no shell
     margin: float = 2.0  # how far beyond the images' borders the shell reaches, in units of the images' size
     distance: float = 1.3  # radius, in units of the farthest known depth
-    opacity: float = 0.95
+    opacity: float = 0.95  # of the shell's Gaussians
 
 
 def far_shell(

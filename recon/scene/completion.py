@@ -37,13 +37,13 @@ MAX_EXTRAPOLATION = 2.0  # factor by which a filled depth may lie nearer or fart
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    min_confidence: float = 0.12  # of stereo: depths from here on are known, those below doubtful
+    min_confidence: float = 0.12  # least confidence of stereo for a known depth; those below are doubtful
     min_usable_confidence: float = 0.1  # doubtful depths below tell less than their surroundings do: they are dropped
     colour_tolerance: float = 0.12  # difference of colour, in [0, 1], up to which a point explains a pixel
     min_object_px: int = 15  # width of a region of other colour from which on it is taken for a foreground object
-    foreground_depth: float = 0.4  # of an unknown foreground, over the nearest known depth of its view
-    background_depth: float = 1.5  # of an unknown background, over the farthest known depth of its view
-    confidence: float = 0.1  # of filled depths
+    foreground_depth: float = 0.4  # depth of an unknown foreground, over the nearest known depth of its view
+    background_depth: float = 1.5  # depth of an unknown background, over the farthest known depth of its view
+    confidence: float = 0.1  # that filled depths get
     most_partners: int = 16  # other views that a view is compared with, at most: those that share most with it
     reduction: int = 4  # the smooth depth is found at 1 / `reduction` of the resolution
     edge_contrast: float = 0.06  # difference of colour, in [0, 1], by which smoothness weakens to 1 / e

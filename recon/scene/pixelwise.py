@@ -18,9 +18,9 @@ from splatnode.recon.scene.seeding import redundant_pixels
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     down_sampling: DownSampling = DownSampling(max_footprint_ratio=1e9)  # equations 14 to 17 as they are written
-    min_confidence: float = 0.05  # of stereo, in [0, 1]: pixels below get no Gaussian
+    min_confidence: float = 0.05  # least confidence of stereo, in [0, 1]: pixels below get no Gaussian
     opacity: float = 0.1  # of a new Gaussian, as in 3DGS
-    neighbours: int = NUM_NEIGHBOURS  # whose mean squared distance is a new Gaussian's variance
+    neighbours: int = NUM_NEIGHBOURS  # points whose mean squared distance is a new Gaussian's variance
     # What lies behind: nothing, as published; our far shell; our filled depths and the shell (MASt3R's have no holes).
     surroundings: Literal["none", "shell", "fill"] = "none"
 

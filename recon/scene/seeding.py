@@ -39,14 +39,15 @@ ERROR_EXPONENT = 1.3  # a piece's error grows a little faster than its area
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth_tolerance: float = 0.02  # theta of equation 16, relative to the depth
     max_footprint_ratio: float = 1.5  # a pixel is redundant only beside a point whose footprint is at most this larger
-    min_confidence: float = 0.05  # of stereo, in [0, 1]: pixels below get no Gaussian
+    min_confidence: float = 0.05  # least confidence of stereo, in [0, 1]: pixels below get no Gaussian
     max_side_px: int = 64  # side of the squares of a grid that no piece reaches across
     min_area_px: float = 3.0  # pieces of at most this area are not cut
-    max_error: float = 0.0021  # of a piece: squared visible deviation of colours in [0, 1], over pixels and channels
+    # Largest error of a piece: squared visible deviation of colours in [0, 1], over pixels and channels
+    max_error: float = 0.0021
     depth_weight: float = 1.0  # a relative difference of depth counts as this many times a difference of colour
     noise: float = 0.01  # standard deviation of colours in [0, 1] that is not worth a Gaussian
-    footprint: float = 1.2  # standard deviations of a new Gaussian, over its piece's
-    thickness: float = 0.15  # standard deviation along the normal, over the smaller one across
+    footprint: float = 1.2  # standard deviations of a new Gaussian across, over its piece's
+    thickness: float = 0.15  # its standard deviation along the normal, over the smaller one across
     opacity: float = 0.5  # of a new Gaussian
 
 

@@ -24,10 +24,10 @@ MIN_LENGTH = (
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    min_matches: int = 40  # of a pair that is asked
+    min_matches: int = 40  # least matches of a pair that is used
     partners: int = 3  # of each frame, those with most matches
-    max_matches: int = 400  # of a pair that are used; more make a relative pose no surer
-    max_error_px: float = 2.5  # of a match, at REFERENCE_SIDE
+    max_matches: int = 400  # matches of a pair that are used; more make a relative pose no surer
+    max_error_px: float = 2.5  # largest error of a match, pixels at REFERENCE_SIDE
 
 
 @dataclass(frozen=True)

@@ -34,15 +34,18 @@ Grey = npt.NDArray[np.float32]
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    cells: int = 20  # along the longer side of the picture: one patch each
+    cells: int = 20  # patches along the longer side of a picture
     partners: int = 2  # pictures in which the patches of one are looked for
-    depths: int = 12  # tried for each patch
-    depth_range: float = 1.15  # about the depth of the plane through the points around the patch, as a factor
-    neighbours: int = 12  # points that define it
-    beside_px: tuple[float, ...] = (-14.0, -7.0, 7.0, 14.0)  # the rival lines, pixels at BESIDE_SIDE
-    patch: int = 7  # pixels
-    min_contrast: float = 4.0  # grey levels (standard deviation) that a patch needs
-    min_likeness: float = 0.7  # on one of the lines; a patch that is like nothing is hidden or seen too differently
+    depths: int = 12  # depths that are tried for each patch
+    # They reach by this factor about the depth of the plane through the points around the patch
+    depth_range: float = 1.15
+    neighbours: int = 12  # points that define that plane
+    # Distances of the rival lines from the predicted one, pixels at a longer side of 512
+    beside_px: tuple[float, ...] = (-14.0, -7.0, 7.0, 14.0)
+    patch: int = 7  # side of a patch, pixels
+    min_contrast: float = 4.0  # least standard deviation of a patch, grey levels
+    # Least likeness on one of the lines; a patch that is like nothing is hidden or seen too differently
+    min_likeness: float = 0.7
 
 
 @dataclass(frozen=True, eq=False)

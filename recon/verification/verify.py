@@ -39,7 +39,7 @@ MIN_MATCHES = 60  # of a pair whose homography says something: fewer are explain
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    tracks_per_camera: int = 300  # of the bundle that is adjusted again
+    tracks_per_camera: int = 300  # tracks of a camera in the bundle that is adjusted again
     epipolar_consistency: epipolar_consistency.Config = epipolar_consistency.Config()
     cycles: cycles.Config = cycles.Config()
     reflection: reflection.Config = reflection.Config()

@@ -480,7 +480,7 @@ def test_a_raw_file_is_that_of_the_commit_that_the_readme_gives(name):
     assert git("diff", "--quiet", listed()[name], "--", f"tests/bench/results/{name}") == 0
 
 
-@pytest.mark.parametrize("page", ["README.md", "CONVENTIONS.md", "docs/tried.md"])
+@pytest.mark.parametrize("page", ["README.md", "CONVENTIONS.md", "docs/tried.md", "docs/configuration.md"])
 def test_paths_that_a_page_names_are_there(page):
     text = (ROOT / page).read_text(encoding="utf-8")
     paths = re.findall(r"`((?:capture|recon|viewer|tests|configs|docs)/[\w./*]*)`|\]\(([\w./]+)\)", text)

@@ -30,16 +30,16 @@ _PARTS = 2  # into which a large Gaussian is split
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_gradient: float = 2e-4  # mean length of the gradient, from which on a Gaussian is cloned or split
     every: int = 50  # iterations between rounds
-    start: float = 500 / 30_000  # share of the iterations, of the first round
-    end: float = 0.5  # and of the last
+    start: float = 500 / 30_000  # share of the iterations at which the first round is
+    end: float = 0.5  # share of the iterations at which the last round is
     reset_every: float = 0.2  # share of the iterations between resets
     reset_opacity: float = 0.01  # largest opacity after a reset
-    min_opacity: float = 0.005  # below it a Gaussian is pruned
+    min_opacity: float = 0.005  # a Gaussian below this opacity is pruned
     clone_scale: float = 0.01  # largest scale of a Gaussian that is cloned and not split, in extents of the scene
-    max_scale: float = 0.1  # after the first reset, in extents of the scene; above it a Gaussian is pruned
-    max_radius_px: float = 20.0  # three standard deviations in a training view, after the first reset; likewise
+    max_scale: float = 0.1  # after the first reset, a Gaussian with a larger scale is pruned, in extents of the scene
+    max_radius_px: float = 20.0  # likewise one whose three standard deviations are more in a training view, pixels
     split_factor: float = 1.6  # scale of a Gaussian over that of its parts
-    max_gaussians: int = 100_000  # at which no more are added
+    max_gaussians: int = 100_000  # at so many no more are added
 
 
 def extent(Ts_world_camera: Sequence[Tensor]) -> float:

@@ -21,8 +21,9 @@ from splatnode.recon.scene.gaussians import Gaussians, concatenate
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     adaptive: adaptive.Config = adaptive.Config()
-    neighbours: int = 3
-    min_distance: float = 0.05  # mean, to the neighbours, in extents of the scene; the paper's unit is not given
+    neighbours: int = 3  # nearest Gaussians to which a distance is measured
+    # Mean distance to them, in extents of the scene, above which Gaussians are added; the paper gives no unit
+    min_distance: float = 0.05
 
 
 def unpooled(gaussians: Gaussians, min_distance: float, neighbours: int) -> Gaussians:

@@ -19,14 +19,15 @@ from splatnode.recon.scene.seeding import REFERENCE_PX
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    at: tuple[float, ...] = (0.3,)  # progress at which Gaussians are pruned, rising, in [0, 1]
-    least_change: float = 0.005  # squared visible difference of colours in [0, 1], over all pixels, channels, views
-    between: int = 1  # pseudo views a photograph, which count as photographs do
+    at: tuple[float, ...] = (0.3,)  # shares of the refinement, rising, after which Gaussians are pruned
+    # Less is not seen: squared difference of colours in [0, 1], over all pixels, channels, views
+    least_change: float = 0.005
+    between: int = 1  # pseudo views for each photograph, which count as photographs do
     off_path: float = 0.3  # largest distance of pseudo views from the path of the cameras, in its steps
-    probes: int = 2  # random images a view from which the differences are estimated
-    # With a deadline: before the first number of iterations the Gaussians are not fitted yet; pruning takes the time of
-    # 30 iterations, and the Gaussians that are left need as many again to close the gaps.
+    probes: int = 2  # random images for each view, from which the differences are estimated
+    # With a deadline, nothing is pruned before: until then the Gaussians are not fitted.
     min_iterations: int = 30
+    # Nor with fewer left: pruning takes the time of 30, and closing the gaps takes as many again.
     min_remaining_iterations: int = 60
 
 

@@ -28,9 +28,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     every: int = 100  # iterations between relocations
     until: float = 0.83  # share of the refinement after which nothing is relocated: 25000 of 30000 iterations
     dead: float = 0.005  # opacity up to which a Gaussian is relocated
-    noise: float = 5e5  # its amplitude, in learning rates of the means
+    noise: float = 5e5  # amplitude of the noise on positions, in learning rates of the means
     rate: float = 1.6e-4  # that learning rate at the start
-    final: float = 0.01  # the share of it that is left at the end, after an exponential fall
+    final: float = 0.01  # part of that rate that is left at the end, after an exponential fall
 
 
 def load(config: Config, seed: int) -> Relocation:

@@ -25,8 +25,8 @@ class Config(Schedule, frozen=True, forbid_unknown_fields=True):
     all that rises and falls, and .11 dB with 128.
     """
 
-    patch: int = 128  # side, pixels
-    share: float = 0.5  # of the patches, drawn anew at each iteration
+    patch: int = 128  # side of a patch, pixels
+    share: float = 0.5  # share of the patches that is drawn, anew at each iteration
 
 
 def prepare(config: Config, supervision: Supervision, seed: int) -> Loss:

@@ -26,9 +26,9 @@ class LossChoice(Plugin):
 class Schedule(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The weight of a loss, and the part of the refinement in which it counts."""
 
-    weight: float = 0.0
-    start: float = 0.0  # shares of all iterations
-    end: float = 1.0
+    weight: float = 0.0  # factor of the loss in the sum of all; 0: it does not count
+    start: float = 0.0  # share of the iterations after which it counts
+    end: float = 1.0  # share of the iterations after which it counts no more
 
     def at(self, progress: float) -> float:
         """The weight at `progress` in [0, 1]."""

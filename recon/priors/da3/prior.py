@@ -22,9 +22,9 @@ PACKAGE = "safetensors"  # reads them
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    weights: Path | None = None  # None: where `splatnode weights` puts them
-    longer_side: int = 504  # of the network's images: what it was published with
-    views_at_once: int = 12  # all of them look at each other: memory and time grow with their square
+    weights: Path | None = None  # file of the network's; None: where `splatnode weights` puts them
+    longer_side: int = 504  # of the network's images, pixels: what it was published with
+    views_at_once: int = 12  # photographs that look at each other: memory and time grow with their square
     seed: int = 0  # every prior has one; this one draws no random numbers
 
 

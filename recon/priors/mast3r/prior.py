@@ -34,8 +34,8 @@ LICENCE = (
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    weights: Path | None = None  # None: where `splatnode weights` puts them
-    longer_side: int = 512  # of the network's images: what it was trained with
+    weights: Path | None = None  # file of the network's; None: where `splatnode weights` puts them
+    longer_side: int = 512  # of the network's images, pixels: what it was trained with
     max_neighbours: int = 6  # places in the circle of frames: of up to 13 frames every pair is asked about
     seed: int = 0  # every prior has one; global alignment has a fixed one
 

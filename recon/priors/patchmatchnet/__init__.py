@@ -15,7 +15,7 @@ WEIGHTS = ("patchmatchnet/patchmatchnet_dtu.pth",)
 
 
 class Config(classical.Config, frozen=True, forbid_unknown_fields=True):
-    weights: Path | None = None  # None: where `splatnode weights` puts them
+    weights: Path | None = None  # file of the network's; None: where `splatnode weights` puts them
 
 
 def load(config: Config) -> ClassicalPrior:

@@ -1,0 +1,1 @@
+"""docs/configuration.md: every option of the configuration files, as the code declares and comments it."""
