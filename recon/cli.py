@@ -17,7 +17,7 @@ from torch import Tensor
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.config import read_yaml
-from splatnode.capture.process.printable import printable_name
+from splatnode.capture.process.progress import Step, Tell, Told, told_to_nobody
 from splatnode.capture.process.terminal import say
 from splatnode.recon.config import Config, overlaid, preset
 from splatnode.recon.evaluate import methods
@@ -55,18 +55,18 @@ def replay(args: argparse.Namespace) -> int:
     _check_apart(args.out, args.source)
     if args.map:
         return replay_map(args, config)
-    if args.source.is_file() and not args.json:
-        say(f"choosing keyframes of {printable_name(args.source.name)}")
-    given = source(args)
-    if given.choice is not None and not args.json:
-        say(str(given.choice))
+    tell = told_to_nobody if args.json else Told()
+    given = source(args, tell)
+    if given.choice is not None:
+        tell(str(given.choice))
     _check_baseline(config, [frame.name for frame in given.frames])
     needed_bytes = largest_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
     with (
         result_folder(args.out, needed_bytes),
         viewer(args.out / "view") if args.view else contextlib.nullcontext(_shown_to_nobody) as show,
     ):
-        snapshot = run(given.frames, with_looks(config, LOOK_EVERY) if args.view else config, show)
+        snapshot = run(given.frames, with_looks(config, LOOK_EVERY) if args.view else config, show, tell)
+        tell(Step("writing the results"))
         snapshot = in_metres(snapshot, config.metric)
         told: dict[str, object] = {"photographs": str(given.keep(args.out).resolve())}
         if given.choice is not None:
@@ -92,8 +92,8 @@ def _check_apart(out: Path, photographs: Path) -> None:
         raise ValueError(f"--out must not be the folder of the photographs; give one in it, such as {out / 'out'}")
 
 
-def _shown_to_nobody(_: object) -> None:
-    """What is done with a snapshot, or a line, where nobody watches."""
+def _shown_to_nobody(_: Snapshot) -> None:
+    """What is done with a snapshot where nobody watches."""
 
 
 def with_looks(config: Config, every: int) -> Config:
@@ -104,11 +104,14 @@ def with_looks(config: Config, every: int) -> Config:
 
 
 def run(
-    frames: Iterable[Frame | DroppedFrame], config: Config, show: Callable[[Snapshot], None] = _shown_to_nobody
+    frames: Iterable[Frame | DroppedFrame],
+    config: Config,
+    show: Callable[[Snapshot], None] = _shown_to_nobody,
+    tell: Tell = told_to_nobody,
 ) -> Snapshot:
-    """The final snapshot; every one is given to `show`."""
+    """The final snapshot; every one is given to `show`, and what is being done to `tell`."""
     snapshot = None
-    for snapshot in reconstruct(frames, config):
+    for snapshot in reconstruct(frames, config, tell):
         show(snapshot)
     if snapshot is None:
         raise AssertionError("reconstruct always yields a last snapshot")
@@ -121,13 +124,13 @@ def demo(args: argparse.Namespace) -> int:
     config = overlaid(preset("balanced"), {"seed": seed, "device": args.device or "cpu"})
     place = synthetic.Config(seed=seed)
     needed_bytes = largest_result_bytes([(place.width, place.height)] * place.views, config.size, None)
-    tell = _shown_to_nobody if args.json else say
+    tell = told_to_nobody if args.json else Told()
     with result_folder(args.out, needed_bytes + largest_capture_bytes(place)):
         capture = args.out / "capture"
         tell(f"photographing the built-in place, {place.views} times")
         split = write_photographs(capture, place)
-        tell("finding the cameras")
-        snapshot = run(folder.stream(folder.Config(folder=capture / "images", names=split.train)), config)
+        photographs = folder.stream(folder.Config(folder=capture / "images", names=split.train))
+        snapshot = run(photographs, config, tell=tell)
         write = partial(finish, snapshot, args.out, seed=seed, preset_name="balanced")
         report = write()
         if not args.json:
@@ -230,7 +233,7 @@ def _tell(snapshot: Snapshot, out: Path) -> None:
         counts = f"{len(snapshot.gaussians)} Gaussians, {len(snapshot.cameras)} cameras"
         say(f"{snapshot.seconds['total']:.1f} s, {counts}")
         if known := bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale):
-            say(f"cameras: {known}")
+            say(f"how well the cameras are known: {known}")
     further = snapshot.seconds.get("ladder", 0.0)
     if further >= 0.1:
         say(f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches (--quick leaves them out)")

@@ -23,7 +23,7 @@ from splatnode.recon.ladder.ladder import climbed
 from splatnode.recon.matching.match import completed, matched_soon
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.memory import Key, Memory
-from splatnode.recon.modelling import Shown, begin_scene, refined, shown, snapshot
+from splatnode.recon.modelling import Shown, begin_scene, in_words, refined, shown, snapshot
 from splatnode.recon.optimize import refinement
 from splatnode.recon.preparation import check_device, load_prior, prepare
 from splatnode.recon.priors.pointmap import Pointmap
@@ -146,9 +146,11 @@ class IncrementalReconstruction:
         self._known = replace(self._known, graph=graph, screened=self._known.screened.with_known(keyframe.frame))
         self._keep_matching(matched_soon(graph, self._prior.matcher), pause)
         newest, num_features = len(self.graph.keyframes) - 1, len(keyframe.features.points)
-        overlapping = len(self.graph.partners(newest))
+        sharing = len(self.graph.partners(newest))
         compared = newest - sum(newest in pair for pair in self.graph.pending)
-        log.info("%s: %d features, overlaps %d of %d frames tried", keyframe.name, num_features, overlapping, compared)
+        told = f"shares points with {sharing} of the {compared} photographs that it was compared with"
+        told = told if compared else "the first photograph"
+        log.info("%s: %s (%d image features)", keyframe.name, told, num_features)
         self.clock.lap("poses")
 
     def complete(self, pause: Pause = without_pause) -> None:
@@ -290,6 +292,8 @@ class IncrementalReconstruction:
         show, seconds, bound = self._known.show, self.clock.booked, ()
         if final and estimate.verdict.publishable:
             bound = hits(self.config, self.begun, show.scene, seconds)
-        return snapshot(
+        made = snapshot(
             next(self.numbers), estimate.conclusion, show, seconds=seconds, dropped=left_out, budget=bound, final=final
         )
+        log.info("%s", in_words(made))
+        return made

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -22,8 +21,6 @@ from splatnode.recon.scene import growth
 from splatnode.recon.scene.first_look import first_look
 from splatnode.recon.scene.initialisation import initial_scene
 from splatnode.recon.scene.scene import Scene
-
-log = logging.getLogger(__name__)
 
 COARSE = "Coarse so far: the matched points alone; depth and refinement follow."
 
@@ -63,13 +60,17 @@ def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
 
 
 def refined(
-    scene: Scene | None, config: Config, steps: refinement.Config, deadline: float | None = None
+    scene: Scene | None,
+    config: Config,
+    steps: refinement.Config,
+    deadline: float | None = None,
+    gone_on: Callable[[int], None] = lambda done: None,
 ) -> Iterator[Shown]:
     """The scene, if there is one, at each checkpoint of its refinement and at its end.
 
     Where it diverges or overfits it ends with a verdict, and with the best scene so far if that is publishable.
-    `deadline` is a time of `time.monotonic()`. The Gaussians are on the configured device while they are refined, and
-    those that are shown on the processor. Raises DeviceUnavailable.
+    `deadline` is a time of `time.monotonic()`; `gone_on` hears how many steps are done. The Gaussians are on the
+    configured device while they are refined, and those that are shown on the processor. Raises DeviceUnavailable.
     """
     if scene is None:
         return
@@ -77,7 +78,8 @@ def refined(
     watching = watch(scene, steps.iterations)
     limit = config.most_gaussians
     give_back_memory()
-    for later in refinement.refine(scene, steps, seed=config.seed, deadline=deadline, max_gaussians=limit):
+    work = refinement.refine(scene, steps, seed=config.seed, deadline=deadline, max_gaussians=limit, gone_on=gone_on)
+    for later in work:
         verdict = None
         if later.losses or later.iterations in config.optimize.checkpoints:
             give_back_memory()
@@ -104,7 +106,7 @@ def snapshot(
     if verdict.publishable and show.verdict is not None:
         verdict = show.verdict
     scene = show.scene if verdict.publishable else None
-    made = Snapshot(
+    return Snapshot(
         sequence=sequence,
         verdict=verdict,
         cameras=scene.cameras(conclusion.bounds) if scene else (),
@@ -118,14 +120,13 @@ def snapshot(
         served_by=scene.served_by if scene else {},
         evidence=conclusion.evidence_record,
     )
-    log.info(
-        "snapshot %d: %s%s, %d cameras, %d Gaussians, %d iterations, %.1f s",
-        sequence,
-        verdict.code.value,
-        ", coarse so far" if scene and not scene.iterations else "",
-        len(made.cameras),
-        len(made.gaussians),
-        made.iterations,
-        made.seconds["total"],
-    )
-    return made
+
+
+def in_words(made: Snapshot) -> str:
+    """The verdict and what there is of a scene, in a line of a log."""
+    seconds = f"after {made.seconds['total']:.1f} s"
+    if not made.cameras:
+        return f"snapshot {made.sequence}: {made.verdict.code.value}: no scene {seconds}"
+    refined = f"refined by {made.iterations} steps" if made.iterations else "coarse so far"
+    counts = f"{len(made.cameras)} cameras, {len(made.gaussians)} Gaussians"
+    return f"snapshot {made.sequence}: {made.verdict.code.value}: {counts}, {refined}, {seconds}"

@@ -15,6 +15,8 @@ from splatnode.capture.cameras import folder, video
 from splatnode.capture.choosing import Choice, choose
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
+from splatnode.capture.process.printable import printable_name
+from splatnode.capture.process.progress import Tell, counted, told_to_nobody
 from splatnode.capture.quality import Limits
 from splatnode.capture.selection import Config
 from splatnode.recon.config import Config as Reconstruction
@@ -77,14 +79,14 @@ class Recording:
         return (each for each in _stream(self.path) if isinstance(each, DroppedFrame) or each.name in names)
 
 
-def recording(args: argparse.Namespace) -> Recording:
+def recording(args: argparse.Namespace, tell: Tell = told_to_nobody) -> Recording:
     """As `source`, without a limit to the number of keyframes."""
     _check_there(args.source)
-    return Recording(args.source, choose(_stream(args.source), _selection(args), Limits(), None))
+    return Recording(args.source, choose(_looked_through(args.source, tell), _selection(args), Limits(), None))
 
 
-def source(args: argparse.Namespace) -> Source:
-    """The frames that the command line asks for.
+def source(args: argparse.Namespace, tell: Tell = told_to_nobody) -> Source:
+    """The frames that the command line asks for; `tell` hears how far the reading is.
 
     Raises FileNotFoundError and ValueError where there is nothing that can be used.
     """
@@ -92,11 +94,13 @@ def source(args: argparse.Namespace) -> Source:
     if args.source.is_file():
         if args.frames:
             raise ValueError("--frames names photographs of a folder; of a video, give --views N or nothing")
-        return _chosen(args, None)
+        return _chosen(args, None, tell)
     names = _names(args)
-    if names or args.every_frame or len(folder.names_in(args.source)) <= ALL:
-        return Source(tuple(folder.stream(folder.Config(folder=args.source, names=names))), args.source, None)
-    return _chosen(args, args.source)
+    there = len(folder.names_in(args.source))
+    if names or args.every_frame or there <= ALL:
+        frames = folder.stream(folder.Config(folder=args.source, names=names))
+        return Source(tuple(counted(frames, tell, "reading", len(names) or there, "photograph")), args.source, None)
+    return _chosen(args, args.source, tell)
 
 
 def _check_there(path: Path) -> None:
@@ -108,14 +112,20 @@ def _stream(path: Path) -> Iterator[Frame | DroppedFrame]:
     return video.stream(video.Config(file=path)) if path.is_file() else folder.stream(folder.Config(folder=path))
 
 
+def _looked_through(path: Path, tell: Tell) -> Iterator[Frame | DroppedFrame]:
+    """All that there is to choose from; how many frames a video has is known at its end."""
+    of = 0 if path.is_file() else len(folder.names_in(path))
+    return counted(_stream(path), tell, f"choosing keyframes of {printable_name(path.name)}", of, "frame")
+
+
 def _selection(args: argparse.Namespace) -> Config:
     config = Config() if args.source.is_file() else Config(per_second=1e9)  # photographs were not taken at any rate
     return msgspec.structs.replace(config, every_frame=args.every_frame)
 
 
-def _chosen(args: argparse.Namespace, photographs: Path | None) -> Source:
+def _chosen(args: argparse.Namespace, photographs: Path | None, tell: Tell) -> Source:
     """The keyframes of a recording; with --views N so many, evenly spread."""
-    choice = choose(_stream(args.source), _selection(args), Limits(), max(MOST, args.views or 0))
+    choice = choose(_looked_through(args.source, tell), _selection(args), Limits(), max(MOST, args.views or 0))
     frames = choice.keyframes
     if args.views:
         if args.views > len(frames):

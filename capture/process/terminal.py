@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+import shutil
 import sys
 import threading
 from collections.abc import Iterator
@@ -25,10 +26,12 @@ def shown_as_text() -> Iterator[None]:
     before = sys.stdout, sys.stderr
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
         sys.stdout.reconfigure(errors="backslashreplace")  # a name that a terminal cannot show costs no result
-    sys.stdout, sys.stderr = (stream and _Shown(stream) for stream in before)  # None where it is closed
+    line = _LineInPlace()
+    sys.stdout, sys.stderr = (stream and _Shown(stream, line) for stream in before)  # None where it is closed
     try:
         yield
     finally:
+        line.end()
         sys.stdout, sys.stderr = before
 
 
@@ -42,24 +45,60 @@ def say(line: object, *, error: bool = False) -> None:
     print(escaped(str(line)), file=sys.stderr if error else sys.stdout, flush=True)
 
 
+def in_place() -> bool:
+    """Whether `progress` shows anything: standard error is a terminal."""
+    return isinstance(sys.stderr, _Shown) and sys.stderr.beneath.isatty()
+
+
 def progress(text: str) -> None:
-    """Shows `text` on standard error in place of the last one, where that is a terminal; the empty text ends it."""
-    stream = beneath(sys.stderr)
-    if stream is not None and stream.isatty():
-        stream.write(f"\r{escaped(text)}" if text else "\n")
-        stream.flush()
+    """Shows `text` on standard error in place of the last one, where that is a terminal; the empty text ends it.
+
+    Whatever else is printed ends it, too.
+    """
+    if isinstance(sys.stderr, _Shown) and in_place():
+        sys.stderr.line.show(sys.stderr.beneath, escaped(text))
+
+
+class _LineInPlace:
+    """The one line of the terminal that is written again and again."""
+
+    def __init__(self) -> None:
+        self._stream: Any = None  # that the line is on while there is one
+        self._length = 0
+        self._writing = threading.Lock()
+
+    def show(self, stream: Any, text: str) -> None:
+        """Writes `text` over the last one, cut to the width of the terminal: a wrapped line could not be replaced."""
+        if not text:
+            self.end()
+            return
+        with self._writing:
+            text = text[: shutil.get_terminal_size().columns - 1]
+            stream.write(f"\r{text.ljust(self._length)}")
+            stream.flush()
+            self._stream, self._length = stream, len(text)
+
+    def end(self) -> None:
+        """What comes next begins on a line of its own."""
+        with self._writing:
+            if self._stream is not None:
+                self._stream.write("\n")
+                self._stream.flush()
+            self._stream, self._length = None, 0
 
 
 class _Shown:
     """A text stream. It has no descriptor and is no terminal: nobody may write past it, nor colour what it shows."""
 
-    def __init__(self, stream: Any) -> None:
-        self.beneath = stream
+    def __init__(self, stream: Any, line: _LineInPlace) -> None:
+        self.beneath, self.line = stream, line
         self.encoding, self.errors = stream.encoding, stream.errors
         self._writing = threading.Lock()
         self._line_begins = True
 
     def write(self, text: str) -> int:
+        if text:
+            self.line.end()
         with self._writing:
             lines = "\n".join(escaped(line) for line in text.split("\n"))
             marked = _PRIORITY.sub(" ", lines if self._line_begins else f"\x00{lines}").removeprefix("\x00")

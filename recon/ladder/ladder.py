@@ -61,7 +61,8 @@ def climbed(
             continue
         other = estimate_cameras(means.graph, rejected, means.config, pause)
         estimate = better(estimate, other)
-        log.info("%s: %s in %.1f s", rung.name, other.verdict.code.value, time.monotonic() - began)
+        gained = "more photographs found their place" if estimate is other else "nothing gained"
+        log.info("looked for more matches: %s: %s in %.1f s", rung.name, gained, time.monotonic() - began)
         tried.append(rung.name)
     return _telling(estimate, {"Also tried": tried, "Not tried": not_tried})
 

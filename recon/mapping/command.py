@@ -15,8 +15,8 @@ import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.process.printable import printable_name
-from splatnode.capture.process.terminal import progress, say
+from splatnode.capture.process.progress import Told, told_to_nobody
+from splatnode.capture.process.terminal import in_place, progress, say
 from splatnode.recon.config import Config
 from splatnode.recon.mapping.scenes import (
     KEYFRAME_BYTES,
@@ -44,16 +44,14 @@ def replay_map(args: argparse.Namespace, config: Config) -> int:
     if given:
         raise ValueError(f"--map makes many scenes and does not go with what is about one: {', '.join(given)}")
     check_begun(args.out)
-    if not args.json:
-        say(f"choosing keyframes of {printable_name(args.source.name)}")
-    source = recording(args)
-    if not args.json:
-        say(str(source.choice))
+    tell = told_to_nobody if args.json else Told()
+    source = recording(args, tell)
+    tell(str(source.choice))
     began_s = time.monotonic()
     with result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):
         frames = _kept(source, args.out) if source.is_video else source.frames()
         logging.getLogger("splatnode").setLevel(logging.WARNING)  # what is told of each step would be too much
-        told = _Told(args.json, len(source.choice.names))
+        told = _ToldOfMap(args.json, len(source.choice.names))
         make_scenes(frames, source.identity(config), node_config(config, args.out), told)
         progress("")
         reports = write_maps(args.out, args.out, partial(most, args), quiet=args.json)
@@ -67,7 +65,7 @@ def replay_map(args: argparse.Namespace, config: Config) -> int:
     return EXIT_GOOD if reports else EXIT_REFUSED
 
 
-class _Told:
+class _ToldOfMap:
     """Says how far the work is: on a terminal again and again, else whenever a scene is final."""
 
     def __init__(self, quiet: bool, keyframes: int) -> None:
@@ -77,8 +75,8 @@ class _Told:
         if self._quiet:
             return
         line = f"{now} ({self._keyframes} keyframes in all)"
-        progress(f"{line}   ")
-        if (now.final, now.maps) != self._last:
+        progress(line)
+        if not in_place() and (now.final, now.maps) != self._last:
             self._last = now.final, now.maps
             say(line)
 

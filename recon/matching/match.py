@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.progress import Step, Tell, told_to_nobody
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import features, pair_matching
 from splatnode.recon.matching.candidates import to_glance_at
@@ -42,17 +43,30 @@ def match(
     keyframes: Iterable[Keyframe],
     config: Config,
     matcher: Matcher | None = None,
-    pause: Callable[[], None] = lambda: None,
     until: float = math.inf,
+    tell: Tell = told_to_nobody,
 ) -> ViewGraph:
-    """The complete view graph of the keyframes. `pause` may raise to abandon the work; `until` as for `completed`."""
+    """The complete view graph of the keyframes. `until` as for `completed`; `tell` hears how far it is."""
     graph = ViewGraph(config)
     for keyframe in keyframes:
         graph = graph.with_keyframe(keyframe)
-    for further in completed(graph, matcher, until):
-        pause()
+    for further in _told(completed(graph, matcher, until), tell):
         graph = further
     return graph
+
+
+def _told(graphs: Iterable[ViewGraph], tell: Tell) -> Iterator[ViewGraph]:
+    """The graphs of `completed`, each of which is told. What is still to match is asked once a round: it takes long."""
+    what, plain, of, weak = "photograph pair", -1, 0, 0
+    for graph in graphs:
+        if len(graph.plain) > plain:
+            plain = len(graph.plain)
+            of = of if plain < of else plain + len(graph.to_match())
+            if of:
+                tell(Step("matching", plain, of, what))
+        elif weak := weak or len(graph.to_tilt()):
+            tell(Step("matching weak pairs again", len(graph.tilted), weak, what))
+        yield graph
 
 
 def matched_soon(graph: ViewGraph, matcher: Matcher | None) -> Iterator[ViewGraph]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Annotated
 
@@ -67,12 +67,19 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def refine(
-    scene: Scene, config: Config, *, seed: int, deadline: float | None = None, max_gaussians: int | None = None
+    scene: Scene,
+    config: Config,
+    *,
+    seed: int,
+    deadline: float | None = None,
+    max_gaussians: int | None = None,
+    gone_on: Callable[[int], None] = lambda done: None,
 ) -> Iterator[Scene]:
     """The scene at every checkpoint and at the end, after at most `config.iterations` steps of one view each.
 
     `deadline` is a time of `time.monotonic()`: the step sizes fall so that they are at their end by then.
-    `max_gaussians` is how many there may be at the end; it is for the control to see to that.
+    `max_gaussians` is how many there may be at the end; it is for the control to see to that. `gone_on` hears after
+    each step how many are done.
     The first view stays where it is: it is the world. All is computed on the device of the scene's Gaussians, except
     that random numbers are drawn on the processor: they are the same everywhere.
     """
@@ -91,6 +98,7 @@ def refine(
         queue = queue or order.permutation(len(scene.views)).tolist()
         with single_torch_thread():
             fit.step(queue.pop(), progress)
+        gone_on(iteration + 1)
         if iteration + 1 in config.checkpoints and iteration + 1 < config.iterations:
             yield fit.scene()
     yield replace(fit.scene(), losses=tuple(fit.losses))

@@ -43,7 +43,7 @@ def photographs(tmp_path):
 )
 def test_what_cannot_end_well_is_not_begun(photographs, monkeypatch, capsys, arguments, code, said):
     monkeypatch.chdir(photographs.parent)
-    monkeypatch.setattr(cli, "reconstruct", lambda frames, config: pytest.fail("was begun"))
+    monkeypatch.setattr(cli, "reconstruct", lambda *_: pytest.fail("was begun"))
     assert command_line.main(["replay", "photographs", *arguments]) == code
     assert said in capsys.readouterr().err
     assert {path.name for path in photographs.parent.iterdir()} == {"photographs"}
@@ -74,7 +74,7 @@ def replayed(photographs, monkeypatch):
 
     def replay(instead) -> int:
         monkeypatch.chdir(photographs.parent)
-        monkeypatch.setattr(cli, "reconstruct", lambda frames, config: instead())
+        monkeypatch.setattr(cli, "reconstruct", lambda *_: instead())
         return command_line.main(["replay", "photographs", "--out", "new/out"])
 
     return replay
@@ -85,7 +85,7 @@ def test_the_terminal_tells_how_well_the_cameras_are_known(replayed, capsys):
     found = replace(make_snapshot(), images=images, seconds={"total": 3.5}, scale=Scale(True, "a ruler"))
     assert replayed(lambda: [found]) == 0
     known = "directions to 0.1 degrees, positions to 2 % of the distance to the scene (2 cm), focal length to 1.5 %"
-    assert f"\ncameras: {known} (95 % bounds)\n" in capsys.readouterr().out
+    assert f"\nhow well the cameras are known: {known} (95 % bounds)\n" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (SystemExit(0), None), (OSError(5, "x"), 74)])

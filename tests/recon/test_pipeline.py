@@ -12,6 +12,7 @@ from msgspec.structs import replace
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.process.progress import Step, Tell, told_to_nobody
 from splatnode.recon.config import PREVIEW, Config
 from splatnode.recon.evaluate.appearance import Splats
 from splatnode.recon.evaluate.camera_errors import camera_errors
@@ -58,13 +59,19 @@ def three() -> list[Frame]:
 
 
 @pytest.fixture(scope="module")
-def quick() -> Snapshot:
+def told() -> list[Step | str]:
+    """What was told while `quick` was made."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def quick(told) -> Snapshot:
     """The last snapshot of three photographs, at a quarter of the pixels."""
-    return last(three(), QUICK)
+    return last(three(), QUICK, told.append)
 
 
-def last(frames: Sequence[Frame | DroppedFrame], config: Config) -> Snapshot:
-    *_, final = reconstruct(frames, config)
+def last(frames: Sequence[Frame | DroppedFrame], config: Config, tell: Tell = told_to_nobody) -> Snapshot:
+    *_, final = reconstruct(frames, config, tell)
     return final
 
 
@@ -86,6 +93,18 @@ def held_out_psnr(snapshot: Snapshot, index: int) -> float:
     aligned = find_test_pose(Splats(snapshot.gaussians, rasterize), image, start, K, steps=60, levels=2)
     rendered = render_rgb(snapshot.gaussians, aligned.T_world_camera, K, SMALL.width, SMALL.height)
     return psnr(torch.from_numpy(rendered), image)
+
+
+def test_who_waits_hears_what_is_done_in_order_and_of_each_photograph_once(quick, told):
+    assert quick.verdict.publishable
+    doing = dict.fromkeys(step.doing for step in told if isinstance(step, Step))
+    wanted = ["finding points to match", "matching", "finding and checking the cameras", "estimating depth"]
+    assert [step for step in doing if step != "matching weak pairs again"] == [*wanted, "refining the scene"]
+    names = [frame.name for frame in three()]
+    said = [line for line in told if isinstance(line, str)]
+    assert said == [f"{place} of 3: {name} shares points with 2 others" for place, name in enumerate(names, start=1)]
+    steps = [step.done for step in told if isinstance(step, Step) and step.doing == "refining the scene"]
+    assert steps == list(range(1, quick.iterations + 1))
 
 
 def test_a_stream_gives_a_snapshot_after_every_frame_and_at_every_checkpoint(streamed):

@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from splatnode.capture.process.terminal import beneath, progress, shown_as_text
+from splatnode.capture.process.terminal import beneath, progress, say, shown_as_text
 from tests.conftest import ROOT
 from tests.support.hostile import TEXTS, unprintable
 
@@ -51,6 +51,20 @@ def test_progress_is_for_a_terminal_and_goes_back_to_the_begin_of_its_line(monke
             progress("")
             assert not sys.stderr.isatty() and beneath(sys.stderr) is stream
         assert stream.getvalue() == expected
+
+
+def test_what_is_printed_after_progress_begins_a_line_of_its_own(monkeypatch):
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stdout", screen)
+    monkeypatch.setattr(sys, "stderr", screen)
+    monkeypatch.setenv("COLUMNS", "12")
+    with shown_as_text():
+        progress("a: 1 of 10 photographs")
+        progress("a: 2 of 10")
+        progress("b")
+        say("found")
+        progress("c")
+    assert screen.getvalue() == "\ra: 1 of 10 \ra: 2 of 10 \rb         \nfound\n\rc\n"
 
 
 def test_a_process_without_standard_output_prints_nothing(monkeypatch):

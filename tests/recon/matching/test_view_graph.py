@@ -156,6 +156,14 @@ def test_out_of_time_no_pair_is_matched_with_tilted_features(compared):
     assert compared == [("A2", "a1")] and not whole.pending and not whole.tilted
 
 
+def test_who_waits_hears_how_many_pairs_are_matched_and_how_many_weak_ones_again(compared):
+    told = []
+    match([keyframe(name) for name in ("a", "b", "A")], matching.Config(), tell=lambda step: told.append(str(step)))
+    matched = [f"matching: {done} of 3 photograph pairs" for done in (1, 2, 3)]
+    assert told[:3] == matched and told[-1] == "matching weak pairs again: 3 of 3 photograph pairs"
+    assert all(line.startswith("matching weak pairs again") for line in told[3:])
+
+
 def test_pairs_from_elsewhere_stay_when_a_keyframe_comes(compared):
     before = {(0, 1): Verified(range(77), ("a1", "a2"))}
     graph: Any = ViewGraph(matching.Config(), (keyframe("a1"), keyframe("a2")), before)
