@@ -16,30 +16,19 @@ from pathlib import Path
 from splatnode.capture.cameras import v4l2
 from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.network import Network, runtime_directory
+from splatnode.capture.process.packages import EXTRAS, REQUIRED
 from splatnode.capture.process.terminal import say
 from splatnode.recon import core
 from splatnode.recon.core.compile import find_compiler
 
 _UDEV_RULES = Path("/etc/udev/rules.d")
 
-# Import name -> distribution.
-REQUIRED = {
-    "cv2": "opencv-contrib-python-headless",
-    "msgspec": "msgspec",
-    "numpy": "numpy",
-    "scipy": "scipy",
-    "torch": "torch",
-    "yaml": "pyyaml",
-    "zmq": "pyzmq",
-}
-
-# Import name -> (distribution, the extra that brings it, what it is for).
-OPTIONAL = {
-    "matplotlib": ("matplotlib", "bench", "charts of splatnode bench"),
-    "pycolmap": ("pycolmap", "bench", "true cameras in COLMAP's format, and COLMAP as a rival"),
-    "open3d": ("open3d", "viewer", "the viewer"),
-    "depthai": ("depthai", "oak", "Luxonis cameras"),
-    "gsplat": ("gsplat", "cuda", "the rasteriser for NVIDIA processors"),
+OPTIONAL = {  # Import name, which is the distribution's too -> what it is for.
+    "matplotlib": "charts of splatnode bench",
+    "pycolmap": "true cameras in COLMAP's format, and COLMAP as a rival",
+    "open3d": "the viewer",
+    "depthai": "Luxonis cameras",
+    "gsplat": "the rasteriser for NVIDIA processors",
 }
 
 
@@ -69,7 +58,7 @@ def findings() -> list[Finding]:
         *(_required(module, distribution) for module, distribution in REQUIRED.items()),
         _poselib(),
         _gpu(),
-        *(_optional(module, *about) for module, about in OPTIONAL.items()),
+        *(_optional(module, purpose) for module, purpose in OPTIONAL.items()),
         *(_lpips(network) for network in ("alex", "vgg")),
         *_learned_parts(),
         _cameras(),
@@ -108,10 +97,10 @@ def _required(module: str, distribution: str) -> Finding:
     return Finding(module, "missing", f"Run: pip install {distribution}")
 
 
-def _optional(module: str, distribution: str, extra: str, purpose: str) -> Finding:
+def _optional(module: str, purpose: str) -> Finding:
     if importlib.util.find_spec(module):
-        return Finding(module, "ok", _version(distribution))
-    return Finding(module, "optional", f"not installed; for {purpose} (the extra named {extra} brings it)")
+        return Finding(module, "ok", _version(module))
+    return Finding(module, "optional", f"not installed; for {purpose} (the extra named {EXTRAS[module]} brings it)")
 
 
 def _poselib() -> Finding:

@@ -27,7 +27,7 @@ from splatnode.recon.verification.verify import verify, verify_further
 # that were taken for this one had up to 20.
 MIN_CONFIRMED_POINTS = 50
 PROVISIONALLY_WIDER = 2.0  # factor of a provisional estimate's bounds, whose sources are quick or taken over
-PROVISIONAL = "For now: all evidence is weighed when no keyframe waits."
+PROVISIONAL = "Provisional: checked again with all evidence when the camera rests."
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,8 @@
 """The command line. Each room lists its verbs in its `verbs.py`; the rest of a room is imported when one of them runs.
 
 Exit codes: 0 good; 2 usage or configuration; 65 the frames cannot be reconstructed (the verdict says why);
-69 camera or package unavailable; 70 internal; 73, 74 cannot write; 75 try again; 77 not allowed; 130 interrupted.
+69 camera or package unavailable; 70 internal; 73, 74 cannot write; 75 try again; 77 not allowed; 130 interrupted;
+141 nobody reads what is printed any more, as after `| head`.
 A daemon that has been ready ends with none of 2 and 77: what fails then is no fault of its configuration.
 SIGTERM is a clean stop with 0; the second one ends the process at once.
 """
@@ -24,9 +25,10 @@ import splatnode.recon.verbs
 import splatnode.viewer.verbs
 from splatnode.capture.process.logs import use_plain_lines
 from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
+from splatnode.capture.process.packages import remedy
 from splatnode.capture.process.printable import printable, printable_lines
 from splatnode.capture.process.stop_signals import on_first
-from splatnode.capture.process.terminal import shown_as_text
+from splatnode.capture.process.terminal import nobody_reads, shown_as_text
 
 # libgomp's threads spin while they wait. On a robot's busy processor that doubles the time of torch's operations.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -34,6 +36,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # What OpenCV warns of, a damaged photograph, is said with the name of that photograph.
 os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+
+_NOBODY_READS = 128 + signal.SIGPIPE  # as a shell says of a program that a closed pipe ended
 
 VERBS = (*splatnode.recon.verbs.VERBS, *splatnode.viewer.verbs.VERBS, *splatnode.capture.verbs.VERBS)
 
@@ -64,6 +68,8 @@ def _run(argv: Sequence[str] | None) -> int:
         print(end="", flush=True)  # where there is a standard output
         return code
     except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, BrokenPipeError) and nobody_reads():
+            return _NOBODY_READS
         if stopping.is_set():  # a package that was being imported makes an ImportError of the exit
             return 0
         if args.debug:
@@ -127,7 +133,7 @@ def _explained(error: BaseException, code: int) -> str:
     if isinstance(error, OSError) and error.strerror:
         return error.strerror if error.filename is None else f"{error.strerror}: {_file(error.filename)}"
     if isinstance(error, ModuleNotFoundError):
-        return f"{error}. ./run in place of splatnode installs what it needs; or run: pip install 'splatnode[bench]'"
+        return f"{error}. {remedy(error.name or '')}"
     if code == 70:
         return f"internal error: {type(error).__name__}: {error} (--debug shows where; splatnode doctor may tell why)"
     return str(error)

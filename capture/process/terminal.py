@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 import re
+import select
 import shutil
 import sys
 import threading
@@ -43,6 +45,25 @@ def beneath(stream: Any) -> Any:
 def say(line: object, *, error: bool = False) -> None:
     """Prints `line` on standard output or error; a line break in it, which a name may have, is shown as an escape."""
     print(escaped(str(line)), file=sys.stderr if error else sys.stdout, flush=True)
+
+
+def nobody_reads() -> bool:
+    """Whether standard output or error is a pipe whose reader has gone. From then on what they get is dropped."""
+    closed = [stream for stream in (sys.stdout, sys.stderr) if stream is not None and _is_closed_pipe(stream)]
+    for stream in closed:
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, beneath(stream).fileno())  # what was not written yet goes there at the end of the process
+        os.close(nowhere)
+    return bool(closed)
+
+
+def _is_closed_pipe(stream: Any) -> bool:
+    poller = select.poll()
+    try:
+        poller.register(beneath(stream).fileno(), 0)  # an end without another end is told in any case
+    except (OSError, ValueError):  # it has no descriptor
+        return False
+    return bool(poller.poll(0))
 
 
 def in_place() -> bool:

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from splatnode import command_line
+from splatnode.capture.process import packages
 from splatnode.capture.process.verb import Verb
 from splatnode.recon.result.export import ResultWriteError
 from splatnode.recon.result.export.format import format_names
@@ -54,6 +55,7 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.capture.process.foreign",
         "splatnode.capture.process.logs",
         "splatnode.capture.process.memory_shortage",
+        "splatnode.capture.process.packages",
         "splatnode.capture.process.printable",
         "splatnode.capture.process.stop_signals",
         "splatnode.capture.process.terminal",
@@ -96,6 +98,48 @@ def test_an_error_is_one_line_and_a_code(monkeypatch, capsys, error, code):
     assert said.startswith("splatnode: ") and said.count("\n") == 1
     if not isinstance(error, KeyboardInterrupt):
         assert (getattr(error, "strerror", None) or str(error)) in said
+
+
+def test_a_missing_module_is_told_with_what_brings_it(monkeypatch, capsys):
+    for module, brought in {**packages.EXTRAS, **packages.REQUIRED}.items():
+        error = ModuleNotFoundError(f"No module named '{module}'", name=f"{module}.part")
+        assert run_verb(monkeypatch, raising(error)) == 69
+        named = f"'splatnode[{brought}]'" if module in packages.EXTRAS else brought
+        assert f"No module named '{module}'. " in (said := capsys.readouterr().err) and f"pip install {named}" in said
+    assert run_verb(monkeypatch, raising(ModuleNotFoundError("No module named 'x'", name="x"))) == 69
+    assert "pip install" not in (said := capsys.readouterr().err) and "./run in place of splatnode" in said
+
+
+def test_what_brings_a_module_is_what_the_project_says():
+    from importlib.metadata import requires
+
+    extras = {}
+    for line in requires("splatnode") or ():
+        if "extra ==" in line:
+            extras.setdefault(re.split(r"[<>=!~ \[;]", line)[0].lower(), set()).add(
+                line.split("extra ==")[1].strip(" '\"")
+            )
+    bringing = {module: extras.get(module, set()) - {"dev"} for module in packages.EXTRAS}
+    assert bringing == {module: {extra} for module, extra in packages.EXTRAS.items()}
+    assert {module for module, brought in extras.items() if brought - {"dev"}} == set(packages.EXTRAS)
+
+
+@pytest.mark.parametrize("to", ["1", "2"])
+def test_when_nobody_reads_any_more_nothing_is_said(to):
+    program = (
+        "import sys\nfrom splatnode import command_line\nfrom splatnode.capture.process.terminal import say\n"
+        "from splatnode.capture.process.verb import Verb\n"
+        f"act = lambda args: [say('line', error={to == '2'}) for _ in range(100000)] and 0\n"
+        "command_line.VERBS = (Verb('act', '', lambda parser: None, act),)\n"
+        "sys.exit(command_line.main(['act']))"
+    )
+    piped = f'{{ "{sys.executable}" -c "$0" {"2>&1 >/dev/null" if to == "2" else ""}; echo $? >&3; }} | head -n 1'
+    read, write = os.pipe()
+    command = ["bash", "-c", f"exec 3>&{write}; {piped}", program]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, pass_fds=(write,), check=False)
+    os.close(write)
+    with os.fdopen(read) as codes:
+        assert (codes.read(), done.stdout, done.stderr) == ("141\n", "line\n", "")
 
 
 def test_debug_shows_the_traceback(monkeypatch, capsys):
