@@ -13,6 +13,7 @@ from importlib import import_module
 from splatnode.capture import cameras, daemon
 from splatnode.capture.config import CaptureConfig, is_live, open_stream
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.last_run import last_run
 from splatnode.capture.messaging import keys as key_files
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import load_config, read_yaml, typed
@@ -21,18 +22,11 @@ from splatnode.capture.process.terminal import say
 from splatnode.capture.reader import Reader, State
 from splatnode.capture.recording import Recorder
 from splatnode.capture.status import heartbeats, say_seen
+from splatnode.capture.status_words import described
 
 log = logging.getLogger(__name__)
 
 EXIT_GOOD, EXIT_SILENT = 0, 75
-NOT_PRINTED = {
-    "session",
-    "sequence",
-    "mono_ns",
-    "type",
-    "state",
-    "tracked",
-}  # fields of a heartbeat that tell a user nothing
 
 
 def capture(args: argparse.Namespace) -> int:
@@ -109,33 +103,24 @@ def keys(args: argparse.Namespace) -> int:
 
 
 def status(args: argparse.Namespace) -> int:
-    """Waits for a heartbeat of each process and prints it; 75 where one is silent. `--seen`: what it tells is known."""
+    """Waits for a heartbeat of each process and prints it; 75 where one is silent. `--seen`: what it tells is known.
+
+    A capture that has come to the end of its recording is not silent.
+    """
     network = typed(read_yaml(args.config).get("network") or {}, Network, "network") if args.config else Network()
     found = heartbeats(network)
+    ended = last_run(network) if found["capture"] is None else None
     if args.json:
         print(json.dumps(found))
     else:
         for room, fields in found.items():
-            for line in _described(room, fields):
+            silent = f"{room}: silent; is splatnode {room} running, with the same network?"
+            if room == "capture" and ended is not None:
+                silent = f"{room}: {ended}"
+            for line in [silent] if fields is None else described(room, fields):
                 say(line)
     if args.seen:
         for room, answer in say_seen(network, [room for room, fields in found.items() if fields]).items():
             say(f"{room}: {answer}")
-    return EXIT_GOOD if all(found.values()) else EXIT_SILENT
-
-
-def _described(room: str, fields: dict[str, object] | None) -> list[str]:
-    if fields is None:
-        return [f"{room}: silent; is splatnode {room} running, with the same network?"]
-    lines = [f"{room}: {fields.get('state', 'running')}"]
-    for key, value in fields.items():
-        if key not in NOT_PRINTED and value not in ("", None, []):
-            shown = "; ".join(map(_shown, value)) if isinstance(value, list) else _shown(value)
-            lines.append(f"  {key.replace('_', ' '):20}{shown}")
-    return lines
-
-
-def _shown(value: object) -> str:
-    if isinstance(value, dict) and {"name", "reason"} <= value.keys():  # a keyframe that was set aside
-        return f"{value['name']}: {value['reason']}"
-    return f"{value:.1f}" if isinstance(value, float) else str(value)
+    heard = {room: bool(fields) for room, fields in found.items()} | ({"capture": True} if ended else {})
+    return EXIT_GOOD if all(heard.values()) else EXIT_SILENT

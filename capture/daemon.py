@@ -12,6 +12,7 @@ import cv2
 
 from splatnode.capture.config import CaptureConfig, is_live, open_stream
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.last_run import begin_run, end_run
 from splatnode.capture.messaging.broadcast import Publisher
 from splatnode.capture.messaging.commands import Answer, CommandServer, Seen
 from splatnode.capture.messaging.keyframes import KeyframeServer
@@ -55,7 +56,7 @@ def capture(config: CaptureConfig) -> None:
         camera = config.camera
         reader = resources.enter_context(Reader(lambda: open_stream(camera), is_live(camera), config.reader))
         resources.callback(manager.stopping)
-        event(log, logging.INFO, "started", camera=camera.kind, waiting=server.queued)
+        begin_run(config.network)
         if why := server.spool.shortage():
             event(log, logging.WARNING, "disk_space", problem=why)
         sound_s = math.inf if is_live(camera) else time.monotonic() + SOUND_S  # a live camera proves it by a frame
@@ -64,11 +65,16 @@ def capture(config: CaptureConfig) -> None:
                 item = reader.next(POLL_S)
                 if item is not None or time.monotonic() > sound_s:
                     manager.ready()
+                    session.say_started()
                 session.handle(item, reader.state)
                 session.serve()
                 session.beat(reader)
                 manager.alive(f"{reader.state.value}: {session.frames} frames, {session.keyframes} keyframes")
         event(log, logging.INFO, "finished", frames=session.frames, keyframes=session.keyframes)
+        try:
+            end_run(config.network, session.frames, session.keyframes)
+        except OSError as error:
+            log.warning("splatnode status will not know that this capture finished: %s", error)
 
 
 class _Session:
@@ -79,6 +85,7 @@ class _Session:
         self.frames = self.keyframes = self.unusable = self.dropped = self.not_taken = 0
         self.last_decision = ""
         self._spool_full = ""
+        self._started = False
         self._server = server
         self._selector = Selector(config.selection, config.quality)
         self._problems = Problems()
@@ -88,8 +95,14 @@ class _Session:
         self._preview_numbers = Numbering(server.numbering.session)
         self._heartbeat_numbers = Numbering(server.numbering.session)
         self._next_preview_ns = 0
-        self._started = self._next_beat = time.monotonic()
+        self._began = self._next_beat = time.monotonic()
         self._rate = _Rate()
+
+    def say_started(self) -> None:
+        """Logs, once, that the camera is open and gives frames."""
+        if not self._started:
+            self._started = True
+            event(log, logging.INFO, "started", camera=self.config.camera.kind, waiting=self._server.queued)
 
     def handle(self, item: Frame | DroppedFrame | None, state: State) -> None:
         """Takes or drops what came, if something did. Whatever a frame's content makes fail costs that frame alone."""
@@ -140,7 +153,7 @@ class _Session:
             why=printable(reader.why or self._spool_full or self._shortage()),
             camera=self.config.camera.kind,
             pid=os.getpid(),
-            uptime_s=time.monotonic() - self._started,
+            uptime_s=time.monotonic() - self._began,
             frames=self.frames,
             frames_per_second=self._rate.per_second(),
             keyframes=self.keyframes,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -28,6 +29,7 @@ Image = npt.NDArray[np.uint8]
 FRAMES_PER_S = 25
 _LIVE = "live.png"
 _WAIT_S = 0.1
+_PATIENCE_S = 1.0  # without a word
 
 
 def write_series(moment: Moment, folder: Path, width: int, height: int, frames: int) -> Path:
@@ -98,7 +100,7 @@ def keep_picture(
 
     A moment that comes while another one is painted replaces those that wait: nothing piles up.
     """
-    for moment in _moments(source):
+    for moment in _moments(source, say):
         started = time.perf_counter()
         picture = overview_picture(analyse(moment), width, height)
         write_file(folder / _LIVE, encode_png(picture))
@@ -108,12 +110,19 @@ def keep_picture(
             return
 
 
-def _moments(source: Source) -> Iterator[Moment]:
+def _moments(source: Source, say: Callable[[str], None]) -> Iterator[Moment]:
+    """Those that come; says what it waits for before the first one, after a second and when the node is heard of."""
+    began_s, came, told = time.monotonic(), False, ""
     while True:
         moment = source.take()
         if moment is not None:
+            came = True
             yield moment
         elif source.age_s is None:
             return
         else:
+            line = words.waiting_line(source.age_s if source.age_s == math.inf else 0.0)
+            if not came and line != told and time.monotonic() - began_s >= _PATIENCE_S:
+                told = line
+                say(line)
             time.sleep(_WAIT_S)

@@ -92,7 +92,7 @@ def feed_line(age_s: float | None, final: bool) -> str:
     if age_s is None:
         return "a finished result"
     if age_s == float("inf"):
-        return "waiting for the node: nothing has come yet"
+        return "waiting for splatnode recon: nothing has come yet"
     if final:
         return "the scene is finished"
     if age_s > _STALE_S:
@@ -103,7 +103,7 @@ def feed_line(age_s: float | None, final: bool) -> str:
 def waiting_line(age_s: float | None) -> str:
     """What there is to say before there is a scene."""
     if age_s is not None and age_s <= _STALE_S:
-        return "the node is there: waiting for its first scene"
+        return "splatnode recon is there: waiting for its first scene"
     return feed_line(age_s, final=False)
 
 

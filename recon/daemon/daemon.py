@@ -202,7 +202,7 @@ class Daemon:
         scenes, maps, loops = worker.known
         return ReconStatus(
             **self._numbering.next(),
-            state=State.FULL if intake.full else worker.place.state,
+            state=State.FULL if intake.full else State.LOADING if worker.loading else worker.place.state,
             uptime_s=time.monotonic() - self._started_s,
             scene_id=self._store.scene_id,
             keyframe=intake.newest,

@@ -10,6 +10,7 @@ from splatnode.recon.result.message import CameraRecord
 
 
 class State(enum.Enum):
+    LOADING = "loading"  # what an earlier process knew, after a start
     WAITING = "waiting"  # until there are keyframes enough for a scene
     GROWING = "growing"  # adds keyframes to the scene
     REFINING = "refining"  # no keyframe is waiting: the scene is built anew from all of them and optimised

@@ -49,6 +49,7 @@ class Worker:
         self.problem = ""
         self.moved_s = time.monotonic()  # when the work last got on
         self.rests = 0  # how often there was nothing to do
+        self.loading = len(store.names)  # keyframes of an earlier process that are not known again yet
 
     @property
     def unfinished(self) -> int:
@@ -69,6 +70,8 @@ class Worker:
     @property
     def delay(self) -> tuple[float, str]:
         """How long the oldest keyframe has waited that no scene shows yet, seconds, and what it waits for."""
+        if self.loading:
+            return time.monotonic() - self._quiet_since_s, f"{self.loading} keyframes are being loaded"
         under_way, waiting = list(self.place.under_way), len(self._inbox)
         oldest_s = under_way[0].at_s if under_way else self._inbox.oldest_s
         if oldest_s is None:
@@ -78,6 +81,7 @@ class Worker:
     def run(self) -> None:
         """Until the daemon stops; an export that has begun is finished. Raises MemoryError and the like."""
         found = self._restored()
+        self.loading = 0
         if found is not None:
             self._guarded(lambda: self.place.go_on(found))
         while not self._stopping.is_set():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -21,6 +22,7 @@ from splatnode.capture.cameras import folder
 from splatnode.capture.config import Camera, CaptureConfig
 from splatnode.capture.daemon import capture
 from splatnode.capture.frame import Frame
+from splatnode.capture.last_run import last_run
 from splatnode.capture.messaging.broadcast import Subscriber
 from splatnode.capture.messaging.keyframe_messages import FrameHeader
 from splatnode.capture.messaging.keyframes import KeyframeClient
@@ -282,3 +284,31 @@ def test_a_camera_that_fails_after_it_gave_frames_is_no_fault_of_the_configurati
     )
     with pytest.raises(Failed, match="half way"):
         capture(config)
+
+
+def test_status_tells_a_capture_that_has_finished_from_one_that_is_silent(tmp_path, start):
+    """Until another one begins."""
+    command = [sys.executable, "-m", "splatnode", "status", "--config", str(tmp_path / "capture.yaml")]
+    process = start()
+    items = take_all(tmp_path, process)
+    assert process.wait(60) == 0 and "event=started" in process.stderr.read()
+    told = subprocess.run(command, cwd=ROOT, capture_output=True, text=True).stdout
+    keyframes = sum(isinstance(item, Frame) for item in items)
+    assert re.search(
+        rf"^capture: finished at \d\d:\d\d:\d\d: recon has answered all of its {keyframes} keyframes", told
+    )
+    assert "recon: silent" in told
+    start(", loops: 1000")
+    wait_for(lambda: heartbeats(network(tmp_path))["capture"])
+    assert last_run(network(tmp_path)) is None
+
+
+def test_a_capture_without_its_camera_never_says_that_it_started(tmp_path):
+    config = tmp_path / "capture.yaml"
+    config.write_text(
+        f"camera: {{kind: v4l2, device: {tmp_path / 'no camera'}}}\n"
+        f"spool: {{directory: {tmp_path / 'state'}}}\nnetwork: {{directory: {tmp_path / 'run'}}}\n"
+    )
+    command = [sys.executable, "-m", "splatnode", "capture", str(config)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 69 and "no camera at" in done.stderr and "event=started" not in done.stderr

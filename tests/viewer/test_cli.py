@@ -283,6 +283,33 @@ def test_a_node_is_watched_without_a_display(node, tmp_path, monkeypatch, capsys
     assert given_up == [1, 1, 5]  # one thread, and only what the node leaves
 
 
+def test_a_viewer_that_waits_says_for_what(node, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(cli, "_give_way", lambda: None)
+    server, network = node
+    config = tmp_path / "node.yaml"
+    config.write_text(f"network: {{directory: {network.directory}}}\n")
+    said = []
+
+    def say(line):
+        said.append(line)
+        if len(said) == 1:  # only now there is a scene
+            server.publish(*to_message(snapshot(), "place", Numbering().next()))
+
+    monkeypatch.setattr(cli, "say", say)
+    arguments = [
+        "view",
+        str(config),
+        "--headless",
+        "--until-final",
+        "--size",
+        "160x120",
+        "--out",
+        str(tmp_path / "out"),
+    ]
+    assert command_line.main(arguments) == 0
+    assert said[0] == "waiting for splatnode recon: nothing has come yet" and "live.png: OK" in said[-1]
+
+
 def test_the_viewer_starts_without_torch_and_without_open3d(result, tmp_path):
     code = (
         "import sys; sys.modules['torch'] = sys.modules['open3d'] = None; from splatnode import command_line; "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -245,6 +246,19 @@ def test_a_stored_frame_that_cannot_be_used_costs_no_other(tmp_path, monkeypatch
     assert [keyframe.name for keyframe in restored.new] == ["0.png", "2.png"]
     assert store.names == {"0.png", "2.png"} and store.dropped[0].name == "1.png"
     store.close()
+
+
+def test_while_a_checkpoint_is_loaded_the_status_says_so(config, monkeypatch):  # noqa: F811
+    with contextlib.closing(Store(config.checkpoint)) as store:
+        for index in range(2):
+            store.put(SimpleNamespace(session="0" * 32, sequence=index, frame=frame(index)))
+    restore, go_on = checkpoint.restore, threading.Event()
+    monkeypatch.setattr(checkpoint, "restore", lambda *given: go_on.wait(60) and restore(*given))
+    with running(config):
+        status = wait_for(lambda: heartbeats(config.network)["recon"])
+        assert (status["state"], status["delay"]) == ("loading", "2 keyframes are being loaded")
+        go_on.set()
+        wait_for(lambda: heartbeats(config.network)["recon"]["state"] != "loading")
 
 
 def test_a_checkpoint_that_there_is_no_memory_for_is_left_as_it_is(tmp_path, monkeypatch):

@@ -1,0 +1,70 @@
+"""What `splatnode status` prints of a heartbeat, in plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+
+def _seconds(value: Any) -> str:
+    return f"{value:.0f} s"
+
+
+def _megabytes(value: Any) -> str:
+    return f"{value:.1f} MB"
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, dict) and {"name", "reason"} <= value.keys():  # a keyframe that was set aside
+        return f"{value['name']}: {value['reason']}"
+    return f"{value:.1f}" if isinstance(value, float) else str(value)
+
+
+# Field of a heartbeat -> what it is called, and how its value is written; other fields go by their names.
+_WORDS: Mapping[str, tuple[str, Callable[[Any], str]]] = {
+    "uptime_s": ("running for", _seconds),
+    "rss_mb": ("memory", _megabytes),
+    # capture's
+    "pid": ("process", _plain),
+    "unusable": ("blurred, dark, copies", _plain),
+    "dropped": ("not readable", _plain),
+    "skipped": ("no time for", _plain),
+    "not_taken": ("no room for", _plain),
+    "waiting": ("waiting for recon", _plain),
+    "waiting_mb": ("waiting for recon", _megabytes),
+    "acknowledged": ("taken by recon", _plain),
+    # recon's
+    "scene_id": ("scene", _plain),
+    "keyframe": ("last keyframe", lambda number: f"number {number}"),
+    "queue": ("waiting", _plain),
+    "keyframes": ("keyframes", _plain),
+    "num_gaussians": ("Gaussians", _plain),
+    "iterations": ("steps of refinement", _plain),
+    "bounds": ("cameras known", _plain),
+    "keyframe_s": ("last shown after", _seconds),
+    "delay_s": ("delay", _seconds),
+    "delay": ("because", _plain),
+    "unfinished": ("places to finish", _plain),
+    "refused": ("refused messages", _plain),
+    "duplicates": ("came again", _plain),
+}
+_NOT_PRINTED = {"session", "sequence", "mono_ns", "type", "state", "tracked"}  # they tell a user nothing
+_NOTHING = ("", None, [])
+_LOADING = "loading"  # recon's state in which it knows nothing yet: zeros would pass for what there is
+
+
+def described(room: str, fields: Mapping[str, Any]) -> list[str]:
+    """Lines about the process of this room, by its heartbeat."""
+    state = fields.get("state", "running")
+    lines = [f"{room}: {state}"]
+    for key, value in fields.items():
+        if key in _NOT_PRINTED or value in _NOTHING or (key == "keyframe" and value == -1):
+            continue
+        if state == _LOADING and not value:
+            continue
+        name, written = _WORDS.get(key, (key.replace("_", " "), _plain))
+        shown = "; ".join(map(_plain, value)) if isinstance(value, list) else written(value)
+        lines.append(f"  {name:24}{shown}")
+    return lines

@@ -1,0 +1,48 @@
+"""What `splatnode status` says of a heartbeat."""
+
+from __future__ import annotations
+
+import msgspec
+
+from splatnode.capture.status import CaptureStatus
+from splatnode.capture.status_words import _NOT_PRINTED, _WORDS, described
+from splatnode.recon.daemon.status import ReconStatus
+
+RECON = {"state": "growing", "keyframe": 7, "queue": 17, "delay_s": 240.1, "keyframe_s": 26.4, "camera_moved": False}
+
+
+def test_a_heartbeat_is_told_in_words_with_units():
+    assert described("recon", RECON) == [
+        "recon: growing",
+        "  last keyframe           number 7",
+        "  waiting                 17",
+        "  delay                   240 s",
+        "  last shown after        26 s",
+        "  camera moved            no",
+    ]
+
+
+def test_what_is_not_known_yet_is_not_told():
+    assert described("recon", {"state": "waiting", "keyframe": -1, "keyframe_s": None, "problem": ""}) == [
+        "recon: waiting"
+    ]
+
+
+def test_a_node_that_is_loading_says_so_and_no_zeros():
+    fields = {
+        "state": "loading",
+        "keyframes": 0,
+        "final": False,
+        "delay_s": 2.0,
+        "delay": "25 keyframes are being loaded",
+    }
+    assert described("recon", fields) == [
+        "recon: loading",
+        "  delay                   2 s",
+        "  because                 25 keyframes are being loaded",
+    ]
+
+
+def test_every_field_that_has_words_is_one_of_a_heartbeat():
+    fields = {field.encode_name for status in (CaptureStatus, ReconStatus) for field in msgspec.structs.fields(status)}
+    assert set(_WORDS) <= fields and fields | {"type"} >= _NOT_PRINTED
