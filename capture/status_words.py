@@ -28,18 +28,17 @@ _WORDS: Mapping[str, tuple[str, Callable[[Any], str]]] = {
     "rss_mb": ("memory", _megabytes),
     # capture's
     "pid": ("process", _plain),
-    "unusable": ("blurred, dark, copies", _plain),
-    "dropped": ("not readable", _plain),
-    "skipped": ("no time for", _plain),
-    "not_taken": ("no room for", _plain),
-    "waiting": ("waiting for recon", _plain),
-    "waiting_mb": ("waiting for recon", _megabytes),
-    "acknowledged": ("taken by recon", _plain),
+    "unusable": ("blurred, dark or copied", _plain),
+    "dropped": ("frames not readable", _plain),
+    "skipped": ("frames passed over", _plain),
+    "not_taken": ("keyframes without room", _plain),
+    "waiting": ("keyframes not at recon", _plain),
+    "waiting_mb": ("size of those", _megabytes),
+    "acknowledged": ("keyframes at recon", _plain),
     # recon's
     "scene_id": ("scene", _plain),
     "keyframe": ("last keyframe", lambda number: f"number {number}"),
-    "queue": ("waiting", _plain),
-    "keyframes": ("keyframes", _plain),
+    "queue": ("keyframes waiting", _plain),
     "num_gaussians": ("Gaussians", _plain),
     "iterations": ("steps of refinement", _plain),
     "bounds": ("cameras known", _plain),
@@ -48,7 +47,7 @@ _WORDS: Mapping[str, tuple[str, Callable[[Any], str]]] = {
     "delay": ("because", _plain),
     "unfinished": ("places to finish", _plain),
     "refused": ("refused messages", _plain),
-    "duplicates": ("came again", _plain),
+    "duplicates": ("keyframes come again", _plain),
 }
 _NOT_PRINTED = {"session", "sequence", "mono_ns", "type", "state", "tracked"}  # they tell a user nothing
 _NOTHING = ("", None, [])

@@ -16,6 +16,8 @@ STAYS = 0.5  # of the Gaussians that a scene begins with, after pruning without 
 # What held-out views lacked, in dB of PSNR, where there was less: means of the 2 scenes of `tests.bench budgets`.
 FEWER = ((0.0, 0.0), (1.0, 0.0), (2.0, 0.6), (3.0, 1.3), (4.0, 2.0))  # by how often the Gaussians were halved
 EARLIER = ((0.0, 6.1), (0.05, 1.9), (0.1, 1.0), (0.2, 0.5), (0.4, 0.2), (1.0, 0.0))  # by the share of the iterations
+# From so many dB of PSNR on that new views lack, how a scene looks beside the one without a limit.
+_WORSE = ((0.0, "hardly worse"), (0.1, "a little worse"), (0.5, "noticeably worse"), (2.0, "much worse"))
 WINDOW = 0.2  # of the iterations, at the end, from which the slope of the loss is told
 
 
@@ -28,17 +30,17 @@ class Hit:
     would_take: float  # in the same unit: what the scene would have taken by itself, an estimate
     gain_db: float  # by which new views would then be better, as they were in scenes that were measured
     basis: str  # what the estimate rests on
+    at_least: bool = False  # it would take more than `would_take`
 
     def record(self) -> dict[str, object]:
         """For report.json."""
         code = Code.BUDGET_HIT.value
         unit = {"max_gaussians": "Gaussians", "max_mb": "MB", "budget_s": "s"}[self.limit]
-        bound = f"{self.limit} of {self.given:g} bound the scene, which would take about {self.would_take:.7g} {unit}"
-        beyond = self.limit != "budget_s" and self.gain_db >= FEWER[-1][1]  # fewer than were ever measured
-        gain = f"{'at least' if beyond else 'about'} {self.gain_db:.1f} dB of PSNR"
-        gain = gain if self.gain_db >= 0.1 else "sharpness, but hardly PSNR"
+        worse = next(words for least, words in reversed(_WORSE) if self.gain_db >= least)
+        about = "more than" if self.at_least else "about"
         message = (
-            f"{code}: {bound} by itself ({self.basis}). New views would gain {gain}, as in scenes that were measured"
+            f"{code}: {self.limit} of {self.given:g} {unit} made the scene {worse} than without this limit; "
+            f"{about} {self.would_take:.7g} {unit} would suffice"
         )
         return {"code": code, **asdict(self), "message": message}
 
@@ -78,7 +80,7 @@ def _seconds(config: Config, begun: Scene, scene: Scene, seconds: Mapping[str, f
         taken = ", ".join(f"{name} {spent:.1f} s" for name, spent in stages.items())
         beyond = seconds["total"] - config.budget_s
         basis = f"the least took {beyond:.1f} s too long ({taken}), nothing was refined, and refining takes time on top"
-        return Hit("budget_s", config.budget_s, round(seconds["total"], 1), gain, basis)
+        return Hit("budget_s", config.budget_s, round(seconds["total"], 1), gain, basis, at_least=True)
     each = seconds.get("optimise", 0.0) / done
     would_take = round(seconds["total"] + each * (planned - done), 1)
     fall = loss_fall(scene.losses) / each

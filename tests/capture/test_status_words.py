@@ -15,7 +15,7 @@ def test_a_heartbeat_is_told_in_words_with_units():
     assert described("recon", RECON) == [
         "recon: growing",
         "  last keyframe           number 7",
-        "  waiting                 17",
+        "  keyframes waiting       17",
         "  delay                   240 s",
         "  last shown after        26 s",
         "  camera moved            no",
