@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 from splatnode.capture.frame import Intrinsics
 
@@ -21,8 +21,10 @@ _FILM_DIAGONAL_MM = math.hypot(36.0, 24.0)
 _ASPECT_TOLERANCE = 0.02  # relative; cameras round sides to whole blocks of pixels, and a crop changes more
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 _MOST_VALUES = 16  # of a tag; texts, thumbnails and maker notes have more
+_ASCII, _LONGEST_TEXT = 2, 64  # TIFF type; characters
 _FORMATS = {1: "B", 3: "H", 4: "I", 5: "II", 8: "h", 9: "i", 10: "ii"}  # TIFF type -> struct codes of one value
 # From a fisheye to a long telephoto lens; what lies outside is a wrong tag.
+_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}  # byte order of struct, by how a TIFF structure begins
 _PLAUSIBLE_FOCAL = (0.2, 12.0)  # in longer image sides
 
 
@@ -31,7 +33,7 @@ def read_tags(tiff: bytes) -> Tags:
 
     What cannot be parsed is left out: EXIF is a hint that an image may lack, and many programs damage it.
     """
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(tiff[:4])
+    order = _ORDERS.get(tiff[:4])
     if order is None:
         return {}
     try:
@@ -46,18 +48,43 @@ def read_tags(tiff: bytes) -> Tags:
 def read_directory(tiff: bytes, offset: int, order: str) -> dict[int, tuple[float, ...]]:
     """The numeric tags of the directory at `offset`, in the byte order `order` of struct. Raises struct.error."""
     tags: dict[int, tuple[float, ...]] = {}
-    (entries,) = struct.unpack_from(order + "H", tiff, offset)
-    for entry in range(offset + 2, offset + 2 + 12 * entries, 12):
-        tag, kind, count = struct.unpack_from(order + "HHI", tiff, entry)
+    for tag, kind, count, entry in _entries(tiff, offset, order):
         if kind not in _FORMATS or not 1 <= count <= _MOST_VALUES:
             continue
         layout = struct.Struct(order + _FORMATS[kind] * count)
-        start = entry + 8 if layout.size <= 4 else struct.unpack_from(order + "I", tiff, entry + 8)[0]
-        values = layout.unpack_from(tiff, start)
+        values = layout.unpack_from(tiff, _start(tiff, entry, layout.size, order))
         if len(_FORMATS[kind]) == 2:
             values = tuple(p / q if q else math.nan for p, q in zip(values[::2], values[1::2], strict=True))
         tags[tag] = values
     return tags
+
+
+def read_texts(tiff: bytes) -> dict[int, str]:
+    """The short texts of the EXIF part, by tag. What cannot be parsed is left out, as in `read_tags`."""
+    order, part = _ORDERS.get(tiff[:4]), first(read_tags(tiff), EXIF_IFD)
+    if order is None or part is None:
+        return {}
+    texts: dict[int, str] = {}
+    try:
+        for tag, kind, count, entry in _entries(tiff, int(part), order):
+            if kind == _ASCII and 1 <= count <= _LONGEST_TEXT:
+                start = _start(tiff, entry, count, order)
+                texts[tag] = tiff[start : start + count].partition(b"\0")[0].decode("ascii", "replace")
+    except struct.error:
+        return {}
+    return texts
+
+
+def _entries(tiff: bytes, offset: int, order: str) -> Iterator[tuple[int, int, int, int]]:
+    """Tag, type, number of values and place of each entry of the directory at `offset`. Raises struct.error."""
+    (entries,) = struct.unpack_from(order + "H", tiff, offset)
+    for entry in range(offset + 2, offset + 2 + 12 * entries, 12):
+        yield *struct.unpack_from(order + "HHI", tiff, entry), entry
+
+
+def _start(tiff: bytes, entry: int, size: int, order: str) -> int:
+    """Where the values of an entry begin: in it if they have room there. Raises struct.error."""
+    return entry + 8 if size <= 4 else struct.unpack_from(order + "I", tiff, entry + 8)[0]
 
 
 def exif_intrinsics(tags: Tags, width: int, height: int) -> Intrinsics | None:

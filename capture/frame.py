@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
+from splatnode.capture.stamp import Stamp
 
 LARGEST_NUMBER = 2**62  # of ids and stamps
 LARGEST_SIDE = 65_535  # pixels, as of a JPEG
@@ -71,10 +72,11 @@ class Frame:
 
     frame_id: int  # position in its stream, from 0
     name: str  # printable, unique in its stream; for a file, its name as `printable_name` writes it
-    stamp_ns: int  # monotonic time of exposure
+    stamp_ns: int  # time in its stream, which grows; of a live camera, the monotonic clock at exposure
     image: npt.NDArray[np.uint8]  # (H, W, 3) RGB
     intrinsics: Intrinsics | None  # None: nothing is known about this camera
     encoded: bytes | None = field(default=None, repr=False)  # the JPEG or PNG that `image` was decoded from, if any
+    captured_at: Stamp | None = None  # None: nobody knows
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", printable(self.name, LONGEST_NAME))
@@ -132,14 +134,15 @@ def framed(
     image: npt.NDArray[np.uint8],
     intrinsics: Intrinsics | None,
     encoded: bytes | None = None,
+    captured_at: Stamp | None = None,
 ) -> Frame | DroppedFrame:
     """What a camera or a file gave as a Frame; left out, with the reason, where it keeps a Frame's bounds not."""
     try:
-        return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded)
+        return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at)
     except ValueError as error:
         return DroppedFrame(name, f"it cannot be a frame: {error}")
 
 
 def renamed(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame | DroppedFrame:
     """The same image as another frame, which may be beyond a Frame's bounds."""
-    return framed(frame_id, name, stamp_ns, frame.image, frame.intrinsics, frame.encoded)
+    return framed(frame_id, name, stamp_ns, frame.image, frame.intrinsics, frame.encoded, frame.captured_at)

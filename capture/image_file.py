@@ -8,7 +8,7 @@ before it allocates the memory.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import cv2
 import msgspec
@@ -16,10 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture import exif
+from splatnode.capture.exif_time import exif_time
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.image_header import UnusableImage, read_header
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
+from splatnode.capture.stamp import Stamp
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}  # of what can be decoded
 MAX_PIXELS = 100_000_000  # of an image, unless another limit is given
@@ -27,6 +29,14 @@ MaxPixels = Annotated[int, msgspec.Meta(ge=1, le=1 << 30)]  # of a configuration
 BYTES_A_PIXEL = 16  # of memory at most beside the file itself, until an image is decoded; afterwards it has 3
 _FILE_BYTES_A_PIXEL = 8  # 16 bits, four channels, not compressed
 _FURTHER_FILE_BYTES = 64_000_000  # what a telephone puts behind a photograph: a film, a depth map
+
+
+class DecodedImage(NamedTuple):
+    """An image, and what its EXIF tells: of the camera, and when it was taken."""
+
+    image: npt.NDArray[np.uint8]  # (H, W, 3) RGB, upright
+    intrinsics: Intrinsics | None
+    captured_at: Stamp | None
 
 
 def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
@@ -37,8 +47,8 @@ def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
     return read_bounded(path, _FILE_BYTES_A_PIXEL * max_pixels + _FURTHER_FILE_BYTES, UnusableImage)
 
 
-def decode_image(data: bytes, max_pixels: int = MAX_PIXELS) -> tuple[npt.NDArray[np.uint8], Intrinsics | None]:
-    """The image (H, W, 3) uint8 RGB, upright after its EXIF orientation, with the intrinsics that its EXIF tells.
+def decode_image(data: bytes, max_pixels: int = MAX_PIXELS) -> DecodedImage:
+    """The image (H, W, 3) uint8 RGB, upright after its EXIF orientation, with the camera and time that its EXIF tells.
 
     Grey becomes RGB, 16 bits become the upper 8, and alpha is dropped: the colours beneath it are kept as stored, as
     COLMAP does. Of a file with several pages, the first. It takes at most BYTES_A_PIXEL of memory for each of
@@ -54,7 +64,8 @@ def decode_image(data: bytes, max_pixels: int = MAX_PIXELS) -> tuple[npt.NDArray
             stated = f"{header.width} x {header.height}"
             raise UnusableImage(f"damaged: it states {stated} pixels and is decoded to {width} x {height}")
         intrinsics = exif.exif_intrinsics(exif.read_tags(header.exif), width, height)
-        return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False), intrinsics
+        rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+        return DecodedImage(rgb, intrinsics, exif_time(header.exif))
 
 
 def _decode(data: bytes) -> npt.NDArray:

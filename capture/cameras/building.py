@@ -25,6 +25,7 @@ from splatnode.capture.diorama.building.walk import Walk, walk
 from splatnode.capture.diorama.cast import Camera
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.pace import FramesPerSecond, Pace, paced
+from splatnode.capture.stamp import Clock, Stamp
 
 SAME_PLACE = 0.3  # of what two keyframes show: as much in common, and they show the same place
 BARE = 16.0  # texels a metre, where only surfaces matter: they are the same at every density, and soon made
@@ -55,7 +56,8 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
 def _frames(config: Config) -> Iterator[Frame]:
     for index in range(config.keyframes):
         stamp_ns = round(index / config.frames_per_second * 1e9)
-        yield Frame(index, frame_name(index), stamp_ns, photograph(config, index), intrinsics=None)
+        image, captured_at = photograph(config, index), Stamp(stamp_ns, Clock.RECORDING)
+        yield Frame(index, frame_name(index), stamp_ns, image, intrinsics=None, captured_at=captured_at)
 
 
 def frame_name(index: int) -> str:

@@ -19,6 +19,7 @@ import numpy as np
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.pace import FramesPerSecond
 from splatnode.capture.process.logs import event
+from splatnode.capture.stamp import wall_clock
 from splatnode.capture.unavailable import CameraUnavailable
 
 log = logging.getLogger(__name__)
@@ -110,7 +111,8 @@ def to_frame(message: Any, frame_id: int) -> Frame | DroppedFrame:
     stamp_ns = message.getTimestamp() // timedelta(microseconds=1) * 1000
     image = cv2.cvtColor(message.getCvFrame(), cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
     intrinsics = _intrinsics(message.getTransformation(), image.shape[1], image.shape[0])
-    return framed(frame_id, f"{stamp_ns / 1e9:.6f}", stamp_ns, image, intrinsics)
+    name = f"{stamp_ns / 1e9:.6f}"
+    return framed(frame_id, name, stamp_ns, image, intrinsics, captured_at=wall_clock(stamp_ns))
 
 
 def holding(dai: ModuleType, config: Config) -> Any:

@@ -73,7 +73,7 @@ def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]
         name = frame_name(path)
         try:
             data = read_image_file(path, config.max_pixels)
-            image, intrinsics = decode_image(data, config.max_pixels)
+            image, intrinsics, captured_at = decode_image(data, config.max_pixels)
         except UnusableImage as error:
             yield DroppedFrame(name, str(error))
         except OSError as error:
@@ -83,7 +83,7 @@ def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]
             if config.intrinsics is not None and _same_aspect(config.intrinsics, width, height):
                 intrinsics = config.intrinsics.resized(width, height)
             stamp_ns = round(frame_id / config.frames_per_second * 1e9)
-            item = framed(frame_id, name, stamp_ns, image, intrinsics, encoded=data)
+            item = framed(frame_id, name, stamp_ns, image, intrinsics, data, captured_at)
             frame_id += isinstance(item, Frame)
             yield item
 

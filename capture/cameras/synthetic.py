@@ -20,6 +20,7 @@ from splatnode.capture.diorama.look_at import look_at
 from splatnode.capture.diorama.solids import Solid
 from splatnode.capture.frame import Frame
 from splatnode.capture.pace import FramesPerSecond
+from splatnode.capture.stamp import Clock, Stamp
 
 TARGET = np.array([1.05, 1.05, 0.82])  # what the photographer looks at: the table in the corner, metres
 
@@ -41,7 +42,8 @@ def stream(config: Config) -> Iterator[Frame]:
     """The photographs in the order of the path."""
     for index, camera in enumerate(scene_cameras(config)):
         stamp_ns = round(index / config.frames_per_second * 1e9)
-        yield Frame(index, frame_name(index), stamp_ns, photograph(config, camera, index), intrinsics=None)
+        image, captured_at = photograph(config, camera, index), Stamp(stamp_ns, Clock.RECORDING)
+        yield Frame(index, frame_name(index), stamp_ns, image, intrinsics=None, captured_at=captured_at)
 
 
 def frame_name(index: int) -> str:

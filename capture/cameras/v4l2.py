@@ -16,6 +16,7 @@ import numpy.typing as npt
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.image_file import UnusableImage, decode_image
 from splatnode.capture.pace import FramesPerSecond
+from splatnode.capture.stamp import wall_clock
 from splatnode.capture.unavailable import CameraUnavailable
 from splatnode.capture.video4linux import locks
 from splatnode.capture.video4linux.device import Device, Format, RawFrame, System
@@ -103,7 +104,7 @@ def _frame(raw: RawFrame, chosen: Format, frame_id: int, intrinsics: Intrinsics 
     if intrinsics is not None:
         intrinsics = intrinsics.resized(image.shape[1], image.shape[0])
     encoded = raw.data if chosen.pixels == "MJPG" else None
-    return framed(frame_id, name, raw.stamp_ns, image, intrinsics, encoded=encoded)
+    return framed(frame_id, name, raw.stamp_ns, image, intrinsics, encoded, wall_clock(raw.stamp_ns))
 
 
 def _decode(data: bytes, chosen: Format) -> npt.NDArray[np.uint8]:

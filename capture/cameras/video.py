@@ -14,6 +14,7 @@ from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.image_file import MaxPixels
 from splatnode.capture.pace import Pace, paced
 from splatnode.capture.process.printable import LONGEST_NAME, printable_name
+from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.video_process import MAX_VIDEO_PIXELS, VideoError, VideoFrame, decoded
 
 _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes behind it
@@ -63,4 +64,5 @@ def _frame(found: VideoFrame, frame_id: int, config: Config) -> Frame | DroppedF
     rgb = cv2.cvtColor(found.image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
     intrinsics = config.intrinsics.resized(rgb.shape[1], rgb.shape[0]) if config.intrinsics else None
     name = f"{_stem(config)}_{found.index:06d}.png"
-    return framed(frame_id, name, round(found.index / found.rate * 1e9), rgb, intrinsics)
+    stamp_ns = round(found.index / found.rate * 1e9)
+    return framed(frame_id, name, stamp_ns, rgb, intrinsics, captured_at=Stamp(stamp_ns, Clock.RECORDING))

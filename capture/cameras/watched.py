@@ -20,6 +20,7 @@ from splatnode.capture.image_file import (
     read_header,
     read_image_file,
 )
+from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.unavailable import CameraUnavailable
 
 _TEMPORARY_SUFFIXES = {".tmp", ".part", ".partial", ".crdownload", ".filepart"}
@@ -95,17 +96,17 @@ def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> 
     except UnusableImage as error:
         waited = now - seen[path.name].first
         return None if waited < config.give_up_s else DroppedFrame(name, f"{error}, after {waited:.0f} s")
-    return _decoded(name, data, config, frame_id)
+    return _decoded(name, data, Stamp(max(0, found.st_mtime_ns), Clock.FILE), config, frame_id)
 
 
-def _decoded(name: str, data: bytes, config: Config, frame_id: int) -> Frame | DroppedFrame:
+def _decoded(name: str, data: bytes, written_at: Stamp, config: Config, frame_id: int) -> Frame | DroppedFrame:
     try:
-        image, intrinsics = decode_image(data, config.max_pixels)
+        image, intrinsics, captured_at = decode_image(data, config.max_pixels)
     except UnusableImage as error:
         return DroppedFrame(name, str(error))
     if config.intrinsics is not None:
         intrinsics = config.intrinsics.resized(image.shape[1], image.shape[0])
-    return framed(frame_id, name, time.monotonic_ns(), image, intrinsics, encoded=data)
+    return framed(frame_id, name, time.monotonic_ns(), image, intrinsics, data, captured_at or written_at)
 
 
 def _listed(folder: Path) -> list[Path]:

@@ -14,6 +14,7 @@ from splatnode.capture.diorama.building.rooms import CHAIR_ROOM, LOOK_ALIKES, MI
 from splatnode.capture.diorama.look_at import look_at
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.config import typed
+from splatnode.capture.stamp import Clock, Stamp
 
 TINY = building.Config(width=96, height=72, samples=1)
 
@@ -42,6 +43,7 @@ def test_it_is_a_camera_of_capture_whose_photographs_are_made_when_they_are_aske
     assert isinstance(first, Frame) and isinstance(second, Frame)
     assert first.image.shape == (72, 96, 3) and first.intrinsics is None
     assert (first.name, second.stamp_ns - first.stamp_ns) == ("keyframe_00000.png", 500_000_000)
+    assert second.captured_at == Stamp(500_000_000, Clock.RECORDING)
     assert building.frame_index(second.name) == 1
 
 

@@ -6,6 +6,7 @@ import itertools
 import os
 import subprocess
 import sys
+import time
 from datetime import timedelta
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +18,7 @@ import pytest
 from splatnode.capture.cameras import depthai as oak
 from splatnode.capture.cameras.depthai import Config, find, read, stream, to_frame
 from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.stamp import Clock
 from splatnode.capture.unavailable import CameraUnavailable
 from tests.conftest import ROOT
 
@@ -126,6 +128,8 @@ def framed(message, frame_id: int) -> Frame:
 def test_a_frame_has_its_own_calibration():
     frame = framed(message(7, distortion=(0.1, -0.2, 0, 0, 0.05)), 3)
     assert (frame.frame_id, frame.stamp_ns, frame.name) == (3, 100_000_000_007_000, "100000.000007")
+    assert frame.captured_at is not None and frame.captured_at.clock is Clock.UTC
+    assert abs(frame.captured_at.ns - frame.stamp_ns - (time.time_ns() - time.monotonic_ns())) < 100_000_000
     assert frame.image[0, 0].tolist() == [3, 2, 1]
     expected = Intrinsics(1280, 720, 800.0, 801.0, 640.0, 360.0, "calibration", (0.1, -0.2, 0, 0, 0.05))
     assert frame.intrinsics == expected

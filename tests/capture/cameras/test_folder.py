@@ -10,6 +10,7 @@ from splatnode.capture.cameras.folder import Config, stream
 from splatnode.capture.exif import exif_intrinsics, read_tags
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.image_file import UnusableImage, read_header
+from splatnode.capture.stamp import Clock, Stamp
 
 # Left half red, right half blue, the top left corner white: tells every orientation and channel order apart.
 PICTURE = np.zeros((48, 64, 3), np.uint8)
@@ -26,7 +27,7 @@ def encoded(suffix=".jpg", image=PICTURE, *options):
 
 
 def tiff(tags, exif_tags=None, order=">"):
-    """A TIFF structure: tag -> int (SHORT) or (numerator, denominator) (RATIONAL), in one or two directories."""
+    """A TIFF structure in one or two directories: tag -> int (SHORT), (numerator, denominator) (RATIONAL) or text."""
     directories = [dict(tags)] + ([exif_tags] if exif_tags else [])
     if exif_tags:
         directories[0][0x8769] = 8 + 2 + 12 * len(directories[0]) + 12 + 4
@@ -38,6 +39,11 @@ def tiff(tags, exif_tags=None, order=">"):
             if isinstance(value, tuple):
                 entries += struct.pack(order + "HHII", tag, 5, 1, end + len(values))
                 values += struct.pack(order + "II", *value)
+            elif isinstance(value, str):
+                text = value.encode() + b"\0"
+                inside = text.ljust(4, b"\0") if len(text) <= 4 else struct.pack(order + "I", end + len(values))
+                entries += struct.pack(order + "HHI", tag, 2, len(text)) + inside
+                values += text if len(text) > 4 else b""
             elif tag == 0x8769:
                 entries += struct.pack(order + "HHII", tag, 4, 1, value)
             else:
@@ -162,6 +168,20 @@ def test_natural_order_ids_stamps_and_choice(tmp_path):
     assert [frame.frame_id for frame in frames] == [0, 1, 2, 3, 4]
     assert [frame.stamp_ns for frame in frames] == [0, 250_000_000, 500_000_000, 750_000_000, 1_000_000_000]
     assert [frame.name for frame in stream(Config(tmp_path, names=("img10", "img2.png")))] == ["img2.png", "img10.png"]
+
+
+def test_a_photograph_has_the_time_that_its_exif_tells_and_another_one_has_none(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(with_exif(encoded(), {}, {0x9003: "2024:05:06 10:00:07", 0x9291: "25"}))
+    (tmp_path / "b.jpg").write_bytes(encoded())
+    told, silent = (item for item in stream(Config(tmp_path)) if isinstance(item, Frame))
+    assert told.captured_at == Stamp(1_714_989_607_250_000_000, Clock.LOCAL)
+    assert silent.captured_at is None and (told.stamp_ns, silent.stamp_ns) == (0, 100_000_000)
+
+
+def test_a_photograph_that_is_shown_again_was_captured_when_it_was(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(with_exif(encoded(), {}, {0x9003: "2024:05:06 10:00:07"}))
+    once, again = (item for item in stream(Config(tmp_path, loops=2)) if isinstance(item, Frame))
+    assert once.captured_at == again.captured_at is not None and once.stamp_ns < again.stamp_ns
 
 
 def truncated(suffix):

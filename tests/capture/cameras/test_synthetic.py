@@ -8,6 +8,7 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama.layout import place
 from splatnode.capture.diorama.solids import Shape, face_points, ray_interval, surface_coordinates
+from splatnode.capture.stamp import Clock, Stamp
 from tests.support.synthetic import SMALL, photographs, planar, pure_rotation, pure_rotation_cameras, tiny_scene
 
 
@@ -58,6 +59,7 @@ def test_frames_are_those_of_an_unknown_camera():
     assert [frame.frame_id for frame in frames] == list(range(SMALL.views))
     assert len({frame.name for frame in frames}) == SMALL.views
     assert all(a.stamp_ns < b.stamp_ns for a, b in itertools.pairwise(frames))
+    assert all(frame.captured_at == Stamp(frame.stamp_ns, Clock.RECORDING) for frame in frames)
     assert all(frame.image.shape == (240, 320, 3) and frame.intrinsics is None for frame in frames)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import itertools
+import time
 from typing import Any
 
 import cv2
@@ -14,6 +15,7 @@ import pytest
 from splatnode.capture.cameras import v4l2
 from splatnode.capture.cameras.v4l2 import Config, find, stream
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.stamp import Clock
 from splatnode.capture.unavailable import CameraUnavailable
 from splatnode.capture.video4linux import layout, locks
 from splatnode.capture.video4linux.device import Device, System
@@ -149,6 +151,13 @@ def test_jpeg_frames_keep_their_bytes():
     assert np.abs(first.image.astype(int) - IMAGE).mean() < 5
     assert (first.frame_id, first.name, first.stamp_ns) == (0, "100.001000", 100_001_000_000)
     assert (second.frame_id, second.name, second.stamp_ns) == (1, "100.002000", 100_002_000_000)
+
+
+def test_the_drivers_stamps_are_told_by_the_wall_clock():
+    (frame,) = frames(Driver(), 1)
+    ahead_ns = time.time_ns() - time.monotonic_ns()
+    assert frame.captured_at.clock is Clock.UTC
+    assert abs(frame.captured_at.ns - frame.stamp_ns - ahead_ns) < 100_000_000
 
 
 @pytest.mark.parametrize("padding", [0, 16])

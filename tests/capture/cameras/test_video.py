@@ -13,6 +13,7 @@ from splatnode.capture.cameras import folder
 from splatnode.capture.cameras.video import Config, stream
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.pace import paced
+from splatnode.capture.stamp import Clock, Stamp
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +34,7 @@ def test_frames_at_their_times(walk):
     assert [frame.name for frame in frames][-1] == "walk_000011.png"
     assert np.allclose([frame.image[60, 80, 2] for frame in frames], 20 * np.arange(12), atol=6)
     assert frames[0].intrinsics == lens.resized(160, 120)
+    assert frames[-1].captured_at == Stamp(550_000_000, Clock.RECORDING)
 
 
 def test_some_of_the_frames(walk):

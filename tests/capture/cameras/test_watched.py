@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 from types import SimpleNamespace
@@ -13,7 +14,9 @@ import pytest
 
 from splatnode.capture.cameras.watched import Config, stream
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.unavailable import CameraUnavailable
+from tests.capture.cameras.test_folder import with_exif
 
 QUICK = {"poll_s": 0.01, "settle_s": 0.05, "give_up_s": 0.4}
 
@@ -49,6 +52,15 @@ def test_photographs_come_once_in_their_order(tmp_path):
     before = time.monotonic_ns()
     third = next(frames)
     assert (third.name, third.frame_id) == ("a.jpg", 2) and before < third.stamp_ns <= time.monotonic_ns()
+
+
+def test_a_photograph_has_its_own_time_and_else_that_of_its_file(tmp_path):
+    (tmp_path / "a.jpg").write_bytes(with_exif(photograph(0), {}, {0x9003: "2024:05:06 10:00:07"}))
+    (tmp_path / "b.jpg").write_bytes(photograph(1))
+    os.utime(tmp_path / "b.jpg", ns=(0, 1_714_989_607_123_456_000))
+    frames = watch(tmp_path)
+    assert next(frames).captured_at == Stamp(1_714_989_607_000_000_000, Clock.LOCAL)
+    assert next(frames).captured_at == Stamp(1_714_989_607_123_456_000, Clock.FILE)
 
 
 @pytest.mark.parametrize("pause_s", [0.02, 0.1])  # 0.1: it pauses for longer than it takes to settle
