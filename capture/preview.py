@@ -13,6 +13,7 @@ from splatnode.capture.messaging.jpeg import from_jpeg, to_jpeg
 from splatnode.capture.messaging.values import Name, Sequential, Text
 from splatnode.capture.messaging.wire import Header, Message, Numbering, WireError
 from splatnode.capture.process.printable import printable
+from splatnode.capture.stamp import Stamp
 
 _LARGEST_SIDE = 4096  # of what is decoded: a JPEG of a few bytes may ask for gigabytes
 
@@ -32,6 +33,7 @@ class PreviewHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=Tru
     state: Name  # of the camera: reader.State
     taken: bool  # it became a keyframe
     reason: Text  # why, or why not
+    captured_at: Stamp | None = None
 
 
 def encode_preview(
@@ -39,7 +41,13 @@ def encode_preview(
 ) -> tuple[PreviewHeader, list[npt.NDArray[np.uint8]]]:
     jpeg = to_jpeg(reduced(frame.image, config.longer_side), config.jpeg_quality)
     header = PreviewHeader(
-        **numbering.next(), name=frame.name, stamp_ns=frame.stamp_ns, state=state, taken=taken, reason=printable(reason)
+        **numbering.next(),
+        name=frame.name,
+        stamp_ns=frame.stamp_ns,
+        state=state,
+        taken=taken,
+        reason=printable(reason),
+        captured_at=frame.captured_at,
     )
     return header, [jpeg]
 

@@ -23,6 +23,7 @@ from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.durable import sync_folder
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import LONGEST_NAME, is_printable, marked_name, printable
+from splatnode.capture.stamp import Stamp
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +43,7 @@ class _Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="frame"
     intrinsics: Intrinsics | None
     file: str
     sha256: str
+    captured_at: Stamp | None = None  # earlier recordings do not tell
 
 
 class _DroppedLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="dropped"):
@@ -89,7 +91,7 @@ class Recorder:
             temporary.unlink(missing_ok=True)
             raise OSError(error.errno, error.strerror, str(path)) from error
         digest = hashlib.sha256(content).hexdigest()
-        self._append(_Line(item.name, item.stamp_ns, item.intrinsics, path.name, digest))
+        self._append(_Line(item.name, item.stamp_ns, item.intrinsics, path.name, digest, item.captured_at))
         self.frames += 1
         if self.frames % _SYNC_EVERY == 0:
             self._sync()
@@ -141,14 +143,14 @@ class Recording:
             return DroppedFrame(line.name, line.reason)
         try:
             content = read_image_file(self.folder / line.file, max_pixels)
-            image, _ = decode_image(content, max_pixels)
+            image = decode_image(content, max_pixels).image
         except UnusableImage as error:
             return DroppedFrame(line.name, str(error))
         except OSError as error:
             return DroppedFrame(line.name, f"cannot be read: {error.strerror}")
         if hashlib.sha256(content).hexdigest() != line.sha256:
             return DroppedFrame(line.name, f"{line.file} is not the file that was recorded")
-        return framed(frame_id, line.name, line.stamp_ns, image, line.intrinsics, encoded=content)
+        return framed(frame_id, line.name, line.stamp_ns, image, line.intrinsics, content, line.captured_at)
 
 
 def _shown(name: str) -> str:

@@ -27,6 +27,7 @@ from splatnode.capture.messaging.wire import (
     plain_header,
 )
 from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
+from splatnode.capture.stamp import Stamp
 
 MOST_HELD = 64  # frames that a client may hold without acknowledging them
 DELIVERY_PARTS = 2  # that come before a frame's own
@@ -39,6 +40,7 @@ class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True,
     name: Name
     stamp_ns: Sequential
     intrinsics: Intrinsics | None
+    captured_at: Stamp | None = None
 
 
 class DroppedHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="dropped"):
@@ -112,6 +114,7 @@ def to_message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
         name=frame.name,
         stamp_ns=frame.stamp_ns,
         intrinsics=frame.intrinsics,
+        captured_at=frame.captured_at,
     )
     return encode(header, [frame.image])
 
@@ -134,7 +137,14 @@ def received(key: Key, parts: list[zmq.Frame], limits: Limits) -> ReceivedFrame:
     if len(message.arrays) != 1:
         raise WireError(f"a frame has one image, got {len(message.arrays)}")
     try:
-        frame = Frame(header.frame_id, header.name, header.stamp_ns, message.arrays[0], header.intrinsics)
+        frame = Frame(
+            header.frame_id,
+            header.name,
+            header.stamp_ns,
+            message.arrays[0],
+            header.intrinsics,
+            captured_at=header.captured_at,
+        )
     except ValueError as error:
         raise WireError(str(error)) from error
     return ReceivedFrame(*key, frame)

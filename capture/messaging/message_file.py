@@ -16,7 +16,8 @@ LARGEST = 4 << 30  # bytes of a body, unless the reader knows better
 _HEAD = struct.Struct("<8sIQI")  # magic, parts, bytes of the body, its CRC-32
 _MAGIC = b"SPLSPOOL"
 _SIZE = struct.Struct("<Q")
-_EARLIER = MAGIC[:-1] + b"\x01"  # of files that version 1 wrote, whose headers and arrays are those of today
+# Of files that versions 1 and 2 wrote: what they lack in today's headers has a default.
+_EARLIER = (MAGIC[:-1] + b"\x01", MAGIC[:-1] + b"\x02")
 
 
 def size_in_file(parts: Sequence[Part]) -> int:
@@ -47,7 +48,7 @@ def read_message(path: Path, most_bytes: int = LARGEST) -> list[Part]:
     if magic != _MAGIC or len(body) != size or zlib.crc32(body) != checksum:
         raise MessageFileError(f"{path} is damaged")
     parts: list[Part] = list(_parts(body, count, path))
-    return [MAGIC, *parts[1:]] if parts and parts[0] == _EARLIER else parts
+    return [MAGIC, *parts[1:]] if parts and parts[0] in _EARLIER else parts
 
 
 def _parts(body: memoryview, count: int, path: Path) -> Iterator[memoryview]:

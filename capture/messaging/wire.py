@@ -25,7 +25,7 @@ import zmq
 from splatnode.capture.messaging.values import Sequential, SessionId, check
 from splatnode.capture.process.foreign import foreign
 
-VERSION = 2  # of the messages: 1 knew no answer to a keyframe that cannot be taken
+VERSION = 3  # of the messages: 1 knew no answer to a keyframe that cannot be taken, 2 no time of capture
 MAGIC = b"SPLAT" + bytes([VERSION])
 DTYPES = {name: np.dtype(f"<{name}") for name in ("u1", "u2", "u4", "i4", "i8", "f4", "f8")}
 

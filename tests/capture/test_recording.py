@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 
 import cv2
@@ -14,6 +15,7 @@ from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.recording import INDEX, Recorder, RecordingError
+from splatnode.capture.stamp import Clock, Stamp
 from tests.support.crafted import recordings
 
 LENS = Intrinsics(16, 12, 20.5, 20.25, 8.0, 6.1, "calibration", (0.1, -0.02, 0.001, 0.0, 1e-17))
@@ -26,7 +28,7 @@ def frames():
     decoded = cv2.cvtColor(cv2.imdecode(np.frombuffer(jpeg, np.uint8), 1), cv2.COLOR_BGR2RGB)
     return [
         Frame(0, "b 1.png", 10**15 + 7, images[0], LENS),
-        Frame(1, "ä/2", 10**15 + 33_333_340, images[1], None),
+        Frame(1, "ä/2", 10**15 + 33_333_340, images[1], None, captured_at=Stamp(1_714_989_607_250_000_001, Clock.UTC)),
         DroppedFrame("c.jpg", "truncated: the file ends early"),
         Frame(2, "d", 10**15 + 66_666_673, images[2], replace(LENS, source="given")),
         Frame(3, "e", 10**15 + 99_999_999, decoded, None, encoded=jpeg),
@@ -42,7 +44,7 @@ def record(path, items):
 
 def seen(items):
     return [
-        (item.frame_id, item.name, item.stamp_ns, item.intrinsics, item.image.tobytes(), item.image.shape)
+        (item.frame_id, item.name, item.stamp_ns, item.captured_at, item.intrinsics, item.image.tobytes())
         if isinstance(item, Frame)
         else item
         for item in items
@@ -56,6 +58,16 @@ def test_the_same_frames_come_back(tmp_path):
     again = record(tmp_path / "copy", folder.stream(folder.Config(path)))
     assert seen(folder.stream(folder.Config(again))) == seen(sent)
     assert (again / "000003.jpg").read_bytes() == sent[4].encoded
+
+
+def test_an_earlier_recording_tells_no_time_of_capture(tmp_path):
+    path = record(tmp_path / "walk", frames())
+    index = (path / INDEX).read_bytes()
+    earlier = re.sub(rb',"captured_at":(null|\{[^}]*\})', b"", index)
+    assert index.count(b"captured_at") == 4 and b"captured_at" not in earlier
+    (path / INDEX).write_bytes(earlier)
+    found = [item for item in folder.stream(folder.Config(path)) if isinstance(item, Frame)]
+    assert [item.captured_at for item in found] == [None] * 4
 
 
 def test_a_copy_of_a_folder_of_photographs(shared, tmp_path):

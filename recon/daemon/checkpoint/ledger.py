@@ -14,7 +14,7 @@ from splatnode.capture.messaging.wire import Limits, decode, encode
 
 log = logging.getLogger(__name__)
 
-VERSION = 1  # of all files of a checkpoint
+VERSION = 2  # of all files of a checkpoint: 1 knew no time of capture
 FILE = "ledger"
 # Of what this process wrote itself.
 LIMITS = Limits(header_bytes=64 << 20, arrays=1 << 20, total_bytes=4 << 30, own=True)
@@ -53,12 +53,17 @@ def read_ledger(directory: Path) -> Ledger:
             f"the checkpoint in {directory} is damaged ({error}). Move the folder away to begin anew; "
             "its keyframes are in frames/"
         ) from error
-    if found.version != VERSION:
+    if not is_readable(found.version):
         raise CheckpointError(
             f"the checkpoint in {directory} is of version {found.version}, this is version {VERSION}. "
             "Use the splatnode that wrote it, or move the folder away to begin anew"
         )
     return found
+
+
+def is_readable(version: int) -> bool:
+    """Whether files of a checkpoint of this version can be read: what earlier ones lack has a default."""
+    return 1 <= version <= VERSION
 
 
 def write_ledger(directory: Path, ledger: Ledger) -> None:
@@ -67,13 +72,16 @@ def write_ledger(directory: Path, ledger: Ledger) -> None:
 
 
 def identified(directory: Path) -> Ledger:
-    """The ledger with the checkpoint's identity, which it is given where it has none. Raises CheckpointError."""
-    ledger = read_ledger(directory)
-    if ledger.identity:
-        return ledger
-    ledger = msgspec.structs.replace(ledger, identity=uuid.uuid4().hex)
+    """The ledger with the checkpoint's identity, which it is given where it has none. Raises CheckpointError.
+
+    It is of this version from now on, so that an earlier splatnode leaves alone what it could not read.
+    """
+    found = read_ledger(directory)
+    ledger = msgspec.structs.replace(found, version=VERSION, identity=found.identity or uuid.uuid4().hex)
+    if ledger == found:
+        return found
     try:
         write_ledger(directory, ledger)
     except OSError as error:
-        log.warning("the checkpoint's identity is this process's alone: %s", error)
+        log.warning("the checkpoint's identity and version are this process's alone: %s", error)
     return ledger

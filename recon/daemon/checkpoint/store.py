@@ -22,7 +22,7 @@ import re
 import threading
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +36,7 @@ from splatnode.capture.process.durable import remove_leftovers
 from splatnode.capture.process.lock import Held, exclusive
 from splatnode.capture.process.printable import LONGEST_NAME, printable
 from splatnode.capture.process.private import own_files, private_folder
+from splatnode.capture.stamp import Stamp
 from splatnode.recon.daemon.checkpoint import left, made_anew
 from splatnode.recon.daemon.checkpoint.ledger import (
     LIMITS,
@@ -43,6 +44,7 @@ from splatnode.recon.daemon.checkpoint.ledger import (
     CheckpointError,
     Ledger,
     identified,
+    is_readable,
     write_ledger,
 )
 from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
@@ -65,6 +67,7 @@ class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     name: str
     stamp_ns: int
     intrinsics: Intrinsics | None
+    captured_at: Stamp | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,9 +173,9 @@ class Store:
                 return None
             number = self._next
             name = self._unused(frame.name, number)
-            header = FrameRecord(VERSION, *key, name, frame.stamp_ns, frame.intrinsics)
+            header = FrameRecord(VERSION, *key, name, frame.stamp_ns, frame.intrinsics, frame.captured_at)
             write_message(self._frames / FILE.format(number), encode(header, [frame.image]))
-            stored = StoredFrame(number, key, Frame(number, name, frame.stamp_ns, frame.image, frame.intrinsics))
+            stored = StoredFrame(number, key, replace(frame, frame_id=number, name=name, encoded=None))
             self._next = number + 1
             self._remember(stored)
             return stored
@@ -289,7 +292,8 @@ class Store:
 def _stored(number: int, parts: Any) -> StoredFrame:
     message = decode(parts, FrameRecord, LIMITS)
     header = message.header
-    if header.version != VERSION or len(message.arrays) != 1:
+    if not is_readable(header.version) or len(message.arrays) != 1:
         raise WireError(f"frame {number} is of version {header.version} with {len(message.arrays)} images")
-    frame = Frame(number, header.name, header.stamp_ns, message.arrays[0], header.intrinsics)
+    known = header.stamp_ns, message.arrays[0], header.intrinsics
+    frame = Frame(number, header.name, *known, captured_at=header.captured_at)
     return StoredFrame(number, (header.session, header.sequence), frame)

@@ -21,8 +21,9 @@ from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
 from splatnode.capture.messaging.network import AlreadyRunning, Network, runtime_directory
 from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES
 from splatnode.capture.messaging.spool import Config, Key, Spool, SpoolFull, spool_directory
-from splatnode.capture.messaging.wire import WireError, decode, encode
+from splatnode.capture.messaging.wire import MAGIC, WireError, decode, encode
 from splatnode.capture.process.lock import Held
+from splatnode.capture.stamp import Clock, Stamp
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 from tests.conftest import ROOT
 from tests.support.strays import STRAYS
@@ -33,7 +34,8 @@ KEY = Key("0" * 32, 0)
 
 def frame(index, size=(6, 8)):
     image = np.random.default_rng(index).integers(0, 256, (*size, 3)).astype(np.uint8)
-    return Frame(index, f"{index}.png", index * 1000, image, INTRINSICS if index % 2 else None)
+    lens, captured_at = (INTRINSICS, Stamp(index + 10**18, Clock.UTC)) if index % 2 else (None, None)
+    return Frame(index, f"{index}.png", index * 1000, image, lens, captured_at=captured_at)
 
 
 def open_spool(folder, **limits):
@@ -65,6 +67,7 @@ def settle(server, client, until=lambda: True):
 
 def assert_same(received, sent):
     assert (received.frame_id, received.name, received.stamp_ns) == (sent.frame_id, sent.name, sent.stamp_ns)
+    assert received.captured_at == sent.captured_at
     assert received.intrinsics == sent.intrinsics and np.array_equal(received.image, sent.image)
 
 
@@ -176,6 +179,14 @@ def unusual(**numbers):
     return made
 
 
+def unusual_stamp(**parts):
+    """A time that no process of ours tells."""
+    made = Stamp(1, Clock.UTC)
+    for name, part in parts.items():
+        object.__setattr__(made, name, part)
+    return made
+
+
 NO_KEYFRAMES = {
     "no image": encode(HEADER),
     "two images": encode(HEADER, [IMAGE, IMAGE]),
@@ -187,6 +198,8 @@ NO_KEYFRAMES = {
     "another number": encode(changed(HEADER, sequence=7), [IMAGE]),
     "stamp": encode(changed(HEADER, stamp_ns=5 * 10**18), [IMAGE]),
     "negative stamp": encode(changed(HEADER, stamp_ns=-1), [IMAGE]),
+    "capture": encode(changed(HEADER, captured_at=unusual_stamp(ns=5 * 10**18)), [IMAGE]),
+    "clock": encode(changed(HEADER, captured_at=unusual_stamp(clock="sundial")), [IMAGE]),
     "id": encode(changed(HEADER, frame_id=2**63), [IMAGE]),
     "no name": encode(changed(HEADER, name=""), [IMAGE]),
     "terminal": encode(changed(HEADER, name="\x1b[2J"), [IMAGE]),
@@ -196,7 +209,7 @@ NO_KEYFRAMES = {
     "lens": encode(changed(HEADER, intrinsics=unusual(distortion=(0.0,) * 15)), [IMAGE]),
     "lens's size": encode(changed(HEADER, intrinsics=unusual(width=2**40)), [IMAGE]),
     "source": encode(changed(HEADER, intrinsics=unusual(source="\x1b")), [IMAGE]),
-    "rubbish": [b"SPLAT\x02", b"junk"],
+    "rubbish": [MAGIC, b"junk"],
     "version 1": [b"SPLAT\x01", *encode(HEADER, [IMAGE])[1:]],
     "nothing": [],
 }
@@ -242,7 +255,7 @@ def test_what_does_not_say_which_frame_it_is_is_counted_and_the_journal_is_not_f
         rubbish = [
             [b""],
             [b"hello"],
-            [b"SPLAT\x02", b"\x90"],
+            [MAGIC, b"\x90"],
             encode(HEADER, [IMAGE]),
             encode(Delivery("x", 0)),
             [b"x"] * 50,

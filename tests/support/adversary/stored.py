@@ -80,6 +80,7 @@ def recording(rng: random.Random) -> Files:
             "distortion": [0.1],
         }
         line = {"type": "frame", "name": f"a{index}.png", "stamp_ns": index, "intrinsics": rng.choice((None, lens))}
+        line |= {"captured_at": rng.choice((None, {"ns": index, "clock": "utc"}))}
         line |= {"file": "000000.png", "sha256": hashlib.sha256(data).hexdigest()}
         dropped = {"type": "dropped", "name": "b.png", "reason": "blurred"}
         lines.append(edges.mangled(rng, rng.choice((line, line, dropped)), rng.choice((0, 1, 2))))

@@ -5,16 +5,20 @@ from __future__ import annotations
 import errno
 import os
 
+import msgspec
 import numpy as np
 import pytest
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
+from splatnode.capture.messaging.message_file import write_message
+from splatnode.capture.messaging.wire import MAGIC, encode
+from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.daemon.checkpoint import ledger as ledger_module
 from splatnode.recon.daemon.checkpoint import left
 from splatnode.recon.daemon.checkpoint import store as store_module
-from splatnode.recon.daemon.checkpoint.ledger import CheckpointError, Ledger
-from splatnode.recon.daemon.checkpoint.store import REMEMBERED_DROPPED, Store
+from splatnode.recon.daemon.checkpoint.ledger import CheckpointError, Ledger, read_ledger
+from splatnode.recon.daemon.checkpoint.store import FILE, REMEMBERED_DROPPED, Store
 from tests.support.strays import STRAYS
 
 SESSION = "0123456789abcdef" * 2
@@ -26,7 +30,8 @@ def image(sequence: int) -> np.ndarray:
 
 
 def received(sequence: int, name: str | None = None) -> ReceivedFrame:
-    frame = Frame(sequence, name or f"{sequence}.png", 10 * sequence, image(sequence), LENS)
+    captured_at = Stamp(10**18 + sequence, Clock.UTC)
+    frame = Frame(sequence, name or f"{sequence}.png", 10 * sequence, image(sequence), LENS, captured_at=captured_at)
     return ReceivedFrame(SESSION, sequence, frame)
 
 
@@ -51,7 +56,21 @@ def test_a_frame_survives_the_process_with_all_that_it_had(open_store):
     (stored,) = open_store().frames()
     assert (stored.number, stored.key, stored.frame.name) == (put.number, (SESSION, 5), "5.png")
     assert stored.frame.intrinsics == LENS and stored.frame.stamp_ns == 50
+    assert stored.frame.captured_at == put.frame.captured_at == Stamp(10**18 + 5, Clock.UTC)
     assert np.array_equal(stored.frame.image, image(5))
+
+
+def test_a_checkpoint_of_the_version_before_is_gone_on_with_and_becomes_one_of_this(open_store):
+    store = open_store()
+    header = {"version": 1, "session": SESSION, "sequence": 4, "name": "a.png", "stamp_ns": 40, "intrinsics": LENS}
+    _, *parts = encode(header, [image(4)])
+    write_message(store.directory / "frames" / FILE.format(0), [MAGIC[:-1] + b"\x02", *parts])
+    store._write(msgspec.structs.replace(store.ledger, version=1))
+    again = open_store()
+    (stored,) = again.frames()
+    assert (stored.key, stored.frame.name, stored.frame.stamp_ns) == ((SESSION, 4), "a.png", 40)
+    assert stored.frame.captured_at is None and again.identity == store.identity
+    assert read_ledger(again.directory).version == 2
 
 
 def test_numbers_go_on_and_frames_keep_their_order(open_store):
@@ -169,7 +188,7 @@ def test_two_processes_do_not_share_a_checkpoint(open_store):
 def test_another_version_and_a_damaged_ledger_are_refused_with_what_to_do(open_store):
     store = open_store()
     store._write(Ledger(version=99))
-    with pytest.raises(CheckpointError, match="version 99, this is version 1.*move the folder away"):
+    with pytest.raises(CheckpointError, match="version 99, this is version 2.*move the folder away"):
         open_store()
     (store.directory / "ledger").write_bytes(b"rubbish")
     with pytest.raises(CheckpointError, match=r"damaged.*Move the folder away"):
