@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from splatnode.capture.stamp import Stamp
 from splatnode.recon.config import Config
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.deadline import pausing_until
@@ -37,6 +38,7 @@ class Conclusion:
     verdict: Verdict
     bounds: Mapping[str, Bounds]  # of the errors of each camera, by the name of its keyframe
     evidence_record: dict[str, object] | None  # for reports; None where nothing was verified
+    captured_at: Mapping[str, Stamp] = field(default_factory=dict)  # by keyframe, where it is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +81,9 @@ class Estimate:
     @property
     def conclusion(self) -> Conclusion:
         """What snapshots tell of it."""
-        return Conclusion(self.verdict, self.bounds, self.evidence_record)
+        stamps = {keyframe.name: keyframe.frame.captured_at for keyframe in self.graph.keyframes}
+        known = {name: stamp for name, stamp in stamps.items() if stamp is not None}
+        return Conclusion(self.verdict, self.bounds, self.evidence_record, known)
 
     @property
     def placed(self) -> set[str]:

@@ -109,7 +109,7 @@ def snapshot(
     return Snapshot(
         sequence=sequence,
         verdict=verdict,
-        cameras=scene.cameras(conclusion.bounds) if scene else (),
+        cameras=scene.cameras(conclusion.bounds, conclusion.captured_at) if scene else (),
         gaussians=scene.arrays() if scene else GaussianArrays.empty(),
         images={view.name: view.image for view in scene.views} if scene else {},
         dropped=tuple(dropped),

@@ -16,6 +16,7 @@ from splatnode.capture.messaging.services import CAPTURE_PREVIEW
 from splatnode.capture.preview import PreviewHeader, decode_preview
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.problems import Problems, is_said
+from splatnode.capture.stamp import Stamp
 from splatnode.recon.daemon.tracking import Config, Motion, Tracker, landmarks
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
@@ -72,16 +73,20 @@ class Watcher:
             try:
                 image = decode_preview(message)
                 tracker = tracker or Tracker(landmarks(watched.snapshot, watched.keyframes, self._config), self._config)
-                self._track(tracker, image, watched.snapshot)
+                self._track(tracker, image, message.header.captured_at, watched.snapshot)
             except Exception as error:  # of one picture; the next one may do
                 self.tracked = None
                 if is_said(self._problems.add("previews in which the camera could not be tracked", error)):
                     log.warning("the camera could not be tracked: %s: %s", type(error).__name__, error)
 
-    def _track(self, tracker: Tracker, image: npt.NDArray[np.uint8], snapshot: Snapshot) -> None:
+    def _track(
+        self, tracker: Tracker, image: npt.NDArray[np.uint8], captured_at: Stamp | None, snapshot: Snapshot
+    ) -> None:
         height, width = image.shape[:2]
         position, motion = tracker.track(image, preview_intrinsics(snapshot.cameras[-1], width, height))
-        self.tracked = position and CameraEstimate("live", -1, position.T_world_camera, position.K, width, height)
+        self.tracked = position and CameraEstimate(
+            "live", -1, position.T_world_camera, position.K, width, height, captured_at=captured_at
+        )
         if motion is not None and motion.moved and not (self.motion and self.motion.moved):
             event(log, logging.WARNING, "camera_moved", how=motion)
         self.motion = motion

@@ -21,6 +21,7 @@ from splatnode.capture.messaging.values import Amount, Count, Finite, Name, Text
 from splatnode.capture.messaging.wire import Header, Message, WireError
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import LONGEST_NAME, printable
+from splatnode.capture.stamp import Stamp
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.camera_check import camera_problem
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
@@ -63,6 +64,7 @@ class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     width: Pixels
     height: Pixels
     bounds: BoundsRecord | None
+    captured_at: Stamp | None = None
 
     def __post_init__(self) -> None:
         """Raises ValueError, of which msgspec makes its own error, where nothing can be seen through it."""
@@ -186,6 +188,7 @@ def camera_record(camera: CameraEstimate) -> CameraRecord:
         width=camera.width,
         height=camera.height,
         bounds=bounds_record(camera.bounds),
+        captured_at=camera.captured_at,
     )
 
 
@@ -198,6 +201,7 @@ def camera_from(record: CameraRecord) -> CameraEstimate:
         width=record.width,
         height=record.height,
         bounds=bounds_from(record.bounds),
+        captured_at=record.captured_at,
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.stamp import Stamp
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.verdict import Verdict
@@ -27,6 +28,7 @@ class CameraEstimate:
     width: int
     height: int
     bounds: Bounds | None = None  # of its errors; None: not estimated
+    captured_at: Stamp | None = None  # of its photograph; None: nobody knows
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from splatnode.capture.stamp import Stamp
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
@@ -52,8 +53,15 @@ class Scene:
         """The same scene with its Gaussians on `device`. Cameras and photographs stay on the processor."""
         return replace(self, gaussians=self.gaussians.map(lambda tensor: tensor.to(device)))
 
-    def cameras(self, bounds: Mapping[str, Bounds] = MappingProxyType({})) -> tuple[CameraEstimate, ...]:
-        """The views' cameras as they are published: copies, in float64, with the `bounds` of their errors by name."""
+    def cameras(
+        self,
+        bounds: Mapping[str, Bounds] = MappingProxyType({}),
+        captured_at: Mapping[str, Stamp] = MappingProxyType({}),
+    ) -> tuple[CameraEstimate, ...]:
+        """The views' cameras as they are published: copies, in float64.
+
+        `bounds` of their errors, and when their photographs were captured, are by name, as far as they are known.
+        """
         return tuple(
             CameraEstimate(
                 name=view.name,
@@ -63,6 +71,7 @@ class Scene:
                 width=view.width,
                 height=view.height,
                 bounds=bounds.get(view.name),
+                captured_at=captured_at.get(view.name),
             )
             for view in self.views
         )

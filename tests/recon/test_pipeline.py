@@ -123,6 +123,14 @@ def test_the_second_frame_gives_a_scene(streamed):
         assert set(snapshot.images) == {camera.name for camera in snapshot.cameras}
 
 
+@pytest.mark.parametrize("snapshots", ["streamed", "at_hand"])
+def test_cameras_have_the_times_at_which_their_photographs_were_captured(snapshots, request):
+    captured_at = {frame.name: frame.captured_at for frame in photographs()}
+    assert None not in captured_at.values()
+    for snapshot in request.getfixturevalue(snapshots):
+        assert all(camera.captured_at == captured_at[camera.name] for camera in snapshot.cameras)
+
+
 def test_a_dropped_frame_is_named_in_the_snapshots_that_follow(streamed):
     assert [snapshot.dropped for snapshot in streamed] == [()] * 3 + [(BLURRED,)] * 6
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.report import build_report
@@ -34,6 +36,13 @@ def make_camera(frame_id: int, angle: float = 0.3) -> CameraEstimate:
     K = np.array([[400.0, 0, 256], [0, 410, 192], [0, 0, 1]])
     bounds = Bounds(0.1, 0.02, 2.0, 1.5, ((0.03, 0.0, 0.0), (0.0, 0.0, 0.01), (0.0, 0.005, 0.0)))
     return CameraEstimate(f"{frame_id:04d}.jpg", frame_id, T_world_camera, K, 512, 384, bounds)
+
+
+def stamped(snapshot: Snapshot, first_ns: int = 1_714_989_607_250_000_001) -> Snapshot:
+    """With times of capture, a second apart."""
+    times = (Stamp(first_ns + index * 10**9, Clock.UTC) for index in range(len(snapshot.cameras)))
+    cameras = tuple(replace(camera, captured_at=stamp) for camera, stamp in zip(snapshot.cameras, times, strict=True))
+    return replace(snapshot, cameras=cameras)
 
 
 def make_snapshot(code: Code = Code.OK, publishable: bool = True) -> Snapshot:

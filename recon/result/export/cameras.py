@@ -15,6 +15,7 @@ import numpy as np
 
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import LONGEST_TEXT, is_printable, printable
+from splatnode.capture.stamp import LARGEST_NS, Clock, Stamp
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.camera_check import MAX_COORDINATE, camera_problem
 from splatnode.recon.result.export.error import SceneFileError
@@ -28,6 +29,9 @@ Row3: TypeAlias = tuple[Number, Number, Number]
 Row4: TypeAlias = tuple[Number, Number, Number, Number]
 Text = Annotated[str, msgspec.Meta(max_length=LONGEST_TEXT)]
 
+STAMP_MEANING = "nanoseconds when the photograph was captured, or null; clock says of what time: " + "; ".join(
+    f"{clock.value}, {clock.meaning}" for clock in Clock
+)
 BOUNDS_MEANING = (
     "hold for 95 % of all cameras: rotation_deg after the best common rotation, centre (in the file's unit) and "
     "centre_percent (of the distance to the scene) after the best similarity, focal_percent of the focal length; axes "
@@ -40,12 +44,18 @@ def camera_record(camera: CameraEstimate) -> dict[str, object]:
     return {
         "name": camera.name,
         "frame_id": camera.frame_id,
+        **stamp_record(camera.captured_at),
         "T_world_camera": camera.T_world_camera.tolist(),
         "K": camera.K.tolist(),
         "width": camera.width,
         "height": camera.height,
         "bounds": None if camera.bounds is None else asdict(camera.bounds),
     }
+
+
+def stamp_record(stamp: Stamp | None) -> dict[str, object]:
+    """A time of capture as the files hold it."""
+    return {"stamp_ns": stamp and stamp.ns, "clock": stamp and stamp.clock.value}
 
 
 def encode_cameras(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -> bytes:
@@ -55,6 +65,7 @@ def encode_cameras(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -
             **scale.record(),
             "axes": "OpenCV: x right, y down, z forward",
             "T_world_camera": "p_world = T_world_camera @ p_camera",
+            "stamp_ns": STAMP_MEANING,
             "bounds": BOUNDS_MEANING,
             "pixel_origin": "the centre of the top-left pixel is (0.5, 0.5)",
             "cameras": [camera_record(camera) for camera in cameras],
@@ -78,6 +89,8 @@ class _Camera(msgspec.Struct, frozen=True):
     width: int
     height: int
     bounds: _Bounds | None = None
+    stamp_ns: Annotated[int, msgspec.Meta(ge=0, le=LARGEST_NS)] | None = None
+    clock: Clock | None = None
 
 
 class _File(msgspec.Struct, frozen=True):
@@ -122,7 +135,11 @@ def _camera(record: _Camera, name: str) -> CameraEstimate:
     problem = camera_problem(T_world_camera, K, record.width, record.height)
     if not is_printable(record.name) or record.name in ("", ".", "..") or "/" in record.name:
         problem = "a name must be that of a file, in printable letters"
+    if (record.stamp_ns is None) != (record.clock is None):
+        problem = "stamp_ns and clock must be there both, or none"
     if problem:
         raise SceneFileError(f"{name}, camera {printable(record.name, 100)!r}: {problem}")
     bounds = record.bounds and Bounds(**msgspec.structs.asdict(record.bounds))
-    return CameraEstimate(record.name, record.frame_id, T_world_camera, K, record.width, record.height, bounds)
+    captured_at = None if record.stamp_ns is None or record.clock is None else Stamp(record.stamp_ns, record.clock)
+    size = record.width, record.height
+    return CameraEstimate(record.name, record.frame_id, T_world_camera, K, *size, bounds, captured_at)

@@ -11,6 +11,7 @@ import pytest
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.messaging.jpeg import to_jpeg
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
+from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.message import SceneHeader, from_message, to_message
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
@@ -37,6 +38,7 @@ def camera(index: int) -> CameraEstimate:
         320,
         200,
         Bounds(0.1, 0.02, 2.0, 1.5, ((0.03, 0.0, 0.0), (0.0, 0.0, 0.01), (0.0, 0.005, 0.0))),
+        Stamp(10**18 + index, Clock.UTC) if index else None,
     )
 
 
@@ -84,7 +86,7 @@ def test_a_scene_comes_out_as_it_went_in():
             other.width,
             other.height,
         )
-        assert one.bounds == other.bounds is not None
+        assert one.bounds == other.bounds is not None and one.captured_at == other.captured_at
 
 
 def test_thumbnails_are_small_and_look_like_the_photograph():

@@ -97,6 +97,7 @@ def cameras(rng: random.Random) -> dict[str, object]:
                 "width": 16,
                 "height": 12,
                 "bounds": rng.choice((None, _BOUNDS)),
+                **rng.choice(({}, {"stamp_ns": index, "clock": rng.choice(("utc", "local"))})),
             }
             for index in range(rng.choice((0, 1, 2)))
         ],

@@ -1,12 +1,14 @@
 """trajectory.tum: the cameras as the TUM RGB-D benchmark's tools read them (Sturm et al. 2012).
 
-A line a camera: `time x y z qx qy qz qw`, from the camera to the world. The time is the frame's id.
+A line a camera: `time x y z qx qy qz qw`, from the camera to the world. The time is that of capture, in seconds, where
+all cameras have one by the same clock; else it is the frame's id. The file's first line says which, and why.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+from splatnode.capture.stamp import Stamp
 from splatnode.recon.result.export.quaternions import quats_from_matrices
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.export.text import number_row, text_file
@@ -21,9 +23,28 @@ def export(result: StoredResult) -> bytes:
 
 
 def encode_tum(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -> bytes:
-    """The file's bytes, in the order of the frames' ids."""
-    lines = []
-    for camera in sorted(cameras, key=lambda camera: camera.frame_id):
-        w, x, y, z = quats_from_matrices(camera.T_world_camera[:3, :3])
-        lines.append(f"{camera.frame_id} {number_row([*camera.T_world_camera[:3, 3], x, y, z, w])}")
-    return text_file("time (frame id), x y z, qx qy qz qw of T_world_camera", lines, scale)
+    """The file's bytes, in the order of time, and of the frames' ids where the time is the same."""
+    ordered = sorted(cameras, key=lambda camera: camera.frame_id)
+    stamps = [camera.captured_at for camera in ordered if camera.captured_at is not None]
+    why_not = _why_not_by(stamps, len(ordered))
+    if why_not:
+        head, rows = f"frame id; {why_not}", [(str(camera.frame_id), camera) for camera in ordered]
+    else:
+        head = f"seconds {stamps[0].clock.meaning}"
+        by_time = sorted(zip(stamps, ordered, strict=True), key=lambda row: row[0].ns)
+        rows = [(stamp.seconds, camera) for stamp, camera in by_time]
+    lines = [f"{time} {number_row(_motion(camera))}" for time, camera in rows]
+    return text_file(f"time ({head}), x y z, qx qy qz qw of T_world_camera", lines, scale)
+
+
+def _why_not_by(stamps: Sequence[Stamp], wanted: int) -> str:
+    """Why these stamps of `wanted` photographs are no times of one trajectory; empty where they are."""
+    if not stamps or len(stamps) < wanted:
+        return f"photographs without a time stamp: {wanted - len(stamps)} of {wanted}"
+    clocks = sorted({stamp.clock.value for stamp in stamps})
+    return f"the time stamps are of different clocks: {', '.join(clocks)}" if len(clocks) > 1 else ""
+
+
+def _motion(camera: CameraEstimate) -> list[float]:
+    w, x, y, z = quats_from_matrices(camera.T_world_camera[:3, :3])
+    return [*camera.T_world_camera[:3, 3], x, y, z, w]

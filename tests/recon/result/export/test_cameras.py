@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from splatnode.recon.result.export import SceneFileError, read_cameras
-from tests.support.exported import make_snapshot, write
+from splatnode.recon.result.export import SceneFileError, export_scene, read_cameras
+from tests.support.exported import make_snapshot, stamped, write
 
 
 def test_cameras_read_back_exactly(tmp_path):
@@ -18,6 +18,49 @@ def test_cameras_read_back_exactly(tmp_path):
         assert np.array_equal(read.K, camera.K)
         assert (read.name, read.frame_id, read.width, read.height) == (camera.name, camera.frame_id, 512, 384)
         assert read.bounds == camera.bounds is not None
+
+
+def test_times_of_capture_read_back_to_the_nanosecond_and_are_in_the_other_files(tmp_path):
+    snapshot = stamped(make_snapshot())
+    write(snapshot, tmp_path)
+    read = [camera.captured_at for camera in read_cameras(tmp_path / "cameras.json")]
+    assert read == [camera.captured_at for camera in snapshot.cameras] and read[0].ns == 1_714_989_607_250_000_001
+    for name, entries in {"cameras.json": "cameras", "report.json": "cameras", "transforms.json": "frames"}.items():
+        first = json.loads((tmp_path / name).read_text())[entries][0]
+        assert (first["stamp_ns"], first["clock"]) == (1_714_989_607_250_000_001, "utc"), name
+    trajectory = (tmp_path / "trajectory.tum").read_bytes()
+    assert b"\n1714989607.250000001 " in trajectory
+    assert export_scene(tmp_path, "tum", tmp_path / "again.tum").read_bytes() == trajectory
+
+
+def test_a_file_without_times_is_that_of_an_earlier_version_and_of_photographs_without(tmp_path):
+    write(make_snapshot(), tmp_path)
+    file = tmp_path / "cameras.json"
+    content = json.loads(file.read_text())
+    for camera in content["cameras"]:
+        assert camera.pop("stamp_ns") is None and camera.pop("clock") is None
+    file.write_text(json.dumps(content))
+    assert [camera.captured_at for camera in read_cameras(file)] == [None, None]
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"stamp_ns": -1},
+        {"stamp_ns": 2**63},
+        {"stamp_ns": 1.5},
+        {"clock": "sundial"},
+        {"clock": None},
+        {"stamp_ns": None},
+    ],
+)
+def test_a_time_that_is_none_is_a_clear_error(tmp_path, parts):
+    write(stamped(make_snapshot()), tmp_path)
+    content = json.loads((tmp_path / "cameras.json").read_text())
+    content["cameras"][0] |= parts
+    (tmp_path / "cameras.json").write_text(json.dumps(content))
+    with pytest.raises(SceneFileError, match="cameras.json"):
+        read_cameras(tmp_path / "cameras.json")
 
 
 @pytest.mark.parametrize("axes", [[[0.1, 0.0, 0.0]], [[float("nan"), 0.0, 0.0]] * 3, None])
