@@ -17,6 +17,7 @@ from splatnode.recon.estimation import Estimate, estimate_cameras
 from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.ladder import learned, tilts
 from splatnode.recon.ladder.better import better
+from splatnode.recon.ladder.others import without_the_doubtful
 from splatnode.recon.ladder.rung import Means, Rung
 from splatnode.recon.result.verdict import Code
 
@@ -40,10 +41,23 @@ def climbed(
 
     With `config.quick` it is `estimate`. `config.ladder.seconds` bounds the work that is added: they are looked at
     between pairs and before each rung, as is `until`, a time of `time.monotonic()`. A pair and an estimate that have
-    begun are finished. `pause` may raise.
+    begun are finished. Where that does not help, photographs in doubt are left out. `pause` may raise.
     """
-    if config.quick or not _lacks_matches(estimate):
+    if config.quick:
         return estimate
+    if _lacks_matches(estimate):
+        estimate = _with_more(estimate, rejected, config, pause, rungs, until)
+    return estimate if time.monotonic() >= until else without_the_doubtful(estimate, rejected, config, pause)
+
+
+def _with_more(
+    estimate: Estimate,
+    rejected: Sequence[Rejected],
+    config: Config,
+    pause: Callable[[], None],
+    rungs: Sequence[Rung],
+    until: float,
+) -> Estimate:
     means, until = Means(estimate.graph, config), min(until, time.monotonic() + config.ladder.seconds)
     tried: list[str] = []
     not_tried: list[str] = []

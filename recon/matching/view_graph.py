@@ -73,6 +73,22 @@ class ViewGraph:
         )
         return rest if rest.to_match() else rest.chosen()
 
+    def without_pairs_of(self, names: Collection[str]) -> ViewGraph:
+        """The same keyframes; nothing is known of the pairs of these, and nothing pending."""
+        gone = {index for index, keyframe in enumerate(self.keyframes) if keyframe.name in names}
+
+        def remaining(pairs: Mapping[Pair, T]) -> dict[Pair, T]:
+            return {pair: found for pair, found in pairs.items() if gone.isdisjoint(pair)}
+
+        return replace(
+            self,
+            pairs=remaining(self.pairs),
+            pending=frozenset(remaining(dict.fromkeys(self.pending))),
+            plain=remaining(self.plain),
+            tilted=remaining(self.tilted),
+            glanced=remaining(self.glanced),
+        )
+
     def joined(self, other: ViewGraph) -> ViewGraph:
         """The view graph of the keyframes of both, by frame id, with the pairs that either has matched.
 

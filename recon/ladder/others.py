@@ -1,0 +1,52 @@
+"""What the others show: where a refusal is about a few photographs, the rest is judged by itself.
+
+A photograph that shows little of what the others show, or only something that may have been moved, says nothing against
+these. They are judged as if it had never been taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from splatnode.recon.config import Config
+from splatnode.recon.estimation import Estimate, estimate_cameras
+from splatnode.recon.frames.screening import Rejected
+from splatnode.recon.result.verdict import Code
+
+MIN_LEFT = 3  # photographs with cameras: of fewer, nothing tells whether one of them is wrong
+
+
+def without_the_doubtful(
+    estimate: Estimate, rejected: Sequence[Rejected], config: Config, pause: Callable[[], None]
+) -> Estimate:
+    """The estimate of the others, where they are most photographs, and are published exactly; else `estimate`.
+
+    The photographs that are left out stay in its view graph, without pairs. `pause` may raise.
+    """
+    other, left_out = estimate, frozenset[str]()
+    while not other.verdict.publishable:
+        left_out = left_out.union(other.verdict.frames)
+        placed = _placed(other) - left_out
+        if not other.verdict.frames or len(placed) < MIN_LEFT or 2 * len(left_out) >= len(estimate.graph.keyframes):
+            return estimate
+        other = estimate_cameras(estimate.graph.without_pairs_of(left_out), rejected, config, pause)
+    if other is estimate or other.verdict.code is Code.OK_ROUGH:
+        return estimate
+    return _telling(other, estimate, left_out)
+
+
+def _placed(estimate: Estimate) -> set[str]:
+    """The keyframes that have a camera, published or not."""
+    if estimate.registration is None:
+        return set()
+    return {estimate.graph.names[camera.index] for camera in estimate.registration.cameras}
+
+
+def _telling(other: Estimate, refused: Estimate, left_out: frozenset[str]) -> Estimate:
+    """With the reason for which the first photographs were left out."""
+    found, count = len(other.placed), len(other.graph.keyframes)
+    names = ", ".join(name for name in other.graph.names if name in left_out)
+    message = f"{found} of {count} frames were placed, without {names}. With these: {refused.verdict.message}"
+    verdict = replace(other.verdict, code=Code.OK_PARTIAL, message=message, advice=refused.verdict.advice)
+    return replace(other, verdict=verdict)
