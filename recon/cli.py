@@ -15,6 +15,7 @@ import msgspec
 from torch import Tensor
 
 from splatnode.capture.cameras import folder, synthetic
+from splatnode.capture.choosing import THINNED
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.progress import Step, Tell, Told, told_to_nobody
@@ -59,6 +60,8 @@ def replay(args: argparse.Namespace) -> int:
     given = source(args, tell)
     if given.choice is not None:
         tell(str(given.choice))
+        if given.choice.left_out.get(THINNED):
+            tell("--map uses the keyframes that were thinned out, too, and makes a map of many scenes")
     _check_baseline(config, [frame.name for frame in given.frames])
     needed_bytes = largest_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
     with (

@@ -16,7 +16,7 @@ import pytest
 from splatnode import command_line
 from splatnode.capture.cameras.folder import Config, stream
 from splatnode.capture.recording import Recorder
-from splatnode.recon import cli
+from splatnode.recon import cli, replay_source
 from splatnode.recon.result.scale import Scale
 from tests.support.exported import make_snapshot
 
@@ -132,3 +132,14 @@ def test_a_nearly_full_disk_is_told_before_the_work(replayed, monkeypatch, capsy
     assert command_line.main(["demo", "--out", "new/out"]) == 74
     assert "the result may take" in capsys.readouterr().err
     assert not Path("new").exists()
+
+
+def test_where_keyframes_were_thinned_out_the_map_is_named(photographs, monkeypatch, capsys):
+    monkeypatch.setattr(replay_source, "ALL", 1)
+    monkeypatch.setattr(replay_source, "MOST", 1)
+    rng = np.random.default_rng(1)
+    for name in ("c.png", "d.png"):
+        cv2.imwrite(str(photographs / name), rng.integers(0, 256, (48, 64, 3)).astype(np.uint8))
+    out = photographs.parent / "out"
+    assert command_line.main(["replay", str(photographs), "--out", str(out)]) == 65
+    assert "thinned out" in (printed := capsys.readouterr().out) and "--map uses the keyframes" in printed
