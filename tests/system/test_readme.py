@@ -375,6 +375,18 @@ def test_stability():
     says(f"In {len(refused)} of the {summary['false_refuse']['of']} trials that deserved a scene there was none")
 
 
+def test_photographs_in_doubt():
+    trials = raw("doubtful")["trials"]
+    partial = [trial for trial in trials if trial["verdict"] == "OK_PARTIAL"]
+    says(f"Of {len(trials)} trials of the kinds that this concerns (`doubtful.json`), {len(partial)} were published")
+    assert max(trial["rotation_error_deg"] for trial in partial) < 0.7
+    assert max(trial["centre_error_pct"] for trial in partial) < 0.5
+    (wrong,) = [trial for trial in trials if trial["outcome"] == "false_accept"]
+    assert (wrong["name"], wrong["verdict"], wrong["num_cameras"]) == ("two places", "OK", 7)
+    says("The 1 that counts as a wrong scene, of two places, is one courtyard")
+    assert wrong["rotation_error_deg"] < 0.2 and wrong["centre_error_pct"] < 0.2
+
+
 def test_stability_of_the_rivals():
     found = {method["method"]: method for method in raw("stability_rivals")["methods"]}
     wrong = [found[name]["false_accept"]["count"] for name in ("splatnode", "colmap", "glomap")]
