@@ -344,6 +344,26 @@ def test_growth():
     says(f"Peak memory is {', '.join(gigabytes)} GB")
 
 
+def test_a_walk_of_a_thousand_keyframes():
+    walk = raw("building_1000")
+    cameras, cost, loops = walk["cameras"], walk["cost"], walk["loops"]
+    says(f"the same for {walk['keyframes']} keyframes, {cameras['path_m']:.0f} m")
+    says(f"{walk['in_a_scene']} in a scene, in {walk['scenes']} scenes")
+    says(
+        f"within {cameras['position_percent_of_path']:.3f} % of the way and {cameras['rotation_deg_most']:.2f} degrees"
+    )
+    seconds = cost["processor_s"]
+    says(f"{seconds['median']:.1f} s of processor a keyframe in the median, {seconds['percentile_95']:.1f} in the 95th")
+    says(f"(the running median by {100 * seconds['slope_of_median_per_100']:.1f} % a hundred keyframes)")
+    memory = cost["rss_mb"]
+    says(f"at most {walk['memory_on_the_way_mb'] / 1e3:.2f} GB on the way, {memory['growth_per_keyframe']:.2f} MB more")
+    disk = cost["checkpoint_mb"]["growth_per_keyframe"]
+    says(f"{memory['most'] / 1e3:.2f} GB while scenes were finished; {disk:.1f} MB of disk")
+    final = sum(not place["provisional"] for place in walk["places"])
+    says(f"when {final} scenes were final: of {loops['loop_links']} loops none wrong")
+    assert loops["wrong_loop_links"] == loops["wrong_chain_links"] == 0
+
+
 def test_trust():
     poses = raw("poses")
     total, rows = poses["summary"], poses["rows"]
