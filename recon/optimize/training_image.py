@@ -42,7 +42,7 @@ def training_image(
     if not shown.all():
         share = cv2.resize(shown.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         weights = torch.from_numpy(np.floor(share + np.float32(_WHOLLY_SHOWN))).to(device)
-    target = torch.from_numpy(image).to(device).float() / 255.0
+    target = torch.tensor(image, device=device).float() / 255.0  # a copy: what is read from a file is read-only
     return TrainingImage(K, width, height, PhotometricLoss(target, dssim, weights))
 
 

@@ -26,3 +26,12 @@ def test_only_what_shows_the_scene_is_compared(scale):
     rows = 3 if scale == 1 else 2  # a pixel of the smaller photograph that mixes both is left out
     assert brighter.grad is not None
     assert not brighter.grad[:rows].any() and bool((brighter.grad[rows:] != 0).all())
+
+
+def test_a_photograph_that_is_read_only_is_nothing_to_warn_of(recwarn):
+    photograph = np.full((8, 12, 3), 51, np.uint8)
+    photograph.setflags(write=False)
+    view = TrainingView("a.png", 0, photograph, torch.eye(4), torch.eye(3))
+    found = training_image(view, np.ones((8, 12), bool), 1.0, 0.0)
+    assert float(found.loss(torch.full((8, 12, 3), 0.2))) == pytest.approx(0.0, abs=1e-6)
+    assert not recwarn.list
