@@ -86,11 +86,15 @@ class Estimate:
         return Conclusion(self.verdict, self.bounds, self.evidence_record, known)
 
     @property
+    def registered(self) -> set[str]:
+        """The keyframes that have a camera, whether it may be published or not."""
+        cameras = () if self.registration is None else self.registration.cameras
+        return {self.graph.keyframes[camera.index].name for camera in cameras}
+
+    @property
     def placed(self) -> set[str]:
         """The keyframes that have a camera in a scene that may be published."""
-        if not self.verdict.publishable or self.registration is None:
-            return set()
-        return {self.graph.keyframes[camera.index].name for camera in self.registration.cameras}
+        return self.registered if self.verdict.publishable else set()
 
 
 def estimate_cameras(

@@ -69,8 +69,12 @@ class Recording:
         return self.path.is_file()
 
     def identity(self, config: Reconstruction) -> str:
-        """32 hexadecimal digits that tell it, reconstructed in this way, from others."""
-        known = [str(self.path.resolve()), self.path.stat().st_mtime_ns, self.choice.names, config]
+        """32 hexadecimal digits that tell it, reconstructed in this way, from others.
+
+        Of a folder the names count: it may hold the results, too, which change when it was last written.
+        """
+        written_ns = self.path.stat().st_mtime_ns if self.is_video else 0
+        known = [str(self.path.resolve()), written_ns, self.choice.names, config]
         return hashlib.sha256(msgspec.json.encode(known)).hexdigest()[:32]
 
     def frames(self) -> Iterator[Frame | DroppedFrame]:

@@ -104,9 +104,7 @@ def doubtful_keyframes(estimate: Estimate) -> frozenset[str]:
 
 def without_cameras(estimate: Estimate) -> frozenset[str]:
     """The names of the keyframes that have no camera."""
-    cameras = estimate.registration.cameras if estimate.registration is not None else ()
-    names = estimate.graph.names
-    return frozenset(names).difference(names[camera.index] for camera in cameras)
+    return frozenset(estimate.graph.names) - estimate.registered
 
 
 def _telling(estimate: Estimate, rungs: Mapping[str, Sequence[str]]) -> Estimate:

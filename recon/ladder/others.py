@@ -26,21 +26,15 @@ def without_the_doubtful(
     """
     other, left_out = estimate, frozenset[str]()
     while not other.verdict.publishable:
-        left_out = left_out.union(other.verdict.frames)
-        placed = _placed(other) - left_out
-        if not other.verdict.frames or len(placed) < MIN_LEFT or 2 * len(left_out) >= len(estimate.graph.keyframes):
+        doubtful = frozenset(other.verdict.frames) - left_out
+        left_out |= doubtful
+        few = 2 * len(left_out) < len(estimate.graph.keyframes)
+        if not doubtful or not few or len(other.registered - left_out) < MIN_LEFT:
             return estimate
         other = estimate_cameras(estimate.graph.without_pairs_of(left_out), rejected, config, pause)
     if other is estimate or other.verdict.code is Code.OK_ROUGH:
         return estimate
     return _telling(other, estimate, left_out)
-
-
-def _placed(estimate: Estimate) -> set[str]:
-    """The keyframes that have a camera, published or not."""
-    if estimate.registration is None:
-        return set()
-    return {estimate.graph.names[camera.index] for camera in estimate.registration.cameras}
 
 
 def _telling(other: Estimate, refused: Estimate, left_out: frozenset[str]) -> Estimate:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import logging
 import time
@@ -26,7 +27,7 @@ from splatnode.recon.mapping.scenes import (
     node_config,
     remove_checkpoint,
 )
-from splatnode.recon.merging.command import Reports, most, write_maps
+from splatnode.recon.merging.command import EXIT_GOOD, EXIT_REFUSED, Reports, most, write_maps
 from splatnode.recon.replay_source import IMAGES, Recording, recording
 from splatnode.recon.result.export import read_cameras, write_file
 from splatnode.recon.result.export.limits import read_json_file
@@ -34,7 +35,6 @@ from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.whole import FILE
 
-EXIT_GOOD, EXIT_REFUSED = 0, 65
 _OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline")
 
 
@@ -50,9 +50,9 @@ def replay_map(args: argparse.Namespace, config: Config) -> int:
     began_s = time.monotonic()
     with result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):
         frames = _kept(source, args.out) if source.is_video else source.frames()
-        logging.getLogger("splatnode").setLevel(logging.WARNING)  # what is told of each step would be too much
         told = _ToldOfMap(args.json, len(source.choice.names))
-        make_scenes(frames, source.identity(config), node_config(config, args.out), told)
+        with _only_warnings():
+            make_scenes(frames, source.identity(config), node_config(config, args.out), told)
         progress("")
         reports = write_maps(args.out, args.out, partial(most, args), quiet=args.json)
         report = _report(source, args.out, reports, time.monotonic() - began_s)
@@ -63,6 +63,18 @@ def replay_map(args: argparse.Namespace, config: Config) -> int:
     else:
         _tell(report, args.out)
     return EXIT_GOOD if reports else EXIT_REFUSED
+
+
+@contextlib.contextmanager
+def _only_warnings() -> Iterator[None]:
+    """What is logged of each step of each scene would be too much."""
+    log = logging.getLogger("splatnode")
+    before = log.level
+    log.setLevel(logging.WARNING)
+    try:
+        yield
+    finally:
+        log.setLevel(before)
 
 
 class _ToldOfMap:

@@ -12,7 +12,7 @@ import torch
 from splatnode.recon.frames import border
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.scene import background, completion, pixelwise, seeding
-from splatnode.recon.scene.gaussians import concatenate
+from splatnode.recon.scene.gaussians import Gaussians, concatenate
 from splatnode.recon.scene.scene import Scene, TrainingView
 
 Image = npt.NDArray[np.uint8]
@@ -43,26 +43,27 @@ def initial_scene(
     pictures = [images[pointmap.name] for pointmap in pointmaps]
     valid = border.valid_masks(pictures)
     pointmaps = tuple(map(Pointmap.masked, pointmaps, valid))
-    if config.pixelwise is not None and config.pixelwise.surroundings == "none":
-        surfaces = pixelwise.pixelwise_gaussians(pointmaps, pictures, config.pixelwise, config.max_gaussians)
-        return Scene(_views(pointmaps, images), surfaces)
     usable = [each.masked(each.confidence >= config.completion.min_usable_confidence) for each in pointmaps]
-    shell_limit = None if config.max_gaussians is None else config.max_gaussians // SHELL_PARTS
-    shell = background.far_shell(usable, pictures, config.background, shell_limit)
-    limit = None if config.max_gaussians is None else config.max_gaussians - len(shell)
-    if config.pixelwise is not None and config.pixelwise.surroundings == "shell":
-        surfaces = pixelwise.pixelwise_gaussians(pointmaps, pictures, config.pixelwise, limit)
-        return Scene(_views(pointmaps, images), concatenate([surfaces, shell]))
-    completed = list(map(Pointmap.masked, completion.complete(usable, pictures, config.completion), valid))
+    surroundings = "fill" if config.pixelwise is None else config.pixelwise.surroundings
+    shells = [] if surroundings == "none" else [_shell(usable, pictures, config)]
+    limit = None if config.max_gaussians is None else config.max_gaussians - sum(map(len, shells))
+    dense = pointmaps
+    if surroundings == "fill":
+        dense = list(map(Pointmap.masked, completion.complete(usable, pictures, config.completion), valid))
     del usable
     if config.pixelwise is not None:
-        surfaces = pixelwise.pixelwise_gaussians(completed, pictures, config.pixelwise, limit)
-        return Scene(_views(completed, images), concatenate([surfaces, shell]))
-    surfaces = seeding.initial_gaussians(completed, pictures, config.seeding)
-    num_unlimited = len(surfaces) + len(shell)
+        surfaces = pixelwise.pixelwise_gaussians(dense, pictures, config.pixelwise, limit)
+        return Scene(_views(dense, images), concatenate([surfaces, *shells]))
+    surfaces = seeding.initial_gaussians(dense, pictures, config.seeding)
+    num_unlimited = len(surfaces) + sum(map(len, shells))
     if limit is not None and len(surfaces) > limit:
-        surfaces = seeding.initial_gaussians(completed, pictures, config.seeding, limit)
-    return Scene(_views(pointmaps, images), concatenate([surfaces, shell]), num_unlimited=num_unlimited)
+        surfaces = seeding.initial_gaussians(dense, pictures, config.seeding, limit)
+    return Scene(_views(pointmaps, images), concatenate([surfaces, *shells]), num_unlimited=num_unlimited)
+
+
+def _shell(pointmaps: Sequence[Pointmap], pictures: Sequence[Image], config: Config) -> Gaussians:
+    limit = None if config.max_gaussians is None else config.max_gaussians // SHELL_PARTS
+    return background.far_shell(pointmaps, pictures, config.background, limit)
 
 
 def _views(pointmaps: Sequence[Pointmap], images: Mapping[str, Image]) -> tuple[TrainingView, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from argparse import Namespace
 
 import cv2
@@ -12,7 +13,8 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import decode_image, encode_png
 from splatnode.recon import replay_source
-from splatnode.recon.replay_source import source
+from splatnode.recon.config import Config
+from splatnode.recon.replay_source import recording, source
 
 WALK = synthetic.Config(views=6, width=160, height=120)
 STEPS = 36
@@ -93,3 +95,13 @@ def test_a_file_that_is_no_video_is_told(tmp_path):
         source(asked(tmp_path / "notes.txt"))
     with pytest.raises(FileNotFoundError, match="nothing.mp4' is not there; give a folder .* or a video"):
         source(asked(tmp_path / "nothing.mp4"))
+
+
+def test_a_folder_into_which_results_were_written_is_the_same_recording(walk, film, tmp_path):
+    folder = folder_of(walk[:3], tmp_path / "photographs")
+    before = recording(asked(folder)).identity(Config())
+    (folder / "out").mkdir()
+    os.utime(folder, ns=(1, 1))
+    assert recording(asked(folder)).identity(Config()) == before
+    assert recording(asked(folder)).identity(Config(seed=1)) != before
+    assert recording(asked(film)).identity(Config()) != before

@@ -81,6 +81,12 @@ def test_where_most_are_in_doubt_the_answer_stays(first, asked):
     assert judged(first) is first and asked() == []
 
 
+def test_a_refusal_that_names_only_what_is_left_out_already_ends_it(asked):
+    graphs = asked(estimate(Code.MIXED_CAMERAS, 5, 5))
+    first = estimate(Code.MOVING_SCENE, 6, 5)
+    assert judged(first) is first and len(graphs) == 1
+
+
 @pytest.mark.parametrize("second", [estimate(Code.OK_ROUGH, 5), estimate(Code.AMBIGUOUS, 5, *range(5))])
 def test_what_is_not_exact_or_not_published_is_not_taken(second, asked):
     asked(second)
