@@ -1,4 +1,8 @@
-"""Finishes the scenes of places that the camera has left, oldest first, from their checkpoints."""
+"""Finishes the scenes of places that the camera has left, oldest first, from their checkpoints.
+
+First every place is judged with all its evidence, and compared with those that were judged before it: that tells where
+the robot is. Then their scenes are made, which takes longer.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ import contextlib
 import logging
 import math
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from splatnode.capture.process.logs import event
@@ -13,7 +18,7 @@ from splatnode.recon.config import Config
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon import finishing, places
 from splatnode.recon.daemon.atlas.atlas import Atlas
-from splatnode.recon.daemon.checkpoint import checkpoint, left
+from splatnode.recon.daemon.checkpoint import checkpoint, left, made_anew
 from splatnode.recon.daemon.checkpoint.ledger import CheckpointError
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.output import Output
@@ -23,6 +28,8 @@ from splatnode.recon.modelling import Shown
 log = logging.getLogger(__name__)
 
 AGAIN_S = 300.0  # after a place could not be finished
+
+_Step = Callable[[Store, checkpoint.Restored, Pause], bool]
 
 
 class LeftPlaces:
@@ -43,26 +50,40 @@ class LeftPlaces:
         if self._work is not None:
             self._work.clock.leave_out(seconds)
 
-    def finish_next(self, pause: Pause) -> bool:
-        """Finishes the oldest place and writes its result; False where there is none to be finished now.
+    def judge_next(self, pause: Pause) -> bool:
+        """Judges the oldest place that is not judged yet with all its evidence, and compares it with the others.
 
-        What places that were left are to lose is taken out of them first. What `pause` raises ends the work; it is
-        begun again another time, as after a failure.
+        Its scene stays a draft, in a result folder, unless there is none to be made. False where there is none to be
+        judged now. What places that were left are to lose is taken out of them first. What `pause` raises ends the
+        work; it is begun again another time, as after a failure.
         """
         self._retract()
+        return self._work_on([each for each in self._waiting if not self._atlas.knows(each.name)], self._judge, pause)
+
+    def finish_next(self, pause: Pause) -> bool:
+        """Makes the scene of the oldest place that is judged, as good as it gets, and writes its result.
+
+        False where there is none to be made now; `pause` as for `judge_next`.
+        """
+        return self._work_on([each for each in self._waiting if self._atlas.knows(each.name)], self._make, pause)
+
+    @property
+    def _waiting(self) -> list[Path]:
+        """The folders of the places that are not finished, the oldest first; not those that failed a moment ago."""
         now = time.monotonic()
-        waiting = [each for each in left.folders(self._here.directory) if self._not_before_s.get(each, 0.0) <= now]
-        if not waiting:
+        return [each for each in left.folders(self._here.directory) if self._not_before_s.get(each, 0.0) <= now]
+
+    def _work_on(self, folders: Sequence[Path], step: _Step, pause: Pause) -> bool:
+        """Takes the step with the first of the places; False where there is none, or the disk did not take it."""
+        if not folders:
             return False
-        folder = waiting[0]
-        self._not_before_s[folder] = now + AGAIN_S
+        folder = folders[0]
+        self._not_before_s[folder] = time.monotonic() + AGAIN_S
         try:
             with contextlib.closing(Store(folder)) as store:
                 found = checkpoint.restore(store, self._config)
                 self._work = found.work
-                finished = self._finished(store, found, pause)
-                if finished:
-                    self._keep(store, found.work, pause)
+                done = step(store, found, pause)
         except OSError as error:
             self._output.complain(
                 f"{folder.name} cannot be finished ({error.strerror or error}): make room on the disk"
@@ -71,7 +92,7 @@ class LeftPlaces:
         finally:
             self._work = None
             give_back_memory()
-        if finished:
+        if done:
             del self._not_before_s[folder]
         return True
 
@@ -94,6 +115,7 @@ class LeftPlaces:
         folder = left.reopen(self._here.directory, scene)
         if folder is not None:
             self._atlas.forget(scene)
+            made_anew.remove(folder, "codes")
             self._not_before_s.pop(folder, None)
             try:
                 with contextlib.closing(Store(folder)) as store:
@@ -102,27 +124,26 @@ class LeftPlaces:
                 self._output.complain(f"{name} cannot be taken out of {scene}: {error}")
         self._here.was_retracted(scene, name)
 
-    def _finished(self, store: Store, found: checkpoint.Restored, pause: Pause) -> bool:
-        """Whether the scene of the place is final now, and its result written."""
+    def _judge(self, store: Store, found: checkpoint.Restored, pause: Pause) -> bool:
+        """Whether the place is judged now, and its result written."""
+        work = found.work
         if found.final and not found.new:  # as it was when the place was left
             self._output.finished(store.scene_id)
-            return True
-        event(log, logging.INFO, "finishing", scene=store.scene_id)
-        exported = self._finish(store, found, pause)
-        if exported:
-            self._output.save(store, found.work, final=True)
-        return exported
+        else:
+            event(log, logging.INFO, "judging", scene=store.scene_id)
+            self._weigh(store, found, pause)
+            if not work.estimate_soon(pause).publishable:
+                return self._make(store, found, pause)
+            work.update(pause)
+            snapshot = work.snapshot(store.dropped, final=False)
+            if not self._output.export(snapshot, store, places.State.LEFT, work.names):
+                return False
+            self._output.save(store, work, final=False)
+        self._atlas.keep(store, work.graph, self._atlas.compare(store.scene_id, work.graph, pause))
+        return True
 
-    def _keep(self, store: Store, work: IncrementalReconstruction, pause: Pause) -> None:
-        """Compares the scene with those before it, and takes it among them; one that is refused is of no use later."""
-        if work.scene is None:
-            left.remove(store.directory)
-            return
-        codes = self._atlas.compare(store.scene_id, work.graph, pause)
-        self._atlas.keep(store, work.graph, codes)
-        store.finish()
-
-    def _finish(self, store: Store, found: checkpoint.Restored, pause: Pause) -> bool:
+    def _weigh(self, store: Store, found: checkpoint.Restored, pause: Pause) -> None:
+        """All evidence on all keyframes; those that do not belong to the place are forgotten."""
         work = found.work
 
         def forget(name: str, reason: str) -> None:
@@ -134,10 +155,25 @@ class LeftPlaces:
         finishing.judge(work, forget, pause)
         for keyframe in work.aside:
             forget(keyframe.name, "it does not fit the scene")
-        work.show(_last(work, self._config, pause))
-        work.estimate_soon(pause)
-        snapshot = work.snapshot(store.dropped, final=True)
-        return self._output.export(snapshot, store, places.State.FINISHED, work.names)
+
+    def _make(self, store: Store, found: checkpoint.Restored, pause: Pause) -> bool:
+        """Whether the scene of a place that is judged is final now, and its result written."""
+        work = found.work
+        if not found.final:
+            event(log, logging.INFO, "finishing", scene=store.scene_id)
+            work.show(_last(work, self._config, pause))
+            work.estimate_soon(pause)
+            snapshot = work.snapshot(store.dropped, final=True)
+            if not self._output.export(snapshot, store, places.State.FINISHED, work.names):
+                return False
+            self._output.save(store, work, final=True)
+        if work.scene is None:  # one that is refused is of no use later
+            self._atlas.forget(store.scene_id)
+            left.remove(store.directory)
+        else:
+            store.remove_shown()
+            store.finish()
+        return True
 
 
 def _last(work: IncrementalReconstruction, config: Config, pause: Pause) -> Shown:

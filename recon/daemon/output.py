@@ -58,14 +58,15 @@ class Output:
         recipe, folder = self._config.reconstruction, self._config.out / place.scene_id
         provisional = folder.with_name(folder.name + PROVISIONAL)
         folder = folder if snapshot.final else provisional
+        before = self.places.cameras(place.scene_id)
         try:
             measured = in_metres(snapshot, recipe.metric)
             finish(measured, folder, seed=recipe.seed, preset_name="live")
             if snapshot.final:
                 remove_result(provisional)
             self.places.tell(_described(place, state, folder.name, snapshot, kept))
-            if snapshot.final:
-                self.places.link(place.scene_id)
+            if snapshot.final or not snapshot.verdict.provisional:
+                self.places.link(place.scene_id, before)
         except OSError as error:
             self.complain(error.strerror or str(error))
             return False

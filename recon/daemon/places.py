@@ -14,7 +14,7 @@ import numpy.typing as npt
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.memory import resident_mb
-from splatnode.recon.daemon.atlas.links import Kind, Link, link
+from splatnode.recon.daemon.atlas.links import Cameras, Kind, Link, carried, link
 from splatnode.recon.daemon.atlas.pose_graph import Pose, optimised
 from splatnode.recon.result.export import SceneFileError, read_cameras, write_file
 from splatnode.recon.result.export.limits import read_json_file
@@ -52,6 +52,7 @@ class Place(msgspec.Struct, frozen=True):
     frames_dropped: tuple[Dropped, ...]  # all others that were taken there, and why they have none
     follows: str = ""  # the scene that it goes on from; empty: it began anew
     shared: tuple[str, ...] = ()  # the photographs that both have
+    judged: bool = False  # whether all evidence was weighed and the cameras may be published; the scene may be a draft
     seconds: float = 0.0  # that were worked on it, by the process that wrote this
     rss_mb: float = 0.0  # memory of that process then
 
@@ -83,6 +84,7 @@ def described(
         publishable=verdict.publishable,
         provisional=verdict.provisional or not snapshot.final,
         num_gaussians=len(snapshot.gaussians),
+        judged=verdict.publishable and not verdict.provisional,
         frames_used=used,
         frames_dropped=(*unplaced, *(Dropped(frame.name, frame.reason) for frame in dropped)),
         follows=follows,
@@ -95,8 +97,8 @@ def described(
 class _Index(msgspec.Struct, frozen=True):
     checkpoint: str  # identity of the one that the places belong to
     places: tuple[Place, ...] = ()
-    links: tuple[Link, ...] = ()  # between final scenes
-    poses: tuple[Pose, ...] = ()  # of final scenes that may be published, by all links together
+    links: tuple[Link, ...] = ()  # between scenes that are judged
+    poses: tuple[Pose, ...] = ()  # of these scenes, by all links together
 
 
 class Places:
@@ -134,29 +136,33 @@ class Places:
 
     @property
     def links(self) -> tuple[Link, ...]:
-        """Between final scenes; those that are retracted say why."""
+        """Between scenes that are judged; those that are retracted say why."""
         return self._index.links
 
     @property
     def poses(self) -> tuple[Pose, ...]:
-        """Of final scenes, in the maps that they belong to."""
+        """Of the scenes that are judged, in the maps that they belong to."""
         return self._index.poses
 
-    def link(self, scene_id: str) -> None:
-        """Writes how this final scene, as it was just written, lies to those that it goes on from, and that follow it.
+    def link(self, scene_id: str, before: Cameras) -> None:
+        """Writes how this scene, which is judged and was just written, lies to those that it goes on from, and others.
 
-        What was known of its place in the map is forgotten. Raises ResultWriteError.
+        Its loops stay where its cameras lie to each other as they did `before`. Raises ResultWriteError.
         """
+        now, judged = self.cameras(scene_id), self._judged
         links = [each for each in self._index.links if scene_id not in (each.scene, each.other)]
-        final = self._final
-        for place in final.values():
-            before = final.get(place.follows)
-            if before is not None and scene_id in (place.scene_id, before.scene_id):
+        for place in judged.values():
+            follows = judged.get(place.follows)
+            if follows is not None and scene_id in (place.scene_id, follows.scene_id):
                 shared = [
                     {name: T for name, T in self.cameras(each.scene_id).items() if name in place.shared}
-                    for each in (before, place)
+                    for each in (follows, place)
                 ]
-                found = link(before.scene_id, place.scene_id, *shared)
+                found = link(follows.scene_id, place.scene_id, *shared)
+                links += [] if found is None else [found]
+        for loop in self._index.links:
+            if loop.kind is Kind.LOOP and scene_id in (loop.scene, loop.other):
+                found = carried(loop, scene_id, before, now)
                 links += [] if found is None else [found]
         self._write_links(links)
 
@@ -166,13 +172,15 @@ class Places:
         self._write_links([*others, *loops])
 
     @property
-    def _final(self) -> dict[str, Place]:
-        return {place.scene_id: place for place in self._index.places if not place.provisional and place.publishable}
+    def _judged(self) -> dict[str, Place]:
+        """Final scenes are, also those of an index that says nothing of it."""
+        places = self._index.places
+        return {each.scene_id: each for each in places if each.judged or (each.publishable and not each.provisional)}
 
     def _write_links(self, links: Sequence[Link]) -> None:
-        """Those between final scenes: a place that was final may have become a draft again."""
-        final = self._final
-        graph = optimised(list(final), [each for each in links if {each.scene, each.other} <= final.keys()])
+        """Those between scenes that are judged: one that was may be none any more."""
+        judged = self._judged
+        graph = optimised(list(judged), [each for each in links if {each.scene, each.other} <= judged.keys()])
         for each in graph.links:
             if each.retracted:
                 log.warning("the loop from %s to %s does not count: %s", each.scene, each.other, each.retracted)

@@ -201,12 +201,14 @@ class PresentPlace:
         Not where the newest alone make no scene.
         """
         newest = membership.newest(self._work, self._config.max_views // SHARED_PART)
+        first = min(each.frame.frame_id for each in newest)
         work = IncrementalReconstruction(self._recipe, self._work.known)
-        work.retract(set(self._work.names).difference(each.name for each in newest))
+        # Also what was set aside before: it stays with the scene that is left.
+        work.retract([each.name for each in (*work.graph.keyframes, *work.aside) if each.frame.frame_id < first])
         if len(work.estimate_thoroughly(self._unless_stopping).placed) < len(newest):
             return
         shared = {each.name for each in newest}
-        before = self._leave(min(each.frame.frame_id for each in newest), shared=shared)
+        before = self._leave(first, shared=shared)
         event(log, logging.INFO, "next_scene", before=before, now=self._store.scene_id, shared=len(newest))
         self._work = work
 

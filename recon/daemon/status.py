@@ -36,7 +36,7 @@ class ReconStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     delay_s: Amount  # that the oldest keyframe has waited which no scene shows yet; 0: none waits
     delay: Text  # what it waits for
     unfinished: Count  # places that were left and whose scenes are not final yet
-    scenes: Count  # final ones, of all places
+    scenes: Count  # whose cameras are judged with all evidence, of all places
     maps: Count  # that these are, joined by the chains and loops that count
     loops: Count
     refused: Count  # malformed messages

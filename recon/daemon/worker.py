@@ -58,7 +58,7 @@ class Worker:
 
     @property
     def known(self) -> tuple[int, int, int]:
-        """How many final scenes there are, how many maps they are, and how many loops count."""
+        """How many scenes are judged, how many maps they are, and how many loops count."""
         poses, links = self._output.places.poses, self._output.places.links
         loops = sum(link.kind is Kind.LOOP and link.retracted is None for link in links)
         return len(poses), len({pose.map for pose in poses}), loops
@@ -92,7 +92,11 @@ class Worker:
 
     def _rest(self) -> None:
         """What there is time for while nothing is to be done for the present place."""
-        if not self._left.finish_next(self._meanwhile) and not self.place.compare(self._atlas):
+        if not (
+            self._left.judge_next(self._meanwhile)
+            or self.place.compare(self._atlas)
+            or self._left.finish_next(self._meanwhile)
+        ):
             self.rests += 1
 
     def _turn(self, wait_s: float) -> bool:

@@ -78,18 +78,18 @@ def _only_warnings() -> Iterator[None]:
 
 
 class _ToldOfMap:
-    """Says how far the work is: on a terminal again and again, else whenever a scene is final."""
+    """Says how far the work is: on a terminal again and again, else whenever a scene is judged or made."""
 
     def __init__(self, quiet: bool, keyframes: int) -> None:
-        self._quiet, self._keyframes, self._last = quiet, keyframes, (0, 0)
+        self._quiet, self._keyframes, self._last = quiet, keyframes, (0, 0, 0)
 
     def __call__(self, now: Progress) -> None:
         if self._quiet:
             return
         line = f"{now} ({self._keyframes} keyframes in all)"
         progress(line)
-        if not in_place() and (now.final, now.maps) != self._last:
-            self._last = now.final, now.maps
+        if not in_place() and (now.judged, now.unfinished, now.maps) != self._last:
+            self._last = now.judged, now.unfinished, now.maps
             say(line)
 
 

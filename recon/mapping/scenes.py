@@ -38,15 +38,15 @@ class Progress:
     """How far the map is."""
 
     taken: int  # keyframes
-    final: int  # scenes
-    unfinished: int
+    judged: int  # scenes whose cameras are judged with all evidence
+    unfinished: int  # places whose scenes are still to be made
     maps: int
     loops: int
 
     def __str__(self) -> str:
-        work = f" ({self.unfinished} in work)" if self.unfinished else ""
+        work = f" ({self.unfinished} still to be made)" if self.unfinished else ""
         loops = f", places found again: {self.loops}" if self.loops else ""
-        return f"keyframes: {self.taken}, scenes finished: {self.final}{work}, maps: {self.maps}{loops}"
+        return f"keyframes: {self.taken}, scenes: {self.judged}{work}, maps: {self.maps}{loops}"
 
 
 def check_begun(out: Path) -> None:

@@ -1,4 +1,4 @@
-"""All finished scenes of a node. Each is compared with those before it once it is final: did the camera come back?"""
+"""All scenes of a node that are judged. Each is compared with those before it then: did the camera come back?"""
 
 from __future__ import annotations
 
@@ -41,32 +41,35 @@ NEAR = 2  # links of a chain: scenes so near have much in common, and a loop bet
 
 class Atlas:
     def __init__(self, directory: Path, config: Config, places: Places) -> None:
-        """`directory` is that of the checkpoint which has finished/ in it, `config` how scenes are made."""
+        """`directory` is that of the checkpoint which has left/ and finished/ in it, `config` how scenes are made."""
         self._directory, self._config, self._places = directory, config, places
         self._matcher: Matcher | None = None
         self._codes: dict[str, Codes] = {}
-        for folder in left.finished(directory):
+        for folder in (*left.finished(directory), *left.folders(directory)):
             try:
                 found = made_anew.load(folder, "codes", CodesRecord)
                 self._codes |= {} if found is None else {folder.name: codes_from(found)}
             except ValueError as error:
                 log.warning("%s is not recognised again: %s", folder.name, error)
 
+    def knows(self, scene: str) -> bool:
+        """Whether the scene was compared with others, and is recognised."""
+        return scene in self._codes
+
     def keep(self, store: Store, graph: ViewGraph, codes: Codes) -> None:
-        """Writes into the checkpoint of a scene that is finished what it is recognised by later: `codes` of its images.
+        """Writes into the checkpoint of a scene that is judged what it is recognised by later: `codes` of its images.
 
         Raises OSError.
         """
         store.save("codes", *codes_message(graph.keyframes, codes))
-        store.remove_shown()
         self._codes[store.scene_id] = codes
 
     def forget(self, scene: str) -> None:
-        """The scene is not final any more."""
+        """The scene is not judged any more."""
         self._codes.pop(scene, None)
 
     def compare(self, scene: str, graph: ViewGraph, pause: Callable[[], None]) -> Codes:
-        """Links a final scene with those before it that show the same; returns the codes of its images.
+        """Links a scene that is judged with those before it that show the same; returns the codes of its images.
 
         What `pause` raises ends the work. Raises ResultWriteError.
         """
@@ -86,8 +89,8 @@ class Atlas:
         return codes[scene]
 
     def _graph(self, scene: str) -> ViewGraph:
-        """Of a finished scene; an empty one where it cannot be read."""
-        folder = left.finished_folder(self._directory, scene)
+        """Of a scene that was judged; an empty one where it cannot be read."""
+        folder = left.folder_of(self._directory, scene)
         if folder.exists():
             try:
                 with contextlib.closing(Store(folder)) as store:

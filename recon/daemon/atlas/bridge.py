@@ -19,6 +19,7 @@ from splatnode.recon.frames.keyframe import Keyframe, longer_side
 from splatnode.recon.matching import pair_matching
 from splatnode.recon.matching.match import Matcher, completed
 from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.result.verdict import Code
 
 Array = npt.NDArray[np.float64]
 Pair = tuple[int, int]
@@ -26,7 +27,7 @@ Pair = tuple[int, int]
 GLANCED = 8  # pairs of photographs, those with codes most alike, matched at a glance for each that is verified
 VERIFIED = 6  # pairs, by their matches at a glance, that are matched and verified
 MIN_VERIFIED = 2  # of these that show the same, of different photographs in both scenes
-VIEWS = (5, 7)  # of each scene that are estimated together; all their pairs are matched. More, where those are too few
+VIEWS = (5, 7)  # of each scene that are estimated together; all their pairs are matched. More, where that may help
 TWIN_PX = 2.0  # median motion of a pair's matches, pixels at REFERENCE_SIDE, below which both have the same camera
 MIN_COMMON = 100  # matches of a photograph with one that is among them already
 MIN_VIEWS = 3  # of each scene that must have a camera then
@@ -56,6 +57,14 @@ class Bridge:
         return f"{self.verified} pairs of photographs show the same, and {photographs}"
 
 
+@dataclass(frozen=True)
+class _Apart:
+    """There is no bridge by some photographs of both scenes."""
+
+    why: str
+    joined: bool  # whether photographs of both had cameras in one world: more photographs may make a bridge of that
+
+
 def bridge(
     one: Side, other: Side, config: Config, matcher: Matcher | None, pause: Callable[[], None] = lambda: None
 ) -> Bridge | str:
@@ -63,18 +72,21 @@ def bridge(
     pairs = verified_pairs(one, other, config, pause)
     if len(_distinct(pairs)) < MIN_VERIFIED:
         return f"{len(pairs)} pairs of photographs show the same"
-    found: Bridge | str = ""
+    why = ""
     for most in VIEWS:
         found = _bridge_of(one, other, pairs, most, config, matcher, pause)
         if isinstance(found, Bridge):
+            return found
+        why = found.why
+        if not found.joined:
             break
-    return found
+    return why
 
 
 def _bridge_of(
     one: Side, other: Side, pairs: Sequence[Pair], most: int, config: Config, matcher: Matcher | None,
     pause: Callable[[], None],
-) -> Bridge | str:  # fmt: skip
+) -> Bridge | _Apart:  # fmt: skip
     """By `most` photographs of each scene."""
     chosen = [views_to_bridge(side, [pair[end] for pair in pairs], most) for end, side in enumerate((one, other))]
     graph = ViewGraph(config.matching)
@@ -85,14 +97,15 @@ def _bridge_of(
         pause()
     twins = _twins(graph, one.scene_id)
     estimate = estimate_cameras(graph.without(twins.keys()), (), config, pause)
-    if not estimate.publishable or estimate.registration is None:
-        return f"together they are {estimate.verdict.code.value}: {estimate.verdict.message}"
-    names = estimate.graph.names
-    found = {names[camera.index]: camera.T_world_camera for camera in estimate.registration.cameras}
+    names, cameras = estimate.graph.names, estimate.registration.cameras if estimate.registration else ()
+    found = {names[camera.index]: camera.T_world_camera for camera in cameras}
     found |= {name: found[twin] for name, twin in twins.items() if twin in found}
     mine, theirs = (_of(side.scene_id, found) for side in (one, other))
+    joined = bool(mine and theirs) and estimate.verdict.code is not Code.SPLIT
+    if not estimate.publishable:
+        return _Apart(f"together they are {estimate.verdict.code.value}: {estimate.verdict.message}", joined)
     if min(len(mine), len(theirs)) < MIN_VIEWS:
-        return f"together only {len(mine)} and {len(theirs)} of their photographs have cameras"
+        return _Apart(f"together only {len(mine)} and {len(theirs)} of their photographs have cameras", joined)
     return Bridge(mine, theirs, len(pairs))
 
 

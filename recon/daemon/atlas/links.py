@@ -15,7 +15,7 @@ from splatnode.recon.geometry import Similarity, align_cameras, angles_deg, spre
 MIN_SHARED = 3  # cameras that two scenes must share, so that one that is wrong shows
 # What no link is surer of, however well its few cameras agree: what the scenes themselves are wrong by.
 LEAST_DEG, LEAST_RELATIVE = 0.1, 0.003  # of the rotation; of the scale, and of the position over the cameras' spread
-MOST_DEG, MOST_RELATIVE = 3.0, 0.1  # that the cameras of a bridge may differ by from those of the scenes, likewise
+MOST_DEG, MOST_RELATIVE = 3.0, 0.1  # that cameras may differ by and still lie alike, likewise
 
 Array = npt.NDArray[np.float64]
 Cameras = Mapping[str, Array]  # T_world_camera (4, 4) by the names of the photographs
@@ -62,6 +62,11 @@ class _Fit:
     sigma_deg: float
     sigma_relative: float  # of the logarithm of the scale; of the mean position over `extent`
 
+    @property
+    def agrees(self) -> bool:
+        """Whether both sets lie alike."""
+        return self.rotation_deg <= MOST_DEG and self.centre_rms <= MOST_RELATIVE * self.extent
+
 
 def link(scene: str, other: str, mine: Cameras, theirs: Cameras) -> Link | None:
     """By the cameras of two scenes that both have, by their names. None where they share fewer than MIN_SHARED."""
@@ -87,10 +92,39 @@ def bridged(
     target = np.stack([mine[name] for name in names[0]])
     to_mine = _fit(np.stack([bridge[0][name] for name in names[0]]), target)
     to_theirs = _fit(np.stack([bridge[1][name] for name in names[1]]), np.stack([theirs[name] for name in names[1]]))
-    if any(fit.rotation_deg > MOST_DEG or fit.centre_rms > MOST_RELATIVE * fit.extent for fit in (to_mine, to_theirs)):
+    if not (to_mine.agrees and to_theirs.agrees):
         return None
     similarity = to_mine.similarity.after(to_theirs.similarity.inverse())
     return _link(Kind.LOOP, scene, other, similarity, [to_mine, to_theirs], target, [*names[0], *names[1]], why)
+
+
+def carried(link: Link, scene: str, before: Cameras, now: Cameras) -> Link | None:
+    """The link, after one of its scenes was made again: from the world in which its cameras lay `before` to that of
+    `now`. None where they lie to each other otherwise now, or have too few in common.
+    """
+    names = [name for name in before if name in now]
+    if len(names) < MIN_SHARED:
+        return None
+    fit = _fit(np.stack([before[name] for name in names]), np.stack([now[name] for name in names]))
+    if not fit.agrees:
+        return None
+    to_now, there, centre, position = fit.similarity, link.similarity, link.centre, link.sigma_position
+    if link.scene == scene:
+        there = to_now.after(there)
+        centre = tuple(to_now(np.array(centre)).tolist())
+        position *= to_now.scale
+    else:
+        there = there.after(to_now.inverse())
+    return msgspec.structs.replace(
+        link,
+        scale=there.scale,
+        rotation=tuple(tuple(row) for row in there.rotation.tolist()),
+        translation=tuple(there.translation.tolist()),
+        centre=centre,
+        sigma_deg=max(link.sigma_deg, fit.sigma_deg),
+        sigma_scale=max(link.sigma_scale, fit.sigma_relative),
+        sigma_position=position,
+    )
 
 
 def _fit(source: Array, target: Array) -> _Fit:

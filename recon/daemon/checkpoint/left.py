@@ -44,6 +44,12 @@ def finished_folder(directory: Path, scene_id: str) -> Path:
     return directory / FINISHED / scene_id
 
 
+def folder_of(directory: Path, scene_id: str) -> Path:
+    """Where the checkpoint of a place that was left is, finished or not, if there is one."""
+    folder = finished_folder(directory, scene_id)
+    return folder if (folder / LEDGER).exists() else directory / LEFT / scene_id
+
+
 def finished(directory: Path) -> list[Path]:
     """The folders of the finished scenes, oldest first."""
     return sorted((path.parent for path in (directory / FINISHED).glob(f"scene-*/{LEDGER}")), key=_place)

@@ -7,7 +7,8 @@
     scene               cameras and Gaussians as they are shown
     pointmaps           depth maps of its views, from which it grows
     left/<place>/       a place that the camera has left and whose scene is not final yet: a checkpoint of its own
-    finished/<place>/   one whose scene is final: frames, graph and judgement, and `codes`, by which it is recognised
+    finished/<place>/   one whose scene is final: frames, graph and judgement
+    codes               in the folder of a place that was left: that it is judged, and by what it is recognised
 
 Graph, judgement, scene and pointmaps are computed again where they are missing. A keyframe is acknowledged once its
 file is there. Every file is whole or not there, and has a checksum. A place is what one scene shows.

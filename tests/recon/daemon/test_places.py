@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import threading
 import time
+from contextlib import closing
 
 import msgspec
 import numpy as np
@@ -16,11 +17,13 @@ from splatnode.capture.messaging.commands import Answer, ask
 from splatnode.capture.messaging.services import RECON_CONTROL
 from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon import left_places
-from splatnode.recon.daemon.checkpoint import left
+from splatnode.recon.daemon.checkpoint import checkpoint, left
+from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.control import Retract
 from splatnode.recon.daemon.inbox import BATCH, Arrived, Inbox
 from splatnode.recon.daemon.left_places import LeftPlaces
 from splatnode.recon.daemon.places import Places, State, described
+from splatnode.recon.daemon.present_place import PresentPlace
 from splatnode.recon.result.export import read_cameras
 from tests.capture.messaging.test_sockets import wait_for
 from tests.recon.daemon.test_daemon import (
@@ -139,6 +142,7 @@ def replace_image(frame, index):
 def test_a_place_that_was_left_is_finished_by_the_next_process(moving, peer, monkeypatch):
     frames = places(seeds=(0, 1))
     with monkeypatch.context() as patch, running(replace(moving, lost_after=3)):
+        patch.setattr(LeftPlaces, "judge_next", never)
         patch.setattr(LeftPlaces, "finish_next", never)
         offer_when_three_are_shown(peer, frames)
         peer.wait(lambda scene: scene.scene_id == "scene-0002", "another place")
@@ -263,6 +267,35 @@ def test_a_scene_that_is_full_goes_on_as_the_next_one_and_both_are_linked(config
     for name in link["shared"]:
         there = link["scale"] * np.array(link["rotation"]) @ cameras["scene-0002"][name] + link["translation"]
         np.testing.assert_allclose(there, cameras["scene-0001"][name], atol=0.02)
+
+
+def test_what_was_set_aside_before_stays_with_the_scene_that_is_left(moving, peer, monkeypatch):
+    ours, (stranger, *_) = photographs(), places(seeds=(0, 1))[3:]
+    came = [*ours[:3], renamed(stranger, 3, "stranger.png", 3)]
+    came += [renamed(frame, 4 + number, frame.name, 4 + number) for number, frame in enumerate(ours[3:])]
+    aside: list[list[str]] = []
+    monkeypatch.setattr(
+        PresentPlace, "export_provisionally", lambda place: aside.append([each.name for each in place._work.aside])
+    )
+    with running(replace(moving, max_views=5, export_every_s=NEVER_S)):
+        for count, frame in enumerate(came, 1):
+            peer.server.offer(frame)
+            if frame.name == "stranger.png":
+                wait_for(
+                    lambda: peer.server.serve(0.02) or heartbeats(moving.network)["recon"]["state"] == "lost",
+                    PATIENCE_S,
+                )
+            elif count >= 3:
+                peer.wait(
+                    lambda scene, frame=frame: frame.name in {each.name for each in scene.snapshot.cameras}, frame.name
+                )
+        peer.wait_for_acknowledgements()
+    assert aside == [[]]  # at the stop
+    with closing(Store(moving.checkpoint)) as store:
+        assert store.scene_id == "scene-0002" and store.names == {frame.name for frame in ours[3:]}
+        assert checkpoint.restore(store, moving.reconstruction).work.remembered() is not None
+    with closing(Store(left.folder_of(moving.checkpoint, "scene-0001"))) as store:
+        assert "stranger.png" in store.names
 
 
 def final(config) -> int:

@@ -22,6 +22,7 @@ from splatnode.recon.evaluate.camera_errors import camera_errors
 from splatnode.recon.matching.match import match
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.preparation import prepare
+from splatnode.recon.result.verdict import Code
 from tests.support.synthetic import SMALL
 
 VIEWS = msgspec.structs.replace(SMALL, views=7)
@@ -122,16 +123,25 @@ def test_what_pause_raises_ends_the_work(sides):
         bridge(sides["scene-0001"], replace(sides["scene-0002"]), Config(), None, end)
 
 
-def test_where_a_few_photographs_do_not_suffice_more_are_asked(sides, monkeypatch):
+@pytest.mark.parametrize("placed", [6, 3])
+def test_where_a_few_photographs_do_not_suffice_but_join_both_more_are_asked(sides, monkeypatch, placed):
     asked: list[int] = []
 
     def refused_at_first(graph, *rest):
         estimate = estimate_cameras(graph, *rest)
         asked.append(len(graph.keyframes))
-        return estimate if len(asked) > 1 else SimpleNamespace(publishable=False, verdict=estimate.verdict)
+        if len(asked) > 1:
+            return estimate
+        assert estimate.registration is not None
+        registration = replace(estimate.registration, cameras=estimate.registration.cameras[:placed])
+        verdict = replace(estimate.verdict, code=Code.AMBIGUOUS, publishable=False)
+        return replace(estimate, registration=registration, verdict=verdict)
 
     monkeypatch.setattr(module, "VIEWS", (3, 4))
     monkeypatch.setattr(module, "estimate_cameras", refused_at_first)
     found = bridge(sides["scene-0001"], sides["scene-0002"], Config(), None)
-    assert isinstance(found, Bridge), found
-    assert asked == [6, 8]
+    if placed == 6:
+        assert isinstance(found, Bridge), found
+        assert asked == [6, 8]
+    else:  # photographs of one scene alone have cameras
+        assert isinstance(found, str) and asked == [6]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.daemon.atlas.links import MIN_SHARED, link
+from splatnode.recon.daemon.atlas.links import MIN_SHARED, carried, link
 from splatnode.recon.geometry import Similarity
 from tests.support.synthetic import SMALL
 
@@ -39,3 +39,28 @@ def test_what_the_shared_cameras_do_not_agree_on_is_told(cameras):
 
 def test_too_few_shared_cameras_link_nothing(cameras):
     assert link("one", "two", cameras, dict(list(cameras.items())[: MIN_SHARED - 1])) is None
+
+
+@pytest.mark.parametrize("again", ["one", "two"])
+def test_a_link_holds_after_one_of_its_scenes_was_made_again_in_another_world(cameras, again):
+    moved = {name: TURNED.inverse().camera(T) for name, T in cameras.items()}
+    worlds = {"one": cameras, "two": moved}
+    made = {name: TURNED.camera(T) for name, T in worlds[again].items()}
+    before = link("one", "two", cameras, moved)
+    assert before is not None
+    found = carried(before, again, worlds[again], made)
+    expected = link("one", "two", *(worlds | {again: made}).values())
+    assert found is not None and expected is not None
+    for field in ("scale", "rotation", "translation", "centre", "sigma_deg", "sigma_scale", "sigma_position"):
+        np.testing.assert_allclose(getattr(found, field), getattr(expected, field), atol=1e-9)
+
+
+def test_a_link_does_not_hold_where_the_cameras_of_a_scene_lie_otherwise_now(cameras):
+    before = link("one", "two", cameras, cameras)
+    assert before is not None
+    other = dict(cameras)
+    name = next(iter(other))
+    other[name] = other[name].copy()
+    other[name][:3, 3] += 2.0
+    assert carried(before, "one", cameras, other) is None
+    assert carried(before, "one", cameras, {"another.png": np.eye(4)}) is None

@@ -125,7 +125,7 @@ def test_a_link_to_a_scene_that_is_a_draft_again_is_forgotten_and_stops_nothing(
         index.tell(place)
     index.add_loops(SCENES[1], [link(at, 0, 1, Kind.LOOP)])
     assert [pose.map for pose in index.poses] == [SCENES[0], SCENES[0], SCENES[2]]
-    index.tell(replace(final[1], provisional=True))
+    index.tell(replace(final[1], provisional=True, judged=False))
     index.add_loops(SCENES[2], [link(at, 0, 2, Kind.LOOP)])
     assert [(each.scene, each.other) for each in index.links] == [(SCENES[0], SCENES[2])]
     assert [(pose.scene, pose.map) for pose in index.poses] == [(SCENES[0], SCENES[0]), (SCENES[2], SCENES[0])]

@@ -19,6 +19,7 @@ from splatnode.recon.daemon.atlas.atlas import Atlas
 from splatnode.recon.daemon.atlas.recognition import codes_message, codes_of
 from splatnode.recon.daemon.checkpoint import checkpoint, left
 from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.left_places import LeftPlaces
 from splatnode.recon.daemon.places import Places
 from splatnode.recon.evaluate.camera_errors import camera_errors
 from splatnode.recon.geometry import Similarity
@@ -42,18 +43,23 @@ def walk() -> list[Frame]:
     return [*places(seeds=(0, 1)), *again]
 
 
+def offer_walk(peer) -> None:
+    """Until the daemon has shown all three scenes."""
+    for number, begin in enumerate((0, 3, 6), 1):
+        for frame in walk()[begin : begin + 3]:
+            peer.server.offer(frame)
+        peer.wait(
+            lambda scene, number=number: scene.scene_id == f"scene-{number:04d}" and finished(3)(scene),
+            f"scene {number}",
+        )
+    peer.wait_for_acknowledgements()
+
+
 @contextmanager
 def walked(config, peer):
     """The daemon, once it has shown all three scenes and finished the two that were left."""
     with running(config):
-        for number, begin in enumerate((0, 3, 6), 1):
-            for frame in walk()[begin : begin + 3]:
-                peer.server.offer(frame)
-            peer.wait(
-                lambda scene, number=number: scene.scene_id == f"scene-{number:04d}" and finished(3)(scene),
-                f"scene {number}",
-            )
-        peer.wait_for_acknowledgements()
+        offer_walk(peer)
         wait_for(lambda: heartbeats(config.network)["recon"]["unfinished"] == 0, PATIENCE_S)
         yield
 
@@ -90,6 +96,29 @@ def test_a_place_that_the_camera_comes_back_to_is_recognised(kidnapped, peer):
     names = [frame.name for frame in (*walk()[:3], *walk()[6:])]
     errors = camera_errors(np.stack([cameras[name] for name in names]), np.stack(true), K, K)
     assert errors.rotation_deg < 1.5 and errors.centre_pct < 8, errors
+
+
+def test_it_is_recognised_before_any_scene_is_made_and_the_loop_stays_when_they_are(kidnapped, peer, monkeypatch):
+    with monkeypatch.context() as patch, running(kidnapped):
+        patch.setattr(LeftPlaces, "finish_next", lambda *_: False)
+        offer_walk(peer)
+        wait_for(lambda: places_file(kidnapped)["links"], PATIENCE_S)
+        wait_for(lambda: heartbeats(kidnapped.network)["recon"]["scenes"] == 3, PATIENCE_S)
+    drafts = places_file(kidnapped)
+    assert [place["judged"] for place in drafts["places"]] == [True] * 3
+    assert [folder.name for folder in left.folders(kidnapped.checkpoint)] == ["scene-0001", "scene-0002"]
+    with running(kidnapped):
+        wait_for(lambda: not left.folders(kidnapped.checkpoint), PATIENCE_S)
+        wait_for(lambda: heartbeats(kidnapped.network)["recon"]["unfinished"] == 0, PATIENCE_S)
+    whole = places_file(kidnapped)
+    assert not any(place["provisional"] for place in whole["places"])
+    (before,), (link,) = drafts["links"], whole["links"]
+    assert (link["kind"], link["scene"], link["other"], link["why"]) == (
+        "loop",
+        "scene-0001",
+        "scene-0003",
+        before["why"],
+    )
 
 
 def test_it_is_recognised_by_the_next_process_where_the_first_one_was_killed(kidnapped, peer, monkeypatch):
