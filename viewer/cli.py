@@ -1,4 +1,4 @@
-"""`splatnode view`: a result, a scene file or a running node, in a window or as pictures."""
+"""`splatnode view`: a result, a scene file or a running node, in a window, in a browser or as pictures."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ from splatnode.viewer.probe import Probe, open3d_installed, probe_window
 from splatnode.viewer.session import Session
 from splatnode.viewer.sources import Finished, Live, Source, found_photographs, load_result
 from splatnode.viewer.state import State
+from splatnode.viewer.web import stage as web
 
 EXIT_GOOD, EXIT_UNAVAILABLE = 0, 69
 
 _NICENESS = 5  # the reconstruction is more important than the picture of it
 _NO_OPEN3D = (
     "splatnode: the window needs Open3D, which is not installed. Run: pip install 'splatnode[viewer]'. "
-    "Pictures need nothing more: splatnode view ... --headless, or --export turntable.mp4"
+    "A browser needs nothing more: splatnode view ... --web; nor do pictures: --headless, or --export turntable.mp4"
 )
 
 _PICTURE = 960, 720  # pixels, where no window is opened
@@ -35,7 +36,11 @@ _PICTURE = 960, 720  # pixels, where no window is opened
 
 def view(args: argparse.Namespace) -> int:
     """Shows what `args.what` names. Raises what opening it raises."""
+    _check_web(args)
     finished, network = _finished(args), _network(args)
+    if args.web:
+        where = web.place(args.listen, web.PORT if args.port is None else args.port, args.key)
+        web.show(_source(finished, network), where, _give_way, say)
     if args.export is not None and (finished is None or args.export.suffix.lower() != ".mp4"):
         raise ValueError("--export needs a finished result and a file that ends with .mp4")
     width, height = args.size or _PICTURE
@@ -61,6 +66,15 @@ def view(args: argparse.Namespace) -> int:
         with contextlib.closing(source):
             keep_picture(source, folder, width, height, until_final=args.until_final, say=say)
     return EXIT_GOOD
+
+
+def _check_web(args: argparse.Namespace) -> None:
+    """Raises ValueError for options that do not go together."""
+    alone = [name for name in ("port", "listen", "key") if getattr(args, name) is not None]
+    if alone and not args.web:
+        raise ValueError(f"--{alone[0]} needs --web")
+    if args.web and (args.headless or args.export is not None):
+        raise ValueError("--web shows it in a browser; --headless and --export write pictures: one of them at a time")
 
 
 def _finished(args: argparse.Namespace) -> Moment | Maps | None:

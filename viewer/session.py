@@ -10,7 +10,7 @@ from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.viewer.analysis import Analysis, Analyst
 from splatnode.viewer.canvas import Canvas, Image, project
 from splatnode.viewer.colours import coloured
-from splatnode.viewer.moment import History, Moment, remembered
+from splatnode.viewer.moment import MEMORY_BYTES, History, Moment, remembered
 from splatnode.viewer.paint import blended, paint_gaussians, with_shapes
 from splatnode.viewer.shapes import Photograph, Shapes, live_camera, shapes
 from splatnode.viewer.sources import Roaming, Source
@@ -24,8 +24,9 @@ _CLICK_RADIUS = 14  # pixels around a camera's centre that are the camera
 class Session:
     """The history, the state and the viewpoint, and the pictures that follow from them. To be used in one thread."""
 
-    def __init__(self, source: Source, state: State) -> None:
+    def __init__(self, source: Source, state: State, memory_bytes: int = MEMORY_BYTES) -> None:
         self.source = source
+        self._memory_bytes = memory_bytes  # of the history
         self.state = state
         self.history: History = ()
         self._analyst = Analyst()
@@ -51,12 +52,17 @@ class Session:
         if moment is None:
             return self._tracked is not before
         elsewhere = bool(self.history) and self.history[-1].scene_id != moment.scene_id
-        self.history = remembered(self.history, moment)
+        self.history = remembered(self.history, moment, self._memory_bytes)
         if elsewhere:
             self._touched = False
         if not self._touched and (self._view is None or moment.snapshot.cameras):
             self._see_all(moment)
         return True
+
+    @property
+    def tracked(self) -> CameraEstimate | None:
+        """The live camera, as it was when something last came."""
+        return self._tracked
 
     @property
     def moment(self) -> Moment | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from splatnode.capture.process.arguments import positive, size
+from splatnode.capture.process.arguments import address, port, positive, size
 from splatnode.capture.process.verb import Verb, lazily
 
 
@@ -24,6 +24,26 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive,
         metavar="N",
         help="of a map of several scenes, loaded at once: the near in full, the far coarsely (default: 1500000)",
+    )
+    parser.add_argument(
+        "--web",
+        action="store_true",
+        help="show it in a browser: this machine needs neither a display nor Open3D. The address that is printed is "
+        "this machine's own; from another one, ssh -L leads to it",
+    )
+    parser.add_argument("--port", type=port, metavar="N", help="of --web (default: 8347; 0: any that is free)")
+    parser.add_argument(
+        "--listen",
+        type=address,
+        metavar="ADDRESS",
+        help="with --web: let other machines in at this address of this one (0.0.0.0: at all), with a key, which the "
+        "address that is printed has",
+    )
+    parser.add_argument(
+        "--key",
+        type=Path,
+        metavar="FILE",
+        help="with --web: ask for the key in FILE, made if it is not there; otherwise each start has a new one",
     )
     parser.add_argument("--headless", action="store_true", help="write pictures instead of opening a window")
     parser.add_argument("--export", type=Path, metavar="FILE.mp4", help="write a turntable, without a window")

@@ -56,10 +56,10 @@ def bounds_lines(moment: Moment, camera: CameraEstimate | None = None) -> list[s
     return [f"Cameras: {known}"] if known else []
 
 
-def dropped_lines(moment: Moment) -> list[str]:
-    """The frames that were left out, the latest last, each with its reason."""
+def dropped_lines(moment: Moment, most: int = _MOST_DROPPED) -> list[str]:
+    """The frames that were left out, the latest last, each with its reason; of more than `most` only their number."""
     dropped = moment.snapshot.dropped
-    lines = [f"left out {frame.name}: {frame.reason}" for frame in dropped[-_MOST_DROPPED:]]
+    lines = [f"left out {frame.name}: {frame.reason}" for frame in dropped[-most:]]
     earlier = len(dropped) - len(lines)
     return [f"{earlier} frames were left out before:"] * (earlier > 0) + lines
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import ipaddress
 import math
 from collections.abc import Callable
 
@@ -10,6 +11,7 @@ from splatnode.capture.process.config_text import MAX_NUMBER
 from splatnode.capture.process.printable import printable
 
 _MAX_DIGITS = 20
+_LAST_PORT = 65535
 
 
 def _whole_number(least: int) -> Callable[[str], int]:
@@ -23,6 +25,22 @@ def _whole_number(least: int) -> Callable[[str], int]:
 
 
 positive, natural = _whole_number(1), _whole_number(0)
+
+
+def port(text: str) -> int:
+    """The number of a port, from 0 to 65535."""
+    number = natural(text)
+    if number > _LAST_PORT:
+        raise argparse.ArgumentTypeError(f"must be the number of a port, from 0 to {_LAST_PORT}; got {_shown(text)}")
+    return number
+
+
+def address(text: str) -> str:
+    """The numeric address of a machine, IPv4 or IPv6: no name is looked up."""
+    try:
+        return str(ipaddress.ip_address(text))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a numeric address, as 192.168.1.5; got {_shown(text)}") from None
 
 
 def seconds(text: str) -> float:

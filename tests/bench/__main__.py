@@ -24,7 +24,7 @@ BENCHMARKS = {
     ),
     "quality": ("poses", "windows", "fit", "priors", "parsimony", "budgets", "spz"),
     "speed": ("rasterize", "stereo", "growth"),
-    "viewer": ("viewer", "drive", "beside"),
+    "viewer": ("viewer", "drive", "drive_web", "beside"),
 }
 MODULES = {name: f"tests.bench.{folder}.{name}" for folder, names in BENCHMARKS.items() for name in names}
 

@@ -42,6 +42,8 @@ def test_the_wheel_installs_and_its_core_loads(project, tmp_path):
     assert {"splatnode/__main__.py", "splatnode/capture/frame.py", "splatnode/recon/core/threads.cpp"} <= names
     configs = {path.relative_to(ROOT).as_posix() for path in (ROOT / "configs").rglob("*.*")}
     assert {f"splatnode/{name}" for name in configs} <= names and "configs/udev/80-splatnode-oak.rules" in configs
+    page = {path.name for path in (ROOT / "viewer" / "web" / "page").iterdir()}
+    assert {f"splatnode/viewer/web/page/{name}" for name in page} <= names and "main.js" in page
     assert not [name for name in names if not name.startswith(("splatnode/", "splatnode-"))]
 
     site = tmp_path / "site"
@@ -85,6 +87,7 @@ def test_the_sdist_has_the_sources_and_nothing_compiled(project):
     core = ROOT / "recon" / "core"
     sources = {path.name for pattern in ("*.cpp", "*.h", "*.py") for path in core.glob(pattern)}
     assert {f"splatnode/recon/core/{name}" for name in sources} <= names
+    assert "splatnode/viewer/web/page/main.js" in names
     assert {"pyproject.toml", "constraints.txt", "run", "LICENSE", "tests/conftest.py"} <= names
     assert not [name for name in names if name.endswith((".so", ".stamp", ".pyc"))]
 

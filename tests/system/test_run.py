@@ -36,6 +36,7 @@ def calls(tmp_path):
         (["docs"], "[docs]"),
         (["view", "out"], "[viewer]"),
         (["view", "out", "--headless"], ""),
+        (["view", "--web"], ""),
         (["view", "out", "--export=turntable.mp4"], ""),
         (["replay", "photos", "--out", "o", "--view"], "[viewer]"),
         (["replay", "view", "--out", "o", "--views", "3"], ""),

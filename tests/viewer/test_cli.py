@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import re
 import resource
 import subprocess
 import sys
 import threading
 import time
+import urllib.error
+import urllib.request
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -64,6 +68,54 @@ def test_a_result_is_shown_with_what_is_known_of_it(result, caplog):
     assert list(there.images) == ["0.png"] and "1.png is shown without its photograph" in caplog.text
     alone = load_result(result / "scene.ply", photographs=result / "nowhere").snapshot
     assert len(alone.gaussians) == 225 and not alone.images and "without a report" in alone.verdict.message
+
+
+@pytest.mark.parametrize(
+    ("options", "why"),
+    [
+        (["--port", "80"], "--port needs --web"),
+        (["--listen", "0.0.0.0"], "--listen needs --web"),
+        (["--key", "web.key"], "--key needs --web"),
+        (["--web", "--headless"], "one of them at a time"),
+        (["--web", "--export", "a.mp4"], "one of them at a time"),
+    ],
+)
+def test_options_of_the_browser_go_with_it_alone(result, capsys, options, why):
+    assert command_line.main(["view", str(result), *options]) == 2
+    assert why in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("options", [["--port", "70000"], ["--listen", "robot.local"]])
+def test_a_port_is_a_port_and_an_address_is_numeric(result, capsys, options):
+    with pytest.raises(SystemExit):
+        command_line.main(["view", str(result), "--web", *options])
+    assert f"argument {options[0]}: must be" in capsys.readouterr().err
+
+
+def test_a_browser_is_invited_and_a_signal_ends_it_well(result, tmp_path):
+    """As a process, over a network's address: with the key that it keeps, and not without."""
+    key = tmp_path / "web.key"
+    command = [sys.executable, "-m", "splatnode", "view", str(result), "--web", "--listen", "0.0.0.0"]
+    command += ["--port", "0", "--key", str(key)]
+    viewer = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    try:
+        said = viewer.stdout.readline()
+        port = re.search(r"http://[^ ]*:([0-9]+)/\?key=KEY ", said)[1]
+        asked = urllib.request.Request(f"http://127.0.0.1:{port}/gaussians/1")
+        with pytest.raises(urllib.error.HTTPError, match="401"):
+            urllib.request.urlopen(asked, timeout=20)
+        asked.add_header("Authorization", f"Bearer {key.read_text().strip()}")
+        for _ in range(100):
+            with contextlib.suppress(urllib.error.HTTPError):  # 404: it is not yet there
+                assert len(urllib.request.urlopen(asked, timeout=20).read()) == 225 * 32
+                break
+            time.sleep(0.1)
+        else:
+            raise AssertionError("the scene never came")
+    finally:
+        viewer.terminate()
+        _, errors = viewer.communicate(timeout=30)
+    assert viewer.returncode == 0 and errors.count("\n") == 1 and "without its photograph" in errors
 
 
 def test_photographs_are_found_where_the_report_says_that_they_were(result, tmp_path):

@@ -1,0 +1,72 @@
+"""Who is let in by the web viewer, and where its key is kept."""
+
+from __future__ import annotations
+
+import os
+import stat
+
+import pytest
+
+from splatnode.capture.process.private import NotPrivate
+from splatnode.viewer.web.access import Access, kept_key, new_key
+from splatnode.viewer.web.stage import invitation, place
+
+KEY = "k" * 43
+
+
+@pytest.mark.parametrize("address", ["0.0.0.0", "192.168.1.5", "::", "fe80::1"])
+def test_what_other_machines_can_reach_needs_a_key(address):
+    with pytest.raises(ValueError, match="a key is needed"):
+        Access(address, 8347, None)
+    assert Access(address, 8347, KEY).key == KEY and place(address, 0, None).key
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:8347", "localhost:9000", "LOCALHOST", "[::1]:8347", "127.0.0.2"])
+def test_without_a_key_the_loopback_address_is_asked_by_its_names(host):
+    assert Access("127.0.0.1", 8347, None).host_is_fine(host)
+
+
+@pytest.mark.parametrize(
+    "host", [None, "", "evil.example:8347", "127.0.0.1.evil.example", "192.168.1.5", "[::1", "a:b:c"]
+)
+def test_and_by_no_other_name(host):
+    assert not Access("127.0.0.1", 8347, None).host_is_fine(host)
+    assert Access("0.0.0.0", 8347, KEY).host_is_fine(host)  # the key decides
+
+
+def test_the_key_may_come_in_a_cookie_or_a_header_and_must_be_right():
+    access = Access("0.0.0.0", 8347, KEY)
+    assert access.lets_in({"Cookie": f"other=1; splatnode_8347={KEY}"})
+    assert access.lets_in({"Authorization": f"Bearer {KEY}"})
+    for headers in ({}, {"Cookie": "splatnode_8347=k"}, {"Cookie": f"splatnode_1={KEY}"}, {"Cookie": "=;\x00"},
+                    {"Authorization": "Bearer "}, {"Authorization": f"Bearer {KEY[:-1]}é"}):  # fmt: skip
+        assert not access.lets_in(headers)
+    assert not access.is_key(None) and not Access("127.0.0.1", 1, None).is_key(None)
+
+
+def test_two_keys_differ_and_a_file_keeps_one_for_this_user_alone(tmp_path):
+    assert new_key() != new_key() and len(new_key()) >= 43
+    path = tmp_path / "web.key"
+    key = kept_key(path)
+    assert kept_key(path) == key and stat.S_IMODE(path.stat().st_mode) == 0o600
+    path.chmod(0o640)
+    with pytest.raises(NotPrivate, match="chmod 600"):
+        kept_key(path)
+
+
+@pytest.mark.parametrize("text", ["", "short", "k" * 31, "k" * 200, "k" * 40 + " " + "k" * 5])
+def test_a_file_without_a_key_is_refused(tmp_path, text):
+    path = tmp_path / "web.key"
+    with open(os.open(path, os.O_WRONLY | os.O_CREAT, 0o600), "w") as file:
+        file.write(text)
+    with pytest.raises(ValueError, match="remove it to get a new key"):
+        kept_key(path)
+
+
+def test_the_invitation_names_ssh_on_loopback_and_says_what_a_network_means(tmp_path):
+    alone = invitation(Access("127.0.0.1", 8347, None), None)
+    assert "http://127.0.0.1:8347/ " in alone and "ssh -L 8347:127.0.0.1:8347 " in alone
+    open_to_all = invitation(Access("192.168.1.5", 8347, KEY), None)
+    assert f"http://192.168.1.5:8347/?key={KEY} " in open_to_all and "not encrypted" in open_to_all
+    kept = invitation(Access("fe80::1", 8347, KEY), tmp_path / "web.key")
+    assert KEY not in kept and "http://[fe80::1]:8347/?key=KEY " in kept and "web.key" in kept

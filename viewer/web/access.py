@@ -1,0 +1,104 @@
+"""Who may look: on this machine's own address anybody on it, over a network who has the key."""
+
+from __future__ import annotations
+
+import hmac
+import http.cookies
+import ipaddress
+import os
+import re
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatnode.capture.process.private import NotPrivate, create_own, read_own
+
+LOOPBACK = "127.0.0.1"
+_KEY = re.compile(r"[A-Za-z0-9_-]{32,128}")
+_KEY_BYTES = 32  # random ones, of a key
+_LARGEST = 1000  # bytes of a file with a key
+_OTHERS = 0o077
+
+
+@dataclass(frozen=True)
+class Access:
+    """The rules of one server."""
+
+    address: str  # numeric, that it listens on
+    port: int
+    key: str | None  # None: none is needed, which is so on a loopback address alone
+
+    def __post_init__(self) -> None:
+        if self.key is None and not ipaddress.ip_address(self.address).is_loopback:
+            raise ValueError(f"a key is needed to listen on {self.address}, which other machines can reach")
+
+    @property
+    def cookie(self) -> str:
+        """The name of the cookie that keeps the key: browsers send cookies to all ports of a machine alike."""
+        return f"splatnode_{self.port}"
+
+    def url(self, machine: str | None = None, key: str | None = None) -> str:
+        """What to open in a browser: by its address or the `machine`'s name, with the key, or what stands for it."""
+        host = machine or (f"[{self.address}]" if ":" in self.address else self.address)
+        return f"http://{host}:{self.port}/" + (f"?key={key or self.key}" if self.key else "")
+
+    def host_is_fine(self, host: str | None) -> bool:
+        """Whether a request was meant for this server.
+
+        Without a key only a name of the loopback address is, with any port, which ssh may have changed: a foreign page
+        whose name was made to lead here (DNS rebinding) has another name.
+        """
+        return self.key is not None or _is_loopback(host or "")
+
+    def is_key(self, text: str | None) -> bool:
+        """Compared in a time that tells nothing of where they differ."""
+        return self.key is not None and hmac.compare_digest((text or "").encode(errors="replace"), self.key.encode())
+
+    def lets_in(self, headers: Mapping[str, str]) -> bool:
+        """Whether a request has the key, in its cookie or as `Authorization: Bearer KEY`; any, where none is needed."""
+        bearer = (headers.get("Authorization") or "").removeprefix("Bearer ")
+        return self.key is None or self.is_key(bearer) or self.is_key(_cookie(headers.get("Cookie"), self.cookie))
+
+
+def new_key() -> str:
+    return secrets.token_urlsafe(_KEY_BYTES)
+
+
+def kept_key(path: Path) -> str:
+    """The key in the file; a new one, which the file gets, where there is none.
+
+    Raises NotPrivate where others may read the file, ValueError for one that holds no key, OSError.
+    """
+    try:
+        descriptor = create_own(path)
+    except FileExistsError:
+        text = read_own(path, _LARGEST, only_ours=True).decode(errors="replace").strip()
+        if path.lstat().st_mode & _OTHERS:
+            raise NotPrivate(f"others may read {path}. Run: chmod 600 {path}") from None
+        if not _KEY.fullmatch(text):
+            raise ValueError(
+                f"{path} must hold 32 to 128 letters, digits, - or _; remove it to get a new key"
+            ) from None
+        return text
+    with os.fdopen(descriptor, "w") as file:
+        file.write((key := new_key()) + "\n")
+    return key
+
+
+def _cookie(header: str | None, name: str) -> str | None:
+    try:
+        morsel = http.cookies.SimpleCookie(header or "").get(name)
+    except http.cookies.CookieError:
+        return None
+    return morsel.value if morsel else None
+
+
+def _is_loopback(host: str) -> bool:
+    """Whether a Host header names the loopback address."""
+    found = re.fullmatch(r"(\[[0-9a-fA-F:]+\]|[^:\[\]]+)(:[0-9]{1,5})?", host)
+    name = found[1].strip("[]").lower() if found else ""
+    try:
+        return name == "localhost" or ipaddress.ip_address(name).is_loopback
+    except ValueError:
+        return False
