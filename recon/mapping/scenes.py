@@ -92,6 +92,7 @@ def make_scenes(
                 check()
                 tell(taken)
                 time.sleep(LOOK_S)
+            tell(taken)
 
 
 def remove_checkpoint(out: Path) -> None:

@@ -57,6 +57,7 @@ def main() -> None:
     )
     parser.add_argument("--max-views", type=int, help="of a scene; default: recon's")
     parser.add_argument("--folder", type=Path, help="for what the processes write, to be kept; it must not exist")
+    parser.add_argument("--score", type=Path, metavar="FOLDER", help="only scores what an earlier walk left there")
     parser.add_argument("--out", type=Path, default=Path("tests/bench/results/building.json"))
     args = parser.parse_args()
     config = building.Config(
@@ -65,6 +66,11 @@ def main() -> None:
     )  # fmt: skip
     recon = {} if args.max_views is None else {"max_views": args.max_views}
     command = shlex.join(["python", "-m", "tests.bench", "building", *sys.argv[1:]])
+    if args.score is not None:
+        result = {"command": command, **scored(config, args.score / "node" / "out", args.score)}
+        args.out.write_text(json.dumps(result, indent=1) + "\n")
+        print(json.dumps({key: value for key, value in result.items() if key != "places"}))
+        return
     with contextlib.ExitStack() as stack:
         folder = args.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
         row, out = walked(folder, config, recon, args.patience_s)
