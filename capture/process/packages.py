@@ -4,7 +4,7 @@ from __future__ import annotations
 
 # Import name -> distribution. An installation brings them all.
 REQUIRED = {
-    "cv2": "opencv-contrib-python-headless",
+    "cv2": "opencv-python-headless",
     "msgspec": "msgspec",
     "numpy": "numpy",
     "scipy": "scipy",

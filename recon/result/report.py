@@ -13,7 +13,7 @@ from splatnode.recon.result.export.formats.ply import ply_bytes
 from splatnode.recon.result.export.prepare import viewer_safe
 from splatnode.recon.result.snapshot import Snapshot
 
-_PACKAGES = ("splatnode", "numpy", "torch", "opencv-contrib-python-headless", "pycolmap", "poselib")
+_PACKAGES = ("splatnode", "numpy", "torch", "opencv-python-headless", "pycolmap", "poselib")
 
 
 def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: float | None) -> dict[str, object]:
