@@ -1,4 +1,4 @@
-"""The release, and the proof that it works: `./run release [--out DIR]`.
+"""The release, and the proof that it works: `./run release [--out DIR] [TARGET ...]`.
 
 It makes the sdist and the wheels in `dist`. What this machine can run is installed in a clean environment outside the
 checkout, where it makes the demo's scene: its wheel, and the sdist with a compiler and without one. Wheels for Linux
@@ -7,7 +7,6 @@ must need no newer system than their names say, as auditwheel sees it.
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 import subprocess
@@ -19,7 +18,7 @@ from pathlib import Path
 
 from splatnode.recon.core.compile import TARGETS, find_compiler, machine
 from splatnode.recon.core.trial import Trial, TrialFailed, try_artefact
-from splatnode.recon.core.wheels import ROOT, build_wheel
+from splatnode.recon.core.wheels import ROOT, asked_for, build_wheel
 
 _NOT_PACKED = (".*", "out", "build", "dist", "docs", "__pycache__", "*.egg-info", "_core_*")
 _BUILD_SDIST = "import sys; from splatnode.recon.core import backend; print(backend.build_sdist(sys.argv[1]))"
@@ -142,11 +141,9 @@ def _row_or_failure(name: str, make: Callable[[], list[Row]]) -> list[Row]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Makes the release and prints the table; 1 where anything is not good."""
-    parser = argparse.ArgumentParser(prog="./run release", description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("dist"), metavar="DIR", help="default: dist")
-    out = parser.parse_args(argv).out
+    targets, out = asked_for("release", __doc__, argv)
     rows: list[Row] = []
-    for target in TARGETS:
+    for target in targets:
         print(f"building the wheel for {target}", file=sys.stderr, flush=True)
         rows += _row_or_failure(f"wheel for {target}", lambda target=target: [_wheel_row(target, out)])
     print("building the sdist", file=sys.stderr, flush=True)

@@ -101,7 +101,11 @@ def test_whatever_fails_is_named_and_so_is_the_exit(monkeypatch, tmp_path, capsy
     said = capsys.readouterr()
     assert "wheel for linux-x86_64: no compiler for linux-x86_64" in said.err and "NOT GOOD: wheel for" in said.err
     monkeypatch.setattr(release, "_wheel_row", lambda target, _: Row(target, 1, None, "fine", good=True))
-    assert release.main(["--out", str(tmp_path)]) == 0
+    capsys.readouterr()
+    assert release.main(["--out", str(tmp_path), "macos-arm64"]) == 0
+    assert "macos-arm64" in (said := capsys.readouterr().out) and "linux" not in said and "all good" in said
+    with pytest.raises(SystemExit):
+        release.main(["atari"])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="names of Linux on x86-64 and aarch64")
