@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture import exif
+from splatnode.capture import exif, heif_file
 from splatnode.capture.exif_time import exif_time
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.image_header import UnusableImage, read_header
@@ -23,7 +23,8 @@ from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.stamp import Stamp
 
-SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp"}  # of what can be decoded
+# Of what can be decoded, HEIC and AVIF with the extra heic.
+SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", *heif_file.SUFFIXES}
 MAX_PIXELS = 100_000_000  # of an image, unless another limit is given
 MaxPixels = Annotated[int, msgspec.Meta(ge=1, le=1 << 30)]  # of a configuration; OpenCV decodes no more
 BYTES_A_PIXEL = 16  # of memory at most beside the file itself, until an image is decoded; afterwards it has 3
@@ -45,6 +46,26 @@ def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
     Raises UnusableImage, OSError.
     """
     return read_bounded(path, _FILE_BYTES_A_PIXEL * max_pixels + _FURTHER_FILE_BYTES, UnusableImage)
+
+
+def decode_photograph(data: bytes, max_pixels: int = MAX_PIXELS) -> DecodedImage:
+    """As `decode_image`, of a file that a person put there: HEIC and AVIF are decoded, too, in a process of their own.
+
+    What another process sent goes to `decode_image`. Raises UnusableImage.
+    """
+    if not heif_file.is_heif(data):
+        return decode_image(data, max_pixels)
+    image, tiff = heif_file.decode(data, max_pixels)
+    height, width = image.shape[:2]
+    return DecodedImage(image, exif.exif_intrinsics(exif.read_tags(tiff), width, height), exif_time(tiff))
+
+
+def check_whole(data: bytes) -> None:
+    """Raises UnusableImage where an image file is not complete, or is none."""
+    if heif_file.is_heif(data):
+        heif_file.check_whole(data)
+    else:
+        read_header(data)
 
 
 def decode_image(data: bytes, max_pixels: int = MAX_PIXELS) -> DecodedImage:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import resource
 import struct
 import subprocess
 import sys
@@ -20,6 +19,8 @@ from typing import IO
 import cv2
 import numpy as np
 import numpy.typing as npt
+
+from splatnode.capture.process import apart
 
 MAX_VIDEO_PIXELS = 36_000_000  # of a frame: 8192 x 4320
 BYTES_A_PIXEL = 80  # of memory at most for the decoder: its frames in flight, in colour, and what it refers to
@@ -44,9 +45,7 @@ def decoded(file: Path, every: int, max_pixels: int) -> Iterator[VideoFrame]:
 
     Raises VideoError, after the frames before it where it is about a later one.
     """
-    # Its path of modules is ours, and not the folder in which we happen to be.
-    code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import _main; _main()"
-    command = [sys.executable, "-I", "-c", code, os.fsdecode(file.absolute()), str(every), str(max_pixels)]
+    command = apart.command(__name__, os.fsdecode(file.absolute()), str(every), str(max_pixels))
     child = subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
@@ -81,11 +80,10 @@ def _received(stream: IO[bytes], max_pixels: int) -> Iterator[VideoFrame]:
         yield VideoFrame(index, rate, np.frombuffer(data, np.uint8).reshape(height, width, 3))
 
 
-def _main() -> None:
+def main() -> None:
     """The decoder's process: FILE EVERY MAX_PIXELS; writes what `_received` reads."""
     file, every, max_pixels = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
-    limit = _data_bytes() + BASE_BYTES + BYTES_A_PIXEL * max_pixels
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
+    apart.limit_memory(BASE_BYTES + BYTES_A_PIXEL * max_pixels)
     threads = min(_MAX_THREADS, os.cpu_count() or 1)
     video = cv2.VideoCapture(file, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, threads])
     if not video.isOpened():
@@ -104,9 +102,3 @@ def _main() -> None:
                 height, width = image.shape[:2]
                 out.write(_FRAME.pack(index, width, height) + image.tobytes())
         index += 1
-
-
-def _data_bytes() -> int:
-    """What RLIMIT_DATA counts, of this process just now."""
-    with open("/proc/self/status") as file:
-        return next(int(line.split()[1]) * 1024 for line in file if line.startswith("VmData"))

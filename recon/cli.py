@@ -20,6 +20,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.progress import Step, Tell, Told, told_to_nobody
 from splatnode.capture.process.terminal import say
+from splatnode.recon import cost
 from splatnode.recon.config import Config, overlaid, preset
 from splatnode.recon.evaluate import methods
 from splatnode.recon.evaluate.bench import Entrants, Plan, Scoring, run_bench, run_line
@@ -36,7 +37,7 @@ from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.rasterize import device
 from splatnode.recon.rasterize.device import Device
 from splatnode.recon.rasterize.dispatch import rasterizer
-from splatnode.recon.replay_source import source
+from splatnode.recon.replay_source import asked_for, source
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.size import largest_result_bytes
@@ -51,8 +52,9 @@ LOOK_EVERY = 50  # iterations between the snapshots that a viewer is shown
 
 
 def replay(args: argparse.Namespace) -> int:
-    """Reconstructs a folder of photographs, or a video."""
+    """Reconstructs a folder of photographs, some photographs of one, a recording, or a video."""
     config = _config(args)
+    args.source, args.listed = asked_for(args.source)
     _check_apart(args.out, args.source)
     if args.map:
         return replay_map(args, config)
@@ -62,6 +64,8 @@ def replay(args: argparse.Namespace) -> int:
         tell(str(given.choice))
         if given.choice.left_out.get(THINNED):
             tell("--map uses the keyframes that were thinned out, too, and makes a map of many scenes")
+    if not args.json and (taken := cost.in_words(given.sizes)) is not None:
+        say(taken, error=True)
     _check_baseline(config, [frame.name for frame in given.frames])
     needed_bytes = largest_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
     with (

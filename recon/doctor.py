@@ -28,6 +28,7 @@ OPTIONAL = {  # Import name, which is the distribution's too -> what it is for.
     "pycolmap": "true cameras in COLMAP's format, and COLMAP as a rival",
     "open3d": "the viewer",
     "depthai": "Luxonis cameras",
+    "pi_heif": "photographs in HEIC and AVIF",
     "gsplat": "the rasteriser for NVIDIA processors",
 }
 

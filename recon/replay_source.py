@@ -1,10 +1,10 @@
-"""What `splatnode replay` is given: a folder of photographs, or more than one looks at, or a video."""
+"""What `splatnode replay` is given: a folder of photographs, or some of its photographs, or a recording, or a video."""
 
 from __future__ import annotations
 
 import argparse
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,6 +62,7 @@ class Recording:
     """All keyframes of a recording, which are read again when they are needed."""
 
     path: Path
+    listed: tuple[str, ...]  # the photographs of the folder that were named; none: all
     choice: Choice
 
     @property
@@ -80,13 +81,34 @@ class Recording:
     def frames(self) -> Iterator[Frame | DroppedFrame]:
         """The keyframes in their order, and what the recording could not give."""
         names = set(self.choice.names)
-        return (each for each in _stream(self.path) if isinstance(each, DroppedFrame) or each.name in names)
+        return (
+            each for each in _stream(self.path, self.listed) if isinstance(each, DroppedFrame) or each.name in names
+        )
+
+
+def asked_for(paths: Sequence[Path]) -> tuple[Path, tuple[str, ...]]:
+    """The folder or the video that the command line names, and the photographs of that folder; none of these: all.
+
+    Raises ValueError where several are named that are not photographs of one folder.
+    """
+    (first, *others) = paths
+    if not others and not (first.suffix.lower() in folder.SUFFIXES | folder.FOREIGN_SUFFIXES and first.is_file()):
+        return first, ()
+    for path in paths:
+        if path.is_dir():
+            raise ValueError(f"{str(path)!r} is a folder; give one folder alone, or photographs of one")
+        if not path.is_file():
+            raise FileNotFoundError(f"{str(path)!r} is not there; give a folder, a video, or photographs of one folder")
+        if path.parent.resolve() != first.parent.resolve():
+            raise ValueError(f"{str(path)!r} lies in another folder than {str(first)!r}; put them into one folder")
+    return first.parent, tuple(folder.frame_name(path) for path in paths)
 
 
 def recording(args: argparse.Namespace, tell: Tell = told_to_nobody) -> Recording:
     """As `source`, without a limit to the number of keyframes."""
     _check_there(args.source)
-    return Recording(args.source, choose(_looked_through(args.source, tell), _selection(args), Limits(), None))
+    choice = choose(_looked_through(args, tell), _selection(args), Limits(), None)
+    return Recording(args.source, args.listed, choice)
 
 
 def source(args: argparse.Namespace, tell: Tell = told_to_nobody) -> Source:
@@ -99,11 +121,11 @@ def source(args: argparse.Namespace, tell: Tell = told_to_nobody) -> Source:
         if args.frames:
             raise ValueError("--frames names photographs of a folder; of a video, give --views N or nothing")
         return _chosen(args, None, tell)
-    names = _names(args)
-    there = len(folder.names_in(args.source))
-    if names or args.every_frame or there <= ALL:
-        frames = folder.stream(folder.Config(folder=args.source, names=names))
-        return Source(tuple(counted(frames, tell, "reading", len(names) or there, "photograph")), args.source, None)
+    names, there = _names(args), _there(args)
+    if names or args.every_frame or len(there) <= ALL:
+        frames = folder.stream(folder.Config(folder=args.source, names=names or args.listed))
+        of = len(names or there)
+        return Source(tuple(counted(frames, tell, "reading", of, "photograph")), args.source, None)
     return _chosen(args, args.source, tell)
 
 
@@ -112,14 +134,22 @@ def _check_there(path: Path) -> None:
         raise FileNotFoundError(f"{str(path)!r} is not there; give a folder that holds photographs, or a video")
 
 
-def _stream(path: Path) -> Iterator[Frame | DroppedFrame]:
-    return video.stream(video.Config(file=path)) if path.is_file() else folder.stream(folder.Config(folder=path))
+def _there(args: argparse.Namespace) -> Sequence[str]:
+    """The names of the photographs that there are to choose from."""
+    return args.listed or folder.names_in(args.source)
 
 
-def _looked_through(path: Path, tell: Tell) -> Iterator[Frame | DroppedFrame]:
+def _stream(path: Path, listed: tuple[str, ...]) -> Iterator[Frame | DroppedFrame]:
+    if path.is_file():
+        return video.stream(video.Config(file=path))
+    return folder.stream(folder.Config(folder=path, names=listed))
+
+
+def _looked_through(args: argparse.Namespace, tell: Tell) -> Iterator[Frame | DroppedFrame]:
     """All that there is to choose from; how many frames a video has is known at its end."""
-    of = 0 if path.is_file() else len(folder.names_in(path))
-    return counted(_stream(path), tell, f"choosing keyframes of {printable_name(path.name)}", of, "frame")
+    of = 0 if args.source.is_file() else len(_there(args))
+    doing = f"choosing keyframes of {printable_name(args.source.name)}"
+    return counted(_stream(args.source, args.listed), tell, doing, of, "frame")
 
 
 def _selection(args: argparse.Namespace) -> Config:
@@ -129,7 +159,7 @@ def _selection(args: argparse.Namespace) -> Config:
 
 def _chosen(args: argparse.Namespace, photographs: Path | None, tell: Tell) -> Source:
     """The keyframes of a recording; with --views N so many, evenly spread."""
-    choice = choose(_looked_through(args.source, tell), _selection(args), Limits(), max(MOST, args.views or 0))
+    choice = choose(_looked_through(args, tell), _selection(args), Limits(), max(MOST, args.views or 0))
     frames = choice.keyframes
     if args.views:
         if args.views > len(frames):
@@ -140,13 +170,15 @@ def _chosen(args: argparse.Namespace, photographs: Path | None, tell: Tell) -> S
 
 def _names(args: argparse.Namespace) -> tuple[str, ...]:
     """Of the photographs to use; none means all."""
+    if args.frames and args.listed:
+        raise ValueError("--frames names photographs of a folder; here they are listed already, so leave it out")
     if args.frames:
         return args.frames
     if not args.views:
         return ()
-    names = folder.names_in(args.source)
+    names = _there(args)
     if args.views > len(names):
-        raise ValueError(f"--views {args.views}: the folder holds {len(names)} photographs; ask for at most as many")
+        raise ValueError(f"--views {args.views}: there are {len(names)} photographs; ask for at most as many")
     return tuple(names[i] for i in _evenly(len(names), args.views))
 
 

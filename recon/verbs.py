@@ -37,9 +37,11 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "source",
         type=Path,
+        nargs="+",
         metavar="SOURCE",
-        help="a folder with photographs of one place, in any order, or a video; of a video, and of more than 30 "
-        "photographs, keyframes are chosen as a live camera's are",
+        help="a folder with photographs of one place, in any order, or some photographs of a folder, or a video, or "
+        "what `splatnode record` wrote; of a video, and of more than 30 photographs, keyframes are chosen as a live "
+        "camera's are",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
     parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with what differs from the defaults")

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
-from splatnode.capture.image_file import UnusableImage, decode_image, read_image_file
+from splatnode.capture.image_file import UnusableImage, decode_photograph, read_image_file
 from splatnode.capture.messaging.broadcast import Subscriber
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_SCENE, RECON_STATUS
@@ -224,7 +224,7 @@ def found_photographs(cameras: tuple[CameraEstimate, ...], folders: Sequence[Pat
             try:
                 if not path.is_file():
                     continue
-                found[camera.name] = _small(decode_image(read_image_file(path))[0])
+                found[camera.name] = _small(decode_photograph(read_image_file(path))[0])
             except (UnusableImage, OSError) as error:
                 log.warning("%s is shown without its photograph: %s", camera.name, error)
             break

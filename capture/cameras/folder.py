@@ -10,15 +10,22 @@ from typing import Annotated
 
 import msgspec
 
-from splatnode.capture import recording
+from splatnode.capture import heif_file, recording
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed, renamed
-from splatnode.capture.image_file import MAX_PIXELS, SUFFIXES, MaxPixels, UnusableImage, decode_image, read_image_file
+from splatnode.capture.image_file import (
+    MAX_PIXELS,
+    SUFFIXES,
+    MaxPixels,
+    UnusableImage,
+    decode_photograph,
+    read_image_file,
+)
 from splatnode.capture.pace import FramesPerSecond, Pace, paced
 from splatnode.capture.process.printable import printable, printable_name
 
 DEFAULT_STEP_NS = 100_000_000  # between two loops of a single photograph, which has no rate
 # Photographs that cannot be decoded here; they are reported as dropped.
-FOREIGN_SUFFIXES = {".heic", ".heif", ".avif", ".jxl", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf"}
+FOREIGN_SUFFIXES = {".jxl", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf"}
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -73,7 +80,7 @@ def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]
         name = frame_name(path)
         try:
             data = read_image_file(path, config.max_pixels)
-            image, intrinsics, captured_at = decode_image(data, config.max_pixels)
+            image, intrinsics, captured_at = decode_photograph(data, config.max_pixels)
         except UnusableImage as error:
             yield DroppedFrame(name, str(error))
         except OSError as error:
@@ -89,11 +96,17 @@ def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]
 
 
 def foreign_file(path: Path) -> DroppedFrame | None:
-    """The photograph left out, where its format is one that cannot be read; else None."""
+    """The photograph left out, where its format is one that cannot be read here; else None."""
     suffix = path.suffix.lower()
-    if suffix not in FOREIGN_SUFFIXES:
-        return None
-    return DroppedFrame(frame_name(path), f"{suffix} files cannot be read; convert it to JPEG or PNG")
+    remedy = _remedy(suffix)
+    return None if remedy is None else DroppedFrame(frame_name(path), f"{suffix} files cannot be read. {remedy}")
+
+
+def _remedy(suffix: str) -> str | None:
+    """What to do with files of this suffix, where they cannot be read here; else None."""
+    if suffix in heif_file.SUFFIXES:
+        return heif_file.lacking()
+    return "Convert it to JPEG or PNG" if suffix in FOREIGN_SUFFIXES else None
 
 
 def frame_name(path: Path) -> str:
@@ -136,9 +149,10 @@ def chosen_images(folder: Path, names: tuple[str, ...] = ()) -> list[Path]:
         inside = sorted(frame_name(child) for child in folder.iterdir() if child.is_dir() and image_paths(child))
         advice = f"give one of its folders: {', '.join(inside)}" if inside else "give a folder of JPEGs or PNGs"
         raise ValueError(f"no photographs in {str(folder)!r}; {advice}")
-    foreign = sorted({path.suffix.lower() for path in paths})
-    if FOREIGN_SUFFIXES.issuperset(foreign):
-        raise ValueError(f"{str(folder)!r} holds only {', '.join(foreign)} files; convert them to JPEG or PNG")
+    suffixes = sorted({path.suffix.lower() for path in paths})
+    remedies = [_remedy(suffix) for suffix in suffixes]
+    if remedies[0] is not None and None not in remedies:
+        raise ValueError(f"{str(folder)!r} holds only {', '.join(suffixes)} files. {remedies[0]}")
     called = {path: {path.name, path.stem, frame_name(path)} for path in paths}
     missing = [printable(name) for name in names if not any(name in own for own in called.values())]
     if missing:

@@ -16,8 +16,8 @@ from splatnode.capture.image_file import (
     MAX_PIXELS,
     MaxPixels,
     UnusableImage,
-    decode_image,
-    read_header,
+    check_whole,
+    decode_photograph,
     read_image_file,
 )
 from splatnode.capture.stamp import Clock, Stamp
@@ -87,7 +87,7 @@ def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> 
         if now - before.since < config.settle_s:
             return None
         data = read_image_file(path, config.max_pixels)
-        read_header(data)
+        check_whole(data)
     except FileNotFoundError:
         seen.pop(path.name, None)
         return None
@@ -101,7 +101,7 @@ def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> 
 
 def _decoded(name: str, data: bytes, written_at: Stamp, config: Config, frame_id: int) -> Frame | DroppedFrame:
     try:
-        image, intrinsics, captured_at = decode_image(data, config.max_pixels)
+        image, intrinsics, captured_at = decode_photograph(data, config.max_pixels)
     except UnusableImage as error:
         return DroppedFrame(name, str(error))
     if config.intrinsics is not None:

@@ -14,11 +14,13 @@ REQUIRED = {
 }
 # Import name -> the extra that brings the package of that name.
 EXTRAS = {
+    "PIL": "heic",
     "depthai": "oak",
     "gsplat": "cuda",
     "matplotlib": "bench",
     "onnxruntime": "xfeat",
     "open3d": "viewer",
+    "pi_heif": "heic",
     "pycolmap": "bench",
     "safetensors": "learned",
 }

@@ -53,18 +53,24 @@ def _copy(source: Path, to: Path) -> None:
         shutil.copy2(source, to)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Builds the wheels that are asked for, all by default, and prints their paths; 1 where one could not be built."""
-    parser = argparse.ArgumentParser(prog="./run wheels", description=__doc__)
+def asked_for(verb: str, description: str | None, argv: Sequence[str] | None) -> tuple[list[str], Path]:
+    """The targets, all by default, and the folder that the arguments of `./run VERB` name."""
+    parser = argparse.ArgumentParser(prog=f"./run {verb}", description=description)
     parser.add_argument("targets", nargs="*", metavar="TARGET", help=f"some of {', '.join(TARGETS)} (default: all)")
     parser.add_argument("--out", type=Path, default=Path("dist"), metavar="DIR", help="default: dist")
     args = parser.parse_args(argv)
     if unknown := set(args.targets) - set(TARGETS):
         parser.error(f"no target {', '.join(sorted(unknown))}; there are: {', '.join(TARGETS)}")
+    return args.targets or list(TARGETS), args.out
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Builds the wheels that are asked for, and prints their paths; 1 where one could not be built."""
+    targets, out = asked_for("wheels", __doc__, argv)
     failed = 0
-    for target in args.targets or TARGETS:
+    for target in targets:
         try:
-            print(build_wheel(target, args.out), flush=True)
+            print(build_wheel(target, out), flush=True)
         except RuntimeError as error:
             print(error, file=sys.stderr)
             failed = 1

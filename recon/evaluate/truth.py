@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import Frame
-from splatnode.capture.image_file import SUFFIXES, UnusableImage, decode_image, read_image_file
+from splatnode.capture.image_file import SUFFIXES, UnusableImage, decode_photograph, read_image_file
 from splatnode.recon.evaluate.json_file import EvaluationFileError
 from splatnode.recon.evaluate.true_cameras import TrueCamera, read_true_cameras
 
@@ -30,7 +30,7 @@ class EvaluationScene:
         """(H, W, 3) RGB. Raises EvaluationFileError where the file is not an image, OSError."""
         path = self.paths[name]
         try:
-            return decode_image(read_image_file(path))[0]
+            return decode_photograph(read_image_file(path))[0]
         except UnusableImage as error:
             raise EvaluationFileError(f"{path} must be an image: {error}") from error
 

@@ -39,8 +39,8 @@ def film(walk, tmp_path_factory):
     return file
 
 
-def asked(source, views=None, frames=(), every_frame=False) -> Namespace:
-    return Namespace(source=source, views=views, frames=frames, every_frame=every_frame)
+def asked(source, views=None, frames=(), every_frame=False, listed=()) -> Namespace:
+    return Namespace(source=source, listed=listed, views=views, frames=frames, every_frame=every_frame)
 
 
 def folder_of(images, folder):
@@ -105,3 +105,37 @@ def test_a_folder_into_which_results_were_written_is_the_same_recording(walk, fi
     assert recording(asked(folder)).identity(Config()) == before
     assert recording(asked(folder)).identity(Config(seed=1)) != before
     assert recording(asked(film)).identity(Config()) != before
+
+
+def test_photographs_of_one_folder_are_named_one_by_one(walk, tmp_path):
+    there = folder_of(walk, tmp_path / "many")
+    path, listed = replay_source.asked_for([there / "007.png", there / "003.png", there / "../many/011.png"])
+    assert path == there and listed == ("007.png", "003.png", "011.png")
+    given = source(asked(path, listed=listed))
+    assert [frame.name for frame in given.frames] == ["003.png", "007.png", "011.png"] and given.choice is None
+    assert given.keep(tmp_path / "out") == there
+    assert [frame.name for frame in source(asked(path, views=2, listed=listed)).frames] == ["007.png", "011.png"]
+    assert replay_source.asked_for([there / "000.png"]) == (there, ("000.png",))
+    every = tuple(f"{i:03d}.png" for i in range(replay_source.ALL + 1))
+    chosen = source(asked(there, listed=every))
+    assert chosen.choice is not None and chosen.choice.examined == len(every)
+
+
+def test_a_folder_a_recording_and_a_video_stand_alone(film, tmp_path):
+    for path in (tmp_path, film):
+        assert replay_source.asked_for([path]) == (path, ())
+    for name in ("a.jpg", "b.jpg", "other/a.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    with pytest.raises(ValueError, match="is a folder; give one folder alone"):
+        replay_source.asked_for([tmp_path / "a.jpg", tmp_path / "other"])
+    with pytest.raises(FileNotFoundError, match="c.jpg' is not there"):
+        replay_source.asked_for([tmp_path / "a.jpg", tmp_path / "c.jpg"])
+    with pytest.raises(ValueError, match="a.jpg' lies in another folder than"):
+        replay_source.asked_for([tmp_path / "b.jpg", tmp_path / "other" / "a.jpg"])
+    with pytest.raises(ValueError, match="no photograph named notes.txt"):
+        (tmp_path / "notes.txt").touch()
+        path, listed = replay_source.asked_for([tmp_path / "a.jpg", tmp_path / "notes.txt"])
+        source(asked(path, listed=listed))
+    with pytest.raises(ValueError, match="they are listed already, so leave it out"):
+        source(asked(tmp_path, frames=("a",), listed=("a.jpg", "b.jpg")))

@@ -119,9 +119,10 @@ def test_what_brings_a_module_is_what_the_project_says():
             extras.setdefault(re.split(r"[<>=!~ \[;]", line)[0].lower(), set()).add(
                 line.split("extra ==")[1].strip(" '\"")
             )
-    bringing = {module: extras.get(module, set()) - {"dev"} for module in packages.EXTRAS}
+    distributions = {module: {"PIL": "pillow"}.get(module, module.replace("_", "-")) for module in packages.EXTRAS}
+    bringing = {module: extras.get(name, set()) - {"dev"} for module, name in distributions.items()}
     assert bringing == {module: {extra} for module, extra in packages.EXTRAS.items()}
-    assert {module for module, brought in extras.items() if brought - {"dev"}} == set(packages.EXTRAS)
+    assert {name for name, brought in extras.items() if brought - {"dev"}} == set(distributions.values())
 
 
 @pytest.mark.parametrize("to", ["1", "2"])

@@ -237,9 +237,9 @@ def test_foreign_content_is_named_and_left_out(tmp_path, name, data, reason):
 
 def test_a_photograph_in_a_foreign_format_is_named_beside_others(tmp_path):
     (tmp_path / "1.jpg").write_bytes(encoded())
-    (tmp_path / "2.heic").write_bytes(b"\0\0\0\x18ftypheic")
+    (tmp_path / "2.jxl").write_bytes(b"\xff\x0a")
     _, dropped = stream(Config(tmp_path))
-    assert dropped == DroppedFrame("2.heic", ".heic files cannot be read; convert it to JPEG or PNG")
+    assert dropped == DroppedFrame("2.jxl", ".jxl files cannot be read. Convert it to JPEG or PNG")
 
 
 def test_too_many_pixels_are_refused_before_they_are_decoded(tmp_path):
@@ -299,8 +299,8 @@ def test_nothing_to_stream_says_what_to_do(tmp_path):
     with pytest.raises(FileNotFoundError, match="is a file, not a folder"):
         stream(Config(tmp_path / "images" / "a.jpg"))
     (tmp_path / "phone").mkdir()
-    (tmp_path / "phone" / "IMG_1.HEIC").write_bytes(b"\0\0\0\x18ftypheic")
-    with pytest.raises(ValueError, match="holds only .heic files; convert them"):
+    (tmp_path / "phone" / "IMG_1.DNG").write_bytes(b"II*\0")
+    with pytest.raises(ValueError, match=r"holds only .dng files\. Convert it to JPEG"):
         stream(Config(tmp_path / "phone"))
     with pytest.raises(ValueError, match="no photograph named b.jpg"):
         stream(Config(tmp_path / "images", names=("b.jpg",)))

@@ -105,8 +105,8 @@ def test_what_lies_there_can_be_left_out(tmp_path):
 
 
 def test_what_cannot_be_read_is_named(tmp_path):
-    (tmp_path / "phone.heic").write_bytes(b"\0\0\0\x18ftypheic")
-    assert "convert it to JPEG" in next(watch(tmp_path)).reason
+    (tmp_path / "phone.dng").write_bytes(b"II*\0")
+    assert "Convert it to JPEG" in next(watch(tmp_path)).reason
 
 
 def test_a_folder_that_is_not_there_or_goes_is_a_lost_camera(tmp_path):

@@ -1,0 +1,158 @@
+"""The release, and the proof that it works: `./run release [--out DIR] [TARGET ...]`.
+
+It makes the sdist and the wheels in `dist`. What this machine can run is installed in a clean environment outside the
+checkout, where it makes the demo's scene: its wheel, and the sdist with a compiler and without one. Wheels for Linux
+must need no newer system than their names say, as auditwheel sees it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatnode.recon.core.compile import TARGETS, find_compiler, machine
+from splatnode.recon.core.trial import Trial, TrialFailed, try_artefact
+from splatnode.recon.core.wheels import ROOT, asked_for, build_wheel
+
+_NOT_PACKED = (".*", "out", "build", "dist", "docs", "__pycache__", "*.egg-info", "_core_*")
+_BUILD_SDIST = "import sys; from splatnode.recon.core import backend; print(backend.build_sdist(sys.argv[1]))"
+_HEADINGS = ("artefact", "size", "installed", "in", "demo")
+_NO_TRIAL = "not for this machine"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table: an artefact, or a way to install it."""
+
+    artefact: str
+    size_bytes: int
+    trial: Trial | None  # None: there was none, or it failed
+    remark: str  # why there is no trial
+    good: bool
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        size = _megabytes(self.size_bytes)
+        if self.trial is None:
+            return (self.artefact, size, "-", "-", self.remark)
+        installed, seconds = _megabytes(self.trial.installed_bytes), f"{self.trial.install_s:.0f} s"
+        return (self.artefact, size, installed, seconds, self.trial.demo)
+
+
+def table(rows: Sequence[Row]) -> str:
+    """The rows beneath their headings, in columns."""
+    lines = [_HEADINGS, *(row.cells for row in rows)]
+    widths = [max(len(line[column]) for line in lines) for column in range(len(_HEADINGS))]
+    return "\n".join(
+        "  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip() for line in lines
+    )
+
+
+def _megabytes(size_bytes: int) -> str:
+    return f"{size_bytes / 1e6:.1f} MB" if size_bytes < 1e8 else f"{size_bytes / 1e6:.0f} MB"
+
+
+def target_here() -> str | None:
+    """The one of TARGETS that this machine can run, or None."""
+    system = {"linux": "linux", "darwin": "macos"}.get(sys.platform)
+    return next(
+        (name for name in TARGETS if name.startswith(f"{system}-") and TARGETS[name].machine == machine()), None
+    )
+
+
+def build_sdist(out: Path) -> Path:
+    """The sdist of the checkout, in the folder `out`. Raises RuntimeError where it cannot be built, with the reason."""
+    out.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="splatnode-sdist-") as folder:
+        copy = Path(folder) / "splatnode"
+        shutil.copytree(ROOT, copy, symlinks=True, ignore=shutil.ignore_patterns(*_NOT_PACKED))
+        command = [sys.executable, "-c", _BUILD_SDIST, str(out.resolve())]
+        environment = {**os.environ, "PYTHONPATH": str(copy)}
+        result = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True)
+    if result.returncode != 0:
+        raise RuntimeError(f"the sdist was not built:\n{result.stderr[-4000:]}")
+    return out / result.stdout.splitlines()[-1]
+
+
+def least_system(said: str) -> str:
+    """The platform tag that a wheel deserves, in what `auditwheel show` says of it. Raises RuntimeError without one."""
+    words = " ".join(said.split())
+    _, found, rest = words.partition('is consistent with the following platform tag: "')
+    if not found:
+        raise RuntimeError(f"auditwheel does not say what system the wheel needs: {words[:400]}")
+    return rest.partition('"')[0]
+
+
+def check_tag(wheel: Path) -> None:
+    """Raises RuntimeError where a wheel for Linux needs a newer system than its name says, or cannot be judged."""
+    result = subprocess.run([sys.executable, "-m", "auditwheel", "show", str(wheel)], capture_output=True, text=True)
+    if result.returncode != 0:
+        raise RuntimeError(f"auditwheel cannot read {wheel.name}: {result.stderr[-1000:]}")
+    if not wheel.stem.endswith(deserved := least_system(result.stdout)):
+        raise RuntimeError(f"{wheel.name} needs {deserved}")
+
+
+def on_trial(name: str, artefact: Path, compiler: bool = True) -> Row:
+    """The row of an artefact that is installed and run; what was seen where it fails goes to standard error."""
+    size_bytes = artefact.stat().st_size
+    print(f"trying {name} in a clean environment", file=sys.stderr, flush=True)
+    with tempfile.TemporaryDirectory(prefix="splatnode-trial-") as folder:
+        try:
+            trial = try_artefact(artefact.resolve(), ROOT / "constraints.txt", Path(folder), compiler)
+        except TrialFailed as error:
+            print(f"{name}: {error}", file=sys.stderr, flush=True)
+            return Row(name, size_bytes, None, "FAILED", good=False)
+    return Row(name, size_bytes, trial, "", good=True)
+
+
+def _wheel_row(target: str, out: Path) -> Row:
+    wheel = build_wheel(target, out)
+    if target.startswith("linux-"):
+        check_tag(wheel)
+    if target == target_here():
+        return on_trial(wheel.name, wheel)
+    return Row(wheel.name, wheel.stat().st_size, None, _NO_TRIAL, good=True)
+
+
+def _sdist_rows(out: Path) -> list[Row]:
+    sdist = build_sdist(out)
+    rows = [on_trial(f"{sdist.name}, compiler of PyPI", sdist, compiler=False)]
+    compiler = find_compiler()
+    if compiler is None or "ziglang" in compiler:
+        remark = "no compiler is installed here"
+        return [*rows, Row(f"{sdist.name}, compiler installed", sdist.stat().st_size, None, remark, good=True)]
+    return [*rows, on_trial(f"{sdist.name}, {compiler[0]}", sdist)]
+
+
+def _row_or_failure(name: str, make: Callable[[], list[Row]]) -> list[Row]:
+    """What `make` makes; an artefact that cannot be built, or that is not what its name says, has a row of its own."""
+    try:
+        return make()
+    except RuntimeError as error:
+        print(f"{name}: {error}", file=sys.stderr, flush=True)
+        return [Row(name, 0, None, "FAILED", good=False)]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Makes the release and prints the table; 1 where anything is not good."""
+    targets, out = asked_for("release", __doc__, argv)
+    rows: list[Row] = []
+    for target in targets:
+        print(f"building the wheel for {target}", file=sys.stderr, flush=True)
+        rows += _row_or_failure(f"wheel for {target}", lambda target=target: [_wheel_row(target, out)])
+    print("building the sdist", file=sys.stderr, flush=True)
+    rows += _row_or_failure("sdist", lambda: _sdist_rows(out))
+    print(table(rows))
+    bad = [row.artefact for row in rows if not row.good]
+    print(f"NOT GOOD: {', '.join(bad)}" if bad else f"{out}: all good", file=sys.stderr if bad else sys.stdout)
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
