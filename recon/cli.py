@@ -39,6 +39,7 @@ from splatnode.recon.rasterize.dispatch import rasterizer
 from splatnode.recon.replay_source import source
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.folder import result_folder
+from splatnode.recon.result.only_seen import only_seen
 from splatnode.recon.result.size import largest_result_bytes
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.write import finish
@@ -54,6 +55,8 @@ def replay(args: argparse.Namespace) -> int:
     """Reconstructs a folder of photographs, or a video."""
     config = _config(args)
     _check_apart(args.out, args.source)
+    if args.map and args.only_seen:
+        raise ValueError("--only-seen is for one scene: a merged map does not tell what two photographs confirm")
     if args.map:
         return replay_map(args, config)
     tell = told_to_nobody if args.json else Told()
@@ -71,6 +74,8 @@ def replay(args: argparse.Namespace) -> int:
         snapshot = run(given.frames, with_looks(config, LOOK_EVERY) if args.view else config, show, tell)
         tell(Step("writing the results"))
         snapshot = in_metres(snapshot, config.metric)
+        if args.only_seen:
+            snapshot = only_seen(snapshot)
         told: dict[str, object] = {"photographs": str(given.keep(args.out).resolve())}
         if given.choice is not None:
             told["selection"] = given.choice.record()
