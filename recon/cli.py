@@ -40,6 +40,7 @@ from splatnode.recon.rasterize.dispatch import rasterizer
 from splatnode.recon.replay_source import asked_for, source
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.folder import result_folder
+from splatnode.recon.result.only_seen import only_seen
 from splatnode.recon.result.size import largest_result_bytes
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.write import finish
@@ -56,6 +57,8 @@ def replay(args: argparse.Namespace) -> int:
     config = _config(args)
     args.source, args.listed = asked_for(args.source)
     _check_apart(args.out, args.source)
+    if args.map and args.only_seen:
+        raise ValueError("--only-seen is for one scene: a merged map does not tell what two photographs confirm")
     if args.map:
         return replay_map(args, config)
     tell = told_to_nobody if args.json else Told()
@@ -75,6 +78,8 @@ def replay(args: argparse.Namespace) -> int:
         snapshot = run(given.frames, with_looks(config, LOOK_EVERY) if args.view else config, show, tell)
         tell(Step("writing the results"))
         snapshot = in_metres(snapshot, config.metric)
+        if args.only_seen:
+            snapshot = only_seen(snapshot)
         told: dict[str, object] = {"photographs": str(given.keep(args.out).resolve())}
         if given.choice is not None:
             told["selection"] = given.choice.record()

@@ -6,10 +6,21 @@ A flag of the reconstruction that is not given is None, so that the configuratio
 from __future__ import annotations
 
 import argparse
+import re
 from pathlib import Path
 from pkgutil import iter_modules
 
-from splatnode.capture.process.arguments import add_json, counts, megabytes, names, natural, percent, positive, seconds
+from splatnode.capture.process.arguments import (
+    add_json,
+    box,
+    counts,
+    megabytes,
+    names,
+    natural,
+    percent,
+    positive,
+    seconds,
+)
 from splatnode.capture.process.verb import Verb, lazily
 
 _FORMATS_FOLDER = Path(__file__).parent / "result" / "export" / "formats"
@@ -71,6 +82,7 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
         "--baseline", nargs=3, metavar=("A", "B", "METRES"), help="how far apart photographs A and B were taken"
     )
     parser.add_argument("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)")
+    add_only_seen(parser)
     parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
     chosen = parser.add_mutually_exclusive_group()
     chosen.add_argument("--views", type=positive, metavar="N", help="use N frames, evenly spread")
@@ -82,6 +94,14 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
         help="of a long recording: use all keyframes, however many; they become linked scenes, and one merged map",
     )
     add_json(parser)
+
+
+def add_only_seen(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--only-seen",
+        action="store_true",
+        help="leave out what no two photographs confirm, and the far background: holes in place of guesses",
+    )
 
 
 def _recon_arguments(parser: argparse.ArgumentParser) -> None:
@@ -99,6 +119,14 @@ def _export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", type=Path, metavar="SCENE", help="a result's folder, or a .ply, .spz or .splat file")
     parser.add_argument("--to", required=True, choices=EXPORT_FORMATS, help="the format")
     parser.add_argument("--out", type=Path, metavar="PATH", help="default: beside the scene")
+    add_only_seen(parser)
+    parser.add_argument(
+        "--crop",
+        type=box,
+        metavar="X0,Y0,Z0,X1,Y1,Z1",
+        help="keep the Gaussians in this box; in the frame and the unit of the scene",
+    )
+    parser._negative_number_matcher = re.compile(r"-[\d.]")  # else a box that begins with a minus is no value
 
 
 def _merge_arguments(parser: argparse.ArgumentParser) -> None:

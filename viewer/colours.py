@@ -12,6 +12,7 @@ import numpy.typing as npt
 from splatnode.recon.result.export.prepare import SH_C0
 from splatnode.recon.result.export.quaternions import matrices_from_quats
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+from splatnode.recon.result.sources import frame_of
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.state import Colouring
 from splatnode.viewer.support import Support
@@ -81,8 +82,8 @@ def _by_source(moment: Moment, support: Support) -> Array:
     """By the frame that started a Gaussian. A file does not keep it: there, by the camera that sees it largest."""
     snapshot = moment.snapshot
     palette = np.array([*(source_colour(index) for index in range(len(snapshot.cameras))), UNKNOWN], np.float32)
-    if not len(snapshot.gaussians) or not (snapshot.gaussians.source_frame >= 0).any():
+    if not len(snapshot.gaussians) or not (frame_of(snapshot.gaussians.source_frame) >= 0).any():
         return palette[support.best]
     index_of = {camera.frame_id: index for index, camera in enumerate(snapshot.cameras)}
-    frames, inverse = np.unique(snapshot.gaussians.source_frame, return_inverse=True)
+    frames, inverse = np.unique(frame_of(snapshot.gaussians.source_frame), return_inverse=True)
     return palette[np.array([index_of.get(int(frame), -1) for frame in frames])][inverse]

@@ -84,6 +84,20 @@ def size(text: str) -> tuple[int, int]:
     return sides[0], sides[1]
 
 
+def box(text: str) -> tuple[float, float, float, float, float, float]:
+    """x0,y0,z0,x1,y1,z1: the corners of a box, the first below the second on each axis."""
+    try:
+        x0, y0, z0, x1, y1, z1 = (float(number) for number in text.split(","))
+    except ValueError:
+        x0, y0, z0, x1, y1, z1 = [math.nan] * 6
+    if not all(math.isfinite(number) and abs(number) <= MAX_NUMBER for number in (x0, y0, z0, x1, y1, z1)):
+        raise argparse.ArgumentTypeError(f"must be six numbers with commas between them; got {_shown(text)}")
+    for axis, least, most in (("x", x0, x1), ("y", y0, y1), ("z", z0, z1)):
+        if least >= most:
+            raise argparse.ArgumentTypeError(f"must have {axis}0 below {axis}1; got {_shown(text)}")
+    return x0, y0, z0, x1, y1, z1
+
+
 def counts(text: str) -> tuple[int, ...]:
     """Whole numbers above 0 with commas between them: 3,6,12."""
     return tuple(positive(name) for name in names(text))

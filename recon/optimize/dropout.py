@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.geometry import to_camera
+from splatnode.recon.result.sources import frame_of
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import TrainingView
 
@@ -63,7 +64,7 @@ def uncertainty(gaussians: Gaussians, views: Sequence[TrainingView], sure: float
     device = gaussians.means.device
     result = torch.ones(len(gaussians), device=device)
     for view in views:
-        own = (gaussians.source_frame == view.frame_id).nonzero()[:, 0]
+        own = (frame_of(gaussians.source_frame) == view.frame_id).nonzero()[:, 0]
         if view.pointmap is None:
             result[own] = 0.0
             continue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-BYTES_A_GAUSSIAN = 120  # 68 in scene.ply, 46 to 50 in colmap/points3D.txt
+BYTES_A_GAUSSIAN = 124  # 68 in scene.ply, 46 to 50 in colmap/points3D.txt, 4 in sources.bin
 OTHER_BYTES = 2_000_000  # preview.png (1.2 MB measured at most), report and cameras
 # Photographs of real scenes led to a Gaussian for 28 to 60 pixels; four times as many are allowed for.
 PIXELS_A_GAUSSIAN = 8

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from splatnode.recon.result.export import write_result
+from splatnode.recon.result.export import viewer_safe, write_result
+from splatnode.recon.result.export.sources import SOURCES, encode_sources
 from splatnode.recon.result.preview import contact_sheet
 from splatnode.recon.result.report import build_report, peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
@@ -14,5 +15,7 @@ def finish(snapshot: Snapshot, out: Path, *, seed: int, preset_name: str, **extr
     """Writes the result folder and returns its report. Raises ResultWriteError, with what was there before intact."""
     report = build_report(snapshot, seed=seed, preset=preset_name, peak_rss_mb=peak_rss_mb()) | extra
     preview = contact_sheet(snapshot) if snapshot.verdict.publishable else None
-    write_result(snapshot, out, report, preview=preview)
+    source_frame = viewer_safe(snapshot.gaussians).source_frame  # of those that scene.ply holds
+    further = {SOURCES: encode_sources(source_frame)} if snapshot.verdict.publishable else {}
+    write_result(snapshot, out, report, preview=preview, further=further)
     return report

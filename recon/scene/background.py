@@ -12,13 +12,12 @@ import torch
 
 from splatnode.recon.geometry import project, quat_from_matrix, to_camera
 from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.result.sources import SHELL
 from splatnode.recon.scene.gaussians import SH_C0, Gaussians, logit
 
 Array = npt.NDArray[np.float64]
 Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
-
-SHELL = -1  # the source_frame of the shell's Gaussians, which no frame's pixels seeded
 
 EXTENT = 0.7  # standard deviation of a Gaussian along the shell, over the spacing: neighbours overlap without seams
 THICKNESS = 0.1  # standard deviation of a Gaussian across the shell, over that along it

@@ -11,6 +11,7 @@ import torch
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.registration.register import Registration
+from splatnode.recon.result.sources import frame_of
 from splatnode.recon.scene import initialisation
 from splatnode.recon.scene.gaussians import concatenate
 from splatnode.recon.scene.scene import Scene
@@ -49,7 +50,7 @@ def grow(
     )
     views = tuple(view for view in begun.views if view.name in further)
     ids = torch.tensor([view.frame_id for view in views], dtype=torch.int32)
-    fresh = begun.gaussians.subset(torch.isin(begun.gaussians.source_frame, ids))
+    fresh = begun.gaussians.subset(torch.isin(frame_of(begun.gaussians.source_frame), ids))
     return replace(scene, views=scene.views + views, gaussians=concatenate([scene.gaussians, fresh]))
 
 
@@ -57,7 +58,7 @@ def without_views(scene: Scene, names: Collection[str]) -> Scene:
     """The scene without these views and the Gaussians that were seeded from them, in its first camera's world."""
     gone = torch.tensor([view.frame_id for view in scene.views if view.name in names], dtype=torch.int32)
     views = tuple(view for view in scene.views if view.name not in names)
-    kept = scene.gaussians.subset(~torch.isin(scene.gaussians.source_frame, gone))
+    kept = scene.gaussians.subset(~torch.isin(frame_of(scene.gaussians.source_frame), gone))
     if not views:
         return replace(scene, views=(), gaussians=kept)
     T_camera_world = torch.linalg.inv(views[0].T_world_camera.double())

@@ -8,6 +8,7 @@ Gaussians follows from what there is to see and not from how many pixels show it
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 
 import cv2
@@ -18,7 +19,9 @@ import torch
 
 from splatnode.recon.geometry import quat_from_matrix
 from splatnode.recon.priors import reprojection
+from splatnode.recon.priors.confirmed import confirmed
 from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.result.sources import filled
 from splatnode.recon.scene.contrast_masking import visibility
 from splatnode.recon.scene.gaussians import SH_C0, Gaussians, concatenate, logit
 from splatnode.recon.scene.partition import partition
@@ -31,6 +34,7 @@ REFERENCE_PX = 512  # longer side of the photographs in whose pixels the configu
 PIXEL_VARIANCE = 1 / 12  # pixels squared, along each axis: a pixel is a square, not a point
 MIN_COSINE = 0.25  # between normal and line of sight, 76 degrees: beyond, a surface is known badly
 MIN_NORMAL_LENGTH = 0.3  # of a piece's mean normal: shorter ones are means of normals that contradict each other
+MOST = 0.5  # of a piece's pixels
 ATTEMPTS = 12  # to have at most a given number of Gaussians; then an even choice of them is kept
 MIN_COARSENING = 1.1  # factor by which each attempt is to have fewer pieces
 ERROR_EXPONENT = 1.3  # a piece's error grows a little faster than its area
@@ -73,11 +77,12 @@ def redundant_pixels(pointmaps: Sequence[Pointmap], config: Config) -> list[Mask
 
 
 def gaussians_from_pointmap(
-    pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, config: Config
+    pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, config: Config, sure: Mask | None = None
 ) -> Gaussians:
     """One Gaussian for each piece of the `wanted` (h, w) pixels of a keyframe's `image` (h, w, 3).
 
-    Each lies on its piece's surface and has the piece's mean colour, centre and extent there (moment matching).
+    Each lies on its piece's surface and has the piece's mean colour, centre and extent there (moment matching). It
+    counts as seen by two photographs where most of its pixels are `sure` (h, w); None: all are.
     """
     labels, count = _pieces(pointmap, image, wanted & (pointmap.depth > 0), config)
     wanted = labels >= 0
@@ -96,7 +101,15 @@ def gaussians_from_pointmap(
     uu, vv = (mean(x * x) - centre[:, i] ** 2 + PIXEL_VARIANCE for i, x in enumerate((u, v)))
     uv = mean(u * v) - centre[:, 0] * centre[:, 1]
     spread = np.stack([np.stack([uu, uv], 1), np.stack([uv, vv], 1)], 1)
-    return _on_surface(pointmap, centre, spread, inverse_depth, normal, colour, config)
+    seeded = _on_surface(pointmap, centre, spread, inverse_depth, normal, colour, config)
+    if sure is None:
+        return seeded
+    seen = torch.from_numpy(mean(sure[wanted]) >= MOST)
+    return replace(seeded, source_frame=torch.where(seen, pointmap.frame_id, filled(pointmap.frame_id)).int())
+
+
+def _seeded(pointmap: Pointmap, image: npt.NDArray[np.uint8], wanted: Mask, sure: Mask, config: Config) -> Gaussians:
+    return gaussians_from_pointmap(pointmap, image, wanted, config, sure)
 
 
 def _pieces(
@@ -218,8 +231,10 @@ def initial_gaussians(
         ~covered & (pointmap.confidence >= config.min_confidence)
         for pointmap, covered in zip(pointmaps, redundant_pixels(pointmaps, config), strict=True)
     ]
+    sure = confirmed(pointmaps)
     for _ in range(ATTEMPTS):
-        gaussians = concatenate(each(partial(gaussians_from_pointmap, config=config), pointmaps, images, wanted))
+        seeded = partial(_seeded, config=config)
+        gaussians = concatenate(each(seeded, pointmaps, images, wanted, sure))
         if max_gaussians is None or len(gaussians) <= max_gaussians:
             return gaussians
         config = _coarsened(config, len(gaussians) / max(max_gaussians, 1))

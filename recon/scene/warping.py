@@ -15,6 +15,7 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.registered_camera import modelled_K, sparse_points
 from splatnode.recon.registration.register import RegisteredCamera, Registration
+from splatnode.recon.result.sources import frame_of
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
 
@@ -96,7 +97,7 @@ def warped_scene(
     if any(warp.camera_shift > max_shift or warp.largest_stretch > MAX_STRETCH for warp in warps):
         return None
     gaussians = scene.gaussians.map(torch.clone)
-    source, views = scene.gaussians.source_frame, []
+    source, views = frame_of(scene.gaussians.source_frame), []
     view_ids = torch.tensor([view.frame_id for view in scene.views], dtype=source.dtype)
     for index, (view, warp) in enumerate(zip(scene.views, warps, strict=True)):
         own = source == view.frame_id

@@ -22,7 +22,7 @@ BENCHMARKS = {
         "guided",
         "capture",
     ),
-    "quality": ("poses", "windows", "fit", "priors", "parsimony", "budgets", "spz"),
+    "quality": ("poses", "windows", "fit", "priors", "parsimony", "budgets", "spz", "needles"),
     "speed": ("rasterize", "stereo", "growth"),
     "viewer": ("viewer", "drive", "drive_web", "beside"),
 }

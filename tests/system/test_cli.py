@@ -232,6 +232,10 @@ def test_a_stop_that_an_import_turns_into_its_own_error_is_a_stop(monkeypatch, c
         (["replay", "photos", "--out", "o", "--views", "3", "--frames", "a,b,c"], "not allowed with"),
         (["replay", "photos", "--out", "o", "--frames", "a,,c"], "commas between them"),
         (["export", "scene.ply", "--to", "docx"], "choose from"),
+        (["export", "scene.ply", "--to", "ply", "--crop", "1,2,3"], "must be six numbers"),
+        (["export", "scene.ply", "--to", "ply", "--crop", "-1,0,0,-2,1,1"], "must have x0 below x1"),
+        (["export", "scene.ply", "--to", "ply", "--crop", "0,0,0,1,nan,1"], "must be six numbers"),
+        (["replay", "photos", "--out", "o", "--crop", "0,0,0,1,1,1"], "unrecognized"),
         (["fly"], "choose from"),
     ],
 )
@@ -288,6 +292,12 @@ def test_export_writes_beside_the_scene_but_never_over_a_file(tmp_path, capsys):
     assert len(read_gaussians(tmp_path / "scene.splat")) == 1
     assert command_line.main(["export", str(tmp_path), "--to", "splat"]) == 2
     assert "--out" in capsys.readouterr().err
+
+
+def test_a_box_may_begin_with_a_minus():
+    argv = ["export", "scene.ply", "--to", "ply", "--crop", "-1,-.5,0,1,2.5,3", "--only-seen"]
+    args = command_line.build_parser().parse_args(argv)
+    assert args.crop == (-1, -0.5, 0, 1, 2.5, 3) and args.only_seen and args.scene.name == "scene.ply"
 
 
 def test_doctor_finds_the_core_and_what_it_needs(capsys):

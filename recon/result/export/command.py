@@ -6,8 +6,10 @@ import argparse
 
 from splatnode.capture.process.terminal import say
 from splatnode.recon.result.export.convert import export_scene
+from splatnode.recon.result.export.selection import Box, Selection
 
 
 def export(args: argparse.Namespace) -> int:
-    say(export_scene(args.scene, args.to, args.out))
+    within = None if args.crop is None else Box(args.crop[:3], args.crop[3:])
+    say(export_scene(args.scene, args.to, args.out, Selection(args.only_seen, within)))
     return 0

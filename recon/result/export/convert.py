@@ -5,21 +5,25 @@ from __future__ import annotations
 from pathlib import Path
 
 from splatnode.recon.result.export.format import load_format
+from splatnode.recon.result.export.selection import EVERYTHING, Selection
 from splatnode.recon.result.export.staged import write_file, write_files
 from splatnode.recon.result.export.stored import StoredResult
 
 
-def export_scene(source: Path, to: str, destination: Path | None = None) -> Path:
+def export_scene(source: Path, to: str, destination: Path | None = None, selection: Selection = EVERYTHING) -> Path:
     """Writes the result folder or scene file `source` in the format `to`; returns where it is.
 
-    `to` is a module of recon.result.export.formats. `destination` is a file, or a folder for a format of several files
-    (colmap); without it, it is the format's own name beside the scene, if nothing is there yet. Cameras come from the
-    cameras.json of the folder or beside the file. Raises ValueError for an unknown format or a destination that is
-    taken, SceneFileError for input that cannot be read as what it should be, FileNotFoundError where there is none,
-    ResultWriteError where the output cannot be written.
+    `to` is a module of recon.result.export.formats, `selection` says which Gaussians are written. `destination` is a
+    file, or a folder for a format of several files (colmap); without it, it is the format's own name beside the scene,
+    if nothing is there yet. Cameras come from the cameras.json of the folder or beside the file. Raises ValueError for
+    an unknown format, a destination that is taken, or a selection where the format has no Gaussians; SceneFileError
+    for input that cannot be read as what it should be, or of which nothing is selected; FileNotFoundError where there
+    is none, ResultWriteError where the output cannot be written.
     """
     format_ = load_format(to)
-    result = StoredResult.at(source)
+    if not selection.everything and not getattr(format_, "GAUSSIANS", True):
+        raise ValueError(f"{to} holds cameras and no Gaussians: --only-seen and --crop have nothing to leave out")
+    result = StoredResult.at(source, selection)
     if destination is None:
         destination = result.scene.with_name(format_.DEFAULT_NAME)
         if destination.exists():

@@ -16,7 +16,7 @@ class Format(Protocol):
 
     A module that also has `decode(data: bytes, name: str) -> GaussianArrays` can be read: the files whose suffix is
     the module's name. `decode` raises SceneFileError, which names the file as `name`, where the data are not such a
-    file.
+    file. One whose files hold no Gaussians has `GAUSSIANS = False`.
     """
 
     DEFAULT_NAME: str  # of the file, or of the folder where there are several files, beside the scene

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
@@ -14,6 +14,8 @@ from splatnode.recon.result.export.cameras import decode_cameras, decode_scale
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.limits import read_json_file, read_scene_file
 from splatnode.recon.result.export.prepare import viewer_safe
+from splatnode.recon.result.export.selection import EVERYTHING, Selection
+from splatnode.recon.result.export.sources import SOURCES, decode_sources
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 
@@ -27,15 +29,17 @@ class StoredResult:
     """
 
     scene: Path
+    selection: Selection = EVERYTHING  # of its Gaussians
 
     @classmethod
-    def at(cls, path: Path) -> StoredResult:
+    def at(cls, path: Path, selection: Selection = EVERYTHING) -> StoredResult:
         """The result in a folder, or that of a scene file."""
-        return cls(path / "scene.ply" if path.is_dir() else path)
+        return cls(path / "scene.ply" if path.is_dir() else path, selection)
 
     def gaussians(self) -> GaussianArrays:
-        """With finite values and bounded extents."""
-        return read_gaussians(_existing(self.scene))
+        """Those that are selected, with finite values and bounded extents."""
+        sources = self._sources() if self.selection.only_seen else None
+        return self.selection.of(read_gaussians(_existing(self.scene), sources), self.scene.name)
 
     def cameras(self) -> tuple[CameraEstimate, ...]:
         return read_cameras(_existing(self._cameras))
@@ -44,14 +48,26 @@ class StoredResult:
         """The unit of the lengths, as cameras.json states it; relative where there is no such file."""
         return decode_scale(read_json_file(self._cameras), self._cameras.name) if self._cameras.is_file() else RELATIVE
 
+    def _sources(self) -> Path:
+        """Where it is told which Gaussians two photographs confirm. Raises SceneFileError where it is not."""
+        path = self.scene.with_name(SOURCES)
+        if self.scene.suffix.lower() != ".ply" or not path.is_file():
+            raise SceneFileError(
+                f"{self.scene} does not tell which Gaussians two photographs confirm: that is in the {SOURCES} beside "
+                "a result's scene.ply, which merged maps, and results of earlier versions, do not have. "
+                "Make the scene anew: splatnode replay FOLDER --out DIR"
+            )
+        return path
+
     @property
     def _cameras(self) -> Path:
         return self.scene.with_name("cameras.json")
 
 
-def read_gaussians(path: Path) -> GaussianArrays:
+def read_gaussians(path: Path, sources: Path | None = None) -> GaussianArrays:
     """The Gaussians of a scene file (.ply, .spz, .splat), with finite values and bounded extents.
 
+    Their source frames are unknown but where `sources` has them.
     Raises SceneFileError where the file is truncated or is something else, OSError where it cannot be read.
     """
     decode = _decoders().get(path.suffix.lower())
@@ -59,6 +75,9 @@ def read_gaussians(path: Path) -> GaussianArrays:
         raise SceneFileError(f"{path.name} must end with {', '.join(_decoders())}")
     with foreign(SceneFileError, path.name):
         gaussians = decode(read_scene_file(path), path.name)
+        if sources is not None:
+            source_frame = decode_sources(read_scene_file(sources), len(gaussians))
+            gaussians = replace(gaussians, source_frame=source_frame)
         safe = viewer_safe(gaussians)
         if len(gaussians) and not len(safe):
             raise SceneFileError(f"{path.name} holds {len(gaussians)} Gaussians, none of them with finite values")

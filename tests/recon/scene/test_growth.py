@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from splatnode.recon.result.sources import frame_of
 from splatnode.recon.scene import background
 from splatnode.recon.scene.growth import NUM_NEIGHBOURS, grow, limited, without_views
 from splatnode.recon.scene.initialisation import Config
@@ -21,7 +22,7 @@ def test_growing_adds_a_further_views_gaussians_and_leaves_all_others_as_they_ar
     assert [view.name for view in grown.views] == ["00.png", "01.png", "02.png", "03.png"]
     assert torch.equal(grown.gaussians.means[:count], scene.gaussians.means)
     added = grown.gaussians.subset(torch.arange(count, len(grown.gaussians)))
-    assert set(added.source_frame.tolist()) == {3}
+    assert set(frame_of(added.source_frame).tolist()) == {3}
     # Only what it sees to the right of the view before it is new: a step of 0.3 at depth 2 is 5.3 of 32 columns.
     visible_before = (STEP * 2) + 2.0 * (WIDTH / 2) / (1.1 * WIDTH)
     assert len(added) > 20 and float(added.means[:, 0].min()) > visible_before - 0.3
@@ -55,8 +56,8 @@ def test_a_view_that_goes_takes_its_gaussians_along_and_the_next_becomes_the_wor
     scene = scene_of(3, graph)
     rest = without_views(scene, {"00.png"})
     assert [view.name for view in rest.views] == ["01.png", "02.png"]
-    assert 0 not in rest.gaussians.source_frame
+    assert 0 not in frame_of(rest.gaussians.source_frame)
     np.testing.assert_allclose(rest.views[0].T_world_camera, np.eye(4), atol=1e-6)
-    kept = scene.gaussians.subset(scene.gaussians.source_frame != 0)
+    kept = scene.gaussians.subset(frame_of(scene.gaussians.source_frame) != 0)
     torch.testing.assert_close(rest.gaussians.means, kept.means - torch.tensor([STEP, 0, 0]), rtol=0, atol=1e-5)
     assert without_views(scene, {"00.png", "01.png", "02.png"}).views == ()

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
+from splatnode.recon.result.sources import filled
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.seeding import Config, gaussians_from_pointmap, initial_gaussians, redundant_pixels
 from tests.support.synthetic import plane_pointmap, without
@@ -290,3 +291,19 @@ def render(gaussians: Gaussians, pointmap: Pointmap) -> torch.Tensor:
     image = render_gaussians(gaussians, Camera(*camera, width, height)).rgb
     assert image is not None
     return image
+
+
+def test_a_gaussian_remembers_whether_two_views_confirm_its_depth():
+    """The second camera stands beside the first: what both see is confirmed, the rest of the wall is not."""
+    beside = np.eye(4)
+    beside[0, 3] = 0.9
+    pointmaps = [plane_pointmap(T, width=64, height=64, frame_id=i) for i, T in enumerate((np.eye(4), beside))]
+    gaussians = initial_gaussians(pointmaps, [checkerboard(64, 8)] * 2, Config())
+    sources, x = gaussians.source_frame, gaussians.means[:, 0]
+    left, right = x < -0.1, x > 1.1  # of what both see, by more than a piece's width
+    middle = (x > 0.1) & (x < 0.8)
+    assert left.any() and (sources[left] == filled(0)).all()
+    assert right.any() and (sources[right] == filled(1)).all()
+    assert middle.any() and (sources[middle] >= 0).all()
+    alone = initial_gaussians(pointmaps[:1], [checkerboard(64, 8)], Config())
+    assert (alone.source_frame == filled(0)).all()

@@ -17,6 +17,7 @@ from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate
 
 DEFAULT_NAME = "transforms.json"
+GAUSSIANS = False  # cameras alone
 
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # camera axes right, down, ahead from right, up, back
 

@@ -16,6 +16,7 @@ from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate
 
 DEFAULT_NAME = "trajectory.tum"
+GAUSSIANS = False  # cameras alone
 
 
 def export(result: StoredResult) -> bytes:

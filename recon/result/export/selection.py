@@ -1,0 +1,70 @@
+"""Which Gaussians of a scene an export keeps: all, those that two photographs have seen, those in a box."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.export.prepare import take
+from splatnode.recon.result.snapshot import GaussianArrays
+from splatnode.recon.result.sources import seen
+
+Corner = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Box:
+    """With its faces along the axes of the world; both corners in the file's frame and unit."""
+
+    least: Corner
+    most: Corner
+
+    def __post_init__(self) -> None:
+        for axis, least, most in zip("xyz", self.least, self.most, strict=True):
+            if not least < most:
+                raise ValueError(f"the box must have {axis}0 below {axis}1, got {least:g} and {most:g}")
+
+    def holds(self, points: npt.NDArray[np.float32]) -> npt.NDArray[np.bool_]:
+        """(N,) which of the points (N, 3) are in it."""
+        inside = (points >= np.array(self.least)) & (points <= np.array(self.most))
+        return np.asarray(inside.all(1))
+
+
+@dataclass(frozen=True)
+class Selection:
+    only_seen: bool = False  # without what no two photographs confirm, and without the far shell
+    box: Box | None = None  # those whose centre is in it; None: wherever they are
+
+    @property
+    def everything(self) -> bool:
+        return not self.only_seen and self.box is None
+
+    def of(self, gaussians: GaussianArrays, name: str) -> GaussianArrays:
+        """What is kept of `gaussians`, whose source frames must be known for `only_seen`.
+
+        Raises SceneFileError, which names the file as `name`, where nothing is.
+        """
+        if self.only_seen:
+            gaussians = take(gaussians, seen(gaussians.source_frame))
+            if not len(gaussians):
+                raise SceneFileError(f"{name} has no Gaussian that two photographs confirm: nothing would be left")
+        if self.box is None or not len(gaussians):
+            return gaussians
+        kept = take(gaussians, self.box.holds(gaussians.means))
+        if not len(kept):
+            least, most = (np.percentile(gaussians.means, percent, axis=0) for percent in (1, 99))
+            raise SceneFileError(
+                f"no Gaussian of {name} is in the box: nothing would be left. All but a hundredth of them lie between "
+                f"{_shown(least)} and {_shown(most)} on each axis"
+            )
+        return kept
+
+
+EVERYTHING = Selection()
+
+
+def _shown(corner: npt.NDArray[np.floating]) -> str:
+    return ",".join(f"{value:.3g}" for value in corner)
