@@ -553,3 +553,12 @@ def test_the_table_of_the_readme():
         f"| {walk['in_a_scene']} placed, within {within:.3f} % of the way |",
         on=README,
     )
+
+
+def test_needles():
+    covered = {(row["scene"], row["label"]): row["covered_pct"] for row in raw("needles")["rows"]}
+    rows = []
+    for scene in dict.fromkeys(scene for scene, _ in covered):
+        values = (covered.get((scene, label)) for label in ("main", "only-seen"))
+        rows.append(f"| {scene} | " + " | ".join("–" if value is None else part(value, 2) for value in values) + " |")
+    says(*rows, on="docs/clean_scenes.md")
