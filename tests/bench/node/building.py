@@ -16,6 +16,7 @@ import shlex
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
@@ -65,11 +66,14 @@ def main() -> None:
         frames_per_second=args.per_second, pace="recorded",
     )  # fmt: skip
     recon = {} if args.max_views is None else {"max_views": args.max_views}
-    command = shlex.join(["python", "-m", "tests.bench", "building", *sys.argv[1:]])
+    told = (Path(each).name if each.startswith("/") else each for each in sys.argv[1:])  # no path of this machine
+    command = shlex.join(["python", "-m", "tests.bench", "building", *told])
     if args.score is not None:
-        result = {"command": command, **scored(config, args.score / "node" / "out", args.score)}
+        found = scored(config, args.score / "node" / "out", args.score)
+        states = Counter(place["state"] for place in found.pop("places"))
+        result = {"command": command, "keyframes": config.keyframes, **found, "states": states}
         args.out.write_text(json.dumps(result, indent=1) + "\n")
-        print(json.dumps({key: value for key, value in result.items() if key != "places"}))
+        print(json.dumps(result))
         return
     with contextlib.ExitStack() as stack:
         folder = args.folder or Path(stack.enter_context(tempfile.TemporaryDirectory()))
