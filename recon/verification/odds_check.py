@@ -48,6 +48,10 @@ def _wrong_poses(case: Case, against: str) -> Verdict:
         smallest = min(cameras, key=lambda camera: camera.coverage)
         percent = 100 * smallest.coverage
         return refuse(refusals.FLAT_PATCH, (smallest.name,), name=smallest.name, percent=percent)
+    if against == "coverage":
+        smallest = min(cameras, key=lambda camera: camera.coverage)
+        percent = 100 * smallest.coverage
+        return refuse(refusals.SMALL_PART, (smallest.name,), name=smallest.name, percent=percent)
     if against in ("confirmed", "patches"):
         weakest = min(cameras, key=lambda camera: (camera.confirmed, camera.patches.sigmas))
         return refuse(refusals.UNCONFIRMED, (weakest.name,), name=weakest.name, points=weakest.confirmed)

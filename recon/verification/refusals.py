@@ -105,6 +105,11 @@ CONTRADICTING = Refusal(
     "The frames contradict each other: only {inliers:.0f} % of their matches fit together.",
     "Add photographs between those named; look out for repeated or mirrored structures and moving things.",
 )
+SMALL_PART = Refusal(
+    Code.AMBIGUOUS,
+    "What {name} shares with the others fills only {percent:.0f} % of its picture: too little to tell where it stands.",
+    "Add a photograph between {name} and its neighbours.",
+)
 UNCONFIRMED = Refusal(
     Code.AMBIGUOUS,
     "{name} could stand elsewhere: only {points} of its points are confirmed by two others.",

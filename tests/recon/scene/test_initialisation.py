@@ -12,6 +12,7 @@ from splatnode.capture.process.config import typed
 from splatnode.recon.config import Config
 from splatnode.recon.frames import border
 from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.result.sources import frame_of
 from splatnode.recon.scene import background, initialisation, pixelwise
 from splatnode.recon.scene.initialisation import initial_scene
 from splatnode.recon.scene.scene import Scene
@@ -43,7 +44,7 @@ def test_a_scene_begins_with_the_registered_cameras_and_a_gaussian_for_what_they
     scene = begun()
     assert [(view.name, view.frame_id) for view in scene.views] == [("00.png", 0), ("01.png", 1)]
     assert float(scene.views[1].T_world_camera[0, 3]) == pytest.approx(0.3)
-    sources = scene.gaussians.source_frame
+    sources = frame_of(scene.gaussians.source_frame)
     # Every pixel of noise from the surer view; from the other what only it sees: 0.3 * 35.2 / 2 = 5.3 of 32 columns.
     assert int((sources == 0).sum()) == 32 * 24
     assert 4 * 24 <= int((sources == 1).sum()) <= 6 * 24
@@ -66,7 +67,7 @@ def test_nothing_begins_where_photographs_do_not_show_the_scene(by_pixel, monkey
     scene = begun(by_pixel=by_pixel)
     for view in scene.views:
         assert view.pointmap is not None and not view.pointmap.depth[~right].any()
-        own = scene.gaussians.means[scene.gaussians.source_frame == view.frame_id]
+        own = scene.gaussians.means[frame_of(scene.gaussians.source_frame) == view.frame_id]
         x, _, z = ((own - view.T_world_camera[:3, 3]) @ view.K.T).unbind(1)
         assert len(own) > 0 and bool((x / z > 7.9).all())
 

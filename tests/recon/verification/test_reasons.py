@@ -124,6 +124,7 @@ def doubting(measure: str) -> Fitted:
     [
         ("inlier_ratio", {2: {"inlier_ratio": 0.45}}, {"inlier_ratio": 0.5}, Code.AMBIGUOUS, (2,), "50 % of their"),
         ("camera_inlier_ratio", {2: {"inlier_ratio": 0.45}}, {}, Code.AMBIGUOUS, (2,), "of their matches fit"),
+        ("coverage", {2: {"coverage": 0.06}}, {}, Code.AMBIGUOUS, (2,), "fills only 6 % of its picture"),
         ("confirmed", {3: {"confirmed": 2}, 1: {"confirmed": 60}}, {}, Code.AMBIGUOUS, (3,), "only 2 of its points"),
         ("patches", {1: {"patches": BY_CHANCE, "confirmed": 80}}, {}, Code.AMBIGUOUS, (1,), "could stand elsewhere"),
         (
