@@ -140,7 +140,7 @@ def framed(
     try:
         return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at)
     except ValueError as error:
-        return DroppedFrame(name, f"it cannot be a frame: {error}")
+        return DroppedFrame(name, f"it cannot be used: {error}")
 
 
 def renamed(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame | DroppedFrame:

@@ -107,7 +107,7 @@ def asked_for(paths: Sequence[Path]) -> tuple[Path, tuple[str, ...]]:
 def recording(args: argparse.Namespace, tell: Tell = told_to_nobody) -> Recording:
     """As `source`, without a limit to the number of keyframes."""
     _check_there(args.source)
-    choice = choose(_looked_through(args, tell), _selection(args), Limits(), None)
+    choice = choose(_looked_through(args, tell), _selection(args), Limits(), None, _what(args))
     return Recording(args.source, args.listed, choice)
 
 
@@ -149,7 +149,12 @@ def _looked_through(args: argparse.Namespace, tell: Tell) -> Iterator[Frame | Dr
     """All that there is to choose from; how many frames a video has is known at its end."""
     of = 0 if args.source.is_file() else len(_there(args))
     doing = f"choosing keyframes of {printable_name(args.source.name)}"
-    return counted(_stream(args.source, args.listed), tell, doing, of, "frame")
+    return counted(_stream(args.source, args.listed), tell, doing, of, _what(args))
+
+
+def _what(args: argparse.Namespace) -> str:
+    """One of those that keyframes are chosen of."""
+    return "frame" if args.source.is_file() else "photograph"
 
 
 def _selection(args: argparse.Namespace) -> Config:
@@ -159,7 +164,7 @@ def _selection(args: argparse.Namespace) -> Config:
 
 def _chosen(args: argparse.Namespace, photographs: Path | None, tell: Tell) -> Source:
     """The keyframes of a recording; with --views N so many, evenly spread."""
-    choice = choose(_looked_through(args, tell), _selection(args), Limits(), max(MOST, args.views or 0))
+    choice = choose(_looked_through(args, tell), _selection(args), Limits(), max(MOST, args.views or 0), _what(args))
     frames = choice.keyframes
     if args.views:
         if args.views > len(frames):

@@ -20,6 +20,7 @@ from splatnode.capture.image_file import (
     decode_photograph,
     read_image_file,
 )
+from splatnode.capture.name_time import name_time
 from splatnode.capture.pace import FramesPerSecond, Pace, paced
 from splatnode.capture.process.printable import printable, printable_name
 
@@ -90,7 +91,7 @@ def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]
             if config.intrinsics is not None and _same_aspect(config.intrinsics, width, height):
                 intrinsics = config.intrinsics.resized(width, height)
             stamp_ns = round(frame_id / config.frames_per_second * 1e9)
-            item = framed(frame_id, name, stamp_ns, image, intrinsics, data, captured_at)
+            item = framed(frame_id, name, stamp_ns, image, intrinsics, data, captured_at or name_time(name))
             frame_id += isinstance(item, Frame)
             yield item
 

@@ -20,6 +20,7 @@ from splatnode.capture.image_file import (
     decode_photograph,
     read_image_file,
 )
+from splatnode.capture.name_time import name_time
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.unavailable import CameraUnavailable
 
@@ -106,7 +107,8 @@ def _decoded(name: str, data: bytes, written_at: Stamp, config: Config, frame_id
         return DroppedFrame(name, str(error))
     if config.intrinsics is not None:
         intrinsics = config.intrinsics.resized(image.shape[1], image.shape[0])
-    return framed(frame_id, name, time.monotonic_ns(), image, intrinsics, data, captured_at or written_at)
+    captured_at = captured_at or name_time(name) or written_at
+    return framed(frame_id, name, time.monotonic_ns(), image, intrinsics, data, captured_at)
 
 
 def _listed(folder: Path) -> list[Path]:

@@ -69,7 +69,7 @@ def test_what_keeps_no_bounds_is_no_frame_and_is_left_out_with_the_reason(change
     with pytest.raises(ValueError):
         Frame(**(good | change))
     dropped = framed(**(good | change))
-    assert isinstance(dropped, DroppedFrame) and dropped.reason.startswith("it cannot be a frame: ")
+    assert isinstance(dropped, DroppedFrame) and dropped.reason.startswith("it cannot be used: ")
     if not {"image"} & change.keys():
         kept = {key: value for key, value in (good | change).items() if key not in ("image", "intrinsics")}
         assert renamed(Frame(**good), **kept) == dropped

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import decode_image, encode_png
 from splatnode.recon import replay_source
 from splatnode.recon.config import Config
@@ -57,6 +57,21 @@ def test_a_folder_of_few_photographs_is_used_whole(walk, tmp_path):
     assert given.keep(tmp_path / "out") == folder and given.further_bytes == 0
 
 
+def test_what_is_no_photograph_is_named_and_the_others_are_used(walk, tmp_path):
+    folder = folder_of(walk[:2], tmp_path / "mixed")
+    (folder / "broken.png").write_bytes(encode_png(walk[2])[:2000])
+    (folder / "notes.jpg").write_text("shopping list")
+    (folder / "notes.txt").write_text("is not looked at")
+    given = source(asked(folder)).frames
+    assert [item.name for item in given if isinstance(item, Frame)] == ["000.png", "001.png"]
+    reasons = {item.name: item.reason for item in given if isinstance(item, DroppedFrame)}
+    assert reasons.keys() == {"broken.png", "notes.jpg"}
+    assert reasons["broken.png"].startswith("truncated") and reasons["notes.jpg"].startswith("not an image")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="no photographs in .*empty'; give a folder of JPEGs or PNGs"):
+        source(asked(tmp_path / "empty"))
+
+
 def test_of_a_large_folder_keyframes_are_chosen_unless_all_are_asked_for(walk, tmp_path):
     folder = folder_of(walk, tmp_path / "many")
     given = source(asked(folder))
@@ -75,6 +90,11 @@ def test_keyframes_of_a_video_are_kept_beside_the_result(film, tmp_path):
         assert isinstance(frame, Frame)
         assert np.array_equal(decode_image((images / frame.name).read_bytes())[0], frame.image)
     assert given.further_bytes >= sum(path.stat().st_size for path in images.iterdir())
+
+
+def test_it_says_of_what_the_keyframes_are(walk, film, tmp_path):
+    assert f"of {STEPS} frames are keyframes" in str(source(asked(film)).choice)
+    assert f"of {STEPS} photographs are keyframes" in str(source(asked(folder_of(walk, tmp_path / "many"))).choice)
 
 
 def test_so_many_views_of_a_video_are_spread_evenly(film):

@@ -178,6 +178,14 @@ def test_a_photograph_has_the_time_that_its_exif_tells_and_another_one_has_none(
     assert silent.captured_at is None and (told.stamp_ns, silent.stamp_ns) == (0, 100_000_000)
 
 
+def test_a_name_tells_the_time_where_exif_does_not(tmp_path):
+    (tmp_path / "1341847980.722988.jpg").write_bytes(with_exif(encoded(), {}, {0x9003: "2024:05:06 10:00:07"}))
+    (tmp_path / "1341847981.726650.png").write_bytes(encoded(".png"))
+    by_exif, by_name = (item for item in stream(Config(tmp_path)) if isinstance(item, Frame))
+    assert by_exif.captured_at == Stamp(1_714_989_607_000_000_000, Clock.LOCAL)
+    assert by_name.captured_at == Stamp(1_341_847_981_726_650_000, Clock.UTC)
+
+
 def test_a_photograph_that_is_shown_again_was_captured_when_it_was(tmp_path):
     (tmp_path / "a.jpg").write_bytes(with_exif(encoded(), {}, {0x9003: "2024:05:06 10:00:07"}))
     once, again = (item for item in stream(Config(tmp_path, loops=2)) if isinstance(item, Frame))

@@ -58,9 +58,11 @@ def test_a_photograph_has_its_own_time_and_else_that_of_its_file(tmp_path):
     (tmp_path / "a.jpg").write_bytes(with_exif(photograph(0), {}, {0x9003: "2024:05:06 10:00:07"}))
     (tmp_path / "b.jpg").write_bytes(photograph(1))
     os.utime(tmp_path / "b.jpg", ns=(0, 1_714_989_607_123_456_000))
+    (tmp_path / "c_20240506_100009.jpg").write_bytes(photograph(2))
     frames = watch(tmp_path)
     assert next(frames).captured_at == Stamp(1_714_989_607_000_000_000, Clock.LOCAL)
     assert next(frames).captured_at == Stamp(1_714_989_607_123_456_000, Clock.FILE)
+    assert next(frames).captured_at == Stamp(1_714_989_609_000_000_000, Clock.LOCAL)
 
 
 @pytest.mark.parametrize("pause_s", [0.02, 0.1])  # 0.1: it pauses for longer than it takes to settle

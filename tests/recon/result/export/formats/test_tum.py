@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -68,6 +70,19 @@ def test_without_one_clock_for_all_the_frames_are_numbered_and_the_file_says_why
     comments, rows = read(encode_tum(cameras))
     assert [time for time, _ in rows] == ["1", "3"]
     assert comments[0].startswith("# time (frame id; ") and why in comments[0]
+
+
+def test_every_line_is_one_that_the_benchmark_s_tools_accept():
+    """A comment, or eight decimal numbers with one space between: seconds, x y z, and a unit quaternion x y z w."""
+    number = r"-?[0-9]+(\.[0-9]+)?(e-?[0-9]+)?"
+    for cameras in ([at(index, BEGAN_NS + index) for index in range(3)], [make_camera(4, angle=3.1), at(7, None)]):
+        content = encode_tum(cameras).decode("ascii")
+        assert content.endswith("\n") and "\r" not in content and "\t" not in content
+        rows = [line for line in content.splitlines() if not line.startswith("#")]
+        assert len(rows) == len(cameras)
+        for row in rows:
+            assert re.fullmatch(f"{number}( {number}){{7}}", row), row
+            assert math.isclose(math.hypot(*map(float, row.split()[4:])), 1)
 
 
 def test_odometry_of_the_same_clock_is_associated_with_the_cameras():
