@@ -143,14 +143,14 @@ def why_unusable(quality: Quality, limits: Limits, sharpest_px: float | None = N
     if quality.blur_px > limits.blur_px:
         return f"blurred: its edges are {quality.blur_px:.1f} px wide, at most {limits.blur_px} are allowed"
     if sharpest_px is not None and quality.blur_px > limits.relative_blur * max(sharpest_px, 1):
-        return f"blurred: its edges are {quality.blur_px:.1f} px wide, those of the sharpest frame {sharpest_px:.1f}"
+        return f"blurred: its edges are {quality.blur_px:.1f} px wide, those of the sharpest {sharpest_px:.1f}"
     return None
 
 
 def why_redundant(measured: float, limits: Limits) -> str | None:
     """Why a frame of this `measured` novelty adds nothing to the frame it was compared with; None for a new view."""
     if measured < limits.novelty:
-        return f"duplicate: it differs from an earlier frame by {measured:.3f}, at least {limits.novelty} is a new view"
+        return f"duplicate: it differs from an earlier one by {measured:.3f}, a new view by at least {limits.novelty}"
     return None
 
 

@@ -5,21 +5,25 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
+from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
 from pathlib import Path
 
 import cv2
 
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import read_yaml, typed
+from splatnode.capture.process.progress import telling, waiting
 from splatnode.capture.process.terminal import say
 from splatnode.recon.result.rendering import use_threads
 from splatnode.recon.result.whole import is_whole
 from splatnode.viewer.map_source import BUDGET, Maps, MapSource, map_moment
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.pictures import keep_picture, write_movie, write_series
-from splatnode.viewer.probe import Probe, open3d_installed, probe_window
+from splatnode.viewer.probe import open3d_installed, probe_window
 from splatnode.viewer.session import Session
 from splatnode.viewer.sources import Finished, Live, Source, found_photographs, load_result
+from splatnode.viewer.splash import splash
 from splatnode.viewer.state import State
 from splatnode.viewer.web import stage as web
 
@@ -37,35 +41,69 @@ _PICTURE = 960, 720  # pixels, where no window is opened
 def view(args: argparse.Namespace) -> int:
     """Shows what `args.what` names. Raises what opening it raises."""
     _check_web(args)
-    finished, network = _finished(args), _network(args)
+    if not (args.web or args.headless or args.export is not None):
+        return _in_window(args)
+    with waiting("reading the scene"):
+        finished, network = _finished(args), _network(args)
     if args.web:
         where = web.place(args.listen, web.PORT if args.port is None else args.port, args.key)
         web.show(_source(finished, network), where, _give_way, say)
-    if args.export is not None and (finished is None or args.export.suffix.lower() != ".mp4"):
+    if args.export is None:
+        return _as_pictures(args, finished, network)
+    if finished is None or args.export.suffix.lower() != ".mp4":
         raise ValueError("--export needs a finished result and a file that ends with .mp4")
     width, height = args.size or _PICTURE
-    if args.export is not None and finished is not None:
-        say(write_movie(_moment(finished), args.export, width, height, args.pictures))
-        return EXIT_GOOD
-    window = None if args.headless else _window()
-    if window is None and not args.headless:
-        return EXIT_UNAVAILABLE
-    folder = args.out or (_beside(args.what) if finished is not None else Path("view"))
-    if window is not None and window.window:
-        source = _source(finished, network)
-        from splatnode.viewer.window import show  # brings Open3D
-
-        background = (lambda: None) if finished is not None else _give_way
-        session, size = Session(source, State()), args.size or window.size
-        show(session, software=window.software, screenshots=folder, opened=background, size=size)
-    elif finished is not None:
-        say(write_series(_moment(finished), folder, width, height, args.pictures))
-    else:
-        source = _source(finished, network)
-        _give_way()
-        with contextlib.closing(source):
-            keep_picture(source, folder, width, height, until_final=args.until_final, say=say)
+    with telling() as tell:
+        say(write_movie(_moment(finished), args.export, width, height, args.pictures, tell))
     return EXIT_GOOD
+
+
+def _in_window(args: argparse.Namespace) -> int:
+    """Shows it in a window, or as pictures where there can be none."""
+    installed = open3d_installed()
+    with splash() if installed else contextlib.nullcontext(_nothing) as ready, ThreadPoolExecutor(1) as beside:
+        finished, network = _finished(args), _network(args)
+        if not installed:
+            say(_NO_OPEN3D, error=True)
+            return EXIT_UNAVAILABLE
+        probing = beside.submit(probe_window)
+        with contextlib.suppress(ImportError):  # the probe tells of it
+            import_module("splatnode.viewer.window")  # brings Open3D, which takes as long as the probe
+        probe = probing.result()
+        if not probe.window:
+            say(f"splatnode: no window: {probe.detail}. Writing pictures instead, as with --headless", error=True)
+            ready()
+            return _as_pictures(args, finished, network)
+        source = _source(finished, network)
+        from splatnode.viewer.window import show
+
+        def opened() -> None:
+            ready()
+            if finished is None:
+                _give_way()
+
+        session, size = Session(source, State()), args.size or probe.size
+        show(session, software=probe.software, screenshots=_folder(args, finished), opened=opened, size=size)
+    return EXIT_GOOD
+
+
+def _as_pictures(args: argparse.Namespace, finished: Moment | Maps | None, network: Network) -> int:
+    width, height = args.size or _PICTURE
+    folder = _folder(args, finished)
+    if finished is not None:
+        with telling() as tell:
+            say(write_series(_moment(finished), folder, width, height, args.pictures, tell))
+        return EXIT_GOOD
+    source = _source(finished, network)
+    _give_way()
+    with contextlib.closing(source):
+        keep_picture(source, folder, width, height, until_final=args.until_final, say=say)
+    return EXIT_GOOD
+
+
+def _folder(args: argparse.Namespace, finished: Moment | Maps | None) -> Path:
+    """Where pictures and edited scenes go."""
+    return args.out or (_beside(args.what) if finished is not None else Path("view"))
 
 
 def _check_web(args: argparse.Namespace) -> None:
@@ -105,21 +143,14 @@ def _is_configuration(what: Path) -> bool:
     return what.suffix.lower() in (".yaml", ".yml")
 
 
-def _window() -> Probe | None:
-    """What a window would be like here; None where what it needs is not installed. Says so where there is none."""
-    if not open3d_installed():
-        say(_NO_OPEN3D, error=True)
-        return None
-    probe = probe_window()
-    if not probe.window:
-        say(f"splatnode: no window: {probe.detail}. Writing pictures instead, as with --headless", error=True)
-    return probe
-
-
 def _source(finished: Moment | Maps | None, network: Network) -> Source:
     if finished is None:
         return Live(network)
     return Finished(finished) if isinstance(finished, Moment) else MapSource(finished)
+
+
+def _nothing() -> None:
+    """Closes the splash that there is none of."""
 
 
 def _give_way() -> None:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import cv2
 import numpy as np
 import numpy.typing as npt
 
 from splatnode.viewer.canvas import NEAR, Array, Canvas, Image, in_camera
-from splatnode.viewer.shapes import Lines, Photograph, Shapes
+from splatnode.viewer.shapes import Label, Lines, Photograph, Shapes
 
 _BEHIND = 1.02  # a shape this many times as far as the surface is behind it
 _PIECES = 24  # that a line is cut into, each of them hidden or not
+_LETTERS = 0.5  # of OpenCV's size: 11 pixels high
 _HIDDEN = 0.3  # how much of a line's colour is left where it is behind something
 
 
@@ -19,8 +22,9 @@ def paint_shapes(canvas: Canvas, shapes: Shapes, T_camera_world: Array, K: Array
     in_front = [(in_camera(photograph.corners, T_camera_world), photograph) for photograph in shapes.photographs]
     for corners, photograph in sorted(in_front, key=lambda one: -float(one[0][:, 2].mean())):
         _paint_photograph(canvas, photograph, corners, K)
-    for lines in shapes.lines:
-        _paint_lines(canvas, lines, T_camera_world, K)
+    _paint_lines(canvas, shapes.lines, T_camera_world, K)
+    for label in shapes.labels:
+        _paint_label(canvas, label, T_camera_world, K)
 
 
 def _paint_photograph(canvas: Canvas, photograph: Photograph, corners: Array, K: Array) -> None:
@@ -66,11 +70,15 @@ def _plane_nearness(
     return (sums / (height if abs(height) > 1e-12 else np.inf)).astype(np.float32)
 
 
-def _paint_lines(canvas: Canvas, lines: Lines, T_camera_world: Array, K: Array) -> None:
-    """Lines, bright where nothing is in front of them, dim where something is."""
+def _paint_lines(canvas: Canvas, groups: Sequence[Lines], T_camera_world: Array, K: Array) -> None:
+    """Lines, bright where nothing is in front of them, dim where something is. All at once: there are many groups."""
+    if not groups:
+        return
     height, width = canvas.depth.shape
+    ends = np.concatenate([group.ends for group in groups])
+    group_of = [number for number, group in enumerate(groups) for _ in group.ends]
     steps = np.linspace(0.0, 1.0, _PIECES + 1)
-    start, end = (in_camera(lines.ends[:, i], T_camera_world) for i in (0, 1))
+    start, end = (in_camera(ends[:, i], T_camera_world) for i in (0, 1))
     points = start[:, None] + steps[None, :, None] * (end - start)[:, None]  # (M, pieces + 1, 3)
     ahead = points[..., 2] > NEAR
     pixels = ((points / np.where(ahead, points[..., 2], 1.0)[..., None]) @ K.T)[..., :2]
@@ -79,14 +87,35 @@ def _paint_lines(canvas: Canvas, lines: Lines, T_camera_world: Array, K: Array) 
     surface = canvas.depth[np.clip(rows, 0, height - 1).astype(int), np.clip(columns, 0, width - 1).astype(int)]
     hidden = (points[:, :-1, 2] + points[:, 1:, 2]) / 2.0 > _BEHIND * surface
     drawable = near_window[:, :-1] & near_window[:, 1:]
-    bright = tuple(round(255 * value) for value in lines.colour)
-    dim = tuple(round(_HIDDEN * value + (1 - _HIDDEN) * 60) for value in bright)
-    for chosen, colour, thick in ((drawable & hidden, dim, 1), (drawable & ~hidden, bright, lines.width)):
-        for piece in np.rint((_runs(pixels, chosen) - 0.5) * 16).astype(np.int32):
-            cv2.line(canvas.image, piece[0].tolist(), piece[1].tolist(), colour, thick, cv2.LINE_AA, 4)
+    bright = [tuple(round(255 * value) for value in group.colour) for group in groups]
+    for chosen, behind in ((drawable & hidden, True), (drawable & ~hidden, False)):
+        pieces, line_of = _runs(pixels, chosen)
+        for piece, line in zip(np.rint((pieces - 0.5) * 16).astype(np.int32).tolist(), line_of, strict=True):
+            colour, thick = bright[group_of[line]], groups[group_of[line]].width
+            if behind:
+                colour, thick = tuple(round(_HIDDEN * value + (1 - _HIDDEN) * 60) for value in colour), 1
+            cv2.line(canvas.image, piece[0], piece[1], colour, thick, cv2.LINE_AA, 4)
 
 
-def _runs(pixels: Array, chosen: npt.NDArray[np.bool_]) -> Array:
-    """(R, 2, 2) ends of the parts of M lines (M, pieces + 1, 2) whose pieces are all `chosen` (M, pieces)."""
+def _paint_label(canvas: Canvas, label: Label, T_camera_world: Array, K: Array) -> None:
+    """The letters on a dark plate, over everything else; not of a point that is behind the eye or far off."""
+    at = in_camera(label.at, T_camera_world)
+    height, width = canvas.depth.shape
+    if at[2] < NEAR:
+        return
+    pixel = (K @ (at / at[2]))[:2]
+    if not (np.abs(pixel) < 2 * max(width, height)).all():
+        return
+    column, row = round(float(pixel[0])), round(float(pixel[1]))
+    (wide, high), _ = cv2.getTextSize(label.text, cv2.FONT_HERSHEY_SIMPLEX, _LETTERS, 1)
+    plate = canvas.image[max(row - high - 5, 0) : max(row + 6, 0), max(column - 5, 0) : max(column + wide + 5, 0)]
+    plate[:] = plate // 3
+    colour = tuple(round(255 * value) for value in label.colour)
+    place = column, row
+    cv2.putText(canvas.image, label.text, place, cv2.FONT_HERSHEY_SIMPLEX, _LETTERS, colour, 1, cv2.LINE_AA)
+
+
+def _runs(pixels: Array, chosen: npt.NDArray[np.bool_]) -> tuple[Array, npt.NDArray[np.intp]]:
+    """(R, 2, 2) ends of the parts of M lines (M, pieces + 1, 2) whose pieces are all `chosen`, (R,) of which line."""
     edges = np.diff(np.pad(chosen, ((0, 0), (1, 1))).astype(np.int8), axis=1)  # a line is straight in the picture too
-    return np.stack([pixels[edges > 0], pixels[edges < 0]], 1)
+    return np.stack([pixels[edges > 0], pixels[edges < 0]], 1), np.nonzero(edges > 0)[0]

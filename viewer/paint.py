@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -54,6 +55,22 @@ def paint_gaussians(
     ]
     np.copyto(rendered.depth, np.inf, where=rendered.alpha <= 0.5)
     return Canvas(np.asarray(cv2.merge(planes), np.uint8), rendered.depth)
+
+
+def paint_coarsely(
+    gaussians: GaussianArrays, view: Viewpoint, state: State, size: tuple[int, int], part: int
+) -> Canvas:
+    """The Gaussians for a picture of this size (width, height), painted with one `part`-th of it and made larger."""
+    width, height = size
+    small = -(-width // part), -(-height // part)
+    K = np.diag([small[0] / width, small[1] / height, 1.0]) @ view.K(width, height)
+    points = max(1, round(state.point_size / part))
+    canvas = paint_gaussians(gaussians, view.T_world_camera, K, replace(state, point_size=points), *small)
+    if part == 1:
+        return canvas
+    image = np.asarray(cv2.resize(canvas.image, size, interpolation=cv2.INTER_LINEAR), np.uint8)
+    depth = np.asarray(cv2.resize(canvas.depth, size, interpolation=cv2.INTER_NEAREST), np.float32)
+    return Canvas(image, depth)
 
 
 def blended(image: Image, photograph: Image, camera: CameraEstimate, K: Array, weight: float) -> Image:

@@ -14,32 +14,42 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.image_file import encode_png
+from splatnode.capture.process.progress import Step, Tell, counted, told_to_nobody
 from splatnode.recon.result.export import ResultWriteError, write_file, write_files
 from splatnode.viewer import words
 from splatnode.viewer.analysis import Analysis, analyse
+from splatnode.viewer.ground import ground, ground_lines
+from splatnode.viewer.legend import legend
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.paint import blended, caption, paint
-from splatnode.viewer.shapes import Shapes, shapes
+from splatnode.viewer.shapes import Shapes, shapes, together
 from splatnode.viewer.sources import Source
 from splatnode.viewer.state import State
-from splatnode.viewer.viewpoint import Viewpoint, at_camera, overview, turntable_views
+from splatnode.viewer.turntable import turntable_views
+from splatnode.viewer.viewpoint import Viewpoint, at_camera, overview
 
 Image = npt.NDArray[np.uint8]
 
 FRAMES_PER_S = 25
+_DRAWING = "drawing"
 _LIVE = "live.png"
 _WAIT_S = 0.1
 _PATIENCE_S = 1.0  # without a word
 
 
-def write_series(moment: Moment, folder: Path, width: int, height: int, frames: int) -> Path:
+def write_series(
+    moment: Moment, folder: Path, width: int, height: int, frames: int, tell: Tell = told_to_nobody
+) -> Path:
     """overview.png with all there is to say, a picture from each camera beside its photograph, and a turntable.
 
-    Raises ResultWriteError where they cannot be written.
+    `tell` hears how many are drawn. Raises ResultWriteError where they cannot be written.
     """
+    of = 1 + len(moment.snapshot.cameras) + frames
+    tell(Step(_DRAWING, 0, of, "picture"))
     files = {"overview.png": encode_png(overview_picture(analyse(moment), width, height))}
     view = overview(moment)
     for camera in moment.snapshot.cameras:
+        tell(Step(_DRAWING, len(files), of, "picture"))
         here = at_camera(view, camera)
         image = paint(moment.snapshot.gaussians, Shapes((), ()), here, State(), width, height)
         photograph = moment.snapshot.images.get(camera.name)
@@ -48,19 +58,23 @@ def write_series(moment: Moment, folder: Path, width: int, height: int, frames: 
         files[f"camera_{camera.frame_id:03d}.png"] = encode_png(image)
     for number, image in enumerate(turntable(moment, width, height, frames)):
         files[f"turntable_{number:03d}.png"] = encode_png(image)
+        tell(Step(_DRAWING, len(files), of, "picture"))
     write_files(folder, files)
     return folder
 
 
-def write_movie(moment: Moment, path: Path, width: int, height: int, frames: int) -> Path:
-    """The turntable as an MP4. Raises ResultWriteError; RuntimeError where this OpenCV cannot write MP4."""
+def write_movie(moment: Moment, path: Path, width: int, height: int, frames: int, tell: Tell = told_to_nobody) -> Path:
+    """The turntable as an MP4; `tell` hears how many of its pictures are drawn.
+
+    Raises ResultWriteError; RuntimeError where this OpenCV cannot write MP4.
+    """
     size = width - width % 2, height - height % 2  # the encoding has half the resolution in colour
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "turntable.mp4"
         writer = cv2.VideoWriter(str(draft), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_PER_S, size)
         if not writer.isOpened():
             raise RuntimeError("this OpenCV cannot write MP4; use --headless for a PNG series")
-        for image in turntable(moment, *size, frames):
+        for image in counted(turntable(moment, *size, frames), tell, _DRAWING, frames, "picture"):
             writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
         writer.release()
         if round(cv2.VideoCapture(str(draft)).get(cv2.CAP_PROP_FRAME_COUNT)) != frames:  # the writer tells nothing
@@ -82,7 +96,12 @@ def overview_picture(analysis: Analysis, width: int, height: int) -> Image:
     """The whole scene with cameras, photographs, path and advice, and below it what the panel of a window says."""
     moment, state = analysis.moment, State()
     view: Viewpoint = overview(moment, analysis.advice.arrow or ())
-    image = paint(moment.snapshot.gaussians, shapes(moment, state, analysis.advice), view, state, width, height)
+    shown = together(
+        Shapes(ground_lines(ground(moment)), ()),
+        shapes(moment, state, analysis.advice),
+        legend(view, width, height, moment.snapshot.scale),
+    )
+    image = paint(moment.snapshot.gaussians, shown, view, state, width, height)
     said = [*words.verdict_lines(moment), f"Next view: {words.advice_line(analysis.advice, moment)}"]
     said += [
         *words.bounds_lines(moment),

@@ -10,12 +10,12 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import open3d as o3d  # pyright: ignore[reportMissingImports]
-from open3d.visualization import rendering  # pyright: ignore[reportMissingImports]
+from open3d.visualization import gui, rendering  # pyright: ignore[reportMissingImports]
 
 from splatnode.recon.result.export.prepare import base_rgb
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.viewer.canvas import BACKGROUND
-from splatnode.viewer.shapes import Lines, Photograph, Shapes
+from splatnode.viewer.shapes import Label, Lines, Photograph, Shapes
 from splatnode.viewer.state import State
 from splatnode.viewer.viewpoint import Viewpoint
 
@@ -24,11 +24,13 @@ _CLOUD = "gaussians"
 
 
 class Scene3D:
-    """Keeps an Open3DScene as the caller wants it. To be used in the thread of the window."""
+    """Keeps the scene of a SceneWidget as the caller wants it. To be used in the thread of the window."""
 
-    def __init__(self, scene: rendering.Open3DScene) -> None:
-        self._scene = scene
+    def __init__(self, widget: gui.SceneWidget) -> None:
+        scene: rendering.Open3DScene = widget.scene
+        self._widget, self._scene = widget, scene
         self._shapes: set[str] = set()
+        self._labels: list[gui.Label3D] = []
         scene.set_background([*_encoded(np.array(BACKGROUND) / 255.0), 1.0])
 
     def set_drawing(self, drawing: bool) -> None:
@@ -55,6 +57,14 @@ class Scene3D:
         for name, (geometry, material) in parts.items():
             self._scene.add_geometry(name, geometry, material)
         self._shapes = set(parts)
+        for label in self._labels:
+            self._widget.remove_3d_label(label)
+        self._labels = [self._label(label) for label in shapes.labels]
+
+    def _label(self, label: Label) -> gui.Label3D:
+        there = self._widget.add_3d_label(label.at.astype(np.float32), label.text)
+        there.color = gui.Color(*label.colour)
+        return there
 
     def _remove(self, name: str) -> None:
         if self._scene.has_geometry(name):

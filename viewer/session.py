@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from splatnode.recon.result.export.selection import Selection
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.viewer.analysis import Analysis, Analyst
 from splatnode.viewer.canvas import Canvas, Image, project
 from splatnode.viewer.colours import coloured
+from splatnode.viewer.editing import EditError, Edits, box, box_lines, edited, one_more, room, write_edited
+from splatnode.viewer.ground import Ground, ground, ground_lines
+from splatnode.viewer.legend import legend
+from splatnode.viewer.measuring import measured_shapes, surface_point, with_point
 from splatnode.viewer.moment import MEMORY_BYTES, History, Moment, remembered
-from splatnode.viewer.paint import blended, paint_gaussians, with_shapes
-from splatnode.viewer.shapes import Photograph, Shapes, live_camera, shapes
+from splatnode.viewer.paint import blended, paint_coarsely, with_shapes
+from splatnode.viewer.shapes import Photograph, Shapes, live_camera, shapes, together
 from splatnode.viewer.sources import Roaming, Source
 from splatnode.viewer.state import Colouring, State, go_to_camera, press, shown_moment
 from splatnode.viewer.support import Support
-from splatnode.viewer.viewpoint import Viewpoint, at_camera, overview, scene_pivot
+from splatnode.viewer.viewpoint import Viewpoint, at_camera, at_depth, first_view, overview, scene_pivot
 
 _CLICK_RADIUS = 14  # pixels around a camera's centre that are the camera
 
@@ -34,6 +40,8 @@ class Session:
         self._view: Viewpoint | None = None
         self._tracked: CameraEstimate | None = None  # the live camera
         self._touched = False  # whether the person has chosen a viewpoint
+        self._from_outside = False  # whether the person has asked to see the whole scene
+        self._standing: tuple[Moment, Ground | None] | None = None
         self._coloured: tuple[tuple[object, ...], GaussianArrays] | None = None
         self.paintings = 0  # of the Gaussians, which is what takes the time of a picture
         self._painted: tuple[tuple[object, ...], Canvas] | None = None
@@ -54,9 +62,10 @@ class Session:
         elsewhere = bool(self.history) and self.history[-1].scene_id != moment.scene_id
         self.history = remembered(self.history, moment, self._memory_bytes)
         if elsewhere:
-            self._touched = False
+            self._touched = self._from_outside = False
+            self.state = replace(self.state, measured=(), edits=())
         if not self._touched and (self._view is None or moment.snapshot.cameras):
-            self._see_all(moment)
+            self._look(moment)
         return True
 
     @property
@@ -79,10 +88,14 @@ class Session:
             return known  # what is advised depends on the cameras: the same ones need no second look
         self._analysis = self._analyst.of(moment) or (known if usable else None)
         if self._analysis is not None and not usable and not self._touched and self.state.advice:
-            self._see_all(moment)
+            self._look(moment)
         return self._analysis
 
-    def _see_all(self, moment: Moment) -> None:
+    def _look(self, moment: Moment) -> None:
+        """Takes the viewpoint that nobody has chosen: a photographed one, or from outside if that was asked for."""
+        if not self._from_outside:
+            self._view = first_view(moment)
+            return
         known = self._analysis if self.state.advice else None
         advised = known.advice.arrow if known is not None and _same_cameras(known.moment, moment) else None
         self._view = overview(moment, advised or ())
@@ -96,9 +109,9 @@ class Session:
     def whole_scene(self) -> None:
         """The viewpoint from which all of the scene is seen."""
         self.state = replace(self.state, camera=None, follow=False)
-        self._touched = False
+        self._touched, self._from_outside = False, True
         if self.moment is not None:
-            self._see_all(self.moment)
+            self._look(self.moment)
 
     def camera(self) -> CameraEstimate | None:
         """The camera whose viewpoint is taken, followed or chosen; None for a free one."""
@@ -127,47 +140,71 @@ class Session:
         view, moment = self.viewpoint(), self.moment
         if view is None or moment is None or self.camera() is None:
             return view
-        depth = float((scene_pivot(moment) - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, 2])
-        return replace(view, distance=max(depth, 0.1))
+        return at_depth(view, scene_pivot(moment))
 
     def shapes(self) -> Shapes:
         """What stands in the scene beside the Gaussians."""
-        moment, analysis, view = self.moment, self.analysis(), self.viewpoint()
+        moment, analysis, view, state = self.moment, self.analysis(), self.viewpoint(), self.state
         if moment is None or view is None:
             return Shapes((), ())
-        advice = analysis.advice if analysis else None
-        return shapes(moment, self.state, advice, self._tracked, view.T_world_camera[:3, 3])
+        advice, eye = analysis.advice if analysis else None, view.T_world_camera[:3, 3]
+        standing = ground_lines(self.ground()) if state.ground else ()
+        boxed = (box_lines(box(room(moment), state.box)),) if state.boxed else ()
+        return together(
+            Shapes((*standing, *boxed), ()),
+            shapes(moment, state, advice, self._tracked, eye),
+            measured_shapes(state.measured, eye, moment.snapshot.scale),
+        )
+
+    def furnished(self, width: int, height: int) -> Shapes:
+        """The shapes, and the legend of a picture of this size."""
+        moment, view = self.moment, self.viewpoint_to_move()
+        if moment is None or view is None or not self.state.ground:
+            return self.shapes()
+        return together(self.shapes(), legend(view, width, height, moment.snapshot.scale))
+
+    def ground(self) -> Ground | None:
+        """Below the shown moment; None where there is nothing to stand on."""
+        moment = self.moment
+        if moment is None:
+            return None
+        if self._standing is None or self._standing[0] is not moment:
+            self._standing = moment, ground(moment)
+        return self._standing[1]
 
     def gaussians(self) -> GaussianArrays:
-        """The Gaussians of the shown moment in the colours that are asked for, as soon as those are known."""
+        """What the edits leave of the shown moment, in the colours that are asked for, as soon as those are known."""
         moment, analysis = self.moment, self.analysis()
         if moment is None:
             return GaussianArrays.empty()
         ready = analysis is not None and analysis.moment is moment
         colouring = Colouring.PHOTOGRAPH if self._needs_support() and not ready else self.state.colouring
-        key = (moment, colouring)
+        key = (moment, colouring, self.state.edits)
         if self._coloured is None or self._coloured[0] != key:
             support = analysis.support if analysis and ready else Support(np.zeros((0, 0), np.float32))
-            self._coloured = key, coloured(moment, colouring, support)
+            self._coloured = key, edited(coloured(moment, colouring, support), self.state.edits)
         return self._coloured[1]
 
-    def paint(self, width: int, height: int) -> Image | None:
-        """(height, width, 3) the picture by the project's own rasteriser; None where nothing has come yet."""
+    def paint(self, width: int, height: int, part: int = 1) -> Image | None:
+        """(height, width, 3) the picture by the project's own rasteriser; None where nothing has come yet.
+
+        The Gaussians are painted with one `part`-th of the width and of the height, the shapes over them in full.
+        """
         view = self.viewpoint()
         if view is None:
             return None
-        image = with_shapes(self._canvas(view, width, height), self.shapes(), view)
+        image = with_shapes(self._canvas(view, width, height, part), self.furnished(width, height), view)
         camera, photograph = self.camera(), self.photograph()
         if camera is None or photograph is None or self.state.blend == 0.0:
             return image
         return blended(image, photograph, camera, view.K(width, height), self.state.blend)
 
-    def _canvas(self, view: Viewpoint, width: int, height: int) -> Canvas:
+    def _canvas(self, view: Viewpoint, width: int, height: int, part: int) -> Canvas:
         """The Gaussians alone. They are painted once while nothing but shapes comes and goes."""
         gaussians, state = self.gaussians(), self.state
-        key = (gaussians, view, state.gaussians, state.as_points, state.point_size, width, height)
+        key = (gaussians, view, state.gaussians, state.as_points, state.point_size, width, height, part)
         if self._painted is None or self._painted[0] != key:
-            canvas = paint_gaussians(gaussians, view.T_world_camera, view.K(width, height), state, width, height)
+            canvas = paint_coarsely(gaussians, view, state, (width, height), part)
             self._painted = key, canvas
             self.paintings += 1
         return self._painted[1]
@@ -177,8 +214,34 @@ class Session:
         moment, camera = self.moment, self.camera()
         return moment.snapshot.images.get(camera.name) if moment and camera else None
 
+    def crop(self) -> None:
+        """Takes away what is outside of the box. Raises EditError."""
+        if self.moment is not None:
+            self._edit(Selection(box=box(room(self.moment), self.state.box)))
+
+    def keep_seen(self) -> None:
+        """Takes away what no two photographs confirm. Raises EditError."""
+        self._edit(Selection(only_seen=True))
+
+    def _edit(self, edit: Selection) -> None:
+        if self.moment is not None:
+            edits: Edits = one_more(self.moment, self.state.edits, edit)
+            self.state = replace(self.state, edits=edits, measured=())
+
+    def save(self, folder: Path) -> Path:
+        """Writes what the edits leave as a new result in `folder`. Raises EditError, ResultWriteError."""
+        if self.moment is None:
+            raise EditError("There is no scene yet.")
+        return write_edited(self.moment, self.state.edits, folder)
+
     def click(self, x: float, y: float, width: int, height: int) -> bool:
-        """Goes to the camera that is seen at a pixel of the window; whether there is one."""
+        """Goes to the camera that is seen at a pixel of the window, or measures; whether there was something."""
+        if self.state.measuring:
+            view = self.viewpoint()
+            point = None if view is None else surface_point(self._canvas(view, width, height, 1), view, x, y)
+            if point is not None:
+                self.state = replace(self.state, measured=with_point(self.state.measured, point))
+            return point is not None
         name = self._camera_at(x, y, width, height)
         if name is not None:
             self.state = go_to_camera(self.state, name)

@@ -1,4 +1,4 @@
-"""What stands in the scene beside the Gaussians: frusta, photographs, where cameras may be, the path, the arrow."""
+"""What stands in the scene beside the Gaussians: frusta, photographs, where cameras may be, the path, the next view."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from splatnode.viewer.colours import source_colour
 from splatnode.viewer.graph import Graph, edge_lines, node_marks
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.state import State
+from splatnode.viewer.viewpoint import look_at, scene_up
 
 Array = npt.NDArray[np.float64]
 Colour = tuple[float, float, float]
@@ -49,9 +50,28 @@ class Photograph:
 
 
 @dataclass(frozen=True, eq=False)
+class Label:
+    """A few letters that begin where a point of the world is seen."""
+
+    text: str  # ASCII
+    at: Array  # (3,) world
+    colour: Colour
+
+
+@dataclass(frozen=True, eq=False)
 class Shapes:
     lines: tuple[Lines, ...]
     photographs: tuple[Photograph, ...]
+    labels: tuple[Label, ...] = ()
+
+
+def together(*parts: Shapes) -> Shapes:
+    """All of them."""
+    return Shapes(
+        tuple(lines for part in parts for lines in part.lines),
+        tuple(photograph for part in parts for photograph in part.photographs),
+        tuple(label for part in parts for label in part.labels),
+    )
 
 
 def shapes(
@@ -68,7 +88,7 @@ def shapes(
         for index, camera in enumerate(snapshot.cameras)
         if eye is None or np.linalg.norm(camera.T_world_camera[:3, 3] - eye) > _AT_THE_EYE * depth
     ]
-    lines, photographs = [], []
+    lines, photographs, labels = [], [], []
     if state.path and len(snapshot.cameras) > 1:
         lines.append(Lines(path(snapshot.cameras), PATH_COLOUR, 1))
     if state.cameras:
@@ -86,8 +106,10 @@ def shapes(
         corners = image_corners(tracked, tracked.T_world_camera, 1.2 * depth)
         lines.append(Lines(frustum(tracked.T_world_camera, corners), TRACKED_COLOUR, 3))
     if state.advice and advice is not None and advice.arrow is not None and advice.target is not None:
-        lines.append(Lines(arrow(*advice.arrow, advice.target), ADVICE_COLOUR, 3))
-    return Shapes(tuple(lines), tuple(photographs))
+        start, end = advice.arrow
+        lines += hint(snapshot.cameras, start, end, advice.target, depth)
+        labels.append(Label("next view", end, ADVICE_COLOUR))
+    return Shapes(tuple(lines), tuple(photographs), tuple(labels))
 
 
 def _graph(graph: Graph) -> list[Lines]:
@@ -170,12 +192,11 @@ def path(cameras: tuple[CameraEstimate, ...]) -> Array:
     return np.stack([centres[:-1], centres[1:]], 1)
 
 
-def arrow(start: Array, end: Array, target: Array) -> Array:
-    """(6, 2, 3) an arrow from `start` to `end` with a head of four lines, and a short ray from there to `target`."""
-    length = float(np.linalg.norm(end - start))
-    along = (end - start) / max(length, 1e-12)
-    sight = (target - end) / max(float(np.linalg.norm(target - end)), 1e-12)
-    side = np.cross(along, sight)
-    side /= max(float(np.linalg.norm(side)), 1e-12)
-    barbs = [end - 0.3 * length * along + 0.15 * length * spread for spread in (side, -side, sight, -sight)]
-    return np.array([[start, end], *([end, barb] for barb in barbs), [end, end + length * sight]])
+def hint(
+    cameras: tuple[CameraEstimate, ...], start: Array, end: Array, target: Array, depth: float
+) -> tuple[Lines, Lines]:
+    """A frustum at `end` that looks at `target`, as a camera there would, and the way there from the one at `start`."""
+    T_world_camera = look_at(end, target, scene_up(cameras))
+    corners = image_corners(cameras[0], T_world_camera, depth)
+    way = Lines(np.array([[start, end]]), ADVICE_COLOUR, 1)
+    return Lines(frustum(T_world_camera, corners), ADVICE_COLOUR, 2), way

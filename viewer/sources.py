@@ -28,6 +28,7 @@ from splatnode.capture.process.problems import Problems, is_said
 from splatnode.recon.daemon.status import ReconStatus
 from splatnode.recon.result.export import SceneFileError, read_cameras, read_gaussians, viewer_safe
 from splatnode.recon.result.export.limits import read_json_file
+from splatnode.recon.result.export.sources import SOURCES
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.message import CameraRecord, SceneHeader, camera_from, from_message
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
@@ -160,7 +161,7 @@ def load_result(place: Path, photographs: Path | None = None) -> Moment:
             "file, or the node's configuration (.yaml)"
         )
     report = report or _Report(Verdict(Code.OK, "A scene from a file, without a report.", "", publishable=True))
-    gaussians = read_gaussians(scene) if scene.is_file() else GaussianArrays.empty()
+    gaussians = _gaussians(scene) if scene.is_file() else GaussianArrays.empty()
     cameras = read_cameras(folder / "cameras.json") if (folder / "cameras.json").is_file() else ()
     beside = [folder / "images", folder / "capture" / "images"]
     reported = [] if report.photographs is None else [Path(report.photographs)]
@@ -177,6 +178,17 @@ def load_result(place: Path, photographs: Path | None = None) -> Moment:
         scale=StoredResult(scene).scale(),
     )
     return Moment(snapshot, time.monotonic())
+
+
+def _gaussians(scene: Path) -> GaussianArrays:
+    """With their source frames where the file beside the scene has them. Raises SceneFileError, OSError."""
+    sources = scene.with_name(SOURCES)
+    if scene.suffix.lower() == ".ply" and sources.is_file():
+        try:
+            return read_gaussians(scene, sources)
+        except SceneFileError as error:
+            log.warning("it is not known which photographs the Gaussians come from: %s", error)
+    return read_gaussians(scene)
 
 
 def _safe(snapshot: Snapshot) -> Snapshot:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from open3d.visualization import gui, rendering  # pyright: ignore[reportMissingImports]
 
 from splatnode.viewer.canvas import BACKGROUND
+from splatnode.viewer.pace import first_part, next_part
 from splatnode.viewer.scene3d import Scene3D, image3d, look_from
 from splatnode.viewer.session import Session
 from splatnode.viewer.state import open3d_draws
@@ -21,7 +22,6 @@ from splatnode.viewer.viewpoint import Viewpoint
 
 Image = npt.NDArray[np.uint8]
 
-_SMOOTH_S = 0.04  # a picture that takes longer is painted at half the resolution during a drag
 # Open3D skips a drawing while the one before is under way, and shows what came into its scene a drawing later: so the
 # window is drawn again. Keys and clicks make it draw by themselves, so that what they change is skipped more often. On
 # software Vulkan each drawing takes 60 ms of a processor, which a node may want.
@@ -40,9 +40,10 @@ class Stage:
         self.scene.visible = False  # before it is first drawn: later, the memory is kept all the same
         self.size = (1, 1)  # pixels
         self._software = software
-        self._content = Scene3D(self.scene.scene)
+        self._content = Scene3D(self.scene)
         self._in_scene: tuple[object, ...] = ()  # what the scene widget shows
         self._painted_s = 0.0  # how long the last full picture took
+        self._part: int | None = None  # how coarse the last picture of a drag was; None: there is no drag
         self._redraw_at: list[float] = []  # times to come
 
     @property
@@ -92,13 +93,16 @@ class Stage:
 
     def _paint(self, session: Session, hurried: bool) -> None:
         width, height = self.size
-        half = hurried and self._painted_s > _SMOOTH_S
+        self._part = (self._part or first_part(self._painted_s)) if hurried else None
         started, paintings = time.perf_counter(), session.paintings
-        image = session.paint(*((width // 2, height // 2) if half else (width, height)))
+        image = session.paint(width, height, self._part or 1)
         if image is not None:
             self.picture.update_image(image3d(image))
-        if session.paintings > paintings and not half:
-            self._painted_s = time.perf_counter() - started
+        took = time.perf_counter() - started
+        if self._part is not None:
+            self._part = next_part(self._part, took)
+        elif session.paintings > paintings:
+            self._painted_s = took
 
     def _draw_scene(self, session: Session, view: Viewpoint) -> None:
         state = session.state
@@ -106,6 +110,6 @@ class Stage:
         if len(self._in_scene) != len(wanted) or any(a is not b for a, b in zip(self._in_scene, wanted, strict=True)):
             self._content.show_gaussians(session.gaussians(), state)
             self._in_scene = wanted
-        self._content.show_shapes(session.shapes())
+        self._content.show_shapes(session.furnished(*self.size))
         look_from(self.scene, view, *self.size)
         self.scene.force_redraw()

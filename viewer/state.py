@@ -6,10 +6,16 @@ import enum
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.result.export.selection import Selection
 from splatnode.viewer.moment import History, Moment
 
 POINT_SIZES = (1, 12)  # pixels
 BLEND_STEP = 0.25
+Span = tuple[float, float]  # where a side of the box to crop with begins and ends, 0 to 1 of the room
+WHOLE_ROOM: tuple[Span, Span, Span] = ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
 
 
 class Engine(enum.Enum):
@@ -41,6 +47,7 @@ class State:
     advice: bool = True
     uncertainty: bool = True
     graph: bool = True
+    ground: bool = True  # with the axes and the legend
     which_map: int = 0  # of a folder with several
     help: bool = False
     paused: bool = False
@@ -48,6 +55,11 @@ class State:
     camera: str | None = None  # the viewpoint is that of this camera
     blend: float = 0.0  # how much of its photograph lies over the render there, 0 to 1
     held: Moment | None = None  # a moment of the past; None: the newest
+    measuring: bool = False  # a click on the scene sets a point to measure from or to
+    measured: tuple[npt.NDArray[np.float64], ...] = ()  # at most two points (3,)
+    boxed: bool = False  # the box to crop with is shown
+    box: tuple[Span, Span, Span] = WHOLE_ROOM  # along the world's x, y and z
+    edits: tuple[Selection, ...] = ()  # what was taken out of the scene, in order
 
 
 Change = Callable[[State, History], State]
@@ -118,6 +130,15 @@ def _follow(state: State, _history: History) -> State:
     return replace(state, follow=not state.follow, camera=None)
 
 
+def _measure(state: State, _history: History) -> State:
+    """Begins to measure; ends it, and forgets the points."""
+    return replace(state, measuring=not state.measuring, measured=())
+
+
+def _undo(state: State, _history: History) -> State:
+    return replace(state, edits=state.edits[:-1])
+
+
 def _engine(state: State, _history: History) -> State:
     return replace(state, engine=Engine.OPEN3D if state.engine is Engine.CORE else Engine.CORE)
 
@@ -176,6 +197,10 @@ BINDINGS = (
     Binding("6", "show or hide the advice for the next view", _toggle("advice")),
     Binding("7", "show or hide where the cameras may be, with 95 %", _toggle("uncertainty")),
     Binding("8", "show or hide the graph of a map's scenes", _toggle("graph")),
+    Binding("9", "show or hide the ground, the axes and the scale bar", _toggle("ground")),
+    Binding("d", "measure: the distance between two clicks", _measure),
+    Binding("b", "show or hide the box to crop with", _toggle("boxed")),
+    Binding("z", "undo the last crop or clean-up", _undo),
     Binding("m", "the next map, where there are several", _next_map),
     Binding("n", "go to the next camera", _camera(1)),
     Binding("p", "go to the previous camera", _camera(-1)),
@@ -188,10 +213,17 @@ BINDINGS = (
     Binding("x", "leave a camera, close the help", _leave),
 )
 
-COMMANDS = {"r": "look at the whole scene", "s": "save a screenshot", "q": "close the viewer"}
+COMMANDS = {
+    "r": "look at the whole scene",
+    "k": "keep only what is in the box",
+    "o": "keep only what two photographs confirm",
+    "w": "save what is left as a new result",
+    "s": "save a screenshot",
+    "q": "close the viewer",
+}
 
 MOUSE = (
-    ("left button", "orbit; a click on a camera goes there"),
+    ("left button", "orbit; a click on a camera goes there, or measures (d)"),
     ("right button", "pan"),
     ("wheel", "zoom"),
 )

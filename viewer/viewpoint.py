@@ -17,11 +17,7 @@ Array = npt.NDArray[np.float64]
 _STEEPEST = math.radians(85.0)  # of a viewing direction, from the horizontal
 _SLANT = math.radians(50.0)  # at which a map is looked down on
 _NEAREST = 1e-3  # world units, of the pivot
-# The turntable: an ellipse this much wider than where the cameras were, within these half axes.
-_TOUR_MARGIN = 1.1
-_TOUR_WIDTH = math.radians(6.0), math.radians(60.0)
-_TOUR_HEIGHT = math.radians(3.0), math.radians(20.0)
-_TOUR_ALONE = math.radians(25.0), math.radians(8.0)  # around a single camera
+_SHALLOWEST = 0.1  # world units, of the pivot that a camera's viewpoint is given
 _LENS = np.array([[0.9, 0.0, 0.5], [0.0, 0.9, 0.375], [0.0, 0.0, 1.0]]), 1.0, 0.75  # where no camera suggests one
 
 
@@ -92,6 +88,22 @@ def at_camera(view: Viewpoint, camera: CameraEstimate) -> Viewpoint:
     """The viewpoint of an estimated camera, with its lens."""
     lens = camera.K, float(camera.width), float(camera.height)
     return replace(view, T_world_camera=camera.T_world_camera, lens=lens)
+
+
+def at_depth(view: Viewpoint, pivot: Array) -> Viewpoint:
+    """The same picture, with the point that orbits go around as deep as the `pivot` (3,)."""
+    depth = float((pivot - view.T_world_camera[:3, 3]) @ view.T_world_camera[:3, 2])
+    return replace(view, distance=max(depth, _SHALLOWEST))
+
+
+def first_view(moment: Moment) -> Viewpoint:
+    """From the camera in the middle of the others, which saw what is shown; of a map, or without cameras, outside."""
+    view, cameras = overview(moment), moment.snapshot.cameras
+    if moment.graph is not None or not cameras:
+        return view
+    centres = np.array([camera.T_world_camera[:3, 3] for camera in cameras])
+    middle = cameras[int(np.linalg.norm(centres - centres.mean(0), axis=1).argmin())]
+    return at_depth(at_camera(view, middle), scene_pivot(moment))
 
 
 def overview(moment: Moment, also: Sequence[Array] = ()) -> Viewpoint:
@@ -165,34 +177,6 @@ def scene_spread(moment: Moment, pivot: Array) -> float:
     """The median distance of the Gaussians from the pivot; 1 where there are none."""
     means = moment.snapshot.gaussians.means
     return float(np.median(np.linalg.norm(means - pivot, axis=1))) or 1.0 if len(means) else 1.0
-
-
-def turntable_views(moment: Moment, frames: int) -> list[Viewpoint]:
-    """A closed tour, `frames` long, around the pivot: an ellipse a little wider than where the cameras were.
-
-    A full circle would mostly show what no photograph shows.
-    """
-    start = overview(moment)
-    cameras = moment.snapshot.cameras
-    if len(cameras) < 2:
-        (width, height), distance = _TOUR_ALONE, start.distance
-    else:
-        offsets = np.array([camera.T_world_camera[:3, 3] for camera in cameras]) - start.pivot
-        distances = np.linalg.norm(offsets, axis=1)
-        level = offsets.mean(0) - (offsets.mean(0) @ start.up) * start.up
-        level /= max(float(np.linalg.norm(level)), 1e-12)
-        side = np.cross(start.up, level)
-        azimuths = np.arctan2(offsets @ side, offsets @ level)
-        elevations = np.arcsin(np.clip(offsets @ start.up / distances, -1.0, 1.0))
-        width = float(np.clip(_TOUR_MARGIN * np.ptp(azimuths) / 2.0, *_TOUR_WIDTH))
-        height = float(np.clip(_TOUR_MARGIN * np.ptp(elevations) / 2.0, *_TOUR_HEIGHT))
-        distance = float(np.median(distances))
-        middle = (azimuths.max() + azimuths.min()) / 2.0, (elevations.max() + elevations.min()) / 2.0
-        direction = math.cos(middle[1]) * (math.cos(middle[0]) * level + math.sin(middle[0]) * side)
-        centre = start.pivot + distance * (direction + math.sin(middle[1]) * start.up)
-        start = replace(start, T_world_camera=look_at(centre, start.pivot, start.up), distance=distance)
-    angles = 2.0 * np.pi * np.arange(frames) / frames
-    return [orbited(start, width * math.sin(angle), height * math.cos(angle)) for angle in angles]
 
 
 def _rotation(axis: Array, angle: float) -> Array:

@@ -16,10 +16,11 @@ import open3d as o3d  # pyright: ignore[reportMissingImports]
 from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
 from splatnode.capture.image_file import encode_png
-from splatnode.recon.result.export import write_file
+from splatnode.recon.result.export import ResultWriteError, write_file
 from splatnode.viewer import words
+from splatnode.viewer.editing import EditError
 from splatnode.viewer.help_sheet import HelpSheet
-from splatnode.viewer.panel import Panel
+from splatnode.viewer.panel.panel import Panel
 from splatnode.viewer.pointer import Pointer
 from splatnode.viewer.session import Session
 from splatnode.viewer.stage import Image, Stage
@@ -28,6 +29,7 @@ from splatnode.viewer.state import Engine, open3d_draws
 _IDLE_AFTER_S = 1.0  # without anything to do, ticks begin to sleep
 _IDLE_SLEEP_S = 0.05  # Open3D ticks a hundred times a second, which would take 2 % of a processor
 _WORDS_EVERY_S = 0.5  # the panel's words are brought up to date: times and ages in them change by themselves
+_OPENED_AT = 3  # ticks: the first picture is on the screen then
 _PANEL_EMS = 22  # the panel's width, in letter widths of the theme
 _KEYS = {
     gui.KeyName.SPACE: "space",
@@ -44,7 +46,9 @@ def show(
     opened: Callable[[], None] = lambda: None,
     size: tuple[int, int],
 ) -> None:
-    """Opens the window, calls `opened`, and returns when it is closed. Raises what went wrong while it was open.
+    """Opens the window, calls `opened` once something is drawn, and returns when it is closed.
+
+    Raises what went wrong while it was open.
 
     `software`: Vulkan runs on the processor. There the project's own rasteriser draws, unless the person asks for
     Open3D; its splat shader is not used even then, because it leaves whole rows of its tiles black.
@@ -55,11 +59,10 @@ def show(
     app.initialize()
     state = session.state
     session.state = replace(state, engine=Engine.CORE if software else Engine.OPEN3D)
-    window = _Window(app, session, software, screenshots, size)
+    window = _Window(app, session, software, screenshots, size, opened)
     # A handler that raises would do so where Open3D calls Python, before anything there can catch it.
     handlers = {number: signal.signal(number, window.stop) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        opened()
         app.run()
     finally:
         for number, handler in handlers.items():
@@ -71,7 +74,13 @@ def show(
 
 class _Window:
     def __init__(
-        self, app: gui.Application, session: Session, software: bool, screenshots: Path, size: tuple[int, int]
+        self,
+        app: gui.Application,
+        session: Session,
+        software: bool,
+        screenshots: Path,
+        size: tuple[int, int],
+        opened: Callable[[], None],
     ) -> None:
         self.error: BaseException | None = None
         self._software = software
@@ -80,7 +89,7 @@ class _Window:
         self._stage = Stage(self._window, software)
         self._panel = Panel(self._window, self._guarded(self._change), self._guarded(self._command))
         self._help = HelpSheet(self._window)
-        for widget in (self._stage.picture, self._stage.scene, self._panel.root, self._help.root):
+        for widget in (self._stage.picture, self._stage.scene, *self._panel.widgets, self._help.root):
             self._window.add_child(widget)
         self._stage.picture.set_on_mouse(self._guarded(self._mouse, gui.ImageWidget.EventCallbackResult.HANDLED))
         self._stage.scene.set_on_mouse(self._guarded(self._mouse, gui.Widget.EventCallbackResult.CONSUMED))
@@ -94,6 +103,8 @@ class _Window:
         self._busy_at = 0.0
         self._stopped_by = 0  # a signal
         self._notice = ""
+        self._opened = opened
+        self._ticks = 0
 
     def stop(self, number: int, _frame: object) -> None:
         """The handler of a signal: closes the window at the next tick."""
@@ -117,6 +128,9 @@ class _Window:
 
     def _tick(self) -> bool:
         """Looks for news and redraws where there are any."""
+        self._ticks += 1
+        if self._ticks == _OPENED_AT:
+            self._opened()
         if self._stopped_by:
             raise KeyboardInterrupt if self._stopped_by == signal.SIGINT else SystemExit(0)
         news = self._session.receive()
@@ -145,7 +159,7 @@ class _Window:
         area = self._window.content_rect
         panel = min(round(_PANEL_EMS * self._window.theme.font_size), area.width // 2)
         frame = gui.Rect(area.x, area.y, area.width - panel, area.height)
-        self._panel.root.frame = gui.Rect(area.get_right() - panel, area.y, panel, area.height)
+        self._panel.lay_out(gui.Rect(area.get_right() - panel, area.y, panel, area.height))
         self._help.lay_out(context, frame)
         self._asked |= self._stage.lay_out(frame)  # otherwise the panel's words have changed, no more
 
@@ -160,11 +174,27 @@ class _Window:
             self._session.whole_scene()
         elif key == "s":
             self._screenshot()
+        elif key in ("k", "o", "w"):
+            self._edit(key)
         elif key == "q":
             self._window.close()
         else:
             self._session.press(key)
         self._asked = True
+
+    def _edit(self, key: str) -> None:
+        """Crops, cleans up or saves; what cannot be done is told."""
+        try:
+            if key == "k":
+                self._session.crop()
+            elif key == "o":
+                self._session.keep_seen()
+            else:
+                self._notice = f"saved {self._session.save(self._screenshots)}: a new result to view or export"
+                return
+            self._notice = ""
+        except (EditError, ResultWriteError) as error:
+            self._notice = str(error)
 
     def _key(self, event: gui.KeyEvent) -> bool:
         if event.type != gui.KeyEvent.Type.DOWN:

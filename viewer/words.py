@@ -6,6 +6,8 @@ from splatnode.recon.result.bounds_in_words import of_camera, of_cameras
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.viewer.advice import Advice
 from splatnode.viewer.graph import place_lines as graph_lines
+from splatnode.viewer.ground import Ground
+from splatnode.viewer.lengths import in_words
 from splatnode.viewer.moment import History, Moment
 from splatnode.viewer.state import State, moment_index
 
@@ -47,6 +49,13 @@ def place_lines(moment: Moment) -> list[str]:
     return [] if moment.graph is None else graph_lines(moment.graph)
 
 
+def scale_lines(moment: Moment, ground: Ground | None) -> list[str]:
+    """The unit of all lengths, and how wide the cells of the ground's grid are."""
+    scale = moment.snapshot.scale
+    lines = [f"Scale: {scale.sentence}"]
+    return lines if ground is None else [*lines, f"Ground: cells of {in_words(ground.cell, scale)}"]
+
+
 def bounds_lines(moment: Moment, camera: CameraEstimate | None = None) -> list[str]:
     """How well `camera` is known, or where there is none, or one without bounds: how well all are at least."""
     snapshot = moment.snapshot
@@ -61,7 +70,7 @@ def dropped_lines(moment: Moment, most: int = _MOST_DROPPED) -> list[str]:
     dropped = moment.snapshot.dropped
     lines = [f"left out {frame.name}: {frame.reason}" for frame in dropped[-most:]]
     earlier = len(dropped) - len(lines)
-    return [f"{earlier} frames were left out before:"] * (earlier > 0) + lines
+    return [f"{earlier} photographs were left out before:"] * (earlier > 0) + lines
 
 
 def advice_line(advice: Advice | None, moment: Moment) -> str:

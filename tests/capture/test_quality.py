@@ -70,7 +70,7 @@ def test_a_frame_is_blurred_beside_sharper_ones():
     soft = Quality(4.0, 0.0, 0.0, 40.0)
     assert why_unusable(soft, LIMITS) is None
     assert why_unusable(soft, LIMITS, sharpest_px=2.0) is None
-    assert "sharpest frame 1.2" in (why_unusable(soft, LIMITS, sharpest_px=1.2) or "")
+    assert "sharpest 1.2" in (why_unusable(soft, LIMITS, sharpest_px=1.2) or "")
 
 
 def test_spoilt_frames_are_unusable():

@@ -17,10 +17,10 @@ from splatnode.viewer.shapes import (
     Lines,
     Photograph,
     Shapes,
-    arrow,
     ellipsoid,
     frustum,
     frustum_depth,
+    hint,
     image_corners,
     path,
     shapes,
@@ -131,12 +131,12 @@ def test_frusta_end_at_the_corners_of_the_image():
     assert frustum_depth((one,)) == frustum_depth(())
 
 
-def test_the_path_follows_the_frames_and_the_arrow_ends_where_it_points():
+def test_the_path_follows_the_frames_and_the_hint_is_a_camera_that_looks_where_it_should():
     route = path((camera(0.2, frame_id=2), camera(0.0, frame_id=0), camera(0.1, frame_id=1)))
     assert np.allclose(route[:, :, 0], [[0.0, 0.1], [0.1, 0.2]])
-    lines = arrow(np.zeros(3), np.array([1.0, 0, 0]), np.array([1.0, 0, 5.0]))
-    assert np.allclose(lines[0], [[0, 0, 0], [1, 0, 0]]) and np.allclose(lines[1:, 0], [1, 0, 0])
-    assert np.allclose(lines[-1, 1], [1, 0, 1])
+    frame, way = hint((camera(0.0),), np.zeros(3), np.array([1.0, 0, 0]), np.array([1.0, 0, 5.0]), 0.1)
+    assert np.allclose(way.ends, [[[0, 0, 0], [1, 0, 0]]]) and np.allclose(frame.ends[:4, 0], [1, 0, 0])
+    assert np.allclose(frame.ends[:4, 1, 2], 0.1) and np.allclose(frame.ends[:4, 1].mean(0), [1.0, 0.0, 0.1])
 
 
 def test_an_ellipsoid_ends_at_its_semi_axes_and_nowhere_beyond():
@@ -170,8 +170,8 @@ def test_switches_decide_what_stands_in_the_scene():
     advice = analyse(there).advice
     assert advice.arrow is not None
     every = shapes(there, State(), advice, tracked)
-    assert len(every.lines) == 1 + 2 + 1 + 1 and [one.name for one in every.photographs] == ["0.png"]
-    for switch, left in (("path", 4), ("cameras", 3), ("tracked", 4), ("advice", 4)):
+    assert len(every.lines) == 1 + 2 + 1 + 2 and [one.name for one in every.photographs] == ["0.png"]
+    for switch, left in (("path", 5), ("cameras", 4), ("tracked", 5), ("advice", 4)):
         assert len(shapes(there, State(**{switch: False}), advice, tracked).lines) == left, switch
     assert not shapes(there, State(photographs=False), advice).photographs
     assert len(shapes(there, State(), advice, eye=np.zeros(3)).photographs) == 0  # it would fill the window

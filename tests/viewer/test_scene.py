@@ -177,7 +177,7 @@ def test_words_are_plain():
         "About: 0.png",
     ]
     assert words.count_lines(there) == ["9 Gaussians, 1 camera", "3.0 s (poses 1.2)", "10 iterations"]
-    assert words.dropped_lines(there)[0] == "2 frames were left out before:"
+    assert words.dropped_lines(there)[0] == "2 photographs were left out before:"
     assert words.dropped_lines(there)[-1] == "left out 7.png: blurred"
     assert words.feed_line(None, True) == "a finished result"
     assert "nothing has come" in words.waiting_line(float("inf")) and "is there" in words.waiting_line(1.0)

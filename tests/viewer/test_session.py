@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from splatnode.recon.result.export.selection import Selection
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.viewer.analysis import Analyst
 from splatnode.viewer.canvas import project
@@ -36,7 +37,7 @@ def moments(count: int) -> tuple[Moment, ...]:
 
 def test_every_key_does_something_and_only_its_own():
     history = moments(3)
-    start = State(camera="1.png", blend=0.5, help=True, held=history[1])
+    start = State(camera="1.png", blend=0.5, help=True, held=history[1], edits=(Selection(only_seen=True),))
     for binding in BINDINGS:
         after = press(start, history, binding.key)
         assert after is not start and any(getattr(after, name) is not getattr(start, name) for name in vars(start))
@@ -108,7 +109,9 @@ def test_a_session_from_the_first_moment_to_a_click():
     assert session.receive() and session.moment is first
     image = session.paint(100, 80)
     assert image is not None and image.shape == (80, 100, 3)
+    assert np.array_equal(session.viewpoint().T_world_camera, first.snapshot.cameras[1].T_world_camera)
 
+    session.whole_scene()
     view = session.viewpoint()
     centre = project(first.snapshot.cameras[1].T_world_camera[None, :3, 3], view, 100, 80)[0]
     assert session.click(centre[0], centre[1], 100, 80) and session.state.camera == "1.png"
@@ -145,10 +148,11 @@ def test_the_live_camera_moves_between_moments():
     session.close()
 
 
-def test_the_first_look_makes_room_for_advice_only_where_it_is_shown():
+def test_the_look_at_the_whole_scene_makes_room_for_advice_only_where_it_is_shown():
     for advice in (True, False):
         session = Session(Finished(moments(1)[0]), State(advice=advice))
         session.receive()
+        session.whole_scene()
         before = session.viewpoint()
         deadline = time.monotonic() + 60
         while session.analysis() is None and time.monotonic() < deadline:
@@ -175,6 +179,9 @@ def test_gaussians_are_painted_again_only_where_they_look_different():
     session.paint(60, 40)
     session.paint(30, 20)
     assert session.paintings == 4
+    coarse = session.paint(60, 40, 3)
+    assert session.paintings == 5 and coarse.shape == (40, 60, 3)
+    assert np.abs(coarse.astype(int) - session.paint(60, 40)).mean() < 25
     session.close()
 
 

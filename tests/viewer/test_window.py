@@ -7,11 +7,14 @@ import os
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
 from splatnode.viewer.probe import probe_window
+from splatnode.viewer.splash import splash
 from tests.conftest import ROOT
 from tests.support.walk import write_walk
 
@@ -111,3 +114,67 @@ def test_a_map_of_several_scenes_is_walked_through_in_a_window(display, tmp_path
     command = [sys.executable, "-c", WALK, str(write_walk(tmp_path / "out"))]
     driven = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
     assert driven.returncode == 0 and "closed with 0" in driven.stdout, driven.stderr[-2000:]
+
+
+SPLASH = """
+import time
+from splatnode.viewer.splash import splash
+from tests.support.screen import Screen
+
+def wait(shown):
+    deadline = time.monotonic() + 60
+    while (screen.picture(640, 480).std() > 1) != shown and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return screen.picture(640, 480).std() > 1
+
+screen = Screen()
+with splash() as close:
+    print("shown", wait(True), flush=True)
+    close()
+    print("closed", wait(False), flush=True)
+"""
+
+ORPHAN = """
+import os
+from splatnode.viewer.splash import splash
+with splash() as close:
+    print(close.__closure__[0].cell_contents.pid, flush=True)
+    input()
+    os._exit(0)
+"""
+
+
+def test_the_splash_is_there_until_it_is_closed(display, monkeypatch):
+    pytest.importorskip("tkinter", reason="needs tkinter, which the splash is made of")
+    monkeypatch.setenv("DISPLAY", display)
+    done = subprocess.run([sys.executable, "-c", SPLASH], cwd=ROOT, capture_output=True, text=True, timeout=200)
+    assert done.stdout.split() == ["shown", "True", "closed", "False"], done.stderr[-2000:]
+
+
+def test_the_splash_goes_with_the_viewer_that_asked_for_it(display, monkeypatch):
+    pytest.importorskip("tkinter", reason="needs tkinter, which the splash is made of")
+    monkeypatch.setenv("DISPLAY", display)
+    command = [sys.executable, "-c", ORPHAN]
+    with subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as viewer:
+        assert viewer.stdout is not None and viewer.stdin is not None
+        child = Path("/proc", viewer.stdout.readline().strip())
+        time.sleep(2.0)  # it looks for its parent from the moment it is there
+        viewer.stdin.write("\n")
+    deadline = time.monotonic() + 60
+    while alive(child) and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert not alive(child)
+
+
+def alive(process: Path) -> bool:
+    """Whether the process of this folder of /proc runs: one that nobody waits for is dead, too."""
+    try:
+        return (process / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def test_without_a_display_there_is_no_splash_and_no_error(monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":987")
+    with splash() as close:
+        close()

@@ -15,11 +15,11 @@ from splatnode.recon.result.export.formats.splat import encode_splat
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.viewer.advice import Advice
 from splatnode.viewer.colours import source_colour
+from splatnode.viewer.ground import ground, ground_lines
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.shapes import Lines, frustum_depth, image_corners, shapes
 from splatnode.viewer.state import State
 from splatnode.viewer.viewpoint import Viewpoint, overview, scene_pivot
-from splatnode.viewer.web.ground import ground
 
 THUMBNAIL_SIDE = 256  # pixels, at least where the photograph has as many
 _QUALITY = 85  # of JPEG
@@ -48,7 +48,7 @@ class Content:
 
         The text has the cameras, the viewpoints to start from, and where in the numbers each group of lines is.
         """
-        named = [(name, _group(self, name)) for name in _GROUPS] + [("ground", (ground(self.moment),))]
+        named = [(name, _group(self, name)) for name in _GROUPS] + [("ground", ground_lines(ground(self.moment)))]
         parts, told, at = [], [], 0
         for name, group in named:
             for lines in group:

@@ -109,7 +109,7 @@ def reconstruct(images: Path, names: list[str], case: str) -> dict[str, float]:
             final = audience.wait(lambda scene: scene.snapshot.final and len(scene.snapshot.cameras) == len(names))
             audience.close()
             if placed is None or final is None:
-                raise SystemExit(f"not all frames were placed:\n{node.log('recon')[-2000:]}")
+                raise SystemExit(f"not all photographs were placed:\n{node.log('recon')[-2000:]}")
             snapshot, final_s = final.snapshot, time.monotonic() - begun
             viewer_s = processor_s(shown.pid) - viewer_s if shown else 0.0
             return {

@@ -52,7 +52,7 @@ class Step:
 
 
 def click(x: float, y: float, button: int = 1) -> str:
-    return f"mousemove {round(x)} {round(y)} sleep 0.1 mousedown {button} sleep 0.1 mouseup {button}"
+    return f"mousemove {round(x)} {round(y)} sleep 0.2 mousedown {button} sleep 0.25 mouseup {button}"
 
 
 def drag(button: int) -> str:
@@ -62,8 +62,8 @@ def drag(button: int) -> str:
 
 def steps(camera: npt.NDArray[np.floating]) -> list[Step]:
     """What a person would try; `camera` (2,) is where one is seen. Rows of the panel are where its theme puts them."""
-    switches = ("gaussians", "as_points", "cameras", "photographs", "path", "tracked", "advice")
-    places = [(947, 40), (1069, 40), (947, 67), (1069, 67), (947, 94), (1069, 94), (947, 121)]
+    switches = ("gaussians", "as_points", "cameras", "photographs", "path", "tracked")
+    places = [(x, y) for y in (69, 96, 123) for x in (947, 1097)]
     toggled = [
         Step(f"switch_{name}_{turn}", (click(*place),))
         for name, place in zip(switches, places, strict=True)
@@ -74,6 +74,10 @@ def steps(camera: npt.NDArray[np.floating]) -> list[Step]:
         Step("started", ()),
         Step("help", ("key h",)),
         Step("help_closed", ("key h",)),
+        Step("show_tab", (click(1010, 46),)),
+        Step("ground_hidden", (click(1097, 177),)),
+        Step("ground_shown", (click(1097, 177),)),
+        Step("whole_at_first", ("key r",)),
         *toggled,
         *colours,
         Step("points", ("key g",)),
@@ -95,6 +99,8 @@ def steps(camera: npt.NDArray[np.floating]) -> list[Step]:
         Step("paused", ("key space",)),
         Step("unpaused", ("key space",)),
         *lists_and_sliders(),
+        *photographs(),
+        *tools(),
         Step("saved", ("key s",)),
         Step("open3d", ("key e",)),
         Step("open3d_points", ("key g",)),
@@ -104,19 +110,46 @@ def steps(camera: npt.NDArray[np.floating]) -> list[Step]:
 
 
 def lists_and_sliders() -> list[Step]:
-    """The panel's drop-down lists and sliders by mouse, and back to how it was."""
+    """The drop-down lists and sliders of the tab Show by mouse, and back to how it was."""
     return [
-        Step("colour_list", (click(1269, 158), "mousemove 1060 180")),
-        Step("colour_chosen", (click(1050, 206),)),
-        Step("camera_list", (click(1269, 212), "mousemove 1060 234")),
-        Step("camera_chosen", (click(1050, 260),)),
-        Step("blend_slider", (click(1230, 320),)),
-        Step("blend_slider_back", (click(940, 320),)),
+        Step("colour_list", (click(1269, 250), "mousemove 1060 272")),
+        Step("colour_chosen", (click(1050, 298),)),
         Step("points_again", ("key g",)),
-        Step("points_slider", (click(1230, 266),)),
-        Step("time_slider", (click(1000, 374),)),
-        Step("time_slider_back", (click(1260, 374),)),
+        Step("points_slider", (click(1230, 358),)),
+        Step("time_slider", (click(1000, 412),)),
+        Step("time_slider_back", (click(1260, 412),)),
         Step("as_before", ("key g", "key r", "key c", "key c", "key c", "key c")),
+    ]
+
+
+def photographs() -> list[Step]:
+    """The tab Photographs: the list, the slider, and back."""
+    return [
+        Step("photographs_tab", (click(1086, 46),)),
+        Step("photograph_chosen", (click(980, 238),)),
+        Step("blend_slider", (click(1230, 125),)),
+        Step("blend_slider_back", (click(940, 125),)),
+        Step("photograph_left", (click(1100, 69),)),
+    ]
+
+
+def tools() -> list[Step]:
+    """The tab Tools: measuring, the box, crop, clean-up, undo and a new result."""
+    return [
+        Step("tools_tab", (click(1165, 46),)),
+        Step("measure", (click(1100, 69),)),
+        Step("first_point", (click(430, 400),)),
+        Step("second_point", (click(620, 300),)),
+        Step("measured_no_more", ("key d",)),
+        Step("box", (click(947, 151),)),
+        Step("box_smaller", (click(1050, 205), click(1050, 313))),
+        Step("cropped", (click(1100, 341),)),
+        Step("clean", (click(1100, 397),)),
+        Step("new_result", (click(1180, 453),)),
+        Step("undone", (click(970, 453),)),
+        Step("all_undone", ("key z",)),
+        Step("box_gone", ("key b",)),
+        Step("show_tab_again", (click(1010, 46),)),
     ]
 
 
@@ -129,7 +162,7 @@ def growing(whole: Snapshot) -> list[Snapshot]:
         gaussians = take(whole.gaussians, np.random.default_rng(0).random(len(whole.gaussians)) < share)
         verdict = whole.verdict
         if cameras < count:
-            verdict = Verdict(Code.OK_PARTIAL, f"{cameras} of {count} frames were placed.", "Go on.", (), True)
+            verdict = Verdict(Code.OK_PARTIAL, f"{cameras} of {count} photographs were placed.", "Go on.", (), True)
         parts.append(
             replace(
                 whole,

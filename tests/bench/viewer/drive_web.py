@@ -105,7 +105,9 @@ def steps(page: Browser, node: PretendNode, viewer: Viewer, whole: Snapshot) -> 
     yield Step("waiting", lambda: page.open(viewer.url), said("notice", "waiting"))
     yield Step("first_scene", lambda: node.publish(few), f"{fact('gaussians')} == {len(few.gaussians)}")
     yield Step("at_a_camera", lambda: None, f"{fact('camera')} == '{few.cameras[1].name}'")
-    yield Step("verdict", lambda: None, f"{said('verdict', 'frames were placed')} && {said('state', 'provisional')}")
+    yield Step(
+        "verdict", lambda: None, f"{said('verdict', 'photographs were placed')} && {said('state', 'provisional')}"
+    )
     yield Step("advice", lambda: None, f"{said('sections', 'Next view')} && !{said('sections', 'looking for')}")
     yield Step("overview", lambda: page.press("r"), f"{fact('camera')} == ''")
     yield Step("cameras_hidden", lambda: page.press("2"), f"!{switch('cameras')}")

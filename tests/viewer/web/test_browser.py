@@ -42,7 +42,7 @@ def place() -> Snapshot:
     cameras = [camera(0.12 * (index - 3.5), frame_id=index) for index in range(8)]
     images = {each.name: np.full((80, 100, 3), 20 * index, np.uint8) for index, each in enumerate(cameras)}
     whole = moment(coloured_wall(), *cameras, images=images).snapshot
-    return replace(whole, verdict=replace(whole.verdict, message="All 8 frames were placed."))
+    return replace(whole, verdict=replace(whole.verdict, message="All 8 photographs were placed."))
 
 
 @pytest.fixture(scope="module")

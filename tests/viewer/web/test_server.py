@@ -122,7 +122,7 @@ def test_what_strangers_named_is_printable_and_stays_json():
         words, (text, _) = told(server)["said"], shapes(server, 1)
     lines = [*words["verdict"], *(line for _, lines in words["sections"] for line in lines), text["cameras"][0]["name"]]
     assert all(line.isprintable() for line in lines) and len(lines) < 250
-    assert "300 frames were left out before:" in lines
+    assert "300 photographs were left out before:" in lines
 
 
 def test_nothing_that_a_visitor_sends_is_an_order():
