@@ -23,6 +23,7 @@ class Choice:
     examined: int  # frames
     taken: Mapping[str, int]  # of the keyframes, by what they add: "coverage", "parallax", ...
     left_out: Mapping[str, int]  # of the other frames, by the reason
+    what: str = "frame"  # one of those that were examined: "photograph"
 
     def record(self) -> dict[str, object]:
         """For report.json."""
@@ -33,11 +34,13 @@ class Choice:
         """For people: how many, and why."""
         taken = ", ".join(f"{count} {reason}" for reason, count in self.taken.items())
         others = ", ".join(f"{count} {reason}" for reason, count in self.left_out.items())
-        told = f"{len(self.names)} of {self.examined} frames are keyframes ({taken})"
+        told = f"{len(self.names)} of {self.examined} {self.what}s are keyframes ({taken})"
         return f"{told}; the others: {others}" if others else told
 
 
-def choose(recording: Iterable[Frame | DroppedFrame], config: Config, limits: Limits, most: int | None) -> Choice:
+def choose(
+    recording: Iterable[Frame | DroppedFrame], config: Config, limits: Limits, most: int | None, what: str = "frame"
+) -> Choice:
     """At most `most` keyframes, evenly along the way; only they are held in memory. None: the names of all.
 
     When there are more, every second one is given up, and from then on every second one is taken: so the camera's way
@@ -70,4 +73,4 @@ def choose(recording: Iterable[Frame | DroppedFrame], config: Config, limits: Li
     taken = Counter(reason for *_, reason in kept)
     names = tuple(name for name, *_ in kept)
     frames = tuple(frame for _, frame, _ in kept if frame is not None)
-    return Choice(names, frames, tuple(dropped), examined, taken, left_out)
+    return Choice(names, frames, tuple(dropped), examined, taken, left_out, what)

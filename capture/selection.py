@@ -94,7 +94,8 @@ class Selector:
         self._start: Image | None = None  # the last keyframe, small and grey
         self._corners: Points = np.zeros((0, 1, 2), np.float32)
         self._now: Points = self._corners
-        self._blurs_px: deque[float] = deque(maxlen=REMEMBERED_BLURS)  # of the candidates examined, newest last
+        # Size and blur of the candidates that were examined, newest last
+        self._blurs_px: deque[tuple[tuple[int, int], float]] = deque(maxlen=REMEMBERED_BLURS)
         self._next_ns = 0  # nothing is examined before
 
     def decide(self, frame: Frame, waiting: int = 0) -> Decision:
@@ -139,10 +140,11 @@ class Selector:
                 continue
             if why_redundant(novelty(small, view.small), self.limits):
                 return f"duplicate: it shows what {view.name} shows"
-        quality = assess(frame.image)
-        fault = why_unusable(quality, self.limits, min(self._blurs_px, default=None))
+        quality, size = assess(frame.image), (frame.width, frame.height)
+        of_this_size = [blur_px for each, blur_px in self._blurs_px if each == size]  # others are of another camera
+        fault = why_unusable(quality, self.limits, min(of_this_size, default=None))
         if quality.blur_px is not None:
-            self._blurs_px.append(quality.blur_px)
+            self._blurs_px.append((size, quality.blur_px))
         return fault
 
     def _remember(self, name: str, small: Image, grey: Image) -> None:

@@ -1,8 +1,7 @@
 """A reconstruction whose frames come one at a time: what it knows, and the steps by which it comes to know more.
 
 All that it knows is one frozen record, which each step replaces whole: a step that is abandoned leaves what was known.
-Steps that compute take `pause`, which is called about once a second at least and may raise to abandon the work;
-the others, and `snapshot`, compute nothing.
+Only steps that take `pause` compute: it is called about once a second at least, and may raise to abandon the work.
 """
 
 from __future__ import annotations
@@ -33,9 +32,7 @@ from splatnode.recon.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 
-MAX_CAMERA_SHIFT = (
-    0.1  # in median depths of the scene: where a new estimate moves a camera further, a scene begins anew
-)
+MAX_CAMERA_SHIFT = 0.1  # in median depths: where a new estimate moves a camera further, a scene begins anew
 
 Pause = Callable[[], None]
 
@@ -279,6 +276,10 @@ class IncrementalReconstruction:
     def show(self, show: Shown) -> None:
         """Makes this what snapshots show."""
         self._known = replace(self._known, show=show)
+
+    def release_scene(self) -> None:
+        """Gives the memory of all scenes and depth maps back; the photographs, their pairs and the estimate stay."""
+        self._known = replace(self._known, pointmaps={}, begun=None, show=Shown())
 
     def snapshot(self, dropped: Collection[DroppedFrame] | None = None, final: bool = False) -> Snapshot:
         """What was estimated and is shown. `dropped` are the frames to name as left out; None: those that were dropped.

@@ -15,7 +15,8 @@ from splatnode.capture.messaging.network import Network, NotAllowed
 from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
 from splatnode.capture.process.problems import Problems, is_said
 from splatnode.recon.config import Config
-from splatnode.recon.daemon.checkpoint.store import Store, StoredFrame
+from splatnode.recon.daemon.checkpoint.store import Store
+from splatnode.recon.daemon.checkpoint.stored_frame import StoredFrame
 from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.pipeline import prepare

@@ -16,7 +16,7 @@ from pathlib import Path
 from splatnode.capture.process.logs import event
 from splatnode.recon.config import Config
 from splatnode.recon.core import give_back_memory
-from splatnode.recon.daemon import finishing, places
+from splatnode.recon.daemon import finishing, membership, places
 from splatnode.recon.daemon.atlas.atlas import Atlas
 from splatnode.recon.daemon.checkpoint import checkpoint, left, made_anew
 from splatnode.recon.daemon.checkpoint.ledger import CheckpointError
@@ -83,6 +83,7 @@ class LeftPlaces:
             with contextlib.closing(Store(folder)) as store:
                 found = checkpoint.restore(store, self._config)
                 self._work = found.work
+                give_back_memory()
                 done = step(store, found, pause)
         except OSError as error:
             self._output.complain(
@@ -127,7 +128,7 @@ class LeftPlaces:
     def _judge(self, store: Store, found: checkpoint.Restored, pause: Pause) -> bool:
         """Whether the place is judged now, and its result written."""
         work = found.work
-        if found.final and not found.new:  # as it was when the place was left
+        if found.final and not found.new and not self._part(store, work, pause):  # as it was when the place was left
             self._output.finished(store.scene_id)
         else:
             event(log, logging.INFO, "judging", scene=store.scene_id)
@@ -139,6 +140,8 @@ class LeftPlaces:
             if not self._output.export(snapshot, store, places.State.LEFT, work.names):
                 return False
             self._output.save(store, work, final=False)
+        work.release_scene()  # the checkpoint has it, and comparing takes memory, too
+        give_back_memory()
         self._atlas.keep(store, work.graph, self._atlas.compare(store.scene_id, work.graph, pause))
         return True
 
@@ -153,8 +156,21 @@ class LeftPlaces:
         for keyframe in finishing.screened(work, found.new, forget):  # that came shortly before the place was left
             work.add(keyframe, pause)
         finishing.judge(work, forget, pause)
+        if self._part(store, work, pause):
+            work.estimate_thoroughly(pause)
         for keyframe in work.aside:
             forget(keyframe.name, "it does not fit the scene")
+
+    def _part(self, store: Store, work: IncrementalReconstruction, pause: Pause) -> bool:
+        """Whether some of the keyframes showed other places, and are places of their own now, which wait here."""
+        parts = membership.apart(work, pause)
+        for keyframes in parts:
+            names = [keyframe.name for keyframe in keyframes]
+            scene = store.part(names)
+            self._output.parted(scene, names)
+            event(log, logging.INFO, "parted", scene=store.scene_id, part=scene, keyframes=len(names))
+            work.retract(names)
+        return bool(parts)
 
     def _make(self, store: Store, found: checkpoint.Restored, pause: Pause) -> bool:
         """Whether the scene of a place that is judged is final now, and its result written."""

@@ -13,6 +13,7 @@ from splatnode.recon.incremental import IncrementalReconstruction, Pause, withou
 from splatnode.recon.matching.view_graph import ViewGraph
 
 NEWEST = 3  # keyframes that are never given up: what comes next connects to them
+PLACE = 3  # keyframes that may be a place of their own
 MIN_KEPT_CAMERAS = 0.6  # share of a scene's cameras that a merged scene must keep to count as the same scene
 
 
@@ -64,6 +65,23 @@ def connected(work: IncrementalReconstruction, pause: Pause = without_pause) -> 
     finally:
         work.set_aside(aside)
     return any(not group.isdisjoint(placed) and not group.isdisjoint(aside) for group in groups)
+
+
+def apart(work: IncrementalReconstruction, pause: Pause = without_pause) -> list[list[Keyframe]]:
+    """What shows places of its own: keyframes that verified pairs join to each other, and to none of the scene.
+
+    Where there is no scene, what most keyframes show counts as it. Those that were set aside are asked, too.
+    """
+    placed, aside = work.estimate_soon(pause).placed, {keyframe.name for keyframe in work.aside}
+    work.bring_back(aside)
+    try:
+        work.complete(pause)
+        groups = [[work.graph.keyframes[index] for index in group] for group in work.graph.components()]
+    finally:
+        work.set_aside(aside)
+    here = placed or {keyframe.name for group in groups[:1] for keyframe in group}
+    others = [group for group in groups if here.isdisjoint(keyframe.name for keyframe in group)]
+    return [group for group in others if len(group) >= PLACE]
 
 
 def prove(work: IncrementalReconstruction, pause: Pause = without_pause) -> None:

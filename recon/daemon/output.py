@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from splatnode.capture.process.logs import event
+from splatnode.recon.daemon import places
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
@@ -58,14 +59,15 @@ class Output:
         recipe, folder = self._config.reconstruction, self._config.out / place.scene_id
         provisional = folder.with_name(folder.name + PROVISIONAL)
         folder = folder if snapshot.final else provisional
-        before = self.places.cameras(place.scene_id)
+        judged = snapshot.final or not snapshot.verdict.provisional
+        before = self.places.cameras(place.scene_id) if judged else {}
         try:
             measured = in_metres(snapshot, recipe.metric)
             finish(measured, folder, seed=recipe.seed, preset_name="live")
             if snapshot.final:
                 remove_result(provisional)
             self.places.tell(_described(place, state, folder.name, snapshot, kept))
-            if snapshot.final or not snapshot.verdict.provisional:
+            if judged:
                 self.places.link(place.scene_id, before)
         except OSError as error:
             self.complain(error.strerror or str(error))
@@ -77,6 +79,10 @@ class Output:
     def tell(self, snapshot: Snapshot, state: State, kept: Sequence[str]) -> None:
         """Writes into the index what is known of the present place, which has no result in a folder."""
         self._write(lambda: self.places.tell(_described(self._store, state, None, snapshot, kept)))
+
+    def parted(self, scene_id: str, names: Sequence[str]) -> None:
+        """Writes into the index that these keyframes of a place that was left are one of their own."""
+        self._write(lambda: self.places.tell(places.not_judged(scene_id, names)))
 
     def finished(self, scene_id: str) -> None:
         """Writes into the index that the camera has left a place whose scene is final."""

@@ -20,6 +20,7 @@ from splatnode.recon.result.export import SceneFileError, read_cameras, write_fi
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.verdict import Code
 
 log = logging.getLogger(__name__)
 
@@ -91,6 +92,22 @@ def described(
         shared=tuple(shared),
         seconds=round(sum(snapshot.seconds[stage] for stage in snapshot.seconds.keys() - {"wait", "total"}), 1),
         rss_mb=round(resident_mb()),
+    )
+
+
+def not_judged(scene_id: str, names: Sequence[str]) -> Place:
+    """A place that was left, of whose keyframes nothing is known yet."""
+    return Place(
+        scene_id=scene_id,
+        state=State.LEFT,
+        folder=None,
+        verdict=Code.UNDETERMINED.value,
+        message="This place is judged when there is time for it.",
+        publishable=False,
+        provisional=True,
+        num_gaussians=0,
+        frames_used=(),
+        frames_dropped=tuple(Dropped(name, "its place is not judged yet") for name in names),
     )
 
 
@@ -180,9 +197,10 @@ class Places:
     def _write_links(self, links: Sequence[Link]) -> None:
         """Those between scenes that are judged: one that was may be none any more."""
         judged = self._judged
-        graph = optimised(list(judged), [each for each in links if {each.scene, each.other} <= judged.keys()])
-        for each in graph.links:
-            if each.retracted:
+        given = [each for each in links if {each.scene, each.other} <= judged.keys()]
+        graph = optimised(list(judged), given)
+        for each, before in zip(graph.links, given, strict=True):
+            if each.retracted and not before.retracted:
                 log.warning("the loop from %s to %s does not count: %s", each.scene, each.other, each.retracted)
         self._write(msgspec.structs.replace(self._index, links=graph.links, poses=graph.poses))
 

@@ -11,6 +11,7 @@ from collections.abc import Callable
 import msgspec
 
 from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
+from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon.atlas.atlas import Atlas
 from splatnode.recon.daemon.atlas.links import Kind
 from splatnode.recon.daemon.checkpoint import checkpoint
@@ -71,12 +72,12 @@ class Worker:
     def delay(self) -> tuple[float, str]:
         """How long the oldest keyframe has waited that no scene shows yet, seconds, and what it waits for."""
         if self.loading:
-            return time.monotonic() - self._quiet_since_s, f"{self.loading} keyframes are being loaded"
+            return time.monotonic() - self._quiet_since_s, f"{_keyframes(self.loading)} being loaded"
         under_way, waiting = list(self.place.under_way), len(self._inbox)
         oldest_s = under_way[0].at_s if under_way else self._inbox.oldest_s
         if oldest_s is None:
             return 0.0, ""
-        return time.monotonic() - oldest_s, f"{len(under_way)} keyframes are being worked in, {waiting} wait"
+        return time.monotonic() - oldest_s, f"{_keyframes(len(under_way))} being worked in, {waiting} more waiting"
 
     def run(self) -> None:
         """Until the daemon stops; an export that has begun is finished. Raises MemoryError and the like."""
@@ -84,6 +85,7 @@ class Worker:
         self.loading = 0
         if found is not None:
             self._guarded(lambda: self.place.go_on(found))
+        give_back_memory()
         while not self._stopping.is_set():
             worked = self._turn(min(IDLE_S, self._config.settle_s))
             if not worked and self.place.settled and time.monotonic() >= self._not_before_s:
@@ -172,3 +174,7 @@ class Worker:
     def _complain(self, problem: str) -> None:
         self.problem = problem
         log.error("%s", problem)
+
+
+def _keyframes(number: int) -> str:
+    return "1 keyframe is" if number == 1 else f"{number} keyframes are"

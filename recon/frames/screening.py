@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -94,13 +95,17 @@ def screen_all(
 def screen(summaries: Sequence[FrameSummary], config: Config) -> tuple[list[int], list[Rejected]]:
     """The positions of the frames that are worth working on, and the others with the reason.
 
-    Of copies the first is kept. Blur is compared with the sharpest frame of all, so that the order does not matter.
+    Of copies the first is kept. Blur is compared with the sharpest frame of the same size, so that the order does not
+    matter: frames of another size are of another camera, or of another lens.
     """
-    sharpest = min((each.quality.blur_px for each in summaries if each.quality.blur_px is not None), default=None)
+    sharpest = {summary.size: math.inf for summary in summaries}
+    for summary in summaries:
+        blur_px = summary.quality.blur_px
+        sharpest[summary.size] = min(sharpest[summary.size], math.inf if blur_px is None else blur_px)
     kept: list[int] = []
     rejected: list[Rejected] = []
     for index, summary in enumerate(summaries):
-        why = quality.why_unusable(summary.quality, config.limits, sharpest)
+        why = quality.why_unusable(summary.quality, config.limits, sharpest[summary.size])
         if why is not None:
             rejected.append(Rejected(summary.name, _code(summary.quality, config.limits), why))
             continue

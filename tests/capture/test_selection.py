@@ -68,6 +68,14 @@ def test_a_soft_place_after_a_crisp_one_is_taken_after_a_few_candidates():
     assert all(decision.take for decision in decisions[first:])
 
 
+def test_a_soft_view_of_another_camera_is_taken_at_once():
+    noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3)).astype(np.uint8)
+    soft = cv2.GaussianBlur(view(40, 0, 350).image, (0, 0), 3)
+    crisp = replace(view(0, 0), image=noise)
+    assert "sharpest" in taken([crisp, replace(view(0, 1), image=soft)])[1].reason
+    assert taken([crisp, replace(view(0, 1), image=np.ascontiguousarray(soft[:, :-2]))])[1].take
+
+
 def test_blurred_candidates_are_waited_out():
     blurred = replace(view(100, 1), image=cv2.GaussianBlur(view(100).image, (0, 0), 9))
     decisions = taken([view(0, 0), blurred, view(104, 2)])

@@ -122,7 +122,7 @@ def place(scene_id: str, **values: object) -> dict:
 
 
 def _written(out: Path, scene: WalkScene) -> dict:
-    verdict = Verdict(Code.OK, "All frames were placed.", "", publishable=True)
+    verdict = Verdict(Code.OK, "All photographs were placed.", "", publishable=True)
     snapshot = Snapshot(0, verdict, scene.cameras, scene.gaussians, {}, (), 1, final=True)
     write_result(snapshot, out / scene.scene_id, build_report(snapshot, seed=0, preset="fast", peak_rss_mb=None))
     names = [each.name for each in scene.cameras]

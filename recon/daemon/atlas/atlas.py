@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from splatnode.capture.process.logs import event
 from splatnode.recon.config import Config
+from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon.atlas.bridge import Bridge, Side, bridge
 from splatnode.recon.daemon.atlas.links import Kind, Link, bridged
 from splatnode.recon.daemon.atlas.recognition import (
@@ -82,6 +83,7 @@ class Atlas:
         for other in [each for each in likeliest(scene, codes) if each not in near][:TRIED]:
             pause()
             link = self._bridged(other, mine, common, pause)
+            give_back_memory()
             loops += [] if link is None else [link]
             if len(loops) == MOST_LOOPS:
                 break

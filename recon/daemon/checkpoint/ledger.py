@@ -14,7 +14,7 @@ from splatnode.capture.messaging.wire import Limits, decode, encode
 
 log = logging.getLogger(__name__)
 
-VERSION = 2  # of all files of a checkpoint: 1 knew no time of capture
+VERSION = 3  # of all files of a checkpoint: 1 knew no time of capture, 2 no parts of places
 FILE = "ledger"
 # Of what this process wrote itself.
 LIMITS = Limits(header_bytes=64 << 20, arrays=1 << 20, total_bytes=4 << 30, own=True)
@@ -34,12 +34,13 @@ class Ledger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     identity: SessionId | None = None  # of this checkpoint, for whoever sends keyframes to it
     follows: str = ""  # the scene that the present one goes on from; empty: it began anew
     shared: tuple[str, ...] = ()  # names of the frames that both have
+    part: int = 0  # of a place that turned out to be several: number of its first frame, from 1; 0: no part
     retracted: tuple[tuple[str, str], ...] = ()  # scene and name of frames that places that were left are to lose
 
     @property
     def scene_id(self) -> str:
         """Of the present place's scene."""
-        return f"scene-{self.place:04d}"
+        return f"scene-{self.place:04d}" + (f"-{self.part}" if self.part else "")
 
 
 def read_ledger(directory: Path) -> Ledger:

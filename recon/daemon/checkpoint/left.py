@@ -1,5 +1,6 @@
 """Places that the camera has left, each a checkpoint of its own: left/scene-NNNN while its scene is not final yet.
 
+What turns out to show another place than the rest becomes left/scene-NNNN-M: M is its first frame's number, from 1.
 A folder counts from the moment when it has a ledger, and no longer once it has none. One whose scene is final is
 finished/scene-NNNN: by what it holds a place is recognised when the camera comes back.
 """
@@ -24,14 +25,27 @@ def keep(directory: Path, ledger: Ledger, files: Iterable[str], instead: str) ->
 
     `files` are relative paths. Raises OSError, and NotPrivate, which names what to set `instead`.
     """
-    folder = directory / LEFT / ledger.scene_id
-    remove(folder)
-    for each in (folder.parent, folder, folder / "frames"):
+    _link(directory, directory / LEFT / ledger.scene_id, ledger, files, instead)
+
+
+def part(folder: Path, ledger: Ledger, files: Iterable[str], instead: str) -> None:
+    """Links `files` of a place that was left, in `folder`, into a folder of their own beside it, as `keep` does.
+
+    One that is there already, from a process that did not get any further, stays as it is.
+    """
+    target = folder.with_name(ledger.scene_id)
+    if not (target / LEDGER).exists():
+        _link(folder, target, ledger, files, instead)
+
+
+def _link(source: Path, target: Path, ledger: Ledger, files: Iterable[str], instead: str) -> None:
+    remove(target)
+    for each in (target.parent, target, target / "frames"):
         private_folder(each, instead, ours=True)
     for name in files:
-        os.link(directory / name, folder / name)
-    sync_folder(folder / "frames")
-    write_ledger(folder, ledger)
+        os.link(source / name, target / name)
+    sync_folder(target / "frames")
+    write_ledger(target, ledger)
 
 
 def folders(directory: Path) -> list[Path]:
@@ -88,12 +102,12 @@ def remove(folder: Path) -> None:
 def remove_half_left(directory: Path, place: int) -> None:
     """Removes half-written files, and folders of places that were not left yet, `place` among them, or removed."""
     for folder in (directory / LEFT).glob("scene-*"):
-        if _place(folder) >= place or not (folder / LEDGER).exists():
+        if _place(folder)[0] >= place or not (folder / LEDGER).exists():
             remove(folder)
     for folder in (*folders(directory), *finished(directory)):
         remove_leftovers(folder)
 
 
-def _place(folder: Path) -> int:
-    number = folder.name.removeprefix("scene-")
-    return int(number) if number.isdecimal() else 0
+def _place(folder: Path) -> tuple[int, ...]:
+    """The number of the place, and of the part of it; 0 for what is no number."""
+    return tuple(int(each) if each.isdecimal() else 0 for each in folder.name.removeprefix("scene-").split("-"))

@@ -6,7 +6,7 @@
     judgement           the cameras that they lead to, the evidence and the verdict
     scene               cameras and Gaussians as they are shown
     pointmaps           depth maps of its views, from which it grows
-    left/<place>/       a place that the camera has left and whose scene is not final yet: a checkpoint of its own
+    left/<place>/       a place that was left and whose scene is not final yet: a checkpoint of its own
     finished/<place>/   one whose scene is final: frames, graph and judgement
     codes               in the folder of a place that was left: that it is judged, and by what it is recognised
 
@@ -19,63 +19,37 @@ from __future__ import annotations
 import contextlib
 import itertools
 import logging
-import re
 import threading
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
-from splatnode.capture.messaging.message_file import read_message, write_message
-from splatnode.capture.messaging.wire import Message, WireError, decode, encode
+from splatnode.capture.messaging.wire import Message
 from splatnode.capture.process.durable import remove_leftovers
 from splatnode.capture.process.lock import Held, exclusive
 from splatnode.capture.process.printable import LONGEST_NAME, printable
 from splatnode.capture.process.private import own_files, private_folder
-from splatnode.capture.stamp import Stamp
 from splatnode.recon.daemon.checkpoint import left, made_anew
 from splatnode.recon.daemon.checkpoint.ledger import (
-    LIMITS,
-    VERSION,
     CheckpointError,
     Ledger,
     identified,
-    is_readable,
     write_ledger,
 )
 from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
+from splatnode.recon.daemon.checkpoint.stored_frame import FILE, StoredFrame, file_name, read_frame, write_frame
 
 log = logging.getLogger(__name__)
 
 REMEMBERED = 1000  # removed frames that are recognised if their sender missed the acknowledgement
 REMEMBERED_DROPPED = 1000  # names and reasons, of a place
-FILE = "{:012d}.frame"
-_FILE = re.compile(r"[0-9]{12,18}\.frame")
 _INSTEAD = "--checkpoint (or $XDG_STATE_HOME)"
-
-
-class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A stored keyframe; its image is the only array."""
-
-    version: int
-    session: str
-    sequence: int
-    name: str
-    stamp_ns: int
-    intrinsics: Intrinsics | None
-    captured_at: Stamp | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class StoredFrame:
-    number: int
-    key: tuple[str, int]  # session and sequence
-    frame: Frame  # its frame_id is the number
 
 
 class Store:
@@ -144,11 +118,11 @@ class Store:
 
     def _read_frames(self) -> Iterator[StoredFrame]:
         """The stored frames; a damaged one is renamed and logged, one that is there already left alone."""
-        for path in own_files(self._frames, _FILE, ".frame"):
+        for path in own_files(self._frames, FILE, ".frame"):
             number = int(path.stem)
             try:
                 self._next = max(self._next, number + 1)
-                stored = _stored(number, read_message(path)) if number >= self.ledger.first else None
+                stored = read_frame(path) if number >= self.ledger.first else None
                 if stored is None or stored.key in self.ledger.gone:  # its removal did not come to its end
                     self._remove(number)
                     continue
@@ -174,8 +148,7 @@ class Store:
                 return None
             number = self._next
             name = self._unused(frame.name, number)
-            header = FrameRecord(VERSION, *key, name, frame.stamp_ns, frame.intrinsics, frame.captured_at)
-            write_message(self._frames / FILE.format(number), encode(header, [frame.image]))
+            write_frame(self._frames / file_name(number), key, replace(frame, name=name))
             stored = StoredFrame(number, key, replace(frame, frame_id=number, name=name, encoded=None))
             self._next = number + 1
             self._remember(stored)
@@ -207,11 +180,29 @@ class Store:
         """
         with self._writing:
             own = (number for name, number in self._names.items() if number < first or name in shared)
-            frames = [f"frames/{FILE.format(number)}" for number in own]
+            frames = [f"frames/{file_name(number)}" for number in own]
             made = [name for name in MADE_ANEW if (self.directory / name).exists()]
             ledger = msgspec.structs.replace(self.ledger, next=self._next, gone=(), identity=None, retracted=())
             left.keep(self.directory, ledger, [*frames, *made], _INSTEAD)
             self.begin_place(first, shared)
+
+    def part(self, names: Collection[str]) -> str:
+        """Makes a place of its own of frames of this place, which was left; forgets them; its id. Raises OSError."""
+        with self._writing:
+            numbers = sorted(self._names[name] for name in names)
+            began = {
+                "part": numbers[0] + 1,
+                "first": numbers[0],
+                "gone": (),
+                "dropped": (),
+                "follows": "",
+                "shared": (),
+            }
+            ledger = msgspec.structs.replace(self.ledger, next=self._next, identity=None, **began)
+            left.part(self.directory, ledger, [f"frames/{file_name(number)}" for number in numbers], _INSTEAD)
+            for name in names:
+                self.forget(name, f"it shows another place: {ledger.scene_id}")
+            return ledger.scene_id
 
     def begin_place(self, first: int, shared: Collection[str] = ()) -> None:
         """Begins another place with frame `first`; the frames before it and their scene are removed. Raises OSError.
@@ -269,7 +260,7 @@ class Store:
     def _remove(self, number: int) -> None:
         """The ledger says already that the frame is gone: where the disk keeps the file, the next start removes it."""
         try:
-            (self._frames / FILE.format(number)).unlink(missing_ok=True)
+            (self._frames / file_name(number)).unlink(missing_ok=True)
         except OSError as error:
             log.warning("frame %d is gone, but its file cannot be removed now: %s", number, error.strerror)
 
@@ -288,13 +279,3 @@ class Store:
     def _write(self, ledger: Ledger) -> None:
         write_ledger(self.directory, ledger)
         self.ledger = ledger
-
-
-def _stored(number: int, parts: Any) -> StoredFrame:
-    message = decode(parts, FrameRecord, LIMITS)
-    header = message.header
-    if not is_readable(header.version) or len(message.arrays) != 1:
-        raise WireError(f"frame {number} is of version {header.version} with {len(message.arrays)} images")
-    known = header.stamp_ns, message.arrays[0], header.intrinsics
-    frame = Frame(number, header.name, *known, captured_at=header.captured_at)
-    return StoredFrame(number, (header.session, header.sequence), frame)

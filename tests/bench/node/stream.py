@@ -48,6 +48,7 @@ def main() -> None:
     parser.add_argument("--max-views", type=int, default=30, help="of a scene; a place with more is a chain of scenes")
     parser.add_argument("--hold-out", type=int, default=3, help="one photograph in so many; 0: none")
     parser.add_argument("--and-back", action="store_true", help="with those that were held out, the last one first")
+    parser.add_argument("--until-judged", action="store_true", help="end when all places are, final or not")
     parser.add_argument("--no-offline", action="store_true", help="do not compare with offline runs")
     parser.add_argument("--out", type=Path, default=Path("tests/bench/results/stream.json"))
     args = parser.parse_args()
@@ -58,7 +59,7 @@ def main() -> None:
         back = [f"{name}__{photograph}" for name in scenes for photograph in splits[name].test]
         names += reversed(back) if args.and_back else []
         names = [f"{number:04d}__{name}" for number, name in enumerate(names)]  # they come in the order of their names
-        live, places = _streamed(Path(folder), scenes, names, args.per_second, args.max_views)
+        live, places = _streamed(Path(folder), scenes, names, args)
     if args.and_back:
         live["visits"] = _visits(places, live["poses"], splits)
     live["cameras"] = {name: _camera_errors(name, scene, places, live["poses"]) for name, scene in scenes.items()}
@@ -72,7 +73,7 @@ def main() -> None:
                 and snapshot.cameras
                 and _source(place) == name
             ):
-                place["psnr"] = psnr(snapshot, scene, splits[name])
+                place["psnr"] = psnr(_of(name, snapshot), scene, splits[name])
         if not args.no_offline:
             *_, offline = reconstruct(list(scene.frames(splits[name].train)), Config(max_gaussians=300_000))
             row = {"psnr": psnr(offline, scene, splits[name]), "gaussians": len(offline.gaussians)}
@@ -100,7 +101,7 @@ def _camera_errors(name: str, scene: EvaluationScene, places: list[dict], poses:
     cameras = {
         camera.name: (similarity.camera(camera.T_world_camera), camera)
         for scene_id, similarity in to_map.items()
-        for camera in found[scene_id].cameras
+        for camera in _of(name, found[scene_id]).cameras
     }
     true = scene.cameras
     names = [each for each in cameras if each in true]
@@ -149,10 +150,17 @@ def _split(scene: EvaluationScene, hold_out: int) -> Split:
     return Split(tuple(name for name in names if name not in test), tuple(test))
 
 
+def _judged(node: Node) -> bool:
+    """Whether all places that were left are judged, and compared with the others."""
+    left = Path(node.configs["recon"]["checkpoint"]) / "left"
+    return all((ledger.parent / "codes").exists() for ledger in left.glob("*/ledger"))
+
+
 def _streamed(
-    folder: Path, scenes: dict[str, EvaluationScene], names: list[str], per_second: float, max_views: int
+    folder: Path, scenes: dict[str, EvaluationScene], names: list[str], args: argparse.Namespace
 ) -> tuple[dict, list[dict]]:
-    """What was measured while the photographs came; the places, each with its final `snapshot` as it was exported."""
+    """What was measured while the photographs came; the places, each with its `snapshot` as it was exported last."""
+    per_second: float = args.per_second
     images = folder / "images"
     images.mkdir()
     for name in names:
@@ -165,7 +173,7 @@ def _streamed(
         },
         "selection": {"every_frame": True},
     }  # fmt: skip
-    with running(Node(folder / "node", camera, {"max_views": max_views})) as node:
+    with running(Node(folder / "node", camera, {"max_views": args.max_views})) as node:
         pid = node.start("recon").pid
         time.sleep(5.0)
         node.start("capture")
@@ -183,7 +191,8 @@ def _streamed(
             done = taken(capture)
             if done and taken_s is None:
                 taken_s = time.monotonic() - began
-            resting = resting + 1 if done and at_rest(recon) else 0
+            idle = at_rest(recon) or (args.until_judged and recon["state"] == "idle" and _judged(node))
+            resting = resting + 1 if done and idle else 0
             if resting == RESTS:
                 finished_s = time.monotonic() - began
         codes = {verb: node.end(verb) for verb in ("capture", "recon")}
@@ -214,11 +223,18 @@ def _streamed(
     return row, places
 
 
+def _of(name: str, snapshot: Snapshot) -> Snapshot:
+    """With the cameras of this scene's photographs alone, by the photographs' own names."""
+    cameras = (
+        replace(camera, name=_parts(camera.name)[1]) for camera in snapshot.cameras if _parts(camera.name)[0] == name
+    )
+    return replace(snapshot, cameras=tuple(cameras))
+
+
 def _exported(folder: Path) -> Snapshot | None:
-    """The scene in a result folder, with the photographs' own names."""
+    """The scene in a result folder."""
     if not (folder / "scene.ply").exists():
         return None
     gaussians, cameras = read_gaussians(folder / "scene.ply"), read_cameras(folder / "cameras.json")
-    renamed = tuple(replace(camera, name=_parts(camera.name)[1]) for camera in cameras)
     verdict = Verdict(Code.OK, "", "", publishable=True)
-    return Snapshot(0, verdict, renamed, gaussians, images={}, dropped=(), iterations=0, seconds={}, final=True)
+    return Snapshot(0, verdict, cameras, gaussians, images={}, dropped=(), iterations=0, seconds={}, final=True)

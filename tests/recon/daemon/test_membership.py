@@ -202,3 +202,21 @@ def test_the_older_of_the_two_most_alike_is_given_up(matches, spared):
     pairs: Any = {pair: SimpleNamespace(matches=range(count)) for pair, count in matches.items()}
     graph = ViewGraph(matching.Config(), tuple(keyframe(str(i)) for i in range(6)), pairs)
     assert membership.most_redundant(graph) == spared
+
+
+def test_keyframes_that_only_each_other_join_are_a_place_of_their_own():
+    work = reconstruction("0", "1", "2", "3-other", "4-other", "5-other")
+    assert [named(group) for group in membership.apart(work)] == [["3-other", "4-other", "5-other"]]
+    assert membership.apart(reconstruction("0", "1", "2", "3-other", "4-other")) == []
+
+
+def test_of_those_that_were_set_aside_too():
+    work = reconstruction("0", "1", "2", "3-other", "4-other", "5-other")
+    work.set_aside(["4-other", "5-other"])
+    assert [named(group) for group in membership.apart(work)] == [["3-other", "4-other", "5-other"]]
+    assert work.names == ["0", "1", "2", "3-other"]
+
+
+def test_without_a_scene_what_most_keyframes_show_stays():
+    work = reconstruction("0-bad", "1", "2", "3-other", "4-other", "5-other", "6")
+    assert [named(group) for group in membership.apart(work)] == [["3-other", "4-other", "5-other"]]

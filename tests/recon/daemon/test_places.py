@@ -14,14 +14,17 @@ from msgspec.structs import replace
 
 from splatnode.capture.frame import DroppedFrame, Frame, renamed
 from splatnode.capture.messaging.commands import Answer, ask
+from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.services import RECON_CONTROL
 from splatnode.capture.status import heartbeats
 from splatnode.recon.daemon import left_places
+from splatnode.recon.daemon.atlas.atlas import Atlas
 from splatnode.recon.daemon.checkpoint import checkpoint, left
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.control import Retract
 from splatnode.recon.daemon.inbox import BATCH, Arrived, Inbox
 from splatnode.recon.daemon.left_places import LeftPlaces
+from splatnode.recon.daemon.output import Output
 from splatnode.recon.daemon.places import Places, State, described
 from splatnode.recon.daemon.present_place import PresentPlace
 from splatnode.recon.result.export import read_cameras
@@ -296,6 +299,34 @@ def test_what_was_set_aside_before_stays_with_the_scene_that_is_left(moving, pee
         assert checkpoint.restore(store, moving.reconstruction).work.remembered() is not None
     with closing(Store(left.folder_of(moving.checkpoint, "scene-0001"))) as store:
         assert "stranger.png" in store.names
+
+
+def test_a_place_that_turns_out_to_be_two_becomes_two(config):
+    """Such as one in which there was no scene until the camera was elsewhere."""
+    with closing(Store(config.checkpoint)) as store:
+        frames = places(seeds=(0, 1))
+        for number, frame in enumerate(frames):
+            store.put(ReceivedFrame("0" * 32, number, frame))
+        store.leave_place(len(frames))
+        output = Output(config, store, lambda _: None, pytest.fail)
+        atlas = Atlas(store.directory, config.reconstruction, output.places)
+        waiting = LeftPlaces(store, config.reconstruction, output, atlas)
+        assert waiting.judge_next(lambda: None)
+        first, part = [folder.name for folder in left.folders(config.checkpoint)]
+        ours, other = by_id(config)
+        assert first == ours["scene_id"] == "scene-0001" and part == other["scene_id"] and ours["judged"]
+        assert {each["reason"] for each in ours["frames_dropped"]} == {f"it shows another place: {part}"}
+        assert {each["name"] for each in ours["frames_dropped"]} == {each["name"] for each in other["frames_dropped"]}
+        assert not other["judged"]
+        assert waiting.judge_next(lambda: None) and not waiting.judge_next(lambda: None)
+        ours, other = by_id(config)
+        names = [frame.name for frame in frames]
+        assert other["judged"] and sorted([ours["frames_used"], other["frames_used"]]) == [names[:3], names[3:]]
+        assert output.places.links == ()
+
+
+def by_id(config) -> list[dict]:
+    return sorted(index(config), key=lambda place: place["scene_id"])
 
 
 def final(config) -> int:

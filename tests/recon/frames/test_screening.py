@@ -43,6 +43,14 @@ def test_a_blurred_frame_is_left_out_wherever_it_stands():
         assert rejected.code == Code.BLUR and rejected.name == frames[position].name
 
 
+def test_a_soft_frame_of_another_camera_is_kept():
+    """The width of edges is compared among frames of one size."""
+    crisp, soft = photographs()[0], blurred(photographs()[1], length=15)
+    assert screened([crisp, soft])[0] == [0]
+    cut = replace(soft, image=np.ascontiguousarray(soft.image[:, :-2]))
+    assert screened([crisp, cut]) == ([0, 1], [])
+
+
 def test_blank_and_black_frames_show_nothing():
     frames = renumbered([np.full((240, 320, 3), 128, np.uint8), np.zeros((240, 320, 3), np.uint8)])
     kept, rejected = screened(frames)

@@ -14,8 +14,9 @@ from msgspec.structs import replace
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.recon.config import PREVIEW, Config
 from splatnode.recon.daemon.checkpoint import checkpoint, saved_estimate
+from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
 from splatnode.recon.daemon.checkpoint.saved import GraphRecord
-from splatnode.recon.daemon.checkpoint.store import MADE_ANEW, Store
+from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.preparation import prepare
 from tests.support.synthetic import photographs

@@ -16,9 +16,10 @@ from splatnode.capture.messaging.wire import MAGIC, encode
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.daemon.checkpoint import ledger as ledger_module
 from splatnode.recon.daemon.checkpoint import left
-from splatnode.recon.daemon.checkpoint import store as store_module
-from splatnode.recon.daemon.checkpoint.ledger import CheckpointError, Ledger, read_ledger
-from splatnode.recon.daemon.checkpoint.store import FILE, REMEMBERED_DROPPED, Store
+from splatnode.recon.daemon.checkpoint import stored_frame as stored_frame_module
+from splatnode.recon.daemon.checkpoint.ledger import VERSION, CheckpointError, Ledger, read_ledger
+from splatnode.recon.daemon.checkpoint.store import REMEMBERED_DROPPED, Store
+from splatnode.recon.daemon.checkpoint.stored_frame import file_name
 from tests.support.strays import STRAYS
 
 SESSION = "0123456789abcdef" * 2
@@ -64,13 +65,13 @@ def test_a_checkpoint_of_the_version_before_is_gone_on_with_and_becomes_one_of_t
     store = open_store()
     header = {"version": 1, "session": SESSION, "sequence": 4, "name": "a.png", "stamp_ns": 40, "intrinsics": LENS}
     _, *parts = encode(header, [image(4)])
-    write_message(store.directory / "frames" / FILE.format(0), [MAGIC[:-1] + b"\x02", *parts])
+    write_message(store.directory / "frames" / file_name(0), [MAGIC[:-1] + b"\x02", *parts])
     store._write(msgspec.structs.replace(store.ledger, version=1))
     again = open_store()
     (stored,) = again.frames()
     assert (stored.key, stored.frame.name, stored.frame.stamp_ns) == ((SESSION, 4), "a.png", 40)
     assert stored.frame.captured_at is None and again.identity == store.identity
-    assert read_ledger(again.directory).version == 2
+    assert read_ledger(again.directory).version == VERSION
 
 
 def test_numbers_go_on_and_frames_keep_their_order(open_store):
@@ -168,7 +169,7 @@ def test_a_full_disk_is_told_and_nothing_has_changed(open_store, monkeypatch):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patched:
-        for module in (store_module, ledger_module):
+        for module in (stored_frame_module, ledger_module):
             patched.setattr(module, "write_message", full)
         for frame in (received(1), ReceivedFrame(SESSION, 2, DroppedFrame("2.png", "blurred"))):
             with pytest.raises(OSError, match="No space"):
@@ -188,7 +189,7 @@ def test_two_processes_do_not_share_a_checkpoint(open_store):
 def test_another_version_and_a_damaged_ledger_are_refused_with_what_to_do(open_store):
     store = open_store()
     store._write(Ledger(version=99))
-    with pytest.raises(CheckpointError, match="version 99, this is version 2.*move the folder away"):
+    with pytest.raises(CheckpointError, match=f"version 99, this is version {VERSION}.*move the folder away"):
         open_store()
     (store.directory / "ledger").write_bytes(b"rubbish")
     with pytest.raises(CheckpointError, match=r"damaged.*Move the folder away"):
@@ -343,3 +344,48 @@ def test_a_death_while_a_place_is_left_leaves_it_as_it_was(open_store, monkeypat
     store = open_store()
     assert [stored.frame.name for stored in store.frames()] == ["0.png", "1.png", "2.png"]
     assert left.folders(store.directory) == [] and store.scene_id == "scene-0001"
+
+
+def test_a_part_of_a_place_that_was_left_is_a_place_of_its_own(open_store, tmp_path):
+    store = open_store()
+    for sequence in range(4):
+        store.put(received(sequence))
+    store.leave_place(4)
+    folder = tmp_path / "checkpoint" / "left" / "scene-0001"
+    place = Store(folder)
+    assert place.part(["3.png", "2.png"]) == "scene-0001-3" and place.names == {"0.png", "1.png"}
+    assert {each.reason for each in place.dropped} == {"it shows another place: scene-0001-3"}
+    place.close()
+    open_store()  # whose start removes what was not left yet
+    assert [each.name for each in left.folders(tmp_path / "checkpoint")] == ["scene-0001", "scene-0001-3"]
+    part = Store(folder.with_name("scene-0001-3"))
+    assert [each.frame.name for each in part.frames()] == ["2.png", "3.png"] and part.scene_id == "scene-0001-3"
+    part.close()
+
+
+def test_a_part_that_begins_with_the_very_first_frame_has_a_name_of_its_own(open_store, tmp_path):
+    store = open_store()
+    for sequence in range(2):
+        store.put(received(sequence))
+    store.leave_place(2)
+    place = Store(tmp_path / "checkpoint" / "left" / "scene-0001")
+    assert place.part(["0.png"]) == "scene-0001-1" and place.names == {"1.png"}
+    place.close()
+
+
+def test_a_part_whose_making_was_interrupted_is_made_once(open_store, tmp_path, monkeypatch):
+    store = open_store()
+    for sequence in range(4):
+        store.put(received(sequence))
+    store.leave_place(4)
+    folder = tmp_path / "checkpoint" / "left" / "scene-0001"
+    place = Store(folder)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Store, "forget", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        place.part(["2.png", "3.png"])
+    place.close()
+    place = Store(folder)
+    assert place.names == {"0.png", "1.png", "2.png", "3.png"}
+    assert place.part(["2.png", "3.png"]) == "scene-0001-3" and place.names == {"0.png", "1.png"}
+    place.close()
+    assert len(left.folders(tmp_path / "checkpoint")) == 2

@@ -1,0 +1,57 @@
+"""A keyframe of a checkpoint, in a file of its own: frames/<number>.frame."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.messaging.message_file import read_message, write_message
+from splatnode.capture.messaging.wire import WireError, decode, encode
+from splatnode.capture.stamp import Stamp
+from splatnode.recon.daemon.checkpoint.ledger import LIMITS, VERSION, is_readable
+
+FILE = re.compile(r"[0-9]{12,18}\.frame")
+
+
+class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A stored keyframe; its image is the only array."""
+
+    version: int
+    session: str
+    sequence: int
+    name: str
+    stamp_ns: int
+    intrinsics: Intrinsics | None
+    captured_at: Stamp | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class StoredFrame:
+    number: int
+    key: tuple[str, int]  # session and sequence
+    frame: Frame  # its frame_id is the number
+
+
+def file_name(number: int) -> str:
+    return f"{number:012d}.frame"
+
+
+def write_frame(path: Path, key: tuple[str, int], frame: Frame) -> None:
+    """Whole or not at all; `key` is its session and sequence. Raises OSError."""
+    header = FrameRecord(VERSION, *key, frame.name, frame.stamp_ns, frame.intrinsics, frame.captured_at)
+    write_message(path, encode(header, [frame.image]))
+
+
+def read_frame(path: Path) -> StoredFrame:
+    """The keyframe in a file that is named by its number. Raises OSError and ValueError."""
+    number, message = int(path.stem), decode(read_message(path), FrameRecord, LIMITS)
+    header = message.header
+    if not is_readable(header.version) or len(message.arrays) != 1:
+        raise WireError(f"frame {number} is of version {header.version} with {len(message.arrays)} images")
+    known = header.stamp_ns, message.arrays[0], header.intrinsics
+    frame = Frame(number, header.name, *known, captured_at=header.captured_at)
+    return StoredFrame(number, (header.session, header.sequence), frame)
