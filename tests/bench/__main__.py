@@ -14,6 +14,7 @@ BENCHMARKS = {
         "building",
         "merge",
         "faults",
+        "walk_faults",
         "writes",
         "soak",
         "siege",
@@ -24,7 +25,7 @@ BENCHMARKS = {
     ),
     "quality": ("poses", "windows", "fit", "priors", "parsimony", "budgets", "spz", "needles"),
     "speed": ("rasterize", "stereo", "growth"),
-    "viewer": ("viewer", "drive", "drive_web", "beside"),
+    "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),
 }
 MODULES = {name: f"tests.bench.{folder}.{name}" for folder, names in BENCHMARKS.items() for name in names}
 

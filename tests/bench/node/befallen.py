@@ -11,7 +11,8 @@ import time
 from splatnode.capture.messaging.services import RECON_SCENE
 from splatnode.capture.messaging.state import StateClient
 from splatnode.capture.status import heartbeats
-from splatnode.recon.daemon.checkpoint.store import MADE_ANEW, Store
+from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
+from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.result.message import SceneHeader
 from tests.bench.node.trial import (
     VIEWS,

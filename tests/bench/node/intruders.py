@@ -111,8 +111,11 @@ def rotated_keys(trial: Trial) -> None:
 
 
 def _refusal(network: Network) -> str:
-    """What a client of the scene is told that is not let in."""
-    client = StateClient(RECON_SCENE, network, SceneHeader)
+    return refusal(StateClient(RECON_SCENE, network, SceneHeader))
+
+
+def refusal(client: StateClient) -> str:
+    """What a client of the scene is told that is not let in; it is closed then."""
     deadline = time.monotonic() + 30
     try:
         while time.monotonic() < deadline:

@@ -20,7 +20,8 @@ from splatnode.capture.messaging.keys import allow, create_keys, expect_server, 
 from splatnode.capture.messaging.spool import Config as SpoolConfig
 from splatnode.capture.messaging.spool import Key, Spool, SpoolFull
 from splatnode.recon.daemon.checkpoint import left
-from splatnode.recon.daemon.checkpoint.store import MADE_ANEW, Store
+from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
+from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.result.export import export_scene
 from splatnode.recon.result.export.stored import read_gaussians
 from splatnode.recon.result.folder import result_folder
