@@ -18,6 +18,7 @@ from splatnode.capture.messaging import keys as key_files
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import load_config, read_yaml, typed
 from splatnode.capture.process.logs import use_structured_lines
+from splatnode.capture.process.progress import counted, telling, waiting
 from splatnode.capture.process.terminal import say
 from splatnode.capture.reader import Reader, State
 from splatnode.capture.recording import Recorder
@@ -42,13 +43,13 @@ def record(args: argparse.Namespace) -> int:
     config = _config(args)
     with Recorder(args.out) as recorder:
         camera = config.camera
-        with Reader(lambda: open_stream(camera), is_live(camera), config.reader) as reader:
+        with Reader(lambda: open_stream(camera), is_live(camera), config.reader) as reader, telling() as tell:
             try:
-                for item in _until(reader, args.seconds):
+                for item in counted(_until(reader, args.seconds), tell, "recording", 0, "frame"):
                     recorder.write(item)
             finally:
                 late = f", {reader.skipped} came while the disk was busy and are missing" if reader.skipped else ""
-                say(f"{recorder.frames} frames in {args.out}{late}")
+                say(f"{recorder.frames} frame{'s' * (recorder.frames != 1)} in {args.out}{late}")
     return EXIT_GOOD
 
 
@@ -75,7 +76,8 @@ def find(args: argparse.Namespace) -> int:
     for module in pkgutil.iter_modules(cameras.__path__):
         source = import_module(f"splatnode.capture.cameras.{module.name}")
         if hasattr(source, "find"):
-            found[module.name] = source.find()
+            with waiting("looking for cameras"):
+                found[module.name] = source.find()
     if args.json:
         print(json.dumps(found, indent=1))
         return EXIT_GOOD
@@ -108,13 +110,14 @@ def status(args: argparse.Namespace) -> int:
     A capture that has come to the end of its recording is not silent.
     """
     network = typed(read_yaml(args.config).get("network") or {}, Network, "network") if args.config else Network()
-    found = heartbeats(network)
+    with waiting("listening for capture and recon"):
+        found = heartbeats(network)
     ended = last_run(network) if found["capture"] is None else None
     if args.json:
         print(json.dumps(found))
     else:
         for room, fields in found.items():
-            silent = f"{room}: silent; is splatnode {room} running, with the same network?"
+            silent = f"{room}: nothing heard of it; is `splatnode {room}` running, with the same `network` as here?"
             if room == "capture" and ended is not None:
                 silent = f"{room}: {ended}"
             for line in [silent] if fields is None else described(room, fields):

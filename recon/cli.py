@@ -18,7 +18,7 @@ from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.choosing import THINNED
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.config import read_yaml
-from splatnode.capture.process.progress import Step, Tell, Told, told_to_nobody
+from splatnode.capture.process.progress import Step, Tell, telling, told_to_nobody
 from splatnode.capture.process.terminal import say
 from splatnode.recon import cost
 from splatnode.recon.config import Config, overlaid, preset
@@ -61,7 +61,11 @@ def replay(args: argparse.Namespace) -> int:
         raise ValueError("--only-seen is for one scene: a merged map does not tell what two photographs confirm")
     if args.map:
         return replay_map(args, config)
-    tell = told_to_nobody if args.json else Told()
+    with telling(quiet=args.json) as tell:
+        return _replay(args, config, tell)
+
+
+def _replay(args: argparse.Namespace, config: Config, tell: Tell) -> int:
     given = source(args, tell)
     if given.choice is not None:
         tell(str(given.choice))
@@ -132,11 +136,15 @@ def run(
 
 def demo(args: argparse.Namespace) -> int:
     """Writes the built-in capture, reconstructs it, and then measures the result on views that it has not seen."""
+    with telling(quiet=args.json) as tell:
+        return _demo(args, tell)
+
+
+def _demo(args: argparse.Namespace, tell: Tell) -> int:
     seed = args.seed or 0
     config = overlaid(preset("balanced"), {"seed": seed, "device": args.device or "cpu"})
     place = synthetic.Config(seed=seed)
     needed_bytes = largest_result_bytes([(place.width, place.height)] * place.views, config.size, None)
-    tell = told_to_nobody if args.json else Told()
     with result_folder(args.out, needed_bytes + largest_capture_bytes(place)):
         capture = args.out / "capture"
         tell(f"photographing the built-in place, {place.views} times")
@@ -144,6 +152,7 @@ def demo(args: argparse.Namespace) -> int:
         photographs = folder.stream(folder.Config(folder=capture / "images", names=split.train))
         snapshot = run(photographs, config, tell=tell)
         write = partial(finish, snapshot, args.out, seed=seed, preset_name="balanced")
+        tell(Step("writing the results"))
         report = write()
         if not args.json:
             _tell(snapshot, args.out)

@@ -17,6 +17,7 @@ from splatnode.capture.cameras import v4l2
 from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.network import Network, runtime_directory
 from splatnode.capture.process.packages import EXTRAS, REQUIRED
+from splatnode.capture.process.progress import waiting
 from splatnode.capture.process.terminal import say
 from splatnode.recon import core
 from splatnode.recon.core.compile import find_compiler
@@ -42,7 +43,8 @@ class Finding:
 
 def doctor(args: argparse.Namespace) -> int:
     """Prints the findings; 2 when something is missing that everything needs."""
-    found = findings()
+    with waiting("looking at what is installed"):
+        found = findings()
     if args.json:
         print(json.dumps([asdict(finding) for finding in found], indent=1))
     else:

@@ -85,9 +85,15 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
     add_only_seen(parser)
     parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
     chosen = parser.add_mutually_exclusive_group()
-    chosen.add_argument("--views", type=positive, metavar="N", help="use N frames, evenly spread")
-    chosen.add_argument("--frames", type=names, metavar="A,B,C", help="use these frames, by name")
-    chosen.add_argument("--every-frame", action="store_true", help="use all frames that are sharp and no copies")
+    chosen.add_argument(
+        "--views", type=positive, metavar="N", help="use N photographs (of a video: keyframes), evenly spread"
+    )
+    chosen.add_argument("--frames", type=names, metavar="A,B,C", help="use these photographs, by name")
+    chosen.add_argument(
+        "--every-frame",
+        action="store_true",
+        help="use all photographs, or frames of a video, that are sharp and no copies",
+    )
     parser.add_argument(
         "--map",
         action="store_true",

@@ -1,5 +1,7 @@
 """Structured lines on stderr: `event=keyframe name=0042.png waiting=1`. The journal gets their priorities too.
 
+On a terminal they are for people: `16:35:44 keyframe: name 0042.png, waiting 1`.
+
 A record that `event` makes carries its fields to the formatter; a line is put together once, there, from values of one
 word or in quotes. No text in a record is read again, so none can pass for an event, a field, a line or a priority.
 """
@@ -13,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from splatnode.capture.process.printable import escaped, printable_lines
-from splatnode.capture.process.terminal import beneath
+from splatnode.capture.process.terminal import beneath, in_place
 
 _PRIORITIES = {logging.DEBUG: 7, logging.INFO: 6, logging.WARNING: 4, logging.ERROR: 3, logging.CRITICAL: 2}
 _LONGEST_VALUE = 4000  # characters; a status tells of 1000, and lists of names are longer
@@ -21,9 +23,13 @@ _LONGEST_TRACEBACK = 20_000
 
 
 def use_structured_lines() -> None:
-    """From now on every record of every room is one line of key=value."""
-    handler = logging.StreamHandler(beneath(sys.stderr))
-    handler.setFormatter(StructuredLines(journal="JOURNAL_STREAM" in os.environ))
+    """From now on every record of every room is one line: of key=value, or on a terminal with its time and in words."""
+    if in_place():
+        handler = logging.StreamHandler(sys.stderr)
+        handler.setFormatter(TimedLines())
+    else:
+        handler = logging.StreamHandler(beneath(sys.stderr))
+        handler.setFormatter(StructuredLines(journal="JOURNAL_STREAM" in os.environ))
     logging.getLogger().handlers = [handler]
     logging.captureWarnings(True)
 
@@ -78,6 +84,14 @@ class PlainLines(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         return printable_lines(super().format(record))
+
+
+class TimedLines(PlainLines):
+    """As PlainLines, behind the time of day; and the level, where it is no mere information."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        level = f"{record.levelname.lower()}: " if record.levelno > logging.INFO else ""
+        return f"{self.formatTime(record, '%H:%M:%S')} {level}{super().formatMessage(record)}"
 
 
 def _value(value: object) -> str:

@@ -80,6 +80,18 @@ def progress(text: str) -> None:
         sys.stderr.line.show(sys.stderr.beneath, escaped(text))
 
 
+def again(text: str) -> None:
+    """Shows `text` in place of the last one, if that is still the last thing on the terminal."""
+    if isinstance(sys.stderr, _Shown) and in_place():
+        sys.stderr.line.show(sys.stderr.beneath, escaped(text), anew=False)
+
+
+def taken_away() -> None:
+    """Nothing is left of what `progress` showed last, if nothing was printed since."""
+    if isinstance(sys.stderr, _Shown):
+        sys.stderr.line.clear()
+
+
 class _LineInPlace:
     """The one line of the terminal that is written again and again."""
 
@@ -88,16 +100,29 @@ class _LineInPlace:
         self._length = 0
         self._writing = threading.Lock()
 
-    def show(self, stream: Any, text: str) -> None:
-        """Writes `text` over the last one, cut to the width of the terminal: a wrapped line could not be replaced."""
+    def show(self, stream: Any, text: str, anew: bool = True) -> None:
+        """Writes `text` over the last one, cut to the width of the terminal: a wrapped line could not be replaced.
+
+        Where there is no last one, `anew` says whether a line begins.
+        """
         if not text:
             self.end()
             return
         with self._writing:
+            if self._stream is None and not anew:
+                return
             text = text[: shutil.get_terminal_size().columns - 1]
             stream.write(f"\r{text.ljust(self._length)}")
             stream.flush()
             self._stream, self._length = stream, len(text)
+
+    def clear(self) -> None:
+        """What comes next is written in its place."""
+        with self._writing:
+            if self._stream is not None:
+                self._stream.write(f"\r{' ' * self._length}\r")
+                self._stream.flush()
+            self._stream, self._length = None, 0
 
     def end(self) -> None:
         """What comes next begins on a line of its own."""

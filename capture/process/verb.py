@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
 
+from splatnode.capture.process.progress import waiting
+
 Command = Callable[[argparse.Namespace], int]  # returns the exit code
 
 
@@ -36,7 +38,8 @@ def _loaded(module: str) -> ModuleType:
     """
     gc.disable()
     try:
-        return import_module(module)
+        with waiting("loading splatnode"):
+            return import_module(module)
     finally:
         gc.freeze()
         gc.enable()

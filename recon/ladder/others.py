@@ -42,6 +42,6 @@ def _telling(other: Estimate, refused: Estimate, left_out: frozenset[str]) -> Es
     found, count = len(other.placed), len(other.graph.keyframes)
     names = ", ".join(name for name in other.graph.names if name in left_out)
     gone = f"{names} {'was' if len(left_out) == 1 else 'were'} left out"
-    message = f"{found} of {count} frames were placed, after {gone}: {refused.verdict.message}"
+    message = f"{found} of {count} photographs were placed, after {gone}: {refused.verdict.message}"
     verdict = replace(other.verdict, code=Code.OK_PARTIAL, message=message, advice=refused.verdict.advice)
     return replace(other, verdict=verdict)

@@ -16,7 +16,7 @@ import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
-from splatnode.capture.process.progress import Told, told_to_nobody
+from splatnode.capture.process.progress import Step, telling, times
 from splatnode.capture.process.terminal import in_place, progress, say
 from splatnode.recon.config import Config
 from splatnode.recon.mapping.scenes import (
@@ -44,9 +44,9 @@ def replay_map(args: argparse.Namespace, config: Config) -> int:
     if given:
         raise ValueError(f"--map makes many scenes and does not go with what is about one: {', '.join(given)}")
     check_begun(args.out)
-    tell = told_to_nobody if args.json else Told()
-    source = recording(args, tell)
-    tell(str(source.choice))
+    with telling(quiet=args.json) as tell:
+        source = recording(args, tell)
+        tell(str(source.choice))
     began_s = time.monotonic()
     with result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):
         frames = _kept(source, args.out) if source.is_video else source.frames()
@@ -82,12 +82,14 @@ class _ToldOfMap:
 
     def __init__(self, quiet: bool, keyframes: int) -> None:
         self._quiet, self._keyframes, self._last = quiet, keyframes, (0, 0, 0)
+        self._began_s = time.monotonic()
 
     def __call__(self, now: Progress) -> None:
         if self._quiet:
             return
-        line = f"{now} ({self._keyframes} keyframes in all)"
-        progress(line)
+        step = Step("making scenes", now.taken, self._keyframes, "keyframe")
+        line = f"{step}; {now}"
+        progress(f"{line} ({times(step, time.monotonic() - self._began_s)})")
         if not in_place() and (now.judged, now.unfinished, now.maps) != self._last:
             self._last = now.judged, now.unfinished, now.maps
             say(line)

@@ -46,7 +46,7 @@ class Progress:
     def __str__(self) -> str:
         work = f" ({self.unfinished} still to be made)" if self.unfinished else ""
         loops = f", places found again: {self.loops}" if self.loops else ""
-        return f"keyframes: {self.taken}, scenes: {self.judged}{work}, maps: {self.maps}{loops}"
+        return f"scenes: {self.judged}{work}, maps: {self.maps}{loops}"
 
 
 def check_begun(out: Path) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+from splatnode.capture.process.progress import waiting
 from splatnode.capture.process.terminal import say
 from splatnode.recon.merging.merge import Merged, merged
 from splatnode.recon.merging.submap import Submap, Submaps, load_submaps
@@ -51,14 +52,16 @@ def write_maps(folder: Path, out: Path, most: Callable[[Sequence[Submap]], int |
     whole = read_whole(folder)
     reports = {}
     for each in whole.maps:
-        found = load_submaps(whole, each)
+        with waiting(f"reading the scenes of {each.name}"):
+            found = load_submaps(whole, each)
         if not found.used:
             reasons = "; ".join(f"{scene_id}: {why}" for scene_id, why in found.left_out.items())
             if not quiet:
                 say(f"{each.name}: nothing to merge ({reasons})")
             continue
         merged_into = merged_folder(out, each)
-        reports[merged_into.name] = write_map(whole, each, found, merged_into, most(found.used))
+        with waiting(f"merging {len(found.used)} scenes into {merged_into.name}"):
+            reports[merged_into.name] = write_map(whole, each, found, merged_into, most(found.used))
         if not quiet:
             _tell(reports[merged_into.name], merged_into)
     return reports

@@ -10,7 +10,7 @@ from splatnode.recon.verification.checks import Case
 
 
 def accepted(case: Case) -> Verdict:
-    """OK where all frames were placed, exactly; else what the others show, or how roughly they are placed."""
+    """OK where all photographs were placed, exactly; else what the others show, or how roughly they are placed."""
     left_out = _left_out(case)
     rough = _rough(case)
     if rough:
@@ -25,7 +25,7 @@ def _left_out(case: Case) -> tuple[str, ...]:
 
 def _placed(case: Case) -> str:
     placed, count = len(case.registration.cameras), len(case.graph.keyframes)
-    return f"All {count} frames were placed" if placed == count else f"{placed} of {count} frames were placed"
+    return f"{'All' if placed == count else f'{placed} of'} {count} photographs were placed"
 
 
 def _rough(case: Case) -> str:

@@ -33,13 +33,13 @@ def refuse_unplaced(graph: ViewGraph, registration: Registration | None, config:
         return doubted
     components = graph.components()
     if len(components[0]) < config.min_cameras:
-        found = f"Only {len(components[0])} of {len(names)} frames overlap."
+        found = f"Only {len(components[0])} of {len(names)} photographs overlap."
         return refuse(refusals.NO_OVERLAP, names, found=found)
     turned = _pure_rotations(graph)
     if 2 * len(turned) >= len(graph.pairs):
         return _without_parallax(graph, turned)
     placed = 0 if registration is None else len(registration.cameras)
-    found = f"Only {placed} of {len(names)} frames could be placed with certainty."
+    found = f"Only {placed} of {len(names)} photographs could be placed with certainty."
     return refuse(refusals.NO_OVERLAP, names, found=found)
 
 
@@ -52,7 +52,7 @@ def _too_little(graph: ViewGraph, rejected: Sequence[Rejected], config: Config) 
     plain = [keyframe.name for keyframe in graph.keyframes if len(keyframe.features.points) < config.min_features]
     if len(plain) > len(names) / 2:
         return refuse(refusals.WITHOUT_TEXTURE, plain, plain=len(plain), count=len(names))
-    return refuse(refusals.NO_OVERLAP, names, found="No two frames show enough of the same things.")
+    return refuse(refusals.NO_OVERLAP, names, found="No two photographs show enough of the same things.")
 
 
 def _too_few(names: list[str], rejected: Sequence[Rejected], config: Config) -> Verdict:
@@ -69,7 +69,7 @@ def _too_few(names: list[str], rejected: Sequence[Rejected], config: Config) -> 
         if len(blank) > len(copies):
             of_blank = [frame.name for frame in blank]
             return refuse(refusals.WITHOUT_TEXTURE, of_blank, plain=len(blank), count=len(names) + len(rejected))
-    usable = f"{len(names)} usable frame{'s' if len(names) != 1 else ''}"
+    usable = f"{len(names)} usable photograph{'s' if len(names) != 1 else ''}"
     left_out = f"; {len(rejected)} more were left out ({rejected[0].name}: {rejected[0].reason})" if rejected else ""
     return refuse(refusals.TOO_FEW, names, usable=usable, least=config.min_cameras, left_out=left_out)
 

@@ -35,22 +35,22 @@ TOO_FEW = Refusal(
 )
 ONLY_COPIES = Refusal(
     Code.STATIC_CAMERA,
-    "The camera did not move: the frames that overlap are copies of each other.",
+    "The camera did not move: the photographs that overlap are copies of each other.",
     "Step to the side between photographs, about a tenth of the distance to the scene.",
 )
 ALL_BLURRED = Refusal(
     Code.BLUR,
-    "{count} frames are too blurred to work with ({first}: {reason}).",
+    "{count} photographs are too blurred to work with ({first}: {reason}).",
     _STEADIER,
 )
 BLURRED = Refusal(
     Code.BLUR,
-    "The frames do not fit together: their edges are up to {width_px:.0f} pixels wide.",
+    "The photographs do not fit together: their edges are up to {width_px:.0f} pixels wide.",
     _STEADIER,
 )
 WITHOUT_TEXTURE = Refusal(
     Code.LOW_TEXTURE,
-    "{plain} of {count} frames show too little texture to be matched.",
+    "{plain} of {count} photographs show too little texture to be matched.",
     "Let more structured things into the picture, or step back.",
 )
 NO_OVERLAP = Refusal(
@@ -65,17 +65,18 @@ NO_PARALLAX = Refusal(
 )
 PLANAR = Refusal(
     Code.PLANAR_ONLY,
-    "Everything that the frames have in common lies in one plane: focal length and motion stay open.",
+    "Everything that the photographs have in common lies in one plane: focal length and motion stay open.",
     "Let things at other distances into the picture, or give the camera's calibration.",
 )
 WRONG_FOCAL = Refusal(
     Code.FOCAL_SUSPECT,
-    "The given focal length of {given:.0f} pixels contradicts the frames: they ask for {found:.0f}, {change:+.0f} %.",
+    "The given focal length of {given:.0f} pixels contradicts the photographs: they ask for {found:.0f}, "
+    "{change:+.0f} %.",
     _CALIBRATION,
 )
 WRONG_FOCAL_BY_VOTE = Refusal(
     Code.FOCAL_SUSPECT,
-    "With the given focal length of {given:.0f} pixels the frames find no place; pairs of them ask for about "
+    "With the given focal length of {given:.0f} pixels the photographs find no place; pairs of them ask for about "
     "{voted:.0f}, {change:+.0f} %.",
     _CALIBRATION,
 )
@@ -92,17 +93,17 @@ UNCERTAIN_FOCAL = Refusal(
 )
 MIXED_CAMERAS = Refusal(
     Code.MIXED_CAMERAS,
-    "{others} of {count} frames have another size than most, and their lens cannot be told.",
+    "{others} of {count} photographs have another size than most, and their lens cannot be told.",
     "Leave them out, give their calibration, or take all photographs with one camera, uncropped.",
 )
 APART = Refusal(
     Code.SPLIT,
-    "{count} frames may show another place: almost nothing that can be confirmed joins them to the others.",
+    "{count} photographs may show another place: almost nothing that can be confirmed joins them to the others.",
     "Add photographs that connect the places, or take them one after the other.",
 )
 CONTRADICTING = Refusal(
     Code.AMBIGUOUS,
-    "The frames contradict each other: only {inliers:.0f} % of their matches fit together.",
+    "The photographs contradict each other: only {inliers:.0f} % of their matches fit together.",
     "Add photographs between those named; look out for repeated or mirrored structures and moving things.",
 )
 SMALL_PART = Refusal(
@@ -128,12 +129,12 @@ FLAT_PATCH = Refusal(
 )
 MIRRORED_IN_DEPTH = Refusal(
     Code.AMBIGUOUS,
-    "The frames can be read in two ways, one the mirror image of the other in depth.",
+    "The photographs can be read in two ways, one the mirror image of the other in depth.",
     "Go nearer, or photograph from further to the side.",
 )
 MIRRORED_PHOTOGRAPHS = Refusal(
     Code.AMBIGUOUS,
-    "{count} frames show the place the wrong way round: turned left to right, they match the others better.",
+    "{count} photographs show the place the wrong way round: turned left to right, they match the others better.",
     "Leave out photographs that were mirrored, or turn them back.",
 )
 TOO_CLOSE = Refusal(

@@ -14,18 +14,18 @@ from splatnode.recon.verification.refusals import Refusal, refuse
 UNDETERMINED = Refusal(
     Code.UNDETERMINED,
     "The poses cannot be verified: these could not be computed: {missing}.",
-    "Leave out the frames named, or add photographs from further to the side between them and the others.",
+    "Leave out the photographs named, or add photographs from further to the side between them and the others.",
 )
 
 WORDS = {  # what each field of the evidence says, for the user
     "cameras": "how certain each pose is",
     "inlier_ratio": "how many matches the poses explain",
-    "weakest_link": "what connects the frames",
-    "disconnected": "which frames belong together",
+    "weakest_link": "what connects the photographs",
+    "disconnected": "which photographs belong together",
     "reflection": "whether photographs are mirrored",
     "flatness": "whether everything lies in one plane",
     "mirrored_cost": "how much worse the scene mirrored in depth fits",
-    "cycles": "whether pairs of frames agree with each other",
+    "cycles": "whether pairs of photographs agree with each other",
     "median_angle_deg": "the angle under which points are seen",
     "rms_px": "the reprojection error",
     "focal": "how certain the focal length is",

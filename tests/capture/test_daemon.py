@@ -297,7 +297,7 @@ def test_status_tells_a_capture_that_has_finished_from_one_that_is_silent(tmp_pa
     assert re.search(
         rf"^capture: finished at \d\d:\d\d:\d\d: recon has answered all of its {keyframes} keyframes", told
     )
-    assert "recon: silent" in told
+    assert "recon: nothing heard of it" in told
     start(", loops: 1000")
     wait_for(lambda: heartbeats(network(tmp_path))["capture"])
     assert last_run(network(tmp_path)) is None

@@ -57,6 +57,7 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.capture.process.memory_shortage",
         "splatnode.capture.process.packages",
         "splatnode.capture.process.printable",
+        "splatnode.capture.process.progress",
         "splatnode.capture.process.stop_signals",
         "splatnode.capture.process.terminal",
         "splatnode.capture.process.verb",

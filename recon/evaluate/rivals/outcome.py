@@ -18,7 +18,7 @@ MIN_CAMERAS = 3  # a model of two cameras counts as no answer, for every method
 def verdict(frames: Sequence[Frame], registered: Collection[str]) -> Verdict:
     """What to say when cameras of the frames named `registered` were found."""
     missing = tuple(frame.name for frame in frames if frame.name not in registered)
-    sentence = f"{len(registered)} of {len(frames)} frames were placed."
+    sentence = f"{len(registered)} of {len(frames)} photographs were placed."
     if len(registered) < MIN_CAMERAS:
         return Verdict(Code.NO_OVERLAP, sentence, "", missing)
     return Verdict(Code.OK_PARTIAL if missing else Code.OK, sentence, "", missing, publishable=True)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import logging
 import re
+import sys
 import time
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatnode.capture.process.logs import PlainLines, StructuredLines, event
+from splatnode.capture.process.logs import PlainLines, StructuredLines, TimedLines, event, use_structured_lines
+from splatnode.capture.process.terminal import shown_as_text
+from tests.capture.process.test_terminal import Terminal
 from tests.support.hostile import TEXTS, unprintable
 
 VALUE = r'(?:[^\s"=]+|"(?:[^"\\]|\\.)*")'
@@ -75,6 +79,28 @@ def test_any_text_at_all(text):
             assert_one_line_of_ours(
                 StructuredLines(journal=True).format(record), JOURNAL, {"log", "keyframe", "spool_full"}
             )
+
+
+def test_on_a_terminal_lines_are_for_people(monkeypatch):
+    root = logging.getLogger()
+    monkeypatch.setattr(root, "handlers", [])
+    for stream, written in ((Terminal(), r"\d\d:\d\d:\d\d keyframe: name a.png"), (io.StringIO(), LINE.pattern)):
+        monkeypatch.setattr(sys, "stderr", stream)
+        with shown_as_text():
+            use_structured_lines()
+            event(root, logging.WARNING, "keyframe", name="a.png", why="")
+        found = re.fullmatch(written.replace("keyframe:", "warning: keyframe:"), stream.getvalue().strip())
+        assert found, stream.getvalue()
+    logging.captureWarnings(False)
+
+
+@pytest.mark.parametrize("text", TEXTS.values(), ids=TEXTS)
+def test_no_text_forges_a_line_for_people(text):
+    for log_it in WAYS_IN.values():
+        for record in records_of(lambda log, log_it=log_it: log_it(log, text)):
+            first, *further = TimedLines().format(record).split("\n")
+            assert re.match(r"\d\d:\d\d:\d\d ", first) and not unprintable(first)
+            assert all(line.startswith("  ") and not unprintable(line) for line in further)
 
 
 def test_lines_can_be_taken_apart():

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import sys
+import time
 
 import pytest
 
 from splatnode.capture.process import progress
-from splatnode.capture.process.progress import Step, Told, counted
+from splatnode.capture.process.progress import Step, Told, counted, telling, waiting
 from splatnode.capture.process.terminal import shown_as_text
 from tests.capture.process.test_terminal import Terminal
 
@@ -50,6 +52,93 @@ def test_a_terminal_is_written_to_ten_times_a_second_at_most_and_at_the_end_of_a
         for done in range(1, 6):
             tell(Step("refining", done, 5, "step"))
     assert [part.split()[1] for part in screen.getvalue().split("\r")[1:]] == ["1", "3", "5"]
+
+
+@pytest.mark.parametrize(
+    ("done", "of", "now_s", "said"),
+    [
+        (1, 4, 0.5, "(0 s)"),  # too early to tell
+        (1, 4, 2.0, "(2 s, about 6 s left)"),
+        (3, 4, 90.0, "(90 s, about 30 s left)"),
+        (1, 4, 100.0, "(100 s, about 5 min left)"),
+        (4, 4, 8.0, "(8 s)"),  # nothing is left
+        (3, 0, 8.0, "(8 s)"),  # nobody knows how many there are
+    ],
+)
+def test_a_step_tells_how_long_the_rest_will_take(done, of, now_s, said, monkeypatch):
+    screen = Terminal()
+    monkeypatch.setattr(sys, "stderr", screen)
+    now = iter([0.0, now_s])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
+    with shown_as_text():
+        tell = Told()
+        tell(Step("refining", 0, of, "step"))
+        tell(Step("refining", done, of, "step"))
+    assert screen.getvalue().split("\r")[-1].strip().endswith(said)
+
+
+def test_a_step_that_ends_early_leaves_no_time_behind(monkeypatch):
+    with shown_on_terminal(monkeypatch, tick_s=60.0) as screen:
+        now = iter([0.0, 5.0, 5.0, 5.0])
+        monkeypatch.setattr(progress.time, "monotonic", lambda: next(now))
+        tell = Told()
+        tell(Step("matching", 1, 4, "pair"))
+        tell(Step("matching", 2, 4, "pair"))
+        tell("found")
+    assert screen.getvalue().endswith("(5 s, about 5 s left)\rmatching: 2 of 4 pairs (5 s)                \nfound\n")
+
+
+@contextlib.contextmanager
+def shown_on_terminal(monkeypatch, tick_s=0.01):
+    """A terminal that shows what standard output and error get, on which a second is `tick_s`."""
+    screen = Terminal()
+    monkeypatch.setattr(progress, "_TICK_S", tick_s)
+    monkeypatch.setattr(sys, "stdout", screen)
+    monkeypatch.setattr(sys, "stderr", screen)
+    with shown_as_text():
+        yield screen
+
+
+def shown_within(screen: Terminal, text: str, limit_s: float = 10.0) -> bool:
+    until = time.monotonic() + limit_s
+    while text not in screen.getvalue() and time.monotonic() < until:
+        time.sleep(0.01)
+    return text in screen.getvalue()
+
+
+def test_the_seconds_of_a_step_go_on_while_it_is_not_heard_of(monkeypatch):
+    with shown_on_terminal(monkeypatch) as screen, telling() as tell:
+        tell(Step("thinking"))
+        assert shown_within(screen, "\rthinking (0 s)\rthinking (0 s)")
+        tell("found")
+        after = len(screen.getvalue())
+        time.sleep(0.1)
+        assert len(screen.getvalue()) == after  # what was printed since stands there
+        tell(Step("counting", 2, 2, "sheep"))
+        after = len(screen.getvalue())
+        time.sleep(0.1)
+        assert len(screen.getvalue()) == after  # it is done
+
+
+def test_with_quiet_nobody_is_told(monkeypatch):
+    with shown_on_terminal(monkeypatch) as screen, telling(quiet=True) as tell:
+        tell(Step("thinking"))
+        tell("found")
+    assert not screen.getvalue()
+
+
+def test_what_is_waited_for_is_shown_meanwhile_and_then_taken_away(monkeypatch):
+    with shown_on_terminal(monkeypatch) as screen:
+        with waiting("loading"):
+            assert shown_within(screen, "loading (0 s)")
+        print("there")
+    assert screen.getvalue().endswith("\r" + " " * len("loading (0 s)") + "\rthere\n")
+
+
+def test_what_is_soon_there_is_not_waited_for(monkeypatch):
+    with shown_on_terminal(monkeypatch, tick_s=60.0) as screen, waiting("loading"):
+        pass
+    assert not screen.getvalue()
 
 
 @pytest.mark.parametrize(

@@ -56,14 +56,14 @@ def test_most_photographs_are_published_without_the_one_in_doubt(asked):
     assert graphs[0].names == NAMES and not any(5 in pair for pair in graphs[0].pairs)
     assert (0, 1) in graphs[0].pairs
     assert found.verdict.code is Code.OK_PARTIAL and len(found.placed) == 5
-    assert found.verdict.message == "5 of 6 frames were placed, after 05.png was left out: So it is."
+    assert found.verdict.message == "5 of 6 photographs were placed, after 05.png was left out: So it is."
 
 
 def test_a_further_doubt_leaves_out_a_further_photograph(asked):
     graphs = asked(estimate(Code.AMBIGUOUS, 5, 4), estimate(Code.OK_PARTIAL, 4, 4, 5))
     found = judged(estimate(Code.MOVING_SCENE, 6, 5))
     assert len(graphs) == 2 and not any({4, 5} & set(pair) for pair in graphs[1].pairs)
-    assert found.verdict.message.startswith("4 of 6 frames were placed, after 04.png, 05.png were left out:")
+    assert found.verdict.message.startswith("4 of 6 photographs were placed, after 04.png, 05.png were left out:")
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ def test_a_folder_becomes_a_map(folder, tmp_path, capsys):
     arguments = ["replay", str(folder), "--map", "--preset", "fast", "--size", "320", "--out", str(out)]
     assert command_line.main(arguments) == 0
     printed = capsys.readouterr().out
-    assert "6 of 6 frames are keyframes" in printed and "6 of 6 keyframes are in a map" in printed
+    assert "6 of 6 photographs are keyframes" in printed and "6 of 6 keyframes are in a map" in printed
     assert "OK: One scene of 1: scene-0001." in printed
     report = json.loads((out / "report.json").read_text())
     assert report["keyframes_in_a_map"] == 6 and report["left_out"] == [] and list(report["maps"]) == ["map-scene-0001"]

@@ -78,13 +78,15 @@ def test_a_rough_scene_is_published_and_says_how_rough_it_is():
     rough = evidence((0, 1, 2, 3), {2: {"errors": unsure(centre=0.01)}})
     given = decide(graph(4, all_pairs(4)), registration((0, 1, 2, 3)), rough, WHATEVER_THE_ODDS)
     assert given.code == Code.OK_ROUGH and given.publishable and given.frames == () and given.advice.endswith(".")
-    assert "All 4 frames were placed, roughly: positions are known to" in given.message
+    assert "All 4 photographs were placed, roughly: positions are known to" in given.message
     assert "% of the distance to the scene" in given.message and "of how far the camera moved" in given.message
     pairs = {key: value for key, value in all_pairs(5).items() if 3 not in key}
     left = (0, 1, 2, 4)
     rough = evidence(left, {2: {"errors": unsure(rotation=2.0)}})
     given = decide(graph(5, pairs), registration(left), rough, WHATEVER_THE_ODDS)
-    assert given.code == Code.OK_ROUGH and given.frames == names(3) and "4 of 5 frames were placed" in given.message
+    assert (
+        given.code == Code.OK_ROUGH and given.frames == names(3) and "4 of 5 photographs were placed" in given.message
+    )
 
 
 def test_who_requires_more_than_is_known_gets_a_refusal_that_says_what_is_known():
