@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -19,7 +20,22 @@ def _plain(value: Any) -> str:
         return "yes" if value else "no"
     if isinstance(value, dict) and {"name", "reason"} <= value.keys():  # a keyframe that was set aside
         return f"{value['name']}: {value['reason']}"
+    if isinstance(value, dict) and {"scene_id", "keyframes"} <= value.keys():
+        return _place(value)
     return f"{value:.1f}" if isinstance(value, float) else str(value)
+
+
+def _place(value: Mapping[str, Any]) -> str:
+    """`scene-0002: left, OK, 12 photographs, 1 left out, 43 s of work, 512 MB`."""
+    kept, out = value["keyframes"], value.get("left_out")
+    parts = [
+        f"{value.get('state')}, {value.get('verdict')}",
+        f"{kept} photograph{'' if kept == 1 else 's'}",
+        f"{out} left out" if out else "",
+        f"{value.get('seconds', 0):.0f} s of work",
+        f"{value.get('rss_mb', 0):.0f} MB",
+    ]
+    return f"{value['scene_id']}: {', '.join(filter(None, parts))}"
 
 
 # Field of a heartbeat -> what it is called, and how its value is written; other fields go by their names.
@@ -46,6 +62,7 @@ _WORDS: Mapping[str, tuple[str, Callable[[Any], str]]] = {
     "delay_s": ("delay", _seconds),
     "delay": ("because", _plain),
     "unfinished": ("places to finish", _plain),
+    "newest_places": ("places", _plain),
     "refused": ("refused messages", _plain),
     "duplicates": ("keyframes come again", _plain),
 }
@@ -64,6 +81,9 @@ def described(room: str, fields: Mapping[str, Any]) -> list[str]:
         if state == _LOADING and not value:
             continue
         name, written = _WORDS.get(key, (key.replace("_", " "), _plain))
-        shown = "; ".join(map(_plain, value)) if isinstance(value, list) else written(value)
-        lines.append(f"  {name:24}{shown}")
+        shown = map(_plain, value) if isinstance(value, list) else [written(value)]
+        lines += [
+            f"  {told:24}{each}"
+            for told, each in zip(itertools.chain([name], itertools.repeat("")), shown, strict=False)
+        ]
     return lines

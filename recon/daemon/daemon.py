@@ -221,6 +221,7 @@ class Daemon:
             scenes=scenes,
             maps=maps,
             loops=loops,
+            newest_places=worker.newest_places,
             refused=intake.refused + self._commands.refused + self._scenes.refused,
             duplicates=intake.duplicates,
             rss_mb=resident_mb(),

@@ -16,6 +16,7 @@ from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.memory import resident_mb
 from splatnode.recon.daemon.atlas.links import Cameras, Kind, Link, carried, link
 from splatnode.recon.daemon.atlas.pose_graph import Pose, optimised
+from splatnode.recon.daemon.status import PlaceStatus
 from splatnode.recon.result.export import SceneFileError, read_cameras, write_file
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.staged import json_bytes
@@ -56,6 +57,12 @@ class Place(msgspec.Struct, frozen=True):
     judged: bool = False  # whether all evidence was weighed and the cameras may be published; the scene may be a draft
     seconds: float = 0.0  # that were worked on it, by the process that wrote this
     rss_mb: float = 0.0  # memory of that process then
+
+    @property
+    def status(self) -> PlaceStatus:
+        """As a heartbeat tells it."""
+        kept, out = len(self.frames_used), len(self.frames_dropped)
+        return PlaceStatus(self.scene_id, self.state.value, self.verdict, kept, out, self.seconds, self.rss_mb)
 
 
 def described(
@@ -136,6 +143,10 @@ class Places:
             pass
         except (OSError, SceneFileError) as error:
             log.warning("the index of places begins anew: %s", error)
+
+    def newest(self, most: int) -> Sequence[Place]:
+        """The places that were found last, at most so many."""
+        return self._index.places[-most:]
 
     def scenes_of(self, name: str) -> list[str]:
         """The ids of the scenes that have a camera of this photograph."""

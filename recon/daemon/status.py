@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import enum
+from typing import Annotated
+
+import msgspec
 
 from splatnode.capture.messaging.values import Amount, Count, Name, Text
 from splatnode.capture.messaging.wire import Header
@@ -17,6 +20,21 @@ class State(enum.Enum):
     IDLE = "idle"  # the scene is finished
     LOST = "lost"  # the last keyframes do not belong to the scene
     FULL = "full"  # keyframes cannot be stored; they wait with the sender
+
+
+PLACES = 8  # that a heartbeat tells of; places.json has all
+
+
+class PlaceStatus(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A place, as it was when it was last worked on."""
+
+    scene_id: Name
+    state: Name  # here, left, finished
+    verdict: Text
+    keyframes: Count  # with a camera in its scene
+    left_out: Count  # keyframes without one
+    seconds: Amount  # that were worked on it
+    rss_mb: Amount  # memory of the process then
 
 
 class ReconStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -39,6 +57,7 @@ class ReconStatus(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     scenes: Count  # whose cameras are judged with all evidence, of all places
     maps: Count  # that these are, joined by the chains and loops that count
     loops: Count
+    newest_places: Annotated[tuple[PlaceStatus, ...], msgspec.Meta(max_length=PLACES)]
     refused: Count  # malformed messages
     duplicates: Count  # keyframes that came again
     rss_mb: Amount

@@ -21,6 +21,7 @@ from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
 from splatnode.recon.daemon.left_places import LeftPlaces
 from splatnode.recon.daemon.output import Output, Published
 from splatnode.recon.daemon.present_place import Abandoned, PresentPlace
+from splatnode.recon.daemon.status import PLACES, PlaceStatus
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +64,11 @@ class Worker:
         poses, links = self._output.places.poses, self._output.places.links
         loops = sum(link.kind is Kind.LOOP and link.retracted is None for link in links)
         return len(poses), len({pose.map for pose in poses}), loops
+
+    @property
+    def newest_places(self) -> tuple[PlaceStatus, ...]:
+        """What is known of the newest places, each as it was when it was last worked on."""
+        return tuple(each.status for each in self._output.places.newest(PLACES))
 
     def scenes_left_with(self, name: str) -> list[str]:
         """The ids of the scenes, of places that the camera has left, that have a camera of this photograph."""

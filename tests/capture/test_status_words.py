@@ -43,6 +43,16 @@ def test_a_node_that_is_loading_says_so_and_no_zeros():
     ]
 
 
+def test_each_place_is_told_in_a_line_of_its_own():
+    here = {"scene_id": "scene-0002", "state": "here", "verdict": "OK", "keyframes": 1, "left_out": 0, "seconds": 4.2}
+    left = {"scene_id": "scene-0001", "state": "left", "verdict": "OK", "keyframes": 12, "left_out": 3, "rss_mb": 512.0}
+    assert described("recon", {"state": "growing", "newest_places": [left, here]}) == [
+        "recon: growing",
+        "  places                  scene-0001: left, OK, 12 photographs, 3 left out, 0 s of work, 512 MB",
+        "                          scene-0002: here, OK, 1 photograph, 4 s of work, 0 MB",
+    ]
+
+
 def test_every_field_that_has_words_is_one_of_a_heartbeat():
     fields = {field.encode_name for status in (CaptureStatus, ReconStatus) for field in msgspec.structs.fields(status)}
     assert set(_WORDS) <= fields and fields | {"type"} >= _NOT_PRINTED

@@ -177,6 +177,7 @@ def heartbeat(numbering: Numbering, tracked: CameraEstimate | None) -> ReconStat
     return ReconStatus(
         **numbering.next(), state=State.IDLE, uptime_s=1.0, scene_id="place", keyframe=2, queue=0, keyframes=2,
         num_gaussians=225, iterations=500, final=True, verdict="OK", message="", bounds="", keyframe_s=None,
-        delay_s=0.0, delay="", unfinished=0, scenes=0, maps=0, loops=0, refused=0, duplicates=0, rss_mb=100.0,
+        delay_s=0.0, delay="", unfinished=0, scenes=0, maps=0, loops=0, newest_places=(), refused=0,
+        duplicates=0, rss_mb=100.0,
         camera_moved=None, moved="", problem="", tracked=camera_record(tracked) if tracked else None,
     )  # fmt: skip
