@@ -66,7 +66,7 @@ def frame_name(index: int) -> str:
 
 def frame_index(name: str) -> int:
     """Inverse of frame_name, of what begins with it, too."""
-    return int(name.removeprefix("keyframe_")[:5])
+    return int(name.removeprefix("keyframe_").partition(".")[0])
 
 
 def scene_camera(config: Config, index: float) -> Camera:

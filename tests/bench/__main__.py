@@ -12,6 +12,7 @@ BENCHMARKS = {
         "live",
         "stream",
         "building",
+        "film",
         "merge",
         "faults",
         "walk_faults",
