@@ -308,6 +308,23 @@ def test_stream_there_and_back():
     says(f"recon's memory at most {back['recon_mb_most'] / 1e3:.2f} GB")
 
 
+def test_stream_of_all_places_there_and_back():
+    every = raw("stream_all")
+    visits, cameras = every["visits"], every["cameras"]
+    assert len(cameras) == 17 and visits["joined"] == [["castle_p30", "entry_p10", "fountain_p11"]]
+    says(f"{every['photographs']} photographs of all 17 real scenes")
+    says(f"{len(visits['found_there'])} of the 17 places found on the way there, {len(visits['recognised'])} of these")
+    assert set(visits["recognised"]) < set(visits["found_there"])
+    left_out, unlisted = len(every["left_out_by_name"]), len(every["in_no_list"])
+    says(f"{every['in_a_scene']} photographs in a scene, {left_out} named with the reason, {unlisted} left out by")
+    known = [cameras[name] for name in visits["recognised"]]
+    rotation, centre = (max(each[what] for each in known) for what in ("rotation_deg", "centre_pct"))
+    says(f"of both visits, within {rotation:.2f} degrees and {centre:.2f} % of the true ones; picture")
+    says(f"{every['delay_s_median']:.0f} s behind the camera in the median, {every['delay_s_most']:.0f} s at most; all")
+    says(f"all judged {every['all_finished_s'] - every['taken_s']:.0f} s after the last photograph; recon's")
+    says(f"recon's memory at most {every['recon_mb_most'] / 1e3:.2f} GB")
+
+
 def test_a_walk_through_the_building():
     walk = raw("building")
     cameras, loops, cost = walk["cameras"], walk["loops"], walk["cost"]
