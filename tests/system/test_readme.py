@@ -315,7 +315,9 @@ def test_stream_of_all_places_there_and_back():
     says(f"{every['photographs']} photographs of all 17 real scenes")
     says(f"{len(visits['found_there'])} of the 17 places found on the way there, {len(visits['recognised'])} of these")
     assert set(visits["recognised"]) < set(visits["found_there"])
-    left_out, unlisted = len(every["left_out_by_name"]), len(every["in_no_list"])
+    used = {name for place in every["places"] for name in place["frames_used"]}
+    left_out, unlisted = len(every["left_out_by_name"].keys() - used), len(every["in_no_list"])
+    assert every["in_a_scene"] + left_out + unlisted == every["photographs"]
     says(f"{every['in_a_scene']} photographs in a scene, {left_out} named with the reason, {unlisted} left out by")
     known = [cameras[name] for name in visits["recognised"]]
     rotation, centre = (max(each[what] for each in known) for what in ("rotation_deg", "centre_pct"))

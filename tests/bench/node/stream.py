@@ -207,7 +207,7 @@ def _streamed(
         "photographs": len(names),
         "per_second": per_second,
         "in_a_scene": len(set(told)),
-        "left_out_by_name": dropped,
+        "left_out_by_name": {name: reason for name, reason in dropped.items() if name not in told},
         "in_no_list": sorted(set(names) - set(told) - set(dropped)),  # what capture left out is among them
         "taken_s": taken_s,
         "all_finished_s": finished_s,
