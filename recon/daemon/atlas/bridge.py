@@ -101,10 +101,11 @@ def _bridge_of(
     found = {names[camera.index]: camera.T_world_camera for camera in cameras}
     found |= {name: found[twin] for name, twin in twins.items() if twin in found}
     mine, theirs = (_of(side.scene_id, found) for side in (one, other))
-    joined = bool(mine and theirs) and estimate.verdict.code is not Code.SPLIT
+    fewest = min(len(mine), len(theirs))
+    joined = fewest >= MIN_VIEWS or (fewest > 0 and estimate.verdict.code is not Code.SPLIT)
     if not estimate.publishable:
         return _Apart(f"together they are {estimate.verdict.code.value}: {estimate.verdict.message}", joined)
-    if min(len(mine), len(theirs)) < MIN_VIEWS:
+    if fewest < MIN_VIEWS:
         return _Apart(f"together only {len(mine)} and {len(theirs)} of their photographs have cameras", joined)
     return Bridge(mine, theirs, len(pairs))
 

@@ -123,8 +123,8 @@ def test_what_pause_raises_ends_the_work(sides):
         bridge(sides["scene-0001"], replace(sides["scene-0002"]), Config(), None, end)
 
 
-@pytest.mark.parametrize("placed", [6, 3])
-def test_where_a_few_photographs_do_not_suffice_but_join_both_more_are_asked(sides, monkeypatch, placed):
+@pytest.mark.parametrize(("code", "placed"), [(Code.AMBIGUOUS, 6), (Code.SPLIT, 6), (Code.AMBIGUOUS, 3)])
+def test_where_a_few_photographs_do_not_suffice_but_join_both_more_are_asked(sides, monkeypatch, code, placed):
     asked: list[int] = []
 
     def refused_at_first(graph, *rest):
@@ -134,7 +134,7 @@ def test_where_a_few_photographs_do_not_suffice_but_join_both_more_are_asked(sid
             return estimate
         assert estimate.registration is not None
         registration = replace(estimate.registration, cameras=estimate.registration.cameras[:placed])
-        verdict = replace(estimate.verdict, code=Code.AMBIGUOUS, publishable=False)
+        verdict = replace(estimate.verdict, code=code, publishable=False)
         return replace(estimate, registration=registration, verdict=verdict)
 
     monkeypatch.setattr(module, "VIEWS", (3, 4))
