@@ -52,11 +52,13 @@ def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
     """The scene of all cameras that were placed, not optimised yet; None where the verdict forbids one."""
     if estimate.registration is None or not estimate.verdict.publishable:
         return None
-    return initial_scene(
+    scene = initial_scene(
         tuple(estimate.pointmaps.values()),
         {keyframe.name: keyframe.image for keyframe in estimate.graph.keyframes},
         config.initialisation,
     )
+    give_back_memory()
+    return scene
 
 
 def refined(

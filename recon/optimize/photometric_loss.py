@@ -1,4 +1,4 @@
-"""The photometric loss: L1 + D-SSIM against a fixed photograph, with the target's part computed once."""
+"""The photometric loss: L1 + D-SSIM against a fixed photograph, whose part can be computed once."""
 
 from __future__ import annotations
 
@@ -17,13 +17,16 @@ class PhotometricLoss:
     """(1 - w) * mean |rgb - target| + w * mean (1 - SSIM), w = `ssim_weight`: the loss of 3DGS.
 
     SSIM has the 11 x 11 Gaussian window of sigma 1.5 and zeros beyond the border. Value and gradient are computed
-    together in the compiled core, in float32; the target's moments are kept. On another device than the processor,
+    together in the compiled core, in float32. On another device than the processor,
     which is the target's, the reference computes both.
     """
 
-    def __init__(self, target: Tensor, ssim_weight: float = 0.2, weights: Tensor | None = None):
+    def __init__(
+        self, target: Tensor, ssim_weight: float = 0.2, weights: Tensor | None = None, keep_moments: bool = True
+    ):
         """`target`: (H, W, 3) in [0, 1]; `weights`: (H, W) >= 0 weigh the pixels of both means, None: all alike.
 
+        The target's moments take twice its memory. Where they are not kept they are computed each time.
         A pixel of weight 0 is ignored: it has no gradient, and in its neighbours' windows it counts as the target's.
         With all weights 0 the loss is 0. Raises ValueError for other shapes and for targets that are not finite.
         """
@@ -42,11 +45,7 @@ class PhotometricLoss:
             return
         pixels = float(target.shape[0] * target.shape[1])
         self._total_weight = pixels if self._weights is None else float(self._weights.sum(dtype=torch.float64))
-        self._mean, self._variance = torch.empty_like(self.target), torch.empty_like(self.target)
-        height, width, _ = target.shape
-        library().core_photometric_moments(
-            _address(self.target), width, height, _address(self._mean), _address(self._variance)
-        )
+        self._moments = self._computed_moments() if keep_moments else None
 
     def __call__(self, rgb: Tensor) -> Tensor:
         """The loss of `rgb` (H, W, 3), scalar."""
@@ -59,13 +58,21 @@ class PhotometricLoss:
             return photometric_reference.photometric_loss(rgb, self.target, self.ssim_weight, self._weights)
         return _Photometric.apply(rgb, self)
 
+    def _computed_moments(self) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the target in the window of each pixel, both (3, H, W)."""
+        mean, variance = torch.empty_like(self.target), torch.empty_like(self.target)
+        _, height, width = self.target.shape
+        library().core_photometric_moments(_address(self.target), width, height, _address(mean), _address(variance))
+        return mean, variance
+
     def evaluate(self, planar: Tensor, gradient: Tensor | None) -> float:
         """The loss of a planar (3, H, W) image; fills `gradient`, of the same shape, where given."""
         _, height, width = self.target.shape
+        mean, variance = self._moments or self._computed_moments()
         evaluate = library().core_photometric
         evaluate.restype = ctypes.c_double
         return evaluate(
-            _address(planar), _address(self.target), _address(self._mean), _address(self._variance),
+            _address(planar), _address(self.target), _address(mean), _address(variance),
             _address(self._weights), ctypes.c_double(self._total_weight), ctypes.c_double(self.ssim_weight),
             width, height, _address(gradient),
         )  # fmt: skip

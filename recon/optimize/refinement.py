@@ -32,6 +32,7 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(ge=0, le=1)]
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # of Gaussians, that are optimised
 _SCALES = {False: 1.0, True: 0.5}  # of the photographs' resolution, by whether it is halved
+_KEPT_PIXELS = 5_000_000  # of all views: of more, what the loss needs of a photograph is computed at each step
 _PROCESSOR = torch.device("cpu")  # where the cameras are, whatever the Gaussians are on
 _POSE_BETAS = (0.9, 0.99)  # of Adam for the cameras: each gets one gradient in as many steps as there are views
 
@@ -123,9 +124,10 @@ class _Fit:
         self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
         self._pose_moments = [Moments(torch.zeros(6), torch.zeros(6)) for _ in scene.views]
         shown = border.valid_masks([view.image for view in scene.views])
+        few = sum(view.width * view.height for view in scene.views) <= _KEPT_PIXELS
         self._images = {
             half: [
-                training_image(*each, scale, config.dssim, gaussians.means.device)
+                training_image(*each, scale, config.dssim, gaussians.means.device, keep_moments=few)
                 for each in zip(scene.views, shown, strict=True)
             ]
             for half, scale in _SCALES.items()

@@ -26,11 +26,17 @@ class TrainingImage:
 
 
 def training_image(
-    view: TrainingView, shown: npt.NDArray[np.bool_], scale: float, dssim: float, device: torch.device = _PROCESSOR
+    view: TrainingView,
+    shown: npt.NDArray[np.bool_],
+    scale: float,
+    dssim: float,
+    device: torch.device = _PROCESSOR,
+    keep_moments: bool = True,
 ) -> TrainingImage:
     """The photograph of `view` at `scale` of its size, with `dssim` the weight of D-SSIM in its loss.
 
-    The photograph lies, and the loss is computed, on `device`: that of the Gaussians which are rendered.
+    The photograph lies, and the loss is computed, on `device`: that of the Gaussians which are rendered. `keep_moments`
+    is the loss's.
 
     `shown` (h, w), at the photograph's own size, is False on the black border that undistortion leaves. A pixel of the
     smaller image is compared only if all pixels that it covers are shown.
@@ -43,7 +49,7 @@ def training_image(
         share = cv2.resize(shown.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         weights = torch.from_numpy(np.floor(share + np.float32(_WHOLLY_SHOWN))).to(device)
     target = torch.tensor(image, device=device).float() / 255.0  # a copy: what is read from a file is read-only
-    return TrainingImage(K, width, height, PhotometricLoss(target, dssim, weights))
+    return TrainingImage(K, width, height, PhotometricLoss(target, dssim, weights, keep_moments))
 
 
 def scaled(K: Tensor, width: int, height: int, scale: float) -> tuple[Tensor, int, int]:

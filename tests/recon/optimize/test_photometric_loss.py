@@ -87,6 +87,12 @@ def test_the_result_does_not_depend_on_threads():
     assert torch.equal(gradients[0], gradients[1]) and torch.equal(gradients[0], gradients[2])
 
 
+def test_moments_that_are_not_kept_change_nothing():
+    rgb, target = textured(40, 30, 3)
+    kept, computed = (PhotometricLoss(target, keep_moments=keep)(rgb.float()) for keep in (True, False))
+    assert kept == computed
+
+
 def test_planar_images_are_not_copied():
     """The rasteriser's images are views of planar memory; so are the gradients that come back."""
     planar = torch.rand(3, 20, 30)
