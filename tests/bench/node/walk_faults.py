@@ -34,7 +34,7 @@ from tests.bench.node.shortages import small_disk
 from tests.bench.node.trial import NotTried, expect, wait_for
 from tests.support.node import Node, at_rest, running
 
-BEFORE, BETWEEN = 30, 4  # photographs before the first fault, and between two
+BEFORE = 30  # photographs before the first fault
 SIDE = 320  # of a photograph, pixels
 MOST_KEYFRAMES = 2000
 RECON = {
@@ -105,7 +105,7 @@ def _begun(folder: Path, disk: Path, walk: building.Config, chance: random.Rando
 def _befall(way: Way, fault: on_the_way.Fault, row: dict[str, Any]) -> None:
     """One fault, and what the node does after it."""
     started = time.monotonic()
-    way.show(BETWEEN)
+    way.show(on_the_way.BETWEEN)
     time.sleep(way.chance.uniform(0, 3.0))
     row["tried"] += 1
     try:
