@@ -345,6 +345,24 @@ def test_a_walk_through_the_building():
     says(f"at most {walked:.2f} GB on the way, {cost['rss_mb']['most'] / 1e3:.2f} GB while scenes were finished")
 
 
+def test_a_film_of_the_building():
+    film = raw("film")
+    live, offline = film["live"], film["offline"]
+    assert live["maps"] == offline["maps"] == 1
+    assert not live["loops"]["wrong_loop_links"] and not offline["loops"]["wrong_loop_links"]
+    says(f"live {live['in_a_scene']} of {live['keyframes']} keyframes in {live['scenes']} scenes")
+    says(f"offline {offline['in_a_scene']} of {offline['keyframes']} in {offline['scenes']}; cameras")
+    for name, run in (("live", live), ("offline", offline)):
+        cameras = run["cameras"]
+        of_the_way, most = cameras["position_percent_of_path"], cameras["rotation_deg_most"]
+        way = " of the way" if run is live else ""
+        says(f"{of_the_way:.3f} %{way} and {most:.2f} degrees {name}")
+    a_keyframe = [run["processor_s"] / run["keyframes"] for run in (live, offline)]
+    says(f"{a_keyframe[0]:.1f} s of processor a keyframe live, {a_keyframe[1]:.1f} offline")
+    says(f"in all {film['offline_over_live']:.2f} times as much")
+    says(f"recon's memory at most {live['peak_mb'] / 1e3:.2f} GB live")
+
+
 def test_stream_of_a_chain():
     chain = raw("stream_chain")
     assert chain["in_a_scene"] == chain["photographs"] == 30 and len(chain["places"]) == 3
