@@ -24,23 +24,16 @@ from pathlib import Path
 import numpy as np
 
 from splatnode.capture.cameras import building
-from splatnode.capture.image_file import encode_png
 from splatnode.capture.status import heartbeats
-from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.true_cameras import TrueCamera
-from splatnode.recon.evaluate.truth import EvaluationScene
-from splatnode.recon.result.export import read_cameras, read_gaussians
-from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.verdict import Code, Verdict
+from splatnode.recon.result.export import read_cameras
 from tests.bench.node.building_cost import Sample, cost_row, folder_mb
 from tests.bench.node.building_score import camera_rows, loop_row, maps
-from tests.bench.node.live import psnr
+from tests.bench.node.first_room import first_room
 from tests.support.node import Node, at_rest, memory_mb, processor_s, running, taken
 
 LOOK_S = 1.0
 RESTS = 5  # looks in a row at which recon has nothing to do: then it is done
 ALONE_S = 5.0  # of recon, before the camera starts: it loads torch
-HELD_OUT = 4  # photographs of the first room's scene
 FARTHEST_M = 6.0  # cameras farther apart are not asked whether they show the same place
 
 
@@ -170,7 +163,7 @@ def scored(config: building.Config, out: Path, folder: Path) -> dict:
         "cameras_by_map": rows,
         "cameras": _over_all(rows),
         "loops": loop_row(found, joined, index["links"], truth, same_place),
-        "first_room": _first_room(config, index["places"], folders, found, folder),
+        "first_room": first_room(config, index["places"], folders, found, folder),
         "places": index["places"],
     }
 
@@ -187,39 +180,3 @@ def _over_all(rows: list[dict]) -> dict:
         "rotation_deg_most": max(row["rotation_deg_most"] for row in rows),
         "path_m": sum(row["path_m"] for row in rows),
     }
-
-
-def _first_room(
-    config: building.Config,
-    places: list[dict],
-    folders: Mapping[str, Path],
-    found: Mapping[str, Mapping],
-    folder: Path,
-) -> dict | None:
-    """Of the scene that has most keyframes of the first tour: its score on photographs midway between them."""
-    tour = [
-        index for index in range(min(config.keyframes, 60)) if building.room(config, index) == building.room(config, 0)
-    ]
-    counts = {scene: len(set(cameras) & set(tour)) for scene, cameras in found.items()}
-    scene = max(counts, key=lambda each: counts[each], default=None)
-    if scene is None or not (folders[scene] / "scene.ply").exists():
-        return None
-    inside = [each for each in tour if each in found[scene] and each + 1 in found[scene]]
-    chosen = inside[1 :: max(1, len(inside) // HELD_OUT)][:HELD_OUT]
-    paths, true = {}, {}
-    for keyframe in chosen:
-        name = f"held_out_{keyframe:05d}.png"
-        paths[name] = folder / name
-        paths[name].write_bytes(encode_png(building.photograph(config, keyframe + 0.5)))
-        true[name] = TrueCamera(*building.held_out_camera(config, keyframe), config.width, config.height)
-    cameras = read_cameras(folders[scene] / "cameras.json")
-    for camera in cameras:
-        known = building.scene_camera(config, building.frame_index(camera.name))
-        true[camera.name] = TrueCamera(*known, config.width, config.height)
-    verdict = Verdict(Code.OK, "", "", publishable=True)
-    gaussians = read_gaussians(folders[scene] / "scene.ply")
-    snapshot = Snapshot(0, verdict, cameras, gaussians, images={}, dropped=(), iterations=0, seconds={}, final=True)
-    split = Split(tuple(camera.name for camera in cameras), tuple(paths))
-    (state,) = [place["state"] for place in places if place["scene_id"] == scene]
-    score = psnr(snapshot, EvaluationScene("building", paths, true), split)
-    return {"scene": scene, "state": state, "held_out": len(paths), "psnr": score, "gaussians": len(gaussians)}
