@@ -7,6 +7,7 @@ first of these that exceeds its limit makes the frame a candidate; only candidat
 
 from __future__ import annotations
 
+import hashlib
 from collections import deque
 from dataclasses import dataclass
 from typing import Annotated
@@ -34,6 +35,7 @@ LUCAS_KANADE = {
 HOMOGRAPHY_PX, HOMOGRAPHY_TRIALS = 1.5, 100  # of RANSAC: an inlier's error, and the number of samples at most
 MAX_COVERAGE = 0.9  # share of lost corners that is always enough, however many frames wait
 REMEMBERED_VIEWS = 64  # newest keyframes of which a new one must not be a copy
+REMEMBERED_FILES = 100_000  # newest keyframes that came as a file, which may come again: a folder may be read anew
 REMEMBERED_BLURS = 8  # candidates with which blur is compared: a soft place after a crisp one is usable soon
 THUMBNAIL = 16, 12  # width and height in pixels
 MAX_THUMBNAIL_DIFFERENCE = 0.3  # mean; copies have 0.05. Others are no copies, which saves a closer comparison
@@ -82,6 +84,7 @@ class _View:
     name: str
     small: Image
     thumbnail: Image
+    file: bytes | None  # digest of the file that it came as
 
 
 class Selector:
@@ -91,6 +94,7 @@ class Selector:
         self.config = config
         self.limits = limits
         self._views: list[_View] = []  # newest last
+        self._files: dict[bytes, None] = {}  # digests of the keyframes' files, newest last
         self._start: Image | None = None  # the last keyframe, small and grey
         self._corners: Points = np.zeros((0, 1, 2), np.float32)
         self._now: Points = self._corners
@@ -112,11 +116,13 @@ class Selector:
         if fault is not None:
             self._next_ns = frame.stamp_ns + round(1e9 * self.config.patience_s)
             return Decision(False, fault, True)
-        self._remember(frame.name, small, grey)
+        self._remember(frame, small, grey)
         return Decision(True, reason, True)
 
     def forget_last(self) -> None:
         """Forgets the last keyframe, which could not be kept: a frame that shows the same may be taken."""
+        for view in self._views[-1:]:
+            self._files.pop(view.file or b"", None)
         self._views = self._views[:-1]
         self._start = None
         self._next_ns += round(1e9 * RETRY_S)
@@ -134,6 +140,8 @@ class Selector:
 
     def _fault(self, frame: Frame, small: Image) -> str | None:
         """Why the frame is unusable, or a copy of a keyframe; None where it is neither."""
+        if _digest(frame.encoded) in self._files:
+            return "duplicate: this very file came before"
         thumbnail = _thumbnail(small)
         for view in reversed(self._views):
             if np.abs(thumbnail - view.thumbnail).mean() > MAX_THUMBNAIL_DIFFERENCE or view.small.shape != small.shape:
@@ -147,11 +155,20 @@ class Selector:
             self._blurs_px.append((size, quality.blur_px))
         return fault
 
-    def _remember(self, name: str, small: Image, grey: Image) -> None:
-        self._views = [*self._views[1 - REMEMBERED_VIEWS :], _View(name, small, _thumbnail(small))]
+    def _remember(self, frame: Frame, small: Image, grey: Image) -> None:
+        view = _View(frame.name, small, _thumbnail(small), _digest(frame.encoded))
+        self._views = [*self._views[1 - REMEMBERED_VIEWS :], view]
+        if view.file is not None:
+            self._files[view.file] = None
+            if len(self._files) > REMEMBERED_FILES:
+                del self._files[next(iter(self._files))]
         self._start = grey
         found = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, qualityLevel=CORNER_QUALITY, minDistance=CORNER_DISTANCE)
         self._corners = self._now = np.zeros((0, 1, 2), np.float32) if found is None else found
+
+
+def _digest(file: bytes | None) -> bytes | None:
+    return None if file is None else hashlib.blake2b(file, digest_size=16).digest()
 
 
 def track(

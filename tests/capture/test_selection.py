@@ -11,7 +11,16 @@ import pytest
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import Frame
 from splatnode.capture.quality import Limits
-from splatnode.capture.selection import REMEMBERED_BLURS, Config, Motion, Selector, measure, track, what_it_adds
+from splatnode.capture.selection import (
+    REMEMBERED_BLURS,
+    REMEMBERED_VIEWS,
+    Config,
+    Motion,
+    Selector,
+    measure,
+    track,
+    what_it_adds,
+)
 from tests.support import synthetic
 
 EVERY = Config(per_second=1000.0, patience_s=0.0)
@@ -100,6 +109,20 @@ def test_what_could_not_be_kept_may_be_taken_again():
     selector.forget_last()
     assert not selector.decide(view(0, 1)).take  # there will be no room in a moment
     assert selector.decide(view(0, 20)).take
+
+
+def test_a_file_that_came_before_is_not_taken_again_however_long_ago():
+    selector = Selector(Config(every_frame=True), Limits())
+    first = replace(view(0), encoded=b"a photograph's file")
+    assert selector.decide(first).take
+    for index in range(1, REMEMBERED_VIEWS + 2):
+        selector.decide(view(80 * (index % 11), index, top=60 * (index // 11)))
+    assert len(selector._views) == REMEMBERED_VIEWS and first.name not in {each.name for each in selector._views}
+    again = selector.decide(replace(first, name="again", stamp_ns=10**12))
+    assert not again.take and "came before" in again.reason
+    selector.decide(replace(view(1, 90), encoded=b"another"))
+    selector.forget_last()
+    assert selector.decide(replace(view(1, 95), encoded=b"another", stamp_ns=10**13)).take
 
 
 def test_photographs_are_taken_unless_they_are_copies():
