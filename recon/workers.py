@@ -1,4 +1,4 @@
-"""Independent pieces of work, one for each processor at a time.
+"""Independent pieces of work, one for each processor that the caller may use at a time.
 
 Threads pay where NumPy, OpenCV, SciPy, PoseLib or the core do the work, which let others run meanwhile. The functions
 must not change what others read.
@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-from splatnode.recon.core import default_threads
+from splatnode.recon.core import allowed_threads, limit_threads, limited_threads
 
 Item = TypeVar("Item")
 T = TypeVar("T")
@@ -28,9 +28,9 @@ def in_turn(function: Callable[[Item], T], items: Iterable[Item]) -> Iterator[T]
     Whoever stops asking gives up the few items that are under way, and no more are begun. What `function` raises is
     raised in the place of its result.
     """
-    threads = default_threads()
+    threads = allowed_threads()
     waiting: deque[Future[T]] = deque()
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(threads, initializer=limit_threads, initargs=(limited_threads(),)) as pool:
         try:
             for item in items:
                 waiting.append(pool.submit(function, item))

@@ -10,6 +10,9 @@ import ctypes
 import functools
 import os
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +28,15 @@ _REQUIRED_FLAGS = {
 }
 _HWCAP = 16  # of the auxiliary vector (Linux, elf.h)
 _HWCAP_ASIMDDP = 1 << 20  # of the processor (Linux on aarch64, asm/hwcap.h)
+
+
+class _Limit(threading.local):
+    """How many threads the work of one thread may take."""
+
+    threads: int | None = None  # None: as many as the process may use
+
+
+_limit = _Limit()
 
 
 def instruction_sets() -> list[str]:
@@ -71,10 +83,47 @@ def default_threads() -> int:
 
 
 def set_threads(threads: int) -> None:
-    """Bounds the core's threads. Raises ValueError below 1."""
+    """Bounds the core's threads, for the whole process. Raises ValueError below 1."""
+    library().core_set_threads(_checked(threads))
+
+
+def allowed_threads() -> int:
+    """As many as the work of this thread may take, itself included."""
+    return min(default_threads(), _limit.threads or sys.maxsize)
+
+
+def limited_threads() -> int | None:
+    """The limit that holds for the work of this thread; None: there is none."""
+    return _limit.threads
+
+
+def limit_threads(threads: int | None) -> None:
+    """From now on the work of this thread takes at most so many; that of other threads is as it was.
+
+    Raises ValueError below 1.
+    """
+    library().core_limit_threads(0 if threads is None else _checked(threads))
+    _limit.threads = threads
+
+
+@contextmanager
+def at_most(threads: int | None) -> Iterator[None]:
+    """Inside the block the work of this thread takes at most so many threads; None: no other limit than before.
+
+    Raises ValueError below 1.
+    """
+    before = _limit.threads
+    limit_threads(before if threads is None else threads)
+    try:
+        yield
+    finally:
+        limit_threads(before)
+
+
+def _checked(threads: int) -> int:
     if threads < 1:
         raise ValueError(f"threads must be at least 1, got {threads}")
-    library().core_set_threads(threads)
+    return threads
 
 
 def give_back_memory() -> None:

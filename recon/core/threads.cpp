@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <atomic>
 #include <condition_variable>
+#include <limits>
 #include <mutex>
 #include <thread>
 #include <vector>
@@ -11,6 +12,8 @@
 
 namespace core {
 namespace {
+
+thread_local int limit = std::numeric_limits<int>::max();  // Of the calls that this thread makes.
 
 class Pool {
 public:
@@ -23,17 +26,19 @@ public:
     }
 
     void run(int num_tasks, const std::function<void(int, int)>& task) {
-        std::lock_guard<std::mutex> guard(callers_);
-        if (size_ == 1 || num_tasks <= 1) {
+        const int allowed = num_threads();
+        if (allowed == 1 || num_tasks <= 1) {  // Needs no other thread, and waits for no other caller.
             for (int index = 0; index < num_tasks; ++index) task(index, 0);
             return;
         }
+        std::lock_guard<std::mutex> guard(callers_);
         if (process_ != getpid()) abandon_workers();  // A fork keeps the memory but not the threads.
         while (int(workers_.size()) < size_ - 1) start_worker(int(workers_.size()) + 1);
         {
             std::lock_guard<std::mutex> lock(mutex_);
             task_ = &task;
             num_tasks_ = num_tasks;
+            allowed_ = allowed;
             next_ = 0;
             running_ = int(workers_.size());
             ++round_;
@@ -59,8 +64,9 @@ private:
                 wake_.wait(lock, [&] { return stopping_ || round_ != round; });
                 if (stopping_) return;
                 round = round_;
+                const bool takes_part = thread < allowed_;
                 lock.unlock();
-                take_tasks(thread);
+                if (takes_part) take_tasks(thread);
                 lock.lock();
                 if (--running_ == 0) done_.notify_one();
             }
@@ -94,7 +100,7 @@ private:
     const std::function<void(int, int)>* task_ = nullptr;
     std::atomic<int> next_{0};
     std::atomic<int> size_{1};
-    int num_tasks_ = 0, running_ = 0;
+    int num_tasks_ = 0, allowed_ = 1, running_ = 0;
     long round_ = 0;
     bool stopping_ = false;
     pid_t process_ = getpid();
@@ -107,7 +113,7 @@ Pool& pool() {
 
 }  // namespace
 
-int num_threads() { return pool().size(); }
+int num_threads() { return std::min(pool().size(), limit); }
 
 void run_parallel(int num_tasks, const std::function<void(int, int)>& task) { pool().run(num_tasks, task); }
 
@@ -121,4 +127,7 @@ void run_ranges(int count, int grain, const std::function<void(int, int, int)>& 
 }  // namespace core
 
 CORE_API void core_set_threads(int threads) { core::pool().resize(threads); }
+CORE_API void core_limit_threads(int threads) {
+    core::limit = threads < 1 ? std::numeric_limits<int>::max() : threads;
+}
 CORE_API int core_get_threads() { return core::num_threads(); }
