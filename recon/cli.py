@@ -7,18 +7,16 @@ import contextlib
 import json
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import msgspec
 from torch import Tensor
 
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.choosing import THINNED
-from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.config import read_yaml
-from splatnode.capture.process.progress import Step, Tell, telling, told_to_nobody
+from splatnode.capture.process.progress import Step, Tell, telling
 from splatnode.capture.process.terminal import say
 from splatnode.recon import cost
 from splatnode.recon.config import Config, overlaid, preset
@@ -32,15 +30,13 @@ from splatnode.recon.evaluate.report import redraw
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.mapping.command import replay_map
-from splatnode.recon.metric import in_metres
-from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.offline import check_baseline, reconstructed, run, shown_to_nobody, with_looks
 from splatnode.recon.rasterize import device
 from splatnode.recon.rasterize.device import Device
 from splatnode.recon.rasterize.dispatch import rasterizer
-from splatnode.recon.replay_source import asked_for, source
+from splatnode.recon.replay_source import Request, asked_for, source
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.folder import result_folder
-from splatnode.recon.result.only_seen import only_seen
 from splatnode.recon.result.size import largest_result_bytes
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.write import finish
@@ -55,39 +51,37 @@ LOOK_EVERY = 50  # iterations between the snapshots that a viewer is shown
 def replay(args: argparse.Namespace) -> int:
     """Reconstructs a folder of photographs, some photographs of one, a recording, or a video."""
     config = _config(args)
-    args.source, args.listed = asked_for(args.source)
-    _check_apart(args.out, args.source)
+    path, listed = asked_for(args.source)
+    request = Request(path, listed, args.views, args.frames or (), args.every_frame)
+    _check_apart(args.out, path)
     if args.map and args.only_seen:
         raise ValueError("--only-seen is for one scene: a merged map does not tell what two photographs confirm")
     if args.map:
-        return replay_map(args, config)
+        return replay_map(args, request, config)
     with telling(quiet=args.json) as tell:
-        return _replay(args, config, tell)
+        return _replay(args, request, config, tell)
 
 
-def _replay(args: argparse.Namespace, config: Config, tell: Tell) -> int:
-    given = source(args, tell)
+def _replay(args: argparse.Namespace, request: Request, config: Config, tell: Tell) -> int:
+    given = source(request, tell)
     if given.choice is not None:
         tell(str(given.choice))
         if given.choice.left_out.get(THINNED):
             tell("--map uses the keyframes that were thinned out, too, and makes a map of many scenes")
     if not args.json and (taken := cost.in_words(given.sizes)) is not None:
         say(taken, error=True)
-    _check_baseline(config, [frame.name for frame in given.frames])
+    check_baseline(config, [frame.name for frame in given.frames])
     needed_bytes = largest_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
     with (
         result_folder(args.out, needed_bytes),
-        viewer(args.out / "view") if args.view else contextlib.nullcontext(_shown_to_nobody) as show,
+        viewer(args.out / "view") if args.view else contextlib.nullcontext(shown_to_nobody) as show,
     ):
-        snapshot = run(given.frames, with_looks(config, LOOK_EVERY) if args.view else config, show, tell)
+        config = with_looks(config, LOOK_EVERY) if args.view else config
+        preset_name = args.preset or "balanced"
+        made = reconstructed(given, config, preset_name, without_guesses=args.only_seen, show=show, tell=tell)
+        del given  # and with it photographs that lie in a folder
         tell(Step("writing the results"))
-        snapshot = in_metres(snapshot, config.metric)
-        if args.only_seen:
-            snapshot = only_seen(snapshot)
-        told: dict[str, object] = {"photographs": str(given.keep(args.out).resolve())}
-        if given.choice is not None:
-            told["selection"] = given.choice.record()
-        report = finish(snapshot, args.out, seed=config.seed, preset_name=args.preset or "balanced", **told)
+        snapshot, report = made.snapshot, made.write(args.out)
         if args.json:
             print(json.dumps(report))
         else:
@@ -95,43 +89,10 @@ def _replay(args: argparse.Namespace, config: Config, tell: Tell) -> int:
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
 
 
-def _check_baseline(config: Config, names: Sequence[str]) -> None:
-    """Raises ValueError before the work where a measured distance names a photograph that is not there."""
-    missing = [name for name in (config.metric.baseline or ())[:2] if name not in names]
-    if missing:
-        raise ValueError(f"the baseline's photograph {missing[0]!r} is not there; there are: {', '.join(names)}")
-
-
 def _check_apart(out: Path, photographs: Path) -> None:
     """Raises ValueError where the preview would be a photograph of the next run."""
     if out.resolve() == photographs.resolve():
         raise ValueError(f"--out must not be the folder of the photographs; give one in it, such as {out / 'out'}")
-
-
-def _shown_to_nobody(_: Snapshot) -> None:
-    """What is done with a snapshot where nobody watches."""
-
-
-def with_looks(config: Config, every: int) -> Config:
-    """The same reconstruction, with a snapshot to look at `every` so many iterations."""
-    optimising = config.optimize
-    looks = sorted({*optimising.checkpoints, *range(every, optimising.iterations, every)})
-    return msgspec.structs.replace(config, optimize=msgspec.structs.replace(optimising, checkpoints=tuple(looks)))
-
-
-def run(
-    frames: Iterable[Frame | DroppedFrame],
-    config: Config,
-    show: Callable[[Snapshot], None] = _shown_to_nobody,
-    tell: Tell = told_to_nobody,
-) -> Snapshot:
-    """The final snapshot; every one is given to `show`, and what is being done to `tell`."""
-    snapshot = None
-    for snapshot in reconstruct(frames, config, tell):
-        show(snapshot)
-    if snapshot is None:
-        raise AssertionError("reconstruct always yields a last snapshot")
-    return snapshot
 
 
 def demo(args: argparse.Namespace) -> int:

@@ -13,6 +13,7 @@ from splatnode.recon.config import Config
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.estimation import Conclusion, Estimate
 from splatnode.recon.optimize import refinement
+from splatnode.recon.optimize.torch_threads import single_torch_thread
 from splatnode.recon.optimize.watch import examine, watch
 from splatnode.recon.rasterize.device import chosen
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
@@ -40,6 +41,7 @@ def shown(scene: Scene | None, config: Config) -> Shown:
     return Shown(None if scene is None else growth.limited(scene, config.most_gaussians))
 
 
+@single_torch_thread()
 def looked_at_first(estimate: Estimate, config: Config) -> Shown | None:
     """A coarse scene as soon as there are cameras, with a verdict that says so; None where no scene is published."""
     if estimate.registration is None or not estimate.verdict.publishable:
@@ -48,6 +50,7 @@ def looked_at_first(estimate: Estimate, config: Config) -> Shown | None:
     return Shown(scene, replace(estimate.verdict, message=f"{estimate.verdict.message} {COARSE}"))
 
 
+@single_torch_thread()
 def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
     """The scene of all cameras that were placed, not optimised yet; None where the verdict forbids one."""
     if estimate.registration is None or not estimate.verdict.publishable:

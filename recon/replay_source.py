@@ -1,8 +1,7 @@
-"""What `splatnode replay` is given: a folder of photographs, or some of its photographs, or a recording, or a video."""
+"""What is reconstructed offline: a folder of photographs, some of its photographs, a recording, a video, or frames."""
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -26,13 +25,26 @@ ALL = 30  # photographs of a folder that are all used; of more, keyframes are ch
 MOST = 60  # keyframes of a video, or of a folder of more photographs
 IMAGES = "images"  # in the result folder: the keyframes of a video
 
+_OF_PHOTOGRAPHS = Config(per_second=1e9)  # which were not taken at any rate
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is to be reconstructed."""
+
+    source: Path  # a folder, or a video
+    listed: tuple[str, ...] = ()  # the photographs of the folder that were named; none: all
+    views: int | None = None  # so many of them, evenly spread
+    frames: tuple[str, ...] = ()  # those of the folder with these names
+    every_frame: bool = False  # all that are sharp and no copies
+
 
 @dataclass(frozen=True, eq=False)
 class Source:
     """The frames to reconstruct, in their order, and where they come from."""
 
     frames: tuple[Frame | DroppedFrame, ...]
-    photographs: Path | None  # the folder that they lie in; None: they are a video's
+    photographs: Path | None  # the folder that they lie in; None: they lie in none, as a video's
     choice: Choice | None  # None: all that were asked for are used
 
     @property
@@ -104,29 +116,42 @@ def asked_for(paths: Sequence[Path]) -> tuple[Path, tuple[str, ...]]:
     return first.parent, tuple(folder.frame_name(path) for path in paths)
 
 
-def recording(args: argparse.Namespace, tell: Tell = told_to_nobody) -> Recording:
+def at_hand(
+    frames: Sequence[Frame], views: int | None = None, every_frame: bool = False, tell: Tell = told_to_nobody
+) -> Source:
+    """Photographs that lie in no folder, or what is used of them: as of a folder's. Raises ValueError as `source`."""
+    if views:
+        return Source(tuple(frames[i] for i in _spread(views, len(frames))), None, None)
+    if every_frame or len(frames) <= ALL:
+        return Source(tuple(frames), None, None)
+    looked_through = counted(frames, tell, "choosing keyframes", len(frames), "photograph")
+    choice = choose(looked_through, _OF_PHOTOGRAPHS, Limits(), MOST, "photograph")
+    return Source((*choice.keyframes, *choice.dropped), None, choice)
+
+
+def recording(request: Request, tell: Tell = told_to_nobody) -> Recording:
     """As `source`, without a limit to the number of keyframes."""
-    _check_there(args.source)
-    choice = choose(_looked_through(args, tell), _selection(args), Limits(), None, _what(args))
-    return Recording(args.source, args.listed, choice)
+    _check_there(request.source)
+    choice = choose(_looked_through(request, tell), _selection(request), Limits(), None, _what(request))
+    return Recording(request.source, request.listed, choice)
 
 
-def source(args: argparse.Namespace, tell: Tell = told_to_nobody) -> Source:
-    """The frames that the command line asks for; `tell` hears how far the reading is.
+def source(request: Request, tell: Tell = told_to_nobody) -> Source:
+    """The frames that are asked for; `tell` hears how far the reading is.
 
     Raises FileNotFoundError and ValueError where there is nothing that can be used.
     """
-    _check_there(args.source)
-    if args.source.is_file():
-        if args.frames:
+    _check_there(request.source)
+    if request.source.is_file():
+        if request.frames:
             raise ValueError("--frames names photographs of a folder; of a video, give --views N or nothing")
-        return _chosen(args, None, tell)
-    names, there = _names(args), _there(args)
-    if names or args.every_frame or len(there) <= ALL:
-        frames = folder.stream(folder.Config(folder=args.source, names=names or args.listed))
+        return _chosen(request, None, tell)
+    names, there = _names(request), _there(request)
+    if names or request.every_frame or len(there) <= ALL:
+        frames = folder.stream(folder.Config(folder=request.source, names=names or request.listed))
         of = len(names or there)
-        return Source(tuple(counted(frames, tell, "reading", of, "photograph")), args.source, None)
-    return _chosen(args, args.source, tell)
+        return Source(tuple(counted(frames, tell, "reading", of, "photograph")), request.source, None)
+    return _chosen(request, request.source, tell)
 
 
 def _check_there(path: Path) -> None:
@@ -134,9 +159,9 @@ def _check_there(path: Path) -> None:
         raise FileNotFoundError(f"{str(path)!r} is not there; give a folder that holds photographs, or a video")
 
 
-def _there(args: argparse.Namespace) -> Sequence[str]:
+def _there(request: Request) -> Sequence[str]:
     """The names of the photographs that there are to choose from."""
-    return args.listed or folder.names_in(args.source)
+    return request.listed or folder.names_in(request.source)
 
 
 def _stream(path: Path, listed: tuple[str, ...]) -> Iterator[Frame | DroppedFrame]:
@@ -145,46 +170,52 @@ def _stream(path: Path, listed: tuple[str, ...]) -> Iterator[Frame | DroppedFram
     return folder.stream(folder.Config(folder=path, names=listed))
 
 
-def _looked_through(args: argparse.Namespace, tell: Tell) -> Iterator[Frame | DroppedFrame]:
+def _looked_through(request: Request, tell: Tell) -> Iterator[Frame | DroppedFrame]:
     """All that there is to choose from; how many frames a video has is known at its end."""
-    of = 0 if args.source.is_file() else len(_there(args))
-    doing = f"choosing keyframes of {printable_name(args.source.name)}"
-    return counted(_stream(args.source, args.listed), tell, doing, of, _what(args))
+    of = 0 if request.source.is_file() else len(_there(request))
+    doing = f"choosing keyframes of {printable_name(request.source.name)}"
+    return counted(_stream(request.source, request.listed), tell, doing, of, _what(request))
 
 
-def _what(args: argparse.Namespace) -> str:
+def _what(request: Request) -> str:
     """One of those that keyframes are chosen of."""
-    return "frame" if args.source.is_file() else "photograph"
+    return "frame" if request.source.is_file() else "photograph"
 
 
-def _selection(args: argparse.Namespace) -> Config:
-    config = Config() if args.source.is_file() else Config(per_second=1e9)  # photographs were not taken at any rate
-    return msgspec.structs.replace(config, every_frame=args.every_frame)
+def _selection(request: Request) -> Config:
+    config = Config() if request.source.is_file() else _OF_PHOTOGRAPHS
+    return msgspec.structs.replace(config, every_frame=request.every_frame)
 
 
-def _chosen(args: argparse.Namespace, photographs: Path | None, tell: Tell) -> Source:
+def _chosen(request: Request, photographs: Path | None, tell: Tell) -> Source:
     """The keyframes of a recording; with --views N so many, evenly spread."""
-    choice = choose(_looked_through(args, tell), _selection(args), Limits(), max(MOST, args.views or 0), _what(args))
+    most = max(MOST, request.views or 0)
+    choice = choose(_looked_through(request, tell), _selection(request), Limits(), most, _what(request))
     frames = choice.keyframes
-    if args.views:
-        if args.views > len(frames):
-            raise ValueError(f"--views {args.views}: {choice}; ask for at most as many")
-        frames = tuple(frames[i] for i in _evenly(len(frames), args.views))
+    if request.views:
+        if request.views > len(frames):
+            raise ValueError(f"{request.views} views are asked for: {choice}; ask for at most as many")
+        frames = tuple(frames[i] for i in _evenly(len(frames), request.views))
     return Source((*frames, *choice.dropped), photographs, choice)
 
 
-def _names(args: argparse.Namespace) -> tuple[str, ...]:
+def _names(request: Request) -> tuple[str, ...]:
     """Of the photographs to use; none means all."""
-    if args.frames and args.listed:
+    if request.frames and request.listed:
         raise ValueError("--frames names photographs of a folder; here they are listed already, so leave it out")
-    if args.frames:
-        return args.frames
-    if not args.views:
+    if request.frames:
+        return request.frames
+    if not request.views:
         return ()
-    names = _there(args)
-    if args.views > len(names):
-        raise ValueError(f"--views {args.views}: there are {len(names)} photographs; ask for at most as many")
-    return tuple(names[i] for i in _evenly(len(names), args.views))
+    names = _there(request)
+    return tuple(names[i] for i in _spread(request.views, len(names)))
+
+
+def _spread(views: int, count: int) -> list[int]:
+    """So many of `count` photographs. Raises ValueError where there are fewer."""
+    if views > count:
+        raise ValueError(f"{views} views are asked for: there are {count} photographs; ask for at most as many")
+    return _evenly(count, views)
 
 
 def _evenly(count: int, wanted: int) -> list[int]:

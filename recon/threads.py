@@ -16,14 +16,14 @@ from splatnode.recon import core
 
 @contextmanager
 def at_most(threads: int | None) -> Iterator[None]:
-    """Inside the block this thread's work takes at most so many threads; None: as many as the process may use.
+    """Inside the block this thread's work takes at most so many threads; None: as many as before.
 
-    The work of other threads goes on as it did. Torch's number is set in any case: a thread that has never used torch
-    would begin with whatever another thread has just set. Raises ValueError below 1.
+    The work of other threads goes on as it did. Raises ValueError below 1.
     """
     with core.at_most(threads):
         before = torch.get_num_threads()  # to be asked first: the first question in a thread sets it anew
-        torch.set_num_threads(core.allowed_threads())
+        if threads is not None:
+            torch.set_num_threads(core.allowed_threads())
         try:
             yield
         finally:

@@ -28,7 +28,7 @@ from splatnode.recon.mapping.scenes import (
     remove_checkpoint,
 )
 from splatnode.recon.merging.command import EXIT_GOOD, EXIT_REFUSED, Reports, most, write_maps
-from splatnode.recon.replay_source import IMAGES, Recording, recording
+from splatnode.recon.replay_source import IMAGES, Recording, Request, recording
 from splatnode.recon.result.export import read_cameras, write_file
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.staged import json_bytes
@@ -38,14 +38,14 @@ from splatnode.recon.result.whole import FILE
 _OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline")
 
 
-def replay_map(args: argparse.Namespace, config: Config) -> int:
+def replay_map(args: argparse.Namespace, request: Request, config: Config) -> int:
     """Writes the scenes, their places.json, a merged result for each map, and a report.json about all."""
     given = [f"--{name.replace('_', '-')}" for name in _OF_ONE_SCENE if getattr(args, name)]
     if given:
         raise ValueError(f"--map makes many scenes and does not go with what is about one: {', '.join(given)}")
     check_begun(args.out)
     with telling(quiet=args.json) as tell:
-        source = recording(args, tell)
+        source = recording(request, tell)
         tell(str(source.choice))
     began_s = time.monotonic()
     with result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):

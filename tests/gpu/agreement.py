@@ -14,9 +14,10 @@ from torch import Tensor
 
 from splatnode.capture.cameras import folder as folder_camera
 from splatnode.capture.cameras import synthetic
-from splatnode.recon.cli import held_out_quality, run
+from splatnode.recon.cli import held_out_quality
 from splatnode.recon.config import overlaid, preset
 from splatnode.recon.evaluate.demo import write_capture
+from splatnode.recon.offline import run
 from splatnode.recon.optimize.adam import Adam
 from splatnode.recon.optimize.control import prune
 from splatnode.recon.optimize.control.control import ControlChoice

@@ -16,7 +16,7 @@ import pytest
 from splatnode import command_line
 from splatnode.capture.cameras.folder import Config, stream
 from splatnode.capture.recording import Recorder
-from splatnode.recon import cli, replay_source
+from splatnode.recon import offline, replay_source
 from splatnode.recon.result.scale import Scale
 from tests.support.exported import make_snapshot
 
@@ -43,7 +43,7 @@ def photographs(tmp_path):
 )
 def test_what_cannot_end_well_is_not_begun(photographs, monkeypatch, capsys, arguments, code, said):
     monkeypatch.chdir(photographs.parent)
-    monkeypatch.setattr(cli, "reconstruct", lambda *_: pytest.fail("was begun"))
+    monkeypatch.setattr(offline, "reconstruct", lambda *_: pytest.fail("was begun"))
     assert command_line.main(["replay", "photographs", *arguments]) == code
     assert said in capsys.readouterr().err
     assert {path.name for path in photographs.parent.iterdir()} == {"photographs"}
@@ -74,7 +74,7 @@ def replayed(photographs, monkeypatch):
 
     def replay(instead) -> int:
         monkeypatch.chdir(photographs.parent)
-        monkeypatch.setattr(cli, "reconstruct", lambda *_: instead())
+        monkeypatch.setattr(offline, "reconstruct", lambda *_: instead())
         return command_line.main(["replay", "photographs", "--out", "new/out"])
 
     return replay

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from argparse import Namespace
 
 import cv2
 import numpy as np
@@ -14,7 +13,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import decode_image, encode_png
 from splatnode.recon import replay_source
 from splatnode.recon.config import Config
-from splatnode.recon.replay_source import recording, source
+from splatnode.recon.replay_source import Request, recording, source
 
 WALK = synthetic.Config(views=6, width=160, height=120)
 STEPS = 36
@@ -39,10 +38,6 @@ def film(walk, tmp_path_factory):
     return file
 
 
-def asked(source, views=None, frames=(), every_frame=False, listed=()) -> Namespace:
-    return Namespace(source=source, listed=listed, views=views, frames=frames, every_frame=every_frame)
-
-
 def folder_of(images, folder):
     folder.mkdir()
     for i, image in enumerate(images):
@@ -52,7 +47,7 @@ def folder_of(images, folder):
 
 def test_a_folder_of_few_photographs_is_used_whole(walk, tmp_path):
     folder = folder_of(walk[: replay_source.ALL], tmp_path / "few")
-    given = source(asked(folder))
+    given = source(Request(folder))
     assert len(given.frames) == replay_source.ALL and given.choice is None
     assert given.keep(tmp_path / "out") == folder and given.further_bytes == 0
 
@@ -62,27 +57,27 @@ def test_what_is_no_photograph_is_named_and_the_others_are_used(walk, tmp_path):
     (folder / "broken.png").write_bytes(encode_png(walk[2])[:2000])
     (folder / "notes.jpg").write_text("shopping list")
     (folder / "notes.txt").write_text("is not looked at")
-    given = source(asked(folder)).frames
+    given = source(Request(folder)).frames
     assert [item.name for item in given if isinstance(item, Frame)] == ["000.png", "001.png"]
     reasons = {item.name: item.reason for item in given if isinstance(item, DroppedFrame)}
     assert reasons.keys() == {"broken.png", "notes.jpg"}
     assert reasons["broken.png"].startswith("truncated") and reasons["notes.jpg"].startswith("not an image")
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match="no photographs in .*empty'; give a folder of JPEGs or PNGs"):
-        source(asked(tmp_path / "empty"))
+        source(Request(tmp_path / "empty"))
 
 
 def test_of_a_large_folder_keyframes_are_chosen_unless_all_are_asked_for(walk, tmp_path):
     folder = folder_of(walk, tmp_path / "many")
-    given = source(asked(folder))
+    given = source(Request(folder))
     assert given.choice is not None and given.choice.examined == STEPS and len(given.frames) < STEPS
     assert given.keep(tmp_path / "out") == folder
-    assert len(source(asked(folder, every_frame=True)).frames) == STEPS
-    assert [frame.name for frame in source(asked(folder, views=2)).frames] == ["000.png", "035.png"]
+    assert len(source(Request(folder, every_frame=True)).frames) == STEPS
+    assert [frame.name for frame in source(Request(folder, views=2)).frames] == ["000.png", "035.png"]
 
 
 def test_keyframes_of_a_video_are_kept_beside_the_result(film, tmp_path):
-    given = source(asked(film))
+    given = source(Request(film))
     assert 2 < len(given.frames) < STEPS and given.choice is not None
     images = given.keep(tmp_path)
     assert sorted(path.name for path in images.iterdir()) == [frame.name for frame in given.frames]
@@ -93,51 +88,65 @@ def test_keyframes_of_a_video_are_kept_beside_the_result(film, tmp_path):
 
 
 def test_it_says_of_what_the_keyframes_are(walk, film, tmp_path):
-    assert f"of {STEPS} frames are keyframes" in str(source(asked(film)).choice)
-    assert f"of {STEPS} photographs are keyframes" in str(source(asked(folder_of(walk, tmp_path / "many"))).choice)
+    assert f"of {STEPS} frames are keyframes" in str(source(Request(film)).choice)
+    assert f"of {STEPS} photographs are keyframes" in str(source(Request(folder_of(walk, tmp_path / "many"))).choice)
 
 
 def test_so_many_views_of_a_video_are_spread_evenly(film):
-    every, few = source(asked(film)).frames, source(asked(film, views=3)).frames
+    every, few = source(Request(film)).frames, source(Request(film, views=3)).frames
     assert [frame.name for frame in few] == [every[i].name for i in (0, round((len(every) - 1) / 2), -1)]
-    with pytest.raises(ValueError, match=r"--views 1000: \d+ of 36 frames are keyframes .* ask for at most as many"):
-        source(asked(film, views=1000))
+    with pytest.raises(
+        ValueError, match=r"1000 views are asked for: \d+ of 36 frames are keyframes .* at most as many"
+    ):
+        source(Request(film, views=1000))
+
+
+def test_frames_at_hand_are_used_as_those_of_a_folder_are(walk, tmp_path):
+    frames = [Frame(i, f"{i:03d}.png", i, image, None) for i, image in enumerate(walk)]
+    assert at_hand(frames[: replay_source.ALL]).frames == tuple(frames[: replay_source.ALL])
+    chosen, in_folder = at_hand(frames), source(Request(folder_of(walk, tmp_path / "many")))
+    assert chosen.choice is not None and in_folder.choice is not None and chosen.choice.names == in_folder.choice.names
+    assert at_hand(frames, every_frame=True).frames == tuple(frames)
+    assert [frame.name for frame in at_hand(frames, views=2).frames] == ["000.png", "035.png"]
+    with pytest.raises(ValueError, match="37 views are asked for: there are 36 photographs"):
+        at_hand(frames, views=37)
+    assert at_hand(frames[:2]).keep(tmp_path / "out") == tmp_path / "out" / "images"
 
 
 def test_names_are_those_of_photographs(film):
     with pytest.raises(ValueError, match="--frames names photographs of a folder"):
-        source(asked(film, frames=("a.png",)))
+        source(Request(film, frames=("a.png",)))
 
 
 def test_a_file_that_is_no_video_is_told(tmp_path):
     (tmp_path / "notes.txt").write_text("not a video")
     with pytest.raises(ValueError, match="notes.txt' is no video that can be"):
-        source(asked(tmp_path / "notes.txt"))
+        source(Request(tmp_path / "notes.txt"))
     with pytest.raises(FileNotFoundError, match="nothing.mp4' is not there; give a folder .* or a video"):
-        source(asked(tmp_path / "nothing.mp4"))
+        source(Request(tmp_path / "nothing.mp4"))
 
 
 def test_a_folder_into_which_results_were_written_is_the_same_recording(walk, film, tmp_path):
     folder = folder_of(walk[:3], tmp_path / "photographs")
-    before = recording(asked(folder)).identity(Config())
+    before = recording(Request(folder)).identity(Config())
     (folder / "out").mkdir()
     os.utime(folder, ns=(1, 1))
-    assert recording(asked(folder)).identity(Config()) == before
-    assert recording(asked(folder)).identity(Config(seed=1)) != before
-    assert recording(asked(film)).identity(Config()) != before
+    assert recording(Request(folder)).identity(Config()) == before
+    assert recording(Request(folder)).identity(Config(seed=1)) != before
+    assert recording(Request(film)).identity(Config()) != before
 
 
 def test_photographs_of_one_folder_are_named_one_by_one(walk, tmp_path):
     there = folder_of(walk, tmp_path / "many")
     path, listed = replay_source.asked_for([there / "007.png", there / "003.png", there / "../many/011.png"])
     assert path == there and listed == ("007.png", "003.png", "011.png")
-    given = source(asked(path, listed=listed))
+    given = source(Request(path, listed=listed))
     assert [frame.name for frame in given.frames] == ["003.png", "007.png", "011.png"] and given.choice is None
     assert given.keep(tmp_path / "out") == there
-    assert [frame.name for frame in source(asked(path, views=2, listed=listed)).frames] == ["007.png", "011.png"]
+    assert [frame.name for frame in source(Request(path, views=2, listed=listed)).frames] == ["007.png", "011.png"]
     assert replay_source.asked_for([there / "000.png"]) == (there, ("000.png",))
     every = tuple(f"{i:03d}.png" for i in range(replay_source.ALL + 1))
-    chosen = source(asked(there, listed=every))
+    chosen = source(Request(there, listed=every))
     assert chosen.choice is not None and chosen.choice.examined == len(every)
 
 
@@ -156,6 +165,6 @@ def test_a_folder_a_recording_and_a_video_stand_alone(film, tmp_path):
     with pytest.raises(ValueError, match="no photograph named notes.txt"):
         (tmp_path / "notes.txt").touch()
         path, listed = replay_source.asked_for([tmp_path / "a.jpg", tmp_path / "notes.txt"])
-        source(asked(path, listed=listed))
+        source(Request(path, listed=listed))
     with pytest.raises(ValueError, match="they are listed already, so leave it out"):
-        source(asked(tmp_path, frames=("a",), listed=("a.jpg", "b.jpg")))
+        source(Request(tmp_path, frames=("a",), listed=("a.jpg", "b.jpg")))

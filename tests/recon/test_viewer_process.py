@@ -15,8 +15,9 @@ import pytest
 import splatnode.recon.viewer_process
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import read_yaml, typed
-from splatnode.recon.cli import LOOK_EVERY, with_looks
+from splatnode.recon.cli import LOOK_EVERY
 from splatnode.recon.config import preset
+from splatnode.recon.offline import with_looks
 from splatnode.recon.viewer_process import viewer
 from tests.viewer.test_cli import snapshot
 

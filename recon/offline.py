@@ -1,0 +1,100 @@
+"""Photographs that are all at hand, from what is asked for to what is written.
+
+`splatnode replay` and the Python interface call this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import msgspec
+
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.process.progress import Tell, told_to_nobody
+from splatnode.recon import threads
+from splatnode.recon.config import Config
+from splatnode.recon.metric import in_metres
+from splatnode.recon.pipeline import reconstruct
+from splatnode.recon.replay_source import Source
+from splatnode.recon.result.only_seen import only_seen
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.write import finish
+
+
+@dataclass(frozen=True, eq=False)
+class Reconstructed:
+    """What came of photographs, and what its report tells of how it was made."""
+
+    snapshot: Snapshot
+    source: Source  # without its frames where a folder has them
+    seed: int
+    preset: str
+
+    def write(self, out: Path) -> dict[str, object]:
+        """Writes the result folder and returns its report.
+
+        Raises ResultWriteError, with what was there before intact.
+        """
+        told: dict[str, object] = {"photographs": str(self.source.keep(out).resolve())}
+        if self.source.choice is not None:
+            told["selection"] = self.source.choice.record()
+        return finish(self.snapshot, out, seed=self.seed, preset_name=self.preset, **told)
+
+
+def shown_to_nobody(_: Snapshot) -> None:
+    """What is done with a snapshot where nobody watches."""
+
+
+def reconstructed(
+    source: Source,
+    config: Config,
+    preset_name: str,
+    *,
+    without_guesses: bool = False,
+    most_threads: int | None = None,
+    show: Callable[[Snapshot], None] = shown_to_nobody,
+    tell: Tell = told_to_nobody,
+) -> Reconstructed:
+    """The final snapshot of what `source` gives, in metres where `config` knows how.
+
+    `without_guesses` leaves out what no two photographs confirm. `show` gets every snapshot, and `tell` hears what is
+    being done. The work takes `most_threads` threads at most; None: as many as the process may use.
+    Raises ValueError where the intrinsics of a photograph or a number of threads cannot be used.
+    """
+    with threads.at_most(most_threads):
+        snapshot = in_metres(run(source.frames, config, show, tell), config.metric)
+    if without_guesses:
+        snapshot = only_seen(snapshot)
+    kept = source if source.photographs is None else replace(source, frames=())
+    return Reconstructed(snapshot, kept, config.seed, preset_name)
+
+
+def run(
+    frames: Iterable[Frame | DroppedFrame],
+    config: Config,
+    show: Callable[[Snapshot], None] = shown_to_nobody,
+    tell: Tell = told_to_nobody,
+) -> Snapshot:
+    """The final snapshot; every one is given to `show`, and what is being done to `tell`."""
+    snapshot = None
+    for snapshot in reconstruct(frames, config, tell):
+        show(snapshot)
+    if snapshot is None:
+        raise AssertionError("reconstruct always yields a last snapshot")
+    return snapshot
+
+
+def check_baseline(config: Config, names: Sequence[str]) -> None:
+    """Raises ValueError before the work where a measured distance names a photograph that is not there."""
+    missing = [name for name in (config.metric.baseline or ())[:2] if name not in names]
+    if missing:
+        raise ValueError(f"the baseline's photograph {missing[0]!r} is not there; there are: {', '.join(names)}")
+
+
+def with_looks(config: Config, every: int) -> Config:
+    """The same reconstruction, with a snapshot to look at `every` so many iterations."""
+    optimising = config.optimize
+    looks = sorted({*optimising.checkpoints, *range(every, optimising.iterations, every)})
+    return msgspec.structs.replace(config, optimize=msgspec.structs.replace(optimising, checkpoints=tuple(looks)))
