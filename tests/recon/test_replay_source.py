@@ -13,7 +13,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import decode_image, encode_png
 from splatnode.recon import replay_source
 from splatnode.recon.config import Config
-from splatnode.recon.replay_source import Request, recording, source
+from splatnode.recon.replay_source import Request, at_hand, recording, source
 
 WALK = synthetic.Config(views=6, width=160, height=120)
 STEPS = 36
