@@ -149,6 +149,13 @@ def reconstruct_stream(frames: Iterable[Frame | DroppedFrame], config: Config) -
         work.take(frame)
         work.update()
         yield work.snapshot()
-    estimate = work.estimate_with_depth()
-    begun = begin_scene(estimate, config)
-    yield from model(estimate.conclusion, begun, work.dropped, config, work.clock, work.numbers, show_begun=False)
+    yield from made_anew(work)
+
+
+def made_anew(work: IncrementalReconstruction, tell: Tell = told_to_nobody) -> Iterator[Snapshot]:
+    """The snapshots of `reconstruct`, from its refinement on, for all frames that `work` has taken."""
+    estimate = work.estimate_with_depth(_doing("finding and checking the cameras", tell))
+    begun = begin_scene(estimate, work.config)
+    yield from model(
+        estimate.conclusion, begun, work.dropped, work.config, work.clock, work.numbers, show_begun=False, tell=tell
+    )

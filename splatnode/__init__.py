@@ -1,1 +1,59 @@
-"""Photographs in, camera poses and a 3D Gaussian scene out, on a CPU."""
+"""Photographs in, camera poses and a 3D Gaussian scene out, on a CPU.
+
+The names below are for your own program. Each is loaded when it is first used: `import splatnode` alone takes no time.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from splatnode.api.camera import Camera
+    from splatnode.api.loading import load
+    from splatnode.api.node import Node, NodeUpdate, connect
+    from splatnode.api.reconstruction import reconstruct
+    from splatnode.api.result import Result
+    from splatnode.api.session import Session, Update
+    from splatnode.api.view import View
+    from splatnode.capture.frame import Intrinsics
+    from splatnode.recon.result.verdict import Verdict
+
+__all__ = [
+    "Camera",
+    "Intrinsics",
+    "Node",
+    "NodeUpdate",
+    "Result",
+    "Session",
+    "Update",
+    "Verdict",
+    "View",
+    "connect",
+    "load",
+    "reconstruct",
+]
+
+_MODULES = {
+    "Camera": "splatnode.api.camera",
+    "Intrinsics": "splatnode.capture.frame",
+    "Node": "splatnode.api.node",
+    "NodeUpdate": "splatnode.api.node",
+    "Result": "splatnode.api.result",
+    "Session": "splatnode.api.session",
+    "Update": "splatnode.api.session",
+    "Verdict": "splatnode.recon.result.verdict",
+    "View": "splatnode.api.view",
+    "connect": "splatnode.api.node",
+    "load": "splatnode.api.loading",
+    "reconstruct": "splatnode.api.reconstruction",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module 'splatnode' has no attribute {name!r}; it has: {', '.join(__all__)}")
+    found = globals()[name] = getattr(import_module(_MODULES[name]), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -92,7 +92,7 @@ class Live:
         self._refusals = Problems()
         self._newest: Moment | None = None
         self._tracked: CameraEstimate | None = None
-        self._lock = threading.Lock()
+        self._lock = threading.Condition()
         self._error: BaseException | None = None
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._listen, name="live scene", daemon=True)
@@ -115,8 +115,16 @@ class Live:
             moment, self._newest = self._newest, None
         return moment
 
+    def wait(self, timeout_s: float | None = None) -> Moment | None:
+        """As `take`, but waits until one comes; None where none comes in time, or when it is closed."""
+        with self._lock:
+            self._lock.wait_for(lambda: self._newest or self._error or self._closing.is_set(), timeout_s)
+        return self.take()
+
     def close(self) -> None:
         self._closing.set()
+        with self._lock:
+            self._lock.notify_all()
         self._thread.join()
         self._client.close()
         self._heartbeats.close()
@@ -141,15 +149,27 @@ class Live:
                     continue
                 with self._lock:
                     self._newest = moment
+                    self._lock.notify_all()
         except Exception as error:
-            self._error = error
+            with self._lock:
+                self._error = error
+                self._lock.notify_all()
 
 
 def load_result(place: Path, photographs: Path | None = None) -> Moment:
     """The moment in a result's folder or a scene file, with the photographs that are found.
 
-    They are looked for in `photographs`, or else where the report says that they were, where a result of
-    `splatnode demo` has them, and beside the scene.
+    They are looked for in `photographs`, or else where `read_result` tells. Raises what that raises.
+    """
+    snapshot, folders = read_result(place)
+    images = found_photographs(snapshot.cameras, [photographs] if photographs else folders)
+    return Moment(replace(snapshot, images=images), time.monotonic())
+
+
+def read_result(place: Path) -> tuple[Snapshot, list[Path]]:
+    """The snapshot in a result's folder or a scene file, and the folders in which its photographs may be.
+
+    These are where the report says that they were, where a result of `splatnode demo` has them, and beside the scene.
     A folder without a scene must have a report that says why. Raises SceneFileError, FileNotFoundError, ValueError.
     """
     folder = place if place.is_dir() else place.parent
@@ -170,14 +190,14 @@ def load_result(place: Path, photographs: Path | None = None) -> Moment:
         verdict=report.verdict,
         cameras=cameras,
         gaussians=gaussians,
-        images=found_photographs(cameras, [photographs] if photographs else reported + beside),
+        images={},
         dropped=report.frames_dropped,
         iterations=report.iterations,
         seconds=report.seconds,
         final=True,
         scale=StoredResult(scene).scale(),
     )
-    return Moment(snapshot, time.monotonic())
+    return snapshot, reported + beside
 
 
 def _gaussians(scene: Path) -> GaussianArrays:

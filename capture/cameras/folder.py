@@ -88,7 +88,7 @@ def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]
             yield DroppedFrame(name, f"cannot be read: {error.strerror}")
         else:
             height, width = image.shape[:2]
-            if config.intrinsics is not None and _same_aspect(config.intrinsics, width, height):
+            if config.intrinsics is not None and same_aspect(config.intrinsics, width, height):
                 intrinsics = config.intrinsics.resized(width, height)
             stamp_ns = round(frame_id / config.frames_per_second * 1e9)
             item = framed(frame_id, name, stamp_ns, image, intrinsics, data, captured_at or name_time(name))
@@ -168,5 +168,6 @@ def natural_order(path: Path) -> tuple:
     return tuple((int(part), "") if part.isdecimal() else (-1, part) for part in parts if part), path.name
 
 
-def _same_aspect(intrinsics: Intrinsics, width: int, height: int) -> bool:
+def same_aspect(intrinsics: Intrinsics, width: int, height: int) -> bool:
+    """Whether an image of this size can be one of the camera's, resized."""
     return abs(intrinsics.width * height - intrinsics.height * width) <= max(width, height)

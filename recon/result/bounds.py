@@ -85,6 +85,12 @@ def axes_of(covariance: Array, centre: float) -> Axes:
     return as_axes(lengths[:, None] * directions * np.sign(largest)[:, None])
 
 
+def covariance(axes: Axes) -> Array:
+    """(3, 3) of the normal distribution whose 95 % ellipsoid has these semi-axes."""
+    rows = np.array(axes)
+    return rows.T @ rows / _CHI2_95_OF_3
+
+
 def as_axes(rows: Array) -> Axes:
     """The rows (3, 3) as axes."""
     first, second, third = ((float(x), float(y), float(z)) for x, y, z in rows)

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
+_CONSTANT = 0.28209479177387814  # the first term
 _DIRECTIONS = 64  # of the fit; a band of degree 3 needs 7
 
 
@@ -17,7 +18,7 @@ def terms(x: Any, y: Any, z: Any, bases: int) -> list[Any]:
 
     The vectors' coordinates are arrays of NumPy or of torch, and so are the terms, of the same shape.
     """
-    found = [0.0 * x + 0.28209479177387814]
+    found = [0.0 * x + _CONSTANT]
     if bases > 1:
         found += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if bases > 4:
@@ -65,3 +66,13 @@ def turned(sh: npt.NDArray[np.float32], rotation: Array) -> npt.NDArray[np.float
         matrix = np.linalg.lstsq(after[:, band], before[:, band], rcond=None)[0]
         result[:, band] = np.einsum("ab,nbc->nac", matrix, sh[:, band])
     return result
+
+
+def flat(colours: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """(N, 1, 3) coefficients of colours (N, 3) in [0, 1] that are the same from all directions."""
+    return ((colours - 0.5) / _CONSTANT)[:, None].astype(np.float32)
+
+
+def mean_colours(sh: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """(N, 3) the colours in [0, 1] of coefficients (N, B, 3), without what depends on the direction."""
+    return np.clip(0.5 + _CONSTANT * sh[:, 0], 0.0, 1.0).astype(np.float32)

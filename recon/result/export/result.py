@@ -57,6 +57,27 @@ def write_result(
     return out_dir / MANIFEST
 
 
+def copy_result(folder: Path, out_dir: Path) -> Path:
+    """Writes the result that lies in `folder` into `out_dir`, as `write_result` wrote it; returns the manifest's path.
+
+    Raises SceneFileError where the files are not those of its manifest any more, and ResultWriteError.
+    """
+    listed, files = _read_manifest(folder), {}
+    for name, digest in listed.items():
+        path = folder / name
+        if not path.is_file() or not path.resolve().is_relative_to(folder.resolve()):
+            raise SceneFileError(f"{path} is not there any more, and {MANIFEST} lists it")
+        files[name] = path.read_bytes()
+        if _sha256(files[name]) != digest:
+            raise SceneFileError(f"{path} was changed since it was written: it is not what {MANIFEST} tells of")
+    if not files:
+        raise SceneFileError(f"{folder} has no {MANIFEST} that can be read: it is no result that was written whole")
+    files[MANIFEST] = (folder / MANIFEST).read_bytes()
+    superseded = {name: digest for name, digest in _read_manifest(out_dir).items() if name not in files}
+    write_files(out_dir, files, superseded)
+    return out_dir / MANIFEST
+
+
 def remove_result(out_dir: Path) -> None:
     """Removes what `write_result` wrote and nobody changed since, and the folder if it is empty then.
 

@@ -1,0 +1,127 @@
+"""A running node, as a program that listens to it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+
+from splatnode.api.camera import Camera, camera_of
+from splatnode.api.result import Result
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.process.config import read_yaml, typed
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.write import finish
+from splatnode.viewer.moment import Moment
+from splatnode.viewer.sources import Live
+
+FIRST_PORT = Network().first_port
+
+
+@dataclass(frozen=True, eq=False)
+class NodeUpdate:
+    """A scene of a node, as it has just become."""
+
+    scene_id: str  # another one is another place, with a world of its own
+    result: Result  # `result.final`: verified with all evidence, and refined; lengths are relative
+
+
+@dataclass(frozen=True, eq=False)
+class Received:
+    """What came over the network, as it can be written."""
+
+    snapshot: Snapshot
+
+    def write(self, out: Path) -> None:
+        finish(self.snapshot, out, seed=0, preset_name="received from a node")
+
+
+class Node:
+    """A connection to a node: its scenes as they change, and where its live camera is.
+
+    Made by `connect`. A thread listens; what nobody has taken is replaced by what is newer. As a context manager it
+    closes itself.
+    """
+
+    def __init__(self, network: Network) -> None:
+        self._live = Live(network)
+
+    def __iter__(self) -> Iterator[NodeUpdate]:
+        """Each update as it comes, the present scene first; ends when the connection is closed by another thread.
+
+        Raises PermissionError where the node does not let this program in.
+        """
+        while (update := self.wait()) is not None:
+            yield update
+
+    def wait(self, timeout_s: float | None = None) -> NodeUpdate | None:
+        """The next update; None where none comes in so many seconds, or when the connection is closed.
+
+        Raises PermissionError where the node does not let this program in.
+        """
+        moment = self._live.wait(timeout_s)
+        return None if moment is None else _update(moment)
+
+    @property
+    def live_camera(self) -> Camera | None:
+        """Where the live camera is now, in the newest scene; None: not known, as before the scene is final.
+
+        The node looks once a second; the camera has no bounds, and its K is that of the preview.
+        """
+        tracked = self._live.tracked
+        return None if tracked is None else camera_of(tracked)
+
+    @property
+    def silent_s(self) -> float:
+        """Seconds since anything was heard; a node is heard each second. Infinite before the first word."""
+        return self._live.age_s
+
+    def close(self) -> None:
+        """Ends the connection, and whoever waits for an update."""
+        self._live.close()
+
+    def __enter__(self) -> Node:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def connect(
+    address: str | PathLike[str] | None = None,
+    *,
+    keys: str | PathLike[str] | None = None,
+    first_port: int = FIRST_PORT,
+) -> Node:
+    """A connection to a node, whether it runs already or starts later.
+
+    - `address`: None for the node of this user on this machine; the folder of its sockets (`network.directory`); its
+      configuration file (.yaml); or, over a network, the machine's address such as "192.168.1.7".
+    - `keys`: over a network, the folder that `splatnode keys` made.
+    - `first_port`: over a network, `network.first_port`.
+
+    Raises ValueError where the address or the keys cannot be used, PermissionError where the folder is not private.
+    """
+    return Node(_network(address, keys, first_port))
+
+
+def _network(address: str | PathLike[str] | None, keys: str | PathLike[str] | None, first_port: int) -> Network:
+    if address is None:
+        return Network()
+    path = Path(address)
+    if path.suffix.lower() in (".yaml", ".yml"):
+        return typed(read_yaml(path).get("network", {}), Network, "network")
+    if path.is_dir():
+        return Network(directory=path)
+    if isinstance(address, PathLike) or "/" in address:
+        raise ValueError(
+            f"{address} is no folder and no .yaml file; give the node's network.directory or configuration"
+        )
+    if keys is None:
+        raise ValueError(f"keys must be the folder that `splatnode keys` made, to connect to {address}; got None")
+    return Network(tcp=address, keys=Path(keys), first_port=first_port)
+
+
+def _update(moment: Moment) -> NodeUpdate:
+    return NodeUpdate(moment.scene_id, Result(moment.snapshot, Received(moment.snapshot)))

@@ -1,0 +1,164 @@
+"""Photographs as a program has them: paths, arrays or PIL images, as the frames that are reconstructed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.cameras.folder import same_aspect
+from splatnode.capture.exif import exif_intrinsics, read_tags
+from splatnode.capture.exif_time import exif_time
+from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.process.progress import Tell
+from splatnode.capture.stamp import Stamp
+from splatnode.recon.replay_source import Request, Source, asked_for, at_hand, source
+
+STEP_NS = 100_000_000  # between two photographs that have no time, as in a folder
+ORIENTATION = 0x0112  # of EXIF
+_TURNS = {
+    1: (0, False),
+    2: (0, True),
+    3: (2, False),
+    4: (2, True),
+    5: (1, True),
+    6: (3, False),
+    7: (3, True),
+    8: (1, False),
+}
+_EXIF = b"Exif\0\0"  # before the TIFF structure
+
+# Of the pictures, NumPy arrays (H, W, 3) uint8 RGB, or PIL images; other shapes are told at `pixels`.
+Picture: TypeAlias = Any
+Images: TypeAlias = "str | PathLike[str] | Picture | Sequence[str | PathLike[str]] | Sequence[Picture]"
+Lens: TypeAlias = "Intrinsics | npt.NDArray[np.floating]"
+
+
+def photographs(images: Images, views: int | None, every_frame: bool, tell: Tell) -> Source:
+    """The frames of a folder, of files, of a video, or of pictures. Raises TypeError, ValueError, FileNotFoundError."""
+    given = _as_list(images)
+    paths = [isinstance(each, (str, PathLike)) for each in given]
+    if all(paths):
+        path, listed = asked_for([Path(each) for each in given])
+        return source(Request(path, listed, views, every_frame=every_frame), tell)
+    if any(paths):
+        raise TypeError("images must be all paths or all pictures, got both. Read the files, or write the pictures")
+    frames = [frame(each, index, f"{index:04d}.png", index * STEP_NS) for index, each in enumerate(given)]
+    return at_hand(frames, views, every_frame, tell)
+
+
+def frame(picture: Picture, frame_id: int, name: str, stamp_ns: int, captured_at: Stamp | None = None) -> Frame:
+    """A picture as a frame, with what its EXIF tells of lens and time. Raises TypeError, ValueError."""
+    try:
+        image, tiff = pixels(picture), _tiff(picture)
+        height, width = image.shape[:2]
+        intrinsics = exif_intrinsics(read_tags(tiff), width, height)
+        return Frame(frame_id, name, stamp_ns, image, intrinsics, captured_at=captured_at or exif_time(tiff))
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"image {name}: {error}") from error
+
+
+def pixels(picture: Picture) -> npt.NDArray[np.uint8]:
+    """A copy of a picture (H, W, 3) RGB, treated as a file's: upright, grey as RGB, 16 bits as the upper 8, no alpha.
+
+    An array must be (H, W), (H, W, 1), (H, W, 3) or (H, W, 4), of uint8 or uint16. Raises TypeError, ValueError.
+    """
+    array = _of_pil(picture) if _is_pil(picture) else picture
+    if not isinstance(array, np.ndarray):
+        raise TypeError(f"must be a NumPy array (H, W, 3) uint8 or a PIL image, got {type(picture).__name__}")
+    if array.dtype == np.uint16:
+        array = (array >> 8).astype(np.uint8)
+    if array.dtype != np.uint8:
+        raise TypeError(f"must be uint8, got {array.dtype}. Of floats in [0, 1]: (255 * image).round().astype('uint8')")
+    if array.ndim == 2:
+        array = array[..., None]
+    if array.ndim != 3 or array.shape[2] not in (1, 3, 4):
+        raise ValueError(f"must be (H, W, 3), got {array.shape}. Channels come last: image.transpose(1, 2, 0)")
+    colours = np.repeat(array, 3, 2) if array.shape[2] == 1 else array[..., :3]
+    return np.array(colours, np.uint8, order="C")
+
+
+def with_lens(given: Source, lens: Lens | None) -> Source:
+    """The frames with this lens, where their aspect ratio is its images', in place of what their EXIF tells.
+
+    A matrix (3, 3) is a pinhole's, for photographs of the first one's size. Raises TypeError, ValueError.
+    """
+    if lens is None:
+        return given
+    frames = [each for each in given.frames if isinstance(each, Frame)]
+    if not frames:
+        return given
+    known = intrinsics_of(lens, frames[0].width, frames[0].height)
+    if not any(same_aspect(known, each.width, each.height) for each in frames):
+        sizes = ", ".join(sorted({f"{each.width} x {each.height}" for each in frames}))
+        raise ValueError(
+            f"intrinsics must be of images of the photographs' aspect ratio, got those of {known.width} x "
+            f"{known.height} for {sizes}. Give the size of the images that were calibrated"
+        )
+    return replace(given, frames=tuple(seen_through(each, known) for each in given.frames))
+
+
+def seen_through(each: Any, known: Intrinsics) -> Any:
+    """The frame with this lens, if it can be one of its images."""
+    if not isinstance(each, Frame) or not same_aspect(known, each.width, each.height):
+        return each
+    return replace(each, intrinsics=known.resized(each.width, each.height))
+
+
+def intrinsics_of(lens: Lens, width: int, height: int) -> Intrinsics:
+    """A lens as it may be given, for photographs of this size. Raises TypeError, ValueError."""
+    if isinstance(lens, Intrinsics):
+        return lens
+    K = np.asarray(lens, np.float64) if isinstance(lens, (np.ndarray, list, tuple)) else None
+    if K is None or K.shape != (3, 3):
+        shape = type(lens).__name__ if K is None else str(K.shape)
+        raise TypeError(f"intrinsics must be splatnode.Intrinsics or a matrix K (3, 3), got {shape}")
+    fx, fy, cx, cy = (float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return Intrinsics(width, height, fx, fy, cx, cy, source="given")
+
+
+def lenses(frames: Iterable[Any]) -> dict[str, Intrinsics]:
+    """By name, the lenses that were given or calibrated."""
+    known = {each.name: each.intrinsics for each in frames if isinstance(each, Frame) and each.intrinsics is not None}
+    return {name: lens for name, lens in known.items() if lens.source in ("given", "calibration")}
+
+
+def _as_list(images: Images) -> list[Any]:
+    one = isinstance(images, (str, PathLike)) or _is_pil(images)
+    if one or (isinstance(images, np.ndarray) and images.ndim < 4):
+        return [images]
+    try:
+        given = list(images)
+    except TypeError as error:
+        raise TypeError(f"images must be a folder, a video, or a list, got {type(images).__name__}") from error
+    if not given:
+        raise ValueError("images must have at least one photograph, got none")
+    return given
+
+
+def _is_pil(picture: Any) -> bool:
+    """Whether it is used as PIL's images are: PIL itself is not needed."""
+    return all(hasattr(picture, name) for name in ("convert", "getbands", "mode", "info"))
+
+
+def _of_pil(picture: Any) -> npt.NDArray:
+    deep = picture.mode.startswith("I;16")
+    return _upright(np.asarray(picture if deep else picture.convert("RGB")), picture.getexif().get(ORIENTATION, 1))
+
+
+def _upright(image: npt.NDArray, orientation: int) -> npt.NDArray:
+    """The image turned as EXIF says; `orientation` is 1 to 8."""
+    quarters, mirrored = _TURNS.get(orientation, _TURNS[1])
+    turned = np.rot90(image, quarters)
+    return turned[:, ::-1] if mirrored else turned
+
+
+def _tiff(picture: Any) -> bytes:
+    """The TIFF structure of a PIL image's EXIF; empty where it has none."""
+    known = picture.info.get("exif", b"") if _is_pil(picture) else b""
+    return known.removeprefix(_EXIF) if isinstance(known, bytes) else b""

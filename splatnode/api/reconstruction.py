@@ -1,0 +1,110 @@
+"""Photographs that are all at hand, reconstructed in the process that asks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any
+
+from splatnode.api.photographs import Images, Lens, lenses, photographs, with_lens
+from splatnode.api.result import Result
+from splatnode.capture.cameras.folder import frame_name
+from splatnode.capture.process.config import read_yaml
+from splatnode.capture.process.progress import Tell, told_to_nobody
+from splatnode.recon.config import Config, overlaid
+from splatnode.recon.config import preset as named
+from splatnode.recon.offline import check_baseline, reconstructed
+
+Baseline = tuple[str | int, str | int, float]
+Changes = Mapping[str, Any] | str | PathLike[str]
+
+
+def reconstruct(
+    images: Images,
+    *,
+    intrinsics: Lens | None = None,
+    scale: Baseline | None = None,
+    budget_s: float | None = None,
+    preset: str = "balanced",
+    config: Changes | None = None,
+    views: int | None = None,
+    every_frame: bool = False,
+    only_seen: bool = False,
+    seed: int | None = None,
+    threads: int | None = None,
+    tell: Tell | None = None,
+) -> Result:
+    """What came of the photographs: the same cameras and Gaussians, to the bit, as of `splatnode replay`.
+
+    A refusal is a result, too: ask `verdict.publishable`. Several threads may call this at once.
+
+    - `images`: a folder, a video, a list of photographs of one folder (paths), or a list of pictures: NumPy arrays
+      (H, W, 3) uint8 RGB, or PIL images. Grey is taken as RGB, 16 bits as the upper 8, alpha is dropped. Of a video,
+      and of more than 30 photographs, keyframes are chosen.
+    - `intrinsics`: the lens of all photographs of its aspect ratio: `Intrinsics`, or K (3, 3) in pixels of the
+      photographs without distortion. None: what EXIF tells, else it is estimated.
+    - `scale`: two photographs and the metres between their cameras: `("a.jpg", "b.jpg", 0.5)`, of pictures their
+      places in the list: `(0, 3, 0.5)`. None: lengths have no unit.
+    - `budget_s`: the best scene within so many seconds. None: as long as it takes.
+    - `preset`: `preview`, `fast`, `balanced` or `quality`.
+    - `config`: what differs from the preset, as `docs/configuration.md` lists it: a mapping, or a YAML file.
+    - `views`: so many photographs or keyframes, evenly spread. `every_frame`: all that are sharp and no copies.
+    - `only_seen`: leaves out what no two photographs confirm, and the far background.
+    - `seed`: of what is drawn by chance. None: the configuration's, 0.
+    - `threads`: of this call at most, of torch and of the compiled core. None: as many as there are processors.
+    - `tell`: hears what is being done, in the calling thread: a step with `doing`, `done`, `of`, or a line of text.
+      What it raises ends the work.
+
+    Raises TypeError and ValueError where an argument is not what it must be, and FileNotFoundError.
+    """
+    telling = tell or told_to_nobody
+    check_count("views", views)
+    check_count("threads", threads)
+    source = with_lens(photographs(images, views, every_frame, telling), intrinsics)
+    flags = {"budget_s": budget_s, "seed": seed}
+    chosen = configured(preset, config, flags, scale, of_pictures=source.photographs is None)
+    check_baseline(chosen, [frame.name for frame in source.frames])
+    known = lenses(source.frames)
+    made = reconstructed(source, chosen, preset, without_guesses=only_seen, most_threads=threads, tell=telling)
+    return Result(made.snapshot, made, known)
+
+
+def configured(
+    preset: str, changes: Changes | None, flags: Mapping[str, Any], scale: Baseline | None, of_pictures: bool
+) -> Config:
+    """The preset, then what differs from it, then the arguments: what comes later wins. Raises TypeError, ValueError."""
+    config = named(preset)
+    if isinstance(changes, (str, PathLike)):
+        config = overlaid(config, read_yaml(Path(changes)))
+    elif isinstance(changes, Mapping):
+        config = overlaid(config, changes)
+    elif changes is not None:
+        raise TypeError(f"config must be a mapping or a YAML file, got {type(changes).__name__}")
+    if scale is not None:
+        config = overlaid(config, {"metric": {"baseline": _baseline(scale, of_pictures)}})
+    return overlaid(config, {name: value for name, value in flags.items() if value is not None})
+
+
+def check_count(name: str, value: int | None) -> None:
+    """Raises ValueError for an argument that is neither a number of things nor None."""
+    if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
+        raise ValueError(f"{name} must be a whole number of 1 or more, or None, got {value!r}")
+
+
+def _baseline(scale: Baseline, of_pictures: bool) -> Sequence[Any]:
+    """As the configuration has it. Raises TypeError."""
+    if not isinstance(scale, (tuple, list)) or len(scale) != 3 or not isinstance(scale[2], (int, float)):
+        raise TypeError(
+            f"scale must be two photographs and the metres between them, ('a.jpg', 'b.jpg', 0.5), got {scale!r}"
+        )
+    first, second, metres = scale
+    return [_name(first, of_pictures), _name(second, of_pictures), float(metres)]
+
+
+def _name(photograph: object, of_pictures: bool) -> str:
+    if isinstance(photograph, int) and of_pictures:
+        return f"{photograph:04d}.png"
+    if isinstance(photograph, (str, PathLike)):
+        return frame_name(Path(fspath(photograph)))
+    raise TypeError(f"scale must name photographs by their files, or pictures by their places, got {photograph!r}")

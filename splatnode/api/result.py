@@ -1,0 +1,121 @@
+"""What came of photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+from typing import Protocol
+
+import numpy.typing as npt
+
+from splatnode.api.camera import Camera, camera_of
+from splatnode.api.view import View, view
+from splatnode.capture.frame import DroppedFrame, Intrinsics
+from splatnode.recon.result.folder import result_folder
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.sources import seen
+from splatnode.recon.result.spherical_harmonics import mean_colours
+from splatnode.recon.result.verdict import Verdict
+
+
+class Files(Protocol):
+    """What knows how a result is written."""
+
+    def write(self, out: Path) -> object:
+        """Writes the result folder. Raises ResultWriteError."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result:
+    """The verdict on photographs and, where it is publishable, their cameras and the scene.
+
+    Made by `reconstruct`, `load`, a `Session` or a `Node`. It can be pickled and used by several threads. Arrays that
+    it gives are copies: a program may change them.
+    """
+
+    _snapshot: Snapshot
+    _files: Files
+    _lenses: Mapping[str, Intrinsics] = field(default_factory=dict)
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether there is a scene (`publishable`), and why: `code`, `message`, `advice`, and `frames` it is about."""
+        return self._snapshot.verdict
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """One for each photograph that was placed, in the order in which they were given; none after a refusal."""
+        return tuple(camera_of(each, self._lenses.get(each.name)) for each in self._snapshot.cameras)
+
+    @property
+    def dropped(self) -> tuple[DroppedFrame, ...]:
+        """The photographs that were left out, each with `name` and `reason`."""
+        return self._snapshot.dropped
+
+    @property
+    def gaussians(self) -> dict[str, npt.NDArray]:
+        """N Gaussians by what is known of them; N is 0 after a refusal.
+
+        `means` (N, 3) centres in the world; `quats` (N, 4) rotations, wxyz, of unit length; `scales` (N, 3) standard
+        deviations along their axes; `opacities` (N,) in (0, 1); `sh` (N, B, 3) spherical harmonics, B being 1, 4, 9 or
+        16; `colours` (N, 3) RGB in [0, 1], without what depends on the direction; `seen` (N,) whether two photographs
+        confirm its depth. All but `seen` are float32.
+        """
+        have = self._snapshot.gaussians
+        known = {name: getattr(have, name).copy() for name in ("means", "quats", "scales", "opacities", "sh")}
+        return known | {"colours": mean_colours(have.sh), "seen": seen(have.source_frame)}
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """How long it took, by stage, and `total`."""
+        return dict(self._snapshot.seconds)
+
+    @property
+    def metric(self) -> bool:
+        """Whether lengths are metres. Otherwise they have no unit: the median depth of the scene is about 1."""
+        return self._snapshot.scale.metric
+
+    @property
+    def final(self) -> bool:
+        """Whether all photographs were judged with all evidence, and the scene is refined."""
+        return self._snapshot.final
+
+    def render(
+        self, T_world_camera: npt.ArrayLike, K: npt.ArrayLike, size: tuple[int, int], *, threads: int | None = None
+    ) -> View:
+        """What a camera at `T_world_camera` (4, 4) with pinhole `K` (3, 3) sees; `size` is (width, height) in pixels.
+
+        Axes and pixels are those of `Camera`. The work takes at most `threads` threads; None: as many as there are
+        processors. Raises ValueError where there is no scene, or these are no camera, and TypeError for other types.
+        """
+        if not self.verdict.publishable:
+            raise ValueError(f"there is no scene to render: {self.verdict.code.value}. Ask verdict.publishable first")
+        return view(self._snapshot.gaussians, T_world_camera, K, size, threads)
+
+    def save(self, folder: str | PathLike[str]) -> Path:
+        """Writes the files that `splatnode replay --out FOLDER` writes, and returns the folder.
+
+        A result that lies there already is replaced; of a refusal there is a report alone. Photographs that came as
+        arrays, and the keyframes of a video, are written into `images`. Raises OSError, with what was there before
+        intact, where that cannot be done.
+        """
+        out = Path(folder)
+        with result_folder(out):
+            self._files.write(out)
+        return out
+
+    def show(self) -> None:
+        """Opens the result in the Open3D window (a process of its own), and returns when that is closed.
+
+        Raises ModuleNotFoundError without Open3D (`pip install 'splatnode[viewer]'`), RuntimeError where no window can
+        be opened.
+        """
+        from splatnode.api.window import show  # brings what finds windows
+
+        show(self)
+
+    def __repr__(self) -> str:
+        counts = f"{len(self._snapshot.cameras)} cameras, {len(self._snapshot.gaussians)} Gaussians"
+        return f"<splatnode.Result {self.verdict.code.value}: {counts}, {len(self.dropped)} left out>"

@@ -1,0 +1,142 @@
+"""Photographs that come one at a time, reconstructed in the process that has them: no sockets, no daemon."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+
+from splatnode.api.photographs import Lens, Picture, frame, intrinsics_of, lenses, seen_through
+from splatnode.api.reconstruction import Baseline, Changes, check_count, configured
+from splatnode.api.result import Result
+from splatnode.capture.frame import Frame
+from splatnode.capture.process.progress import Tell, told_to_nobody
+from splatnode.capture.quality import Limits
+from splatnode.capture.selection import Config as Selection
+from splatnode.capture.selection import Selector
+from splatnode.capture.stamp import Stamp
+from splatnode.recon import threads as limits
+from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.metric import in_metres
+from splatnode.recon.offline import Reconstructed
+from splatnode.recon.pipeline import made_anew
+from splatnode.recon.replay_source import Source
+from splatnode.recon.result.snapshot import Snapshot
+
+_EACH = 1e9  # frames a second: each is examined
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """What became of one photograph of a session, and what is known after it."""
+
+    name: str  # of the photograph
+    taken: bool  # whether it counts; otherwise `reason` says why it does not
+    reason: str  # why it was taken, or not: what it adds, or that it is blurred, a copy, ...
+    result: Result  # of all photographs so far; coarse until `Session.finish`
+
+
+class Session:
+    """A reconstruction that grows with each photograph, as that of a node does.
+
+    One place, of up to some 30 photographs: from a camera's loop most frames are not taken, because they add too
+    little. Several threads may call it; they wait for each other. As a context manager it closes itself.
+    """
+
+    def __init__(
+        self,
+        *,
+        intrinsics: Lens | None = None,
+        scale: Baseline | None = None,
+        preset: str = "balanced",
+        config: Changes | None = None,
+        every_frame: bool = False,
+        seed: int | None = None,
+        threads: int | None = None,
+        tell: Tell | None = None,
+    ) -> None:
+        """The arguments are those of `reconstruct`; `every_frame` takes all photographs that are sharp and no copies.
+
+        Photographs without a name are called 0000.png, 0001.png, ... in the order in which they are given.
+        """
+        check_count("threads", threads)
+        self._config = configured(preset, config, {"seed": seed}, scale, of_pictures=True)
+        self._preset, self._lens, self._threads, self._tell = preset, intrinsics, threads, tell or told_to_nobody
+        self._selector = Selector(Selection(every_frame=every_frame, per_second=_EACH), Limits())
+        self._work: IncrementalReconstruction | None = IncrementalReconstruction(self._config)
+        self._frames: dict[str, Frame] = {}  # that were taken
+        self._given: set[str] = set()
+        self._snapshot: Snapshot | None = None
+        self._lock = threading.RLock()
+
+    def add(self, image: Picture, *, name: str | None = None, captured_at: Stamp | None = None) -> Update:
+        """Shows the session a photograph: a NumPy array (H, W, 3) uint8 RGB, or a PIL image.
+
+        Returns what became of it once the scene has grown, which takes about a second where it is taken, and a few
+        milliseconds where it is not. Raises TypeError and ValueError where it is no image, or a name comes again, and
+        RuntimeError after `finish` or `close`.
+        """
+        with self._lock, limits.at_most(self._threads):
+            work = self._open()
+            number = len(self._given)
+            frame = self._framed(image, number, name or f"{number:04d}.png", captured_at)
+            if frame.name in self._given:
+                raise ValueError(f"name must be new for each photograph; {frame.name!r} was given before")
+            self._given.add(frame.name)
+            decision = self._selector.decide(frame)
+            if decision.take:
+                self._frames[frame.name] = frame
+                work.take(frame)
+                work.update()
+                self._snapshot = work.snapshot()
+            taken = frame.name in work.names
+            left_out = {each.name: each.reason for each in work.dropped}
+            return Update(frame.name, taken, left_out.get(frame.name, decision.reason), self.result)
+
+    def finish(self) -> Result:
+        """Judges all photographs with all evidence, and makes their scene anew; the session is closed then.
+
+        Raises RuntimeError after `finish` or `close`.
+        """
+        with self._lock, limits.at_most(self._threads):
+            for self._snapshot in made_anew(self._open(), self._tell):
+                pass
+            self.close()
+            return self.result
+
+    @property
+    def result(self) -> Result:
+        """What is known of all photographs so far."""
+        with self._lock:
+            snapshot = self._snapshot or self._nothing_yet()
+            snapshot = in_metres(snapshot, self._config.metric)
+            frames = tuple(self._frames.values())
+            made = Reconstructed(snapshot, Source(frames, None, None), self._config.seed, self._preset)
+            return Result(snapshot, made, lenses(frames))
+
+    def close(self) -> None:
+        """Gives back what the session holds beside its last result."""
+        with self._lock:
+            self._work = None
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _open(self) -> IncrementalReconstruction:
+        if self._work is None:
+            raise RuntimeError("the session is closed: begin another one")
+        return self._work
+
+    def _nothing_yet(self) -> Snapshot:
+        work = self._open()
+        work.estimate_soon()
+        return work.snapshot()
+
+    def _framed(self, image: Picture, number: int, name: str, captured_at: Stamp | None) -> Frame:
+        made = frame(image, number, name, time.monotonic_ns(), captured_at)
+        if self._lens is None:
+            return made
+        return seen_through(made, intrinsics_of(self._lens, made.width, made.height))
