@@ -99,7 +99,7 @@ class Live:
         self._thread.start()
 
     @property
-    def age_s(self) -> float | None:
+    def age_s(self) -> float:
         """A scene that is being refined is silent for long: the node's heartbeats tell that it lives."""
         return min(self._client.age_s, self._heartbeats.age_s)
 

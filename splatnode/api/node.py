@@ -74,7 +74,7 @@ class Node:
 
     @property
     def silent_s(self) -> float:
-        """Seconds since anything was heard; a node is heard each second. Infinite before the first word."""
+        """Seconds since anything was heard of the node, which speaks each second; infinite before the first time."""
         return self._live.age_s
 
     def close(self) -> None:

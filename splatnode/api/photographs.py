@@ -21,16 +21,10 @@ from splatnode.recon.replay_source import Request, Source, asked_for, at_hand, s
 
 STEP_NS = 100_000_000  # between two photographs that have no time, as in a folder
 ORIENTATION = 0x0112  # of EXIF
+# By what EXIF says, quarters of a turn to the left, and whether it is mirrored then.
 _TURNS = {
-    1: (0, False),
-    2: (0, True),
-    3: (2, False),
-    4: (2, True),
-    5: (1, True),
-    6: (3, False),
-    7: (3, True),
-    8: (1, False),
-}
+    1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (3, True), 6: (3, False), 7: (1, True), 8: (1, False),
+}  # fmt: skip
 _EXIF = b"Exif\0\0"  # before the TIFF structure
 
 # Of the pictures, NumPy arrays (H, W, 3) uint8 RGB, or PIL images; other shapes are told at `pixels`.
@@ -128,7 +122,7 @@ def lenses(frames: Iterable[Any]) -> dict[str, Intrinsics]:
     return {name: lens for name, lens in known.items() if lens.source in ("given", "calibration")}
 
 
-def _as_list(images: Images) -> list[Any]:
+def _as_list(images: Any) -> list[Any]:
     one = isinstance(images, (str, PathLike)) or _is_pil(images)
     if one or (isinstance(images, np.ndarray) and images.ndim < 4):
         return [images]

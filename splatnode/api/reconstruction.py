@@ -73,7 +73,7 @@ def reconstruct(
 def configured(
     preset: str, changes: Changes | None, flags: Mapping[str, Any], scale: Baseline | None, of_pictures: bool
 ) -> Config:
-    """The preset, then what differs from it, then the arguments: what comes later wins. Raises TypeError, ValueError."""
+    """The preset, then what differs from it, then the arguments: what comes later wins."""
     config = named(preset)
     if isinstance(changes, (str, PathLike)):
         config = overlaid(config, read_yaml(Path(changes)))

@@ -72,8 +72,8 @@ class Session:
     def add(self, image: Picture, *, name: str | None = None, captured_at: Stamp | None = None) -> Update:
         """Shows the session a photograph: a NumPy array (H, W, 3) uint8 RGB, or a PIL image.
 
-        Returns what became of it once the scene has grown, which takes about a second where it is taken, and a few
-        milliseconds where it is not. Raises TypeError and ValueError where it is no image, or a name comes again, and
+        Returns what became of it once the scene has grown, which takes seconds where it is taken, and milliseconds
+        where it is not. Raises TypeError and ValueError where it is no image, or a name comes again, and
         RuntimeError after `finish` or `close`.
         """
         with self._lock, limits.at_most(self._threads):
@@ -99,8 +99,7 @@ class Session:
         Raises RuntimeError after `finish` or `close`.
         """
         with self._lock, limits.at_most(self._threads):
-            for self._snapshot in made_anew(self._open(), self._tell):
-                pass
+            *_, self._snapshot = made_anew(self._open(), self._tell)
             self.close()
             return self.result
 

@@ -25,7 +25,7 @@ def show(result: Result, command: tuple[str, ...] = VIEWER) -> None:
     probe = probe_window()
     if not probe.window:
         raise RuntimeError(
-            f"no window can be opened: {probe.detail}. For a browser: result.save(FOLDER), then splatnode view FOLDER --web"
+            f"no window can be opened: {probe.detail}. In a browser: result.save(DIR), then splatnode view DIR --web"
         )
     with tempfile.TemporaryDirectory(prefix="splatnode-") as folder:
         result.save(folder)
