@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
-from splatnode.api.result import Result
+from splatnode.api.result import Result, result_of
 from splatnode.recon.result.export.result import copy_result
 from splatnode.recon.result.whole import is_whole
 from splatnode.viewer.sources import read_result
@@ -34,4 +34,4 @@ def load(folder: str | PathLike[str]) -> Result:
     if is_whole(place):
         scenes = ", ".join(sorted(path.parent.name for path in place.glob("*/report.json")))
         raise ValueError(f"{place} holds several results; give one of its folders: {scenes}")
-    return Result(read_result(place)[0], Stored(place.resolve()))
+    return result_of(read_result(place)[0], Stored(place.resolve()))

@@ -8,7 +8,7 @@ from os import PathLike
 from pathlib import Path
 
 from splatnode.api.camera import Camera, camera_of
-from splatnode.api.result import Result
+from splatnode.api.result import Result, result_of
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import read_yaml, typed
 from splatnode.recon.result.snapshot import Snapshot
@@ -124,4 +124,4 @@ def _network(address: str | PathLike[str] | None, keys: str | PathLike[str] | No
 
 
 def _update(moment: Moment) -> NodeUpdate:
-    return NodeUpdate(moment.scene_id, Result(moment.snapshot, Received(moment.snapshot)))
+    return NodeUpdate(moment.scene_id, result_of(moment.snapshot, Received(moment.snapshot)))

@@ -126,10 +126,9 @@ def _as_list(images: Any) -> list[Any]:
     one = isinstance(images, (str, PathLike)) or _is_pil(images)
     if one or (isinstance(images, np.ndarray) and images.ndim < 4):
         return [images]
-    try:
-        given = list(images)
-    except TypeError as error:
-        raise TypeError(f"images must be a folder, a video, or a list, got {type(images).__name__}") from error
+    if not isinstance(images, Iterable):
+        raise TypeError(f"images must be a folder, a video, or a list, got {type(images).__name__}")
+    given = list(images)
     if not given:
         raise ValueError("images must have at least one photograph, got none")
     return given

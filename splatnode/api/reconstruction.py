@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.api.photographs import Images, Lens, lenses, photographs, with_lens
-from splatnode.api.result import Result
+from splatnode.api.result import Result, result_of
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.progress import Tell, told_to_nobody
@@ -67,7 +67,7 @@ def reconstruct(
     check_baseline(chosen, [frame.name for frame in source.frames])
     known = lenses(source.frames)
     made = reconstructed(source, chosen, preset, without_guesses=only_seen, most_threads=threads, tell=telling)
-    return Result(made.snapshot, made, known)
+    return result_of(made.snapshot, made, known)
 
 
 def configured(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy.typing as npt
@@ -13,6 +14,7 @@ import numpy.typing as npt
 from splatnode.api.camera import Camera, camera_of
 from splatnode.api.view import View, view
 from splatnode.capture.frame import DroppedFrame, Intrinsics
+from splatnode.recon.result.export.prepare import viewer_safe
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.sources import seen
@@ -119,3 +121,8 @@ class Result:
     def __repr__(self) -> str:
         counts = f"{len(self._snapshot.cameras)} cameras, {len(self._snapshot.gaussians)} Gaussians"
         return f"<splatnode.Result {self.verdict.code.value}: {counts}, {len(self.dropped)} left out>"
+
+
+def result_of(snapshot: Snapshot, files: Files, lenses: Mapping[str, Intrinsics] = MappingProxyType({})) -> Result:
+    """A snapshot as a program sees it: with the Gaussians that its files would have."""
+    return Result(replace(snapshot, gaussians=viewer_safe(snapshot.gaussians)), files, dict(lenses))

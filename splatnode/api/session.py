@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from splatnode.api.photographs import Lens, Picture, frame, intrinsics_of, lenses, seen_through
 from splatnode.api.reconstruction import Baseline, Changes, check_count, configured
-from splatnode.api.result import Result
+from splatnode.api.result import Result, result_of
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.progress import Tell, told_to_nobody
 from splatnode.capture.quality import Limits
@@ -111,7 +111,7 @@ class Session:
             snapshot = in_metres(snapshot, self._config.metric)
             frames = tuple(self._frames.values())
             made = Reconstructed(snapshot, Source(frames, None, None), self._config.seed, self._preset)
-            return Result(snapshot, made, lenses(frames))
+            return result_of(snapshot, made, lenses(frames))
 
     def close(self) -> None:
         """Gives back what the session holds beside its last result."""

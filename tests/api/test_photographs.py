@@ -1,0 +1,70 @@
+"""Pictures that a program has, treated as the same pictures in files are."""
+
+from __future__ import annotations
+
+import io
+
+import cv2
+import numpy as np
+import pytest
+
+from splatnode.api.photographs import frame, pixels
+from splatnode.capture.image_file import decode_image
+
+PICTURE = np.random.default_rng(0).integers(0, 256, (24, 32, 4)).astype(np.uint8)
+DEEP = np.random.default_rng(1).integers(0, 65536, (24, 32)).astype(np.uint16)
+
+
+def in_a_file(array: np.ndarray) -> np.ndarray:
+    """As a PNG is decoded; `array` has its channels as OpenCV has them."""
+    return decode_image(cv2.imencode(".png", array)[1].tobytes()).image
+
+
+@pytest.mark.parametrize(
+    ("array", "as_file"),
+    [
+        (PICTURE[..., :3], PICTURE[..., 2::-1]),
+        (PICTURE, PICTURE[..., [2, 1, 0, 3]]),
+        (PICTURE[..., 0], PICTURE[..., 0]),
+        (PICTURE[..., :1], PICTURE[..., 0]),
+        (DEEP, DEEP),
+        (np.asfortranarray(PICTURE[::-1, ::-1, :3]), PICTURE[::-1, ::-1, 2::-1]),
+    ],
+    ids=["rgb", "alpha", "grey", "one channel", "16 bits", "not contiguous"],
+)
+def test_an_array_is_taken_as_a_file(array, as_file):
+    found = pixels(array)
+    assert np.array_equal(found, in_a_file(np.ascontiguousarray(as_file)))
+    assert found.flags.c_contiguous and not np.shares_memory(found, array)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "1", "P"])
+def test_a_pil_image_is_taken_as_its_file(mode):
+    image = pytest.importorskip("PIL.Image")
+    picture, file = image.fromarray(PICTURE[..., :3]).convert(mode), io.BytesIO()
+    if mode == "RGBA":
+        picture.putalpha(77)
+    picture.save(file, "png")
+    assert np.array_equal(pixels(picture), decode_image(file.getvalue()).image)
+
+
+def test_a_deep_pil_image_keeps_its_upper_bits():
+    image = pytest.importorskip("PIL.Image")
+    assert np.array_equal(pixels(image.fromarray(DEEP)), in_a_file(DEEP))
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_a_pil_image_is_upright_and_tells_its_lens_and_time(orientation):
+    image = pytest.importorskip("PIL.Image")
+    smooth = cv2.resize(PICTURE[:3, :4, :3], (320, 240), interpolation=cv2.INTER_CUBIC)
+    written, file = image.fromarray(smooth), io.BytesIO()
+    exif = written.getexif()
+    exif[0x0112] = orientation
+    exif.get_ifd(0x8769).update({0x9003: "2024:05:06 10:00:07", 0xA405: 28})
+    written.save(file, "jpeg", exif=exif, quality=95)
+    made = frame(image.open(file), 0, "a.jpg", 0)
+    expected = decode_image(file.getvalue())
+    assert made.image.shape == expected.image.shape
+    assert np.abs(made.image.astype(int) - expected.image).mean() < 1.0
+    assert made.intrinsics == expected.intrinsics is not None
+    assert made.captured_at == expected.captured_at is not None

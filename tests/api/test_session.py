@@ -1,0 +1,90 @@
+"""A session: photographs that come one at a time, and the scene that is made of them in the end."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import splatnode
+from tests.api.conftest import QUICK, SMALL
+from tests.support.synthetic import errors
+
+
+@pytest.fixture(scope="module")
+def walked(arrays) -> tuple[list[splatnode.Update], splatnode.Result]:
+    with splatnode.Session(config=QUICK, seed=0) as session:
+        updates = [session.add(image) for image in [arrays[0], arrays[0], *arrays[1:]]]
+        return updates, session.finish()
+
+
+def test_each_photograph_is_told_of_and_the_scene_grows(walked):
+    updates, _ = walked
+    assert [update.name for update in updates] == [f"{index:04d}.png" for index in range(5)]
+    assert [update.taken for update in updates] == [True, False, True, True, True]
+    assert "adds too little" in updates[1].reason and updates[2].reason
+    assert updates[0].result.verdict.code.value == "TOO_FEW_VIEWS" and updates[-1].result.verdict.publishable
+    assert len(updates[-1].result.cameras) == 4 > len(updates[2].result.cameras)
+    assert not updates[-1].result.final and len(updates[-1].result.gaussians["means"])
+
+
+def test_what_an_update_told_stays_as_it_was(walked):
+    updates, _ = walked
+    assert [len(update.result.cameras) for update in updates] == sorted(len(u.result.cameras) for u in updates)
+
+
+def test_the_end_is_as_good_as_a_reconstruction_of_all(walked, result, tmp_path):
+    _, finished = walked
+    assert finished.final and finished.verdict == result.verdict and len(finished.cameras) == len(result.cameras)
+    assert len(finished.gaussians["means"]) == pytest.approx(len(result.gaussians["means"]), rel=0.1)
+    found = [camera.centre for camera in finished.cameras]
+    assert np.allclose(found, [camera.centre for camera in result.cameras], atol=0.02)
+    names = sorted(path.name for path in (finished.save(tmp_path / "out") / "images").iterdir())
+    assert names == ["0000.png", "0002.png", "0003.png", "0004.png"]
+
+
+def test_before_the_first_photograph_it_says_so_and_can_be_finished():
+    session = splatnode.Session()
+    assert session.result.verdict.code.value == "TOO_FEW_VIEWS"
+    assert not session.finish().verdict.publishable
+
+
+def test_a_dark_photograph_does_not_count(arrays):
+    with splatnode.Session(config=QUICK) as session:
+        update = session.add(np.zeros_like(arrays[0]), name="dark.png")
+        assert not update.taken and update.reason and not update.result.verdict.publishable
+
+
+def test_a_session_that_is_closed_says_so_and_keeps_its_last_result(arrays):
+    with splatnode.Session(config=QUICK, threads=1, intrinsics=splatnode.Intrinsics(
+        320, 240, 300, 300, 160, 120, "given"
+    )) as session:  # fmt: skip
+        session.add(arrays[0], name="a.png")
+        with pytest.raises(ValueError, match="name must be new for each photograph; 'a.png' was given before"):
+            session.add(arrays[1], name="a.png")
+        session.add(arrays[1], name="b.png")
+        with pytest.raises(TypeError, match="must be uint8, got float64"):
+            session.add(arrays[1] / 255)
+    assert session.result.cameras[0].lens is not None and len(session.result.cameras) == 2
+    for ask in (session.finish, lambda: session.add(arrays[2])):
+        with pytest.raises(RuntimeError, match="the session is closed: begin another one"):
+            ask()
+
+
+def test_all_that_are_sharp_can_be_asked_for(arrays):
+    with splatnode.Session(config=QUICK, every_frame=True, scale=(0, 1, 2.0)) as session:
+        shifted = np.roll(arrays[0], 3, axis=1)
+        assert session.add(arrays[0]).taken
+        assert "every frame" in session.add(shifted).reason or "duplicate" in session.add(shifted).reason
+        last = session.add(arrays[1])
+        assert last.taken
+
+
+def test_its_cameras_are_right(walked):
+    updates, finished = walked
+    taken = [index for index, update in enumerate(updates) if update.taken]
+    numbers = {updates[index].name: position for position, index in enumerate(taken)}
+    from dataclasses import replace
+
+    snapshot = finished._snapshot
+    cameras = tuple(replace(camera, frame_id=numbers[camera.name]) for camera in snapshot.cameras)
+    assert errors(replace(snapshot, cameras=cameras), SMALL).rotation_deg < 1.0
