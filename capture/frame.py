@@ -118,8 +118,8 @@ def reduced(image: npt.NDArray[np.uint8], longer_side: int) -> npt.NDArray[np.ui
 class DroppedFrame:
     """An image that was left out, and why: a result, not an exception."""
 
-    name: str
-    reason: str
+    name: str  # its file's, or that by which it was given
+    reason: str  # one sentence
 
     def __post_init__(self) -> None:
         """Both are shown to people, and what a decoder says of a stranger's file is a stranger's text."""

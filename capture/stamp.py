@@ -39,8 +39,8 @@ _MEANINGS = {
 class Stamp:
     """A time of capture. Raises ValueError where it is before its clock's zero, or beyond LARGEST_NS."""
 
-    ns: Annotated[int, msgspec.Meta(ge=0, le=LARGEST_NS)]
-    clock: Clock
+    ns: Annotated[int, msgspec.Meta(ge=0, le=LARGEST_NS)]  # nanoseconds
+    clock: Clock  # what they are counted from: UTC, LOCAL, FILE or RECORDING
 
     def __post_init__(self) -> None:
         if not 0 <= self.ns <= LARGEST_NS:

@@ -24,7 +24,7 @@ class Step:
     """A part of the work that is under way."""
 
     doing: str  # "matching"
-    done: int = 0
+    done: int = 0  # things that were counted so far
     of: int = 0  # 0: nobody knows, or there is nothing to count
     what: str = ""  # one of the things that are counted: "photograph pair"
 

@@ -36,11 +36,11 @@ class Code(enum.Enum):
 
 @dataclass(frozen=True)
 class Verdict:
-    """`publishable` says whether a scene may be shown as a result; `frames` are the names that the code is about."""
+    """What can be said of photographs, whether there is a scene of them or not."""
 
-    code: Code
+    code: Code  # OK, OK_PARTIAL or OK_ROUGH, or why there is no scene: docs/verdicts.md explains each
     message: str  # one sentence
     advice: str  # what to do about it; empty when there is nothing to do
-    frames: tuple[str, ...] = ()
-    publishable: bool = False
+    frames: tuple[str, ...] = ()  # the names that the code is about
+    publishable: bool = False  # whether a scene may be shown as a result
     provisional: bool = False  # whether evidence is still to be looked at that may change it

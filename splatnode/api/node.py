@@ -92,21 +92,21 @@ def connect(
     address: str | PathLike[str] | None = None,
     *,
     keys: str | PathLike[str] | None = None,
-    first_port: int = FIRST_PORT,
+    first_port: int | None = None,
 ) -> Node:
     """A connection to a node, whether it runs already or starts later.
 
     - `address`: None for the node of this user on this machine; the folder of its sockets (`network.directory`); its
       configuration file (.yaml); or, over a network, the machine's address such as "192.168.1.7".
     - `keys`: over a network, the folder that `splatnode keys` made.
-    - `first_port`: over a network, `network.first_port`.
+    - `first_port`: over a network, `network.first_port` of the node. None: its default, 47310.
 
     Raises ValueError where the address or the keys cannot be used, PermissionError where the folder is not private.
     """
     return Node(_network(address, keys, first_port))
 
 
-def _network(address: str | PathLike[str] | None, keys: str | PathLike[str] | None, first_port: int) -> Network:
+def _network(address: str | PathLike[str] | None, keys: str | PathLike[str] | None, first_port: int | None) -> Network:
     if address is None:
         return Network()
     path = Path(address)
@@ -120,7 +120,7 @@ def _network(address: str | PathLike[str] | None, keys: str | PathLike[str] | No
         )
     if keys is None:
         raise ValueError(f"keys must be the folder that `splatnode keys` made, to connect to {address}; got None")
-    return Network(tcp=address, keys=Path(keys), first_port=first_port)
+    return Network(tcp=address, keys=Path(keys), first_port=first_port or FIRST_PORT)
 
 
 def _update(moment: Moment) -> NodeUpdate:

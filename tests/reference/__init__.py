@@ -1,1 +1,1 @@
-"""docs/configuration.md: every option of the configuration files, as the code declares and comments it."""
+"""Pages made from the code: docs/configuration.md has every option, docs/api.md the names of `import splatnode`."""

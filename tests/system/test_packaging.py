@@ -39,7 +39,7 @@ def test_the_wheel_installs_and_its_core_loads(project, tmp_path):
     assert wheel.name.startswith("splatnode-") and "-py3-none-" in wheel.name and not wheel.name.endswith("-any.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
     assert {path.name for path in compile.compile_core()} <= {Path(name).name for name in names}
-    assert {"splatnode/__main__.py", "splatnode/capture/frame.py", "splatnode/recon/core/threads.cpp"} <= names
+    assert {"splatnode/__main__.py", "splatnode/py.typed", "splatnode/api/result.py", "splatnode/capture/frame.py", "splatnode/recon/core/threads.cpp"} <= names
     configs = {path.relative_to(ROOT).as_posix() for path in (ROOT / "configs").rglob("*.*")}
     assert {f"splatnode/{name}" for name in configs} <= names and "configs/udev/80-splatnode-oak.rules" in configs
     page = {path.name for path in (ROOT / "viewer" / "web" / "page").iterdir()}
@@ -49,7 +49,7 @@ def test_the_wheel_installs_and_its_core_loads(project, tmp_path):
     site = tmp_path / "site"
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", "--target", str(site)]
     subprocess.run([*pip, str(wheel)], check=True)
-    code = "from splatnode.recon import core; core.library(); print(core.__file__)"
+    code = "import splatnode; splatnode.Result; from splatnode.recon import core; core.library(); print(core.__file__)"
     loaded = subprocess.check_output(
         [sys.executable, "-c", code], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(site)}, text=True
     )
@@ -87,7 +87,7 @@ def test_the_sdist_has_the_sources_and_nothing_compiled(project):
     core = ROOT / "recon" / "core"
     sources = {path.name for pattern in ("*.cpp", "*.h", "*.py") for path in core.glob(pattern)}
     assert {f"splatnode/recon/core/{name}" for name in sources} <= names
-    assert "splatnode/viewer/web/page/main.js" in names
+    assert {"splatnode/viewer/web/page/main.js", "splatnode/py.typed", "splatnode/api/result.py"} <= names
     assert {"pyproject.toml", "constraints.txt", "run", "LICENSE", "tests/conftest.py"} <= names
     assert not [name for name in names if name.endswith((".so", ".stamp", ".pyc"))]
 
