@@ -6,6 +6,7 @@ world's place, direction and scale are not known.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -89,6 +90,14 @@ def covariance(axes: Axes) -> Array:
     """(3, 3) of the normal distribution whose 95 % ellipsoid has these semi-axes."""
     rows = np.array(axes)
     return rows.T @ rows / _CHI2_95_OF_3
+
+
+def length_95(covariance: Array) -> float:
+    """The length that an error with `covariance` (3, 3) keeps below with 95 %; infinite where that is not finite."""
+    if not np.isfinite(covariance).all():
+        return math.inf
+    variances = np.linalg.eigvalsh((covariance + covariance.T) / 2.0).clip(0.0)
+    return math.sqrt(_squared_length_95(variances)) if variances.any() else 0.0
 
 
 def as_axes(rows: Array) -> Axes:

@@ -1,0 +1,62 @@
+"""The lenses that a photograph may have been taken with, the likeliest first."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import Intrinsics
+from splatnode.recon.locating.camera_model import Lens
+from splatnode.recon.result.landmarks import KnownLenses
+
+Array = npt.NDArray[np.float64]
+
+# What is not known of a lens, as in recon/registration (lenses.py, finishing.py); lengths over the longer side.
+_EXIF_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA = 0.05, 0.02, 0.004
+_SAME_LENS_SIGMA, _SAME_RADIAL_SIGMA = 0.01, 0.005  # focusing changes the lens of one camera
+_FREE_SIGMA = 0.3  # of log focal, of a lens of which nothing is known
+_FOCALS = np.geomspace(0.45, 3.2, 9)  # over the longer side, 96 to 18 degrees of view: steps of 28 %
+_SAME_SHAPE = 0.01  # largest difference of two pictures' height over width
+_SAME_FOCAL = 0.15  # of log focals: an EXIF focal length that may be of the result's own lens
+_TOLD_APART = 0.002  # log focals of a result's lenses that are tried one by one
+
+
+def given(intrinsics: Intrinsics) -> Lens | None:
+    """The lens of a photograph without distortion that came with trusted intrinsics; None where they are not."""
+    return Lens(intrinsics.fx, 0.0, np.zeros(2), 0.0, 0.0, 0.0) if intrinsics.source != "exif" else None
+
+
+def own(lenses: KnownLenses, width: int, height: int, intrinsics: Intrinsics | None) -> list[Lens]:
+    """Those of the result's own lenses that took pictures of this shape, upright or not."""
+    side, found = max(width, height), list[Lens]()
+    shape = height / width
+    for focal, radial, shift, known in zip(lenses.focals, lenses.radials, lenses.shifts, lenses.shapes, strict=True):
+        upright = abs(shape - known) <= _SAME_SHAPE
+        if not upright and abs(1.0 / shape - known) > _SAME_SHAPE:
+            continue
+        if intrinsics is not None and abs(np.log(intrinsics.fx / side / focal)) > _SAME_FOCAL:
+            continue
+        if any(abs(np.log(lens.focal / side / focal)) < _TOLD_APART for lens in found):
+            continue
+        moved = shift * side if upright else np.zeros(2)
+        sigmas = _SAME_LENS_SIGMA, _SAME_RADIAL_SIGMA, _SHIFT_SIGMA * side
+        found.append(Lens(float(focal) * side, float(radial), moved, *sigmas))
+    return found
+
+
+def nominal(intrinsics: Intrinsics, side: int) -> Lens:
+    """The lens that EXIF tells, which is right to a few per cent."""
+    return Lens(intrinsics.fx, 0.0, np.zeros(2), _EXIF_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side)
+
+
+def any_lens(side: int) -> list[Lens]:
+    """Focal lengths from wide to long, each with what lies between it and the next."""
+    return [
+        Lens(float(focal) * side, 0.0, np.zeros(2), _FREE_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side)
+        for focal in _FOCALS
+    ]
+
+
+def freed(lens: Lens, side: int) -> Lens:
+    """The lens, of which nothing is known but that it may be this one."""
+    return Lens(lens.focal, lens.radial, lens.shift, _FREE_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side)

@@ -1,0 +1,42 @@
+"""What is claimed of a placed camera: by its own points, and by how well the scene's own cameras are known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.locating.correspondences import Correspondences
+from splatnode.recon.locating.outcome import Claim
+from splatnode.recon.locating.posing import Posed
+from splatnode.recon.locating.refinement import pose_covariance
+from splatnode.recon.result.bounds import length_95
+from splatnode.recon.result.landmarks import Landmarks
+
+Array = npt.NDArray[np.float64]
+
+_BALL_95 = 2.7955  # radius that holds 95 % of a normal distribution with sigma 1 in three dimensions
+_NORMAL_95 = 1.96  # and in one
+_MOST_LOG_FOCAL = math.log(10.0)  # who knows the focal length no better knows nothing
+
+
+def claimed(posed: Posed, known: Correspondences, landmarks: Landmarks) -> tuple[Claim, Array]:
+    """The claim, and the covariance (6, 6) of a small motion in the camera's frame: translation, then turn.
+
+    The scene around the camera is as wrong as its cameras there: as those whose photographs it shares points with.
+    """
+    shares = np.bincount(known.best_photograph[posed.agreeing], minlength=len(landmarks.centre_bounds))
+    shares = shares / max(shares.sum(), 1)
+    turn = np.radians(np.sqrt(shares @ landmarks.rotation_bounds**2)) / _BALL_95
+    move = np.sqrt(shares @ landmarks.centre_bounds**2) / _BALL_95
+    covariance = pose_covariance(posed.fit) + np.diag([move**2] * 3 + [turn**2] * 3)
+    centre = length_95(covariance[:3, :3])
+    focal = _NORMAL_95 * math.sqrt(max(posed.fit.covariance[6, 6], 0.0))
+    claim = Claim(
+        rotation_deg=math.degrees(length_95(covariance[3:, 3:])),
+        centre=centre,
+        centre_percent=100.0 * centre / landmarks.unit,
+        focal_percent=100.0 * math.expm1(min(focal, _MOST_LOG_FOCAL)),
+    )
+    return claim, covariance

@@ -1,0 +1,106 @@
+"""Where in a finished scene a photograph was taken that was not in the set, or why that cannot be said.
+
+Its features are matched with the scene's landmarks, a pose is found on which most of them agree, and everything that
+speaks against it is asked (checks.py): being wrong is worse than refusing.
+"""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.recon.frames.keyframe import REFERENCE_SIDE, longer_side, principal_point
+from splatnode.recon.frames.undistort import undistorted
+from splatnode.recon.locating import candidates, checks, claims, posing
+from splatnode.recon.locating.case import Case
+from splatnode.recon.locating.correspondences import Correspondences, correspondences
+from splatnode.recon.locating.outcome import Located, NotLocated
+from splatnode.recon.locating.posing import Posed
+from splatnode.recon.matching import features, nearest_neighbours
+from splatnode.recon.result.landmarks import Landmarks
+
+Array = npt.NDArray[np.float64]
+
+_OWN_LENS_SIGMAS = 3.0  # standard deviations of the free focal length that still say that the lens is the result's own
+_OWN_LENS_LOG = 0.02  # and this much of its logarithm: nobody tells lenses apart by less
+_AMPLE_NFA = -30.0  # log10: so surely is no pose of another lens needed
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    features: features.Config = features.Config()
+    neighbours: nearest_neighbours.Config = nearest_neighbours.Config()
+    posing: posing.Config = posing.Config()
+    checks: checks.Config = checks.Config()
+
+
+def locate(
+    landmarks: Landmarks,
+    image: npt.NDArray[np.uint8],  # (H, W, 3) RGB
+    intrinsics: Intrinsics | None = None,
+    config: Config = Config(),  # noqa: B008 (it is frozen)
+) -> Located | NotLocated:
+    """The camera of `image` in the world of the landmarks, with what is claimed of it; else why there is none.
+
+    `intrinsics` are those of the image, if they are known; a lens with distortion needs them. Without them the lenses
+    of the scene's own photographs are tried first, then any. Raises ValueError for an image that is not (H, W, 3)
+    uint8, or intrinsics that cannot be used.
+    """
+    frame = undistorted(Frame(0, "photograph", 0, image, intrinsics))
+    found = features.extract(frame.image, config.features)
+    known = correspondences(found, principal_point(frame), landmarks, config.neighbours)
+    case = _case(known, frame, landmarks, config)
+    refusal = checks.refused(case, config.checks)
+    if refusal is not None or case.posed is None:
+        return refusal or checks.nothing_found(case)
+    claim, covariance = claims.claimed(case.posed, known, landmarks)
+    refusal = checks.too_rough(claim, config.checks)
+    if refusal is not None:
+        return refusal
+    camera = case.posed.fit.camera
+    K = np.diag([camera.lens.focal, camera.lens.focal, 1.0])
+    K[:2, 2] = principal_point(frame) + camera.lens.shift
+    return Located(camera.T_world_camera, K, covariance, claim, int(case.posed.agreeing.sum()), landmarks.metric)
+
+
+def _case(known: Correspondences, frame: Frame, landmarks: Landmarks, config: Config) -> Case:
+    """The best camera, of the likeliest lens that explains enough."""
+    side, given = longer_side(frame), frame.intrinsics
+    scale = side / REFERENCE_SIDE
+    noise_px = landmarks.noise_px * scale
+
+    def case(posed: Posed | None) -> Case:
+        return Case.of(known, posed, frame.width, frame.height, scale, noise_px, config.posing)
+
+    certain = None if given is None else candidates.given(given)
+    if certain is not None:
+        return case(posing.posed(known, certain, scale, noise_px, config.posing))
+    best = case(None)
+    for lens in candidates.own(landmarks.lenses, frame.width, frame.height, given):
+        found = case(posing.posed(known, lens, scale, noise_px, config.posing))
+        if found.log10_nfa < best.log10_nfa and _is_own(found, candidates.freed(lens, side), config.posing):
+            best = found
+    if best.log10_nfa < _AMPLE_NFA:
+        return best
+    others = candidates.any_lens(side) if given is None else [candidates.nominal(given, side)]
+    cameras = [posing.searched(known, lens, scale, config.posing) for lens in others]
+    counted = [0 if each is None else posing.agreement(each, known, config.posing.search_px * scale).sum() for each in cameras]
+    likeliest = int(np.argmax(counted))
+    camera = cameras[likeliest]
+    if camera is None:
+        return best
+    found = case(posing.settled(camera, known, others[likeliest], scale, noise_px, config.posing))
+    return found if found.log10_nfa < best.log10_nfa else best
+
+
+def _is_own(found: Case, free: candidates.Lens, config: posing.Config) -> bool:
+    """Whether the focal length stays where it is once it is free: else the picture is of another lens, or a crop."""
+    if found.posed is None:
+        return False
+    camera = found.posed.fit.camera
+    again = posing.settled(camera, found.known, free, found.scale, found.noise_px, config)
+    if again is None:
+        return False
+    moved = abs(np.log(again.fit.camera.lens.focal / free.focal))
+    return bool(moved < max(_OWN_LENS_LOG, _OWN_LENS_SIGMAS * np.sqrt(again.fit.covariance[6, 6])))

@@ -1,0 +1,68 @@
+"""What is said of a photograph: where it was taken, or why that cannot be said."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+class Reason(str, Enum):
+    """Why a photograph was not placed."""
+
+    NOT_FOUND = "NOT_FOUND"  # no more agrees with the scene than chance explains
+    ONE_PATCH = "ONE_PATCH"  # all that agrees lies in one spot
+    ELSEWHERE = "ELSEWHERE"  # another place in the scene explains it nearly as well
+    INCONSISTENT = "INCONSISTENT"  # its parts say different things
+    LENS = "LENS"  # it takes a lens that no camera has
+    UNCERTAIN = "UNCERTAIN"  # where it was taken is known too roughly
+
+
+@dataclass(frozen=True)
+class Claim:
+    """How wrong a placed camera may be: each bound holds for 95 % of them, in the world of the result."""
+
+    rotation_deg: float  # degrees
+    centre: float  # in the unit of the result: metres where it is metric
+    centre_percent: float  # the same, of the distance to the scene: the median depth of its points
+    focal_percent: float  # of the focal length
+
+
+@dataclass(frozen=True, eq=False)
+class Located:
+    """The camera of a photograph in the world of a result. The camera's x is right, y down, z forward."""
+
+    T_world_camera: Array  # (4, 4): p_world = T_world_camera @ p_camera
+    K: Array  # (3, 3) for the photograph at full size, centre of the top-left pixel at (0.5, 0.5)
+    covariance: Array  # (6, 6) of a small motion in the camera's frame: translation (result's unit), then turn (radians)
+    claim: Claim
+    num_points: int  # of the scene that agree with it
+    metric: bool  # lengths are metres
+
+    @property
+    def sentence(self) -> str:
+        """Where, and how sure, in one line."""
+        x, y, z = self.T_world_camera[:3, 3]
+        unit, claim = " m" if self.metric else "", self.claim
+        length = f"{claim.centre:.2g} m" if self.metric else f"{claim.centre_percent:.2g} % of the distance"
+        return (
+            f"placed at ({x:.4g}, {y:.4g}, {z:.4g}){unit}, known to {claim.rotation_deg:.2g} degrees and {length}; "
+            f"{self.num_points} points agree"
+        )
+
+
+@dataclass(frozen=True)
+class NotLocated:
+    """Why a photograph was not placed, and what to do."""
+
+    code: Reason
+    message: str
+    advice: str
+
+    @property
+    def sentence(self) -> str:
+        return f"refused: {self.code.value}: {self.message} {self.advice}"

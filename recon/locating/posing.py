@@ -1,0 +1,88 @@
+"""The pose on which most correspondences agree, for a lens that is known or has to be tried."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon import poselib
+from splatnode.recon.locating.camera_model import CameraModel, Lens, without_distortion
+from splatnode.recon.locating.correspondences import Correspondences
+from splatnode.recon.locating.refinement import Fit, refined
+from splatnode.recon.registration import epipolar
+
+Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+_SAMPLE = 3  # correspondences that define a pose
+_ITERATIONS = {"min_iterations": 500, "max_iterations": 10_000, "seed": 0}  # of RANSAC: 10 000 do for 10 % inliers
+_ROUNDS = 4  # of inliers and refinement; they have settled by then
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    search_px: float = 6.0  # reprojection error of an inlier while the lens is not exact, pixels at REFERENCE_SIDE
+    max_error_px: float = 3.0  # of an inlier in the end
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """A camera, and the correspondences that agree with it."""
+
+    fit: Fit
+    agreeing: Flags  # (M,) of those that were given; at most one of a pixel, and of a landmark
+
+
+def posed(known: Correspondences, lens: Lens, scale: float, noise_px: float, config: Config) -> Posed | None:
+    """The camera that most correspondences agree with, refined; None where not even a sample does.
+
+    `scale` is pixels of the photograph for one at REFERENCE_SIDE; `noise_px` is of an observation, in its pixels.
+    """
+    found = searched(known, lens, scale, config)
+    return None if found is None else settled(found, known, lens, scale, noise_px, config)
+
+
+def searched(known: Correspondences, lens: Lens, scale: float, config: Config) -> CameraModel | None:
+    """The camera by random samples, with the lens as it is given; None where there are too few correspondences."""
+    if len(known) <= _SAMPLE:
+        return None
+    pose, info = poselib.estimate_absolute_pose(
+        without_distortion(known.pixels, lens),
+        known.points,
+        epipolar.pinhole(lens.focal),
+        {"max_reproj_error": config.search_px * scale, **_ITERATIONS},
+    )
+    if sum(info["inliers"]) <= _SAMPLE:
+        return None
+    return CameraModel(np.asarray(pose.R), np.asarray(pose.t), lens)
+
+
+def settled(
+    camera: CameraModel, known: Correspondences, lens: Lens, scale: float, noise_px: float, config: Config
+) -> Posed | None:
+    """The camera refined by its inliers, which are found again, until both have settled."""
+    fit, agreeing = None, np.zeros(len(known), bool)
+    for limit_px in np.linspace(config.search_px, config.max_error_px, _ROUNDS):
+        agreeing = agreement(camera, known, limit_px * scale)
+        if agreeing.sum() <= _SAMPLE:
+            return None
+        fit = refined(camera, lens, known.of(agreeing), noise_px)
+        camera = fit.camera
+    assert fit is not None
+    return Posed(fit, agreement(camera, known, config.max_error_px * scale))
+
+
+def agreement(camera: CameraModel, known: Correspondences, limit_px: float) -> Flags:
+    """(M,) which correspondences the camera explains: of a pixel the best one alone, and of a landmark."""
+    errors = camera.errors(known.points, known.pixels)
+    agreeing = errors < limit_px
+    for kind in (known.feature_of, known.landmark_of):
+        order = np.lexsort((errors, ~agreeing, kind))
+        first = np.ones(len(order), bool)
+        first[1:] = kind[order[1:]] != kind[order[:-1]]
+        best = np.zeros(len(order), bool)
+        best[order[first]] = True
+        agreeing &= best
+    return agreeing

@@ -1,0 +1,89 @@
+"""The pose and the lens that fit correspondences best, and how well these determine them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.locating.camera_model import NUM_PARAMETERS, POSE, CameraModel, Lens
+from splatnode.recon.locating.correspondences import Correspondences
+from splatnode.recon.registration.cross_product import cross_matrix
+
+Array = npt.NDArray[np.float64]
+
+CORRELATED = 100.0  # observations that tell as much as one with an error of its own (recon/registration/finishing.py)
+_ROBUST = 3.0  # scale of the Cauchy loss, in standard deviations
+_STEPS = 12  # Gauss-Newton converges in a few
+_CONVERGED = 1e-8  # largest change of a parameter over its standard deviation, squared
+_RAYLEIGH_MEDIAN = 1.1774  # median length of a 2D error whose components have sigma 1: sqrt(2 log 2)
+_FIXED = 1e-9  # stands for a sigma of 0
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """A camera with what its correspondences say of it."""
+
+    camera: CameraModel
+    covariance: Array  # (NUM_PARAMETERS, NUM_PARAMETERS) of `CameraModel.moved`'s step; NaN where it is not finite
+    spread: float  # of the residuals, over what is expected of them: 1 where all is as it should be
+
+
+def refined(camera: CameraModel, prior: Lens, known: Correspondences, noise_px: float) -> Fit:
+    """The camera with the least robust cost, from `camera` on.
+
+    `noise_px` is the standard deviation of a pixel's coordinate; the points' own uncertainty counts beside it. The
+    lens is held near `prior`, by its sigmas.
+    """
+    information_of_prior = 1.0 / np.maximum(prior.sigmas, _FIXED) ** 2
+    spread = 1.0
+    covariance = np.full((NUM_PARAMETERS, NUM_PARAMETERS), np.nan)
+    for _ in range(_STEPS):
+        rows, residuals = _whitened(camera, known, noise_px)
+        lengths = np.linalg.norm(residuals, axis=1)
+        spread = max(float(np.median(lengths)) / _RAYLEIGH_MEDIAN, 1.0)
+        weights = 1.0 / (1.0 + (lengths / (_ROBUST * spread)) ** 2) / spread**2
+        information = np.einsum("m,mij,mik->jk", weights, rows, rows)
+        gradient = np.einsum("m,mij,mi->j", weights, rows, residuals)
+        # The prior is one observation, and so are a hundred correspondences.
+        lens = slice(POSE, NUM_PARAMETERS)
+        information[lens, lens] += CORRELATED * np.diag(information_of_prior)
+        gradient[lens] += CORRELATED * information_of_prior * (prior.values - camera.lens.values)
+        inverse = _inverse(information)
+        if inverse is None:
+            return Fit(camera, np.full_like(covariance, np.nan), spread)
+        step = inverse @ gradient
+        camera, covariance = camera.moved(step), CORRELATED * inverse
+        if step @ information @ step < _CONVERGED:
+            break
+    return Fit(camera, covariance, spread)
+
+
+def _whitened(camera: CameraModel, known: Correspondences, noise_px: float) -> tuple[Array, Array]:
+    """Derivatives (M, 2, NUM_PARAMETERS) and residuals (M, 2), observed less predicted, in standard deviations."""
+    by_parameters, by_point = camera.derivatives(known.points)
+    predicted, _ = camera.project(known.points)
+    covariances = by_point @ known.covariances @ by_point.transpose(0, 2, 1) + noise_px**2 * np.eye(2)
+    whiten = np.linalg.inv(np.linalg.cholesky(covariances))
+    return whiten @ by_parameters, (whiten @ (known.pixels - predicted)[..., None])[..., 0]
+
+
+def _inverse(information: Array) -> Array | None:
+    """(N, N) inverse of the normal matrix; None where it is not finite or no information at all."""
+    unit = np.sqrt(np.diag(information))
+    if not (np.isfinite(information).all() and (unit > 0).all()):
+        return None
+    try:
+        return np.linalg.inv(information / unit[:, None] / unit) / unit[:, None] / unit
+    except np.linalg.LinAlgError:
+        return None
+
+
+def pose_covariance(fit: Fit) -> Array:
+    """(6, 6) of a small motion in the camera's frame: translation (3), then rotation vector (3), radians."""
+    change = np.zeros((POSE, POSE))
+    change[:3, :3] = -cross_matrix(fit.camera.translation[None])[0]
+    change[:3, 3:] = -np.eye(3)
+    change[3:, :3] = -np.eye(3)
+    return change @ fit.covariance[:POSE, :POSE] @ change.T
