@@ -10,12 +10,14 @@ from splatnode.recon.config import Config
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.deadline import pausing_until
 from splatnode.recon.frames.screening import Rejected
+from splatnode.recon.locating.gathering import gathered
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior
 from splatnode.recon.registration import continuation
 from splatnode.recon.registration.register import Registration, register
 from splatnode.recon.result.bounds import Bounds
+from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.verification.claims import claims, shaped
 from splatnode.recon.verification.decision import decide, refuse_before_registration
@@ -39,6 +41,7 @@ class Conclusion:
     bounds: Mapping[str, Bounds]  # of the errors of each camera, by the name of its keyframe
     evidence_record: dict[str, object] | None  # for reports; None where nothing was verified
     captured_at: Mapping[str, Stamp] = field(default_factory=dict)  # by keyframe, where it is known
+    landmarks: Landmarks | None = None  # of a scene that is to be saved
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +87,18 @@ class Estimate:
         stamps = {keyframe.name: keyframe.frame.captured_at for keyframe in self.graph.keyframes}
         known = {name: stamp for name, stamp in stamps.items() if stamp is not None}
         return Conclusion(self.verdict, self.bounds, self.evidence_record, known)
+
+    @property
+    def conclusion_to_save(self) -> Conclusion:
+        """With the landmarks by which further photographs are placed; gathering them takes up to a second."""
+        return replace(self.conclusion, landmarks=self.landmarks)
+
+    @property
+    def landmarks(self) -> Landmarks | None:
+        """Gathered from the cameras and all matches; None where no scene is published."""
+        if not self.publishable or self.registration is None:
+            return None
+        return gathered(self.graph, self.registration, self.bounds)
 
     @property
     def registered(self) -> set[str]:

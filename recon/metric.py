@@ -129,4 +129,5 @@ def _scaled(snapshot: Snapshot, factor: float) -> Snapshot:
         means=(gaussians.means * factor).astype(np.float32),
         scales=(gaussians.scales * factor).astype(np.float32),
     )
-    return replace(snapshot, cameras=tuple(map(moved, snapshot.cameras)), gaussians=larger)
+    landmarks = snapshot.landmarks and snapshot.landmarks.moved(factor, np.eye(3), np.zeros(3), metric=True)
+    return replace(snapshot, cameras=tuple(map(moved, snapshot.cameras)), gaussians=larger, landmarks=landmarks)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 
 from splatnode.capture.frame import DroppedFrame
@@ -12,6 +13,7 @@ from splatnode.recon.budget import Hit
 from splatnode.recon.config import Config
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.estimation import Conclusion, Estimate
+from splatnode.recon.geometry import align_cameras
 from splatnode.recon.optimize import refinement
 from splatnode.recon.optimize.torch_threads import single_torch_thread
 from splatnode.recon.optimize.watch import examine, watch
@@ -124,7 +126,24 @@ def snapshot(
         final=final,
         served_by=scene.served_by if scene else {},
         evidence=conclusion.evidence_record,
+        landmarks=conclusion.landmarks if scene and final else None,
     )
+
+
+def with_landmarks(made: Snapshot, estimate: Estimate | None) -> Snapshot:
+    """The snapshot of a scene that grew, to be saved: with the landmarks of `estimate` in the world of its cameras.
+
+    Without landmarks where the estimate is not known any more, or has fewer than two of the cameras.
+    """
+    landmarks = None if estimate is None else estimate.landmarks
+    if landmarks is None:
+        return made
+    Ts_shown = {camera.name: camera.T_world_camera for camera in made.cameras}
+    common = [index for index, name in enumerate(landmarks.names) if name in Ts_shown]
+    if len(common) < 2:
+        return made
+    by = align_cameras(landmarks.Ts_world_camera[common], np.stack([Ts_shown[landmarks.names[i]] for i in common]))
+    return replace(made, landmarks=landmarks.moved(by.scale, by.rotation, by.translation))
 
 
 def in_words(made: Snapshot) -> str:

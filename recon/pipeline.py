@@ -51,7 +51,7 @@ def reconstruct(
         yield snapshot(next(numbers), estimate.conclusion, look, seconds=clock.booked, dropped=dropped)
         clock.lap("wait")
     estimate = _with_depth(estimate, prior, config, clock, tell)
-    conclusion, begun = estimate.conclusion, begin_scene(estimate, config)
+    conclusion, begun = estimate.conclusion_to_save, begin_scene(estimate, config)
     del estimate, look  # and with them photographs, features and matches, which are not needed any more
     yield from model(conclusion, begun, dropped, config, clock, numbers, tell=tell)
 
@@ -157,5 +157,5 @@ def made_anew(work: IncrementalReconstruction, tell: Tell = told_to_nobody) -> I
     estimate = work.estimate_with_depth(_doing("finding and checking the cameras", tell))
     begun = begin_scene(estimate, work.config)
     yield from model(
-        estimate.conclusion, begun, work.dropped, work.config, work.clock, work.numbers, show_begun=False, tell=tell
+        estimate.conclusion_to_save, begun, work.dropped, work.config, work.clock, work.numbers, show_begun=False, tell=tell
     )

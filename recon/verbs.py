@@ -12,6 +12,7 @@ from pkgutil import iter_modules
 
 from splatnode.capture.process.arguments import (
     add_json,
+    angle,
     box,
     counts,
     megabytes,
@@ -135,6 +136,17 @@ def _export_arguments(parser: argparse.ArgumentParser) -> None:
     parser._negative_number_matcher = re.compile(r"-[\d.]")  # else a box that begins with a minus is no value
 
 
+def _locate_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("result", type=Path, metavar="RESULT", help="the folder that replay wrote, with landmarks.npz")
+    parser.add_argument(
+        "images", type=Path, nargs="+", metavar="IMAGE", help="photographs, or folders of them, by any camera"
+    )
+    lens = parser.add_mutually_exclusive_group()
+    lens.add_argument("--calibration", type=Path, metavar="FILE", help="YAML with their lens: width, height, fx, ...")
+    lens.add_argument("--fov", type=angle, metavar="DEGREES", help="their angle of view, across the longer side")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write what was found into this file, too")
+
+
 def _merge_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, metavar="OUT_FOLDER", help="that a node writes its scenes into")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where the merged scenes go (default: OUT_FOLDER)")
@@ -222,6 +234,12 @@ VERBS = (
         "write a scene in another format",
         _export_arguments,
         lazily("splatnode.recon.result.export.command", "export"),
+    ),
+    Verb(
+        "locate",
+        "tell where further photographs of a scene were taken",
+        _locate_arguments,
+        lazily("splatnode.recon.locating.command", "locate"),
     ),
     Verb(
         "merge",

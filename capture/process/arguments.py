@@ -58,6 +58,14 @@ def percent(text: str) -> float:
     return _above_zero(text, "percent")
 
 
+def angle(text: str) -> float:
+    """Degrees of an angle of view."""
+    degrees = _above_zero(text, "degrees")
+    if degrees >= 180.0:
+        raise argparse.ArgumentTypeError(f"must be below 180 degrees, got {_shown(text)}")
+    return degrees
+
+
 def _above_zero(text: str, unit: str) -> float:
     try:
         number = float(text)

@@ -12,8 +12,10 @@ from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
 from splatnode.recon.daemon.places import Place, Places, State, described
+from splatnode.recon.estimation import Estimate
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.metric import in_metres
+from splatnode.recon.modelling import with_landmarks
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.export import remove_result
 from splatnode.recon.result.snapshot import Snapshot
@@ -50,11 +52,14 @@ class Output:
         except OSError as error:
             self.complain(f"the scene cannot be saved ({error.strerror}): make room on the disk")
 
-    def export(self, snapshot: Snapshot, place: Store, state: State, kept: Sequence[str]) -> bool:
+    def export(
+        self, snapshot: Snapshot, estimate: Estimate | None, place: Store, state: State, kept: Sequence[str]
+    ) -> bool:
         """Writes the place's result folder, all of it or nothing; returns whether it was written.
 
         The result of a snapshot that is not final lies in a folder of its own, named so, until a final one replaces
-        it. `kept` are the names of the place's keyframes.
+        it. `estimate` is that of its cameras, if it is known still, from which landmarks come;
+        `kept` are the names of the place's keyframes.
         """
         recipe, folder = self._config.reconstruction, self._config.out / place.scene_id
         provisional = folder.with_name(folder.name + PROVISIONAL)
@@ -62,7 +67,7 @@ class Output:
         judged = snapshot.final or not snapshot.verdict.provisional
         before = self.places.cameras(place.scene_id) if judged else {}
         try:
-            measured = in_metres(snapshot, recipe.metric)
+            measured = in_metres(with_landmarks(snapshot, estimate), recipe.metric)
             finish(measured, folder, seed=recipe.seed, preset_name="live")
             if snapshot.final:
                 remove_result(provisional)

@@ -55,7 +55,10 @@ class CameraModel:
             Rotation.from_rotvec(step[:3]).as_matrix() @ self.rotation,
             self.translation + step[3:POSE],
             replace(
-                lens, focal=lens.focal * float(np.exp(step[6])), radial=lens.radial + step[7], shift=lens.shift + step[8:]
+                lens,
+                focal=lens.focal * float(np.exp(step[6])),
+                radial=lens.radial + step[7],
+                shift=lens.shift + step[8:],
             ),
         )
 

@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
 
-from splatnode.recon.geometry import angles_deg
 from splatnode.recon.locating import posing
 from splatnode.recon.locating.camera_model import CameraModel
 from splatnode.recon.locating.case import Case
@@ -41,10 +41,11 @@ def refused(case: Case, config: Config) -> NotLocated | None:
 
 def nothing_found(case: Case) -> NotLocated:
     """Where chance explains what agrees."""
-    count = 0 if case.posed is None else int(case.posed.agreeing.sum())
+    count = len(case.agreeing)
+    agree = f"only {count} points agree with one camera, as chance may give" if count else "no points agree"
     return NotLocated(
         Reason.NOT_FOUND,
-        f"it shows too little of the scene: {count} points agree with one camera, and chance may give as many.",
+        f"too little of it is in the scene: {agree}.",
         "Take it nearer to where the scene's photographs were taken, looking the same way.",
     )
 
@@ -62,7 +63,7 @@ def too_rough(claim: Claim, config: Config) -> NotLocated | None:
 
 
 def _by_chance(case: Case, config: Config) -> NotLocated | None:
-    enough = len(case.agreeing) >= config.min_points and case.log10_nfa <= config.max_log10_nfa
+    enough = case.num_independent >= config.min_points and case.log10_nfa <= config.max_log10_nfa
     return None if enough else nothing_found(case)
 
 
@@ -105,12 +106,13 @@ def _as_well_elsewhere(case: Case, config: Config) -> NotLocated | None:
     assert case.posed is not None
     fit = case.posed.fit
     explained = np.isin(case.known.feature_of, case.agreeing.feature_of)
-    second = posing.searched(case.known.of(~explained), fit.camera.lens, case.scale, case.settings)
-    if second is None:
+    lens = fit.camera.lens
+    start = posing.searched(case.known.of(~explained), lens, case.scale, case.settings)
+    found = start and posing.settled(start, case.known, lens, case.scale, case.noise_px, case.settings)
+    if found is None or _near(fit.camera, found.fit.camera, case.unit):
         return None
-    limit_px = case.settings.search_px * case.scale
-    count = int(posing.agreement(second, case.known, limit_px).sum())
-    if count <= max(config.max_elsewhere * len(case.agreeing), config.min_points) or _near(fit.camera, second):
+    count = int(found.agreeing.sum())
+    if count <= max(config.max_elsewhere * len(case.agreeing), config.min_points):
         return None
     return NotLocated(
         Reason.ELSEWHERE,
@@ -119,13 +121,13 @@ def _as_well_elsewhere(case: Case, config: Config) -> NotLocated | None:
     )
 
 
-_NEAR_DEG, _NEAR_SHARE = 5.0, 0.1  # two cameras nearer than this are one that is known roughly
+_NEAR_DEG, _NEAR_SHARE = 5.0, 0.1  # two cameras nearer than this, of the distance to the scene, are one
 
 
-def _near(one: CameraModel, other: CameraModel) -> bool:
-    turn = angles_deg(one.rotation[None], other.rotation[None])[0]
+def _near(one: CameraModel, other: CameraModel, unit: float) -> bool:
+    turn = np.degrees(Rotation.from_matrix(one.rotation @ other.rotation.T).magnitude())
     apart = np.linalg.norm(one.T_world_camera[:3, 3] - other.T_world_camera[:3, 3])
-    return bool(turn < _NEAR_DEG and apart < _NEAR_SHARE)
+    return bool(turn < _NEAR_DEG and apart < _NEAR_SHARE * unit)
 
 
 def _halves_disagree(case: Case, config: Config) -> NotLocated | None:

@@ -14,7 +14,8 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration import bundle, tracks, triangulation
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 from splatnode.recon.result.bounds import Bounds
-from splatnode.recon.result.landmarks import DESCRIPTORS_A_PHOTOGRAPH, MOST_DESCRIPTORS, KnownLenses, Landmarks
+from splatnode.recon.result.landmarks import KnownLenses, Landmarks
+from splatnode.recon.result.landmarks_file import DESCRIPTORS_A_PHOTOGRAPH, MOST_DESCRIPTORS
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -45,6 +46,7 @@ def gathered(graph: ViewGraph, registration: Registration, bounds: Mapping[str, 
         descriptors=descriptors[kept],
         point_of=point_of,
         photograph_of=position[camera_of[kept]],
+        names=tuple(keyframe.name for keyframe in keyframes),
         Ts_world_camera=np.stack([camera.T_world_camera for camera in registration.cameras]),
         lenses=_lenses(registration.cameras, keyframes),
         rotation_bounds=np.array([_UNKNOWN_DEG if each is None else each.rotation_deg for each in known]),

@@ -6,12 +6,14 @@ speaks against it is asked (checks.py): being wrong is worse than refusing.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.recon.frames.keyframe import REFERENCE_SIDE, longer_side, principal_point
+from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Features, longer_side, principal_point
 from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.locating import candidates, checks, claims, posing
 from splatnode.recon.locating.case import Case
@@ -35,6 +37,14 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     checks: checks.Config = checks.Config()
 
 
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """A photograph without distortion, with its features."""
+
+    frame: Frame
+    features: Features
+
+
 def locate(
     landmarks: Landmarks,
     image: npt.NDArray[np.uint8],  # (H, W, 3) RGB
@@ -43,13 +53,27 @@ def locate(
 ) -> Located | NotLocated:
     """The camera of `image` in the world of the landmarks, with what is claimed of it; else why there is none.
 
-    `intrinsics` are those of the image, if they are known; a lens with distortion needs them. Without them the lenses
-    of the scene's own photographs are tried first, then any. Raises ValueError for an image that is not (H, W, 3)
-    uint8, or intrinsics that cannot be used.
+    `intrinsics` are those of the image, if they are known; a lens with distortion needs them, and the camera is that of
+    the image without it. Without them the lenses of the scene's own photographs are tried first, then any. Raises
+    ValueError for an image that is not (H, W, 3) uint8, or intrinsics that cannot be used.
     """
+    return located(landmarks, described(image, intrinsics, config), config)
+
+
+def described(
+    image: npt.NDArray[np.uint8],
+    intrinsics: Intrinsics | None = None,
+    config: Config = Config(),  # noqa: B008
+) -> Photograph:
+    """What `located` needs of a photograph, which may be looked for in several scenes. As `locate` otherwise."""
     frame = undistorted(Frame(0, "photograph", 0, image, intrinsics))
-    found = features.extract(frame.image, config.features)
-    known = correspondences(found, principal_point(frame), landmarks, config.neighbours)
+    return Photograph(frame, features.extract(frame.image, config.features))
+
+
+def located(landmarks: Landmarks, photograph: Photograph, config: Config = Config()) -> Located | NotLocated:  # noqa: B008
+    """As `locate`."""
+    frame = photograph.frame
+    known = correspondences(photograph.features, principal_point(frame), landmarks, config.neighbours)
     case = _case(known, frame, landmarks, config)
     refusal = checks.refused(case, config.checks)
     if refusal is not None or case.posed is None:
@@ -71,7 +95,7 @@ def _case(known: Correspondences, frame: Frame, landmarks: Landmarks, config: Co
     noise_px = landmarks.noise_px * scale
 
     def case(posed: Posed | None) -> Case:
-        return Case.of(known, posed, frame.width, frame.height, scale, noise_px, config.posing)
+        return Case.of(known, posed, frame.width, frame.height, scale, noise_px, landmarks.unit, config.posing)
 
     certain = None if given is None else candidates.given(given)
     if certain is not None:
@@ -85,7 +109,9 @@ def _case(known: Correspondences, frame: Frame, landmarks: Landmarks, config: Co
         return best
     others = candidates.any_lens(side) if given is None else [candidates.nominal(given, side)]
     cameras = [posing.searched(known, lens, scale, config.posing) for lens in others]
-    counted = [0 if each is None else posing.agreement(each, known, config.posing.search_px * scale).sum() for each in cameras]
+    counted = [
+        0 if each is None else posing.agreement(each, known, config.posing.search_px * scale).sum() for each in cameras
+    ]
     likeliest = int(np.argmax(counted))
     camera = cameras[likeliest]
     if camera is None:

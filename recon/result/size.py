@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 BYTES_A_GAUSSIAN = 124  # 68 in scene.ply, 46 to 50 in colmap/points3D.txt, 4 in sources.bin
 OTHER_BYTES = 2_000_000  # preview.png (1.2 MB measured at most), report and cameras
+LANDMARK_BYTES = 170_000  # a photograph, of landmarks.npz: descriptors, with the points' share
 # Photographs of real scenes led to a Gaussian for 28 to 60 pixels; four times as many are allowed for.
 PIXELS_A_GAUSSIAN = 8
 
@@ -15,9 +16,11 @@ def largest_result_bytes(sizes: Iterable[tuple[int, int]], longer_side: int, mos
 
     `longer_side` of the modelled images is in pixels; `most_gaussians` is the limit that was set, if any.
     """
-    pixels = sum(longer_side**2 * min(size) / max(size) for size in sizes)
+    known = list(sizes)
+    pixels = sum(longer_side**2 * min(size) / max(size) for size in known)
     expected = round(pixels / PIXELS_A_GAUSSIAN)
-    return result_bytes(expected if most_gaussians is None else min(expected, most_gaussians))
+    num_gaussians = expected if most_gaussians is None else min(expected, most_gaussians)
+    return result_bytes(num_gaussians) + LANDMARK_BYTES * len(known)
 
 
 def result_bytes(num_gaussians: int) -> int:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.stamp import Stamp
 from splatnode.recon.result.bounds import Bounds
+from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.verdict import Verdict
 
@@ -72,3 +73,4 @@ class Snapshot:
     served_by: Mapping[str, str] = field(default_factory=dict)  # network or measure, by regularisation that was used
     evidence: Mapping[str, object] | None = None  # recon.verification.likelihood.record; None: nothing to verify
     scale: Scale = RELATIVE  # the unit of all lengths
+    landmarks: Landmarks | None = None  # by which further photographs are placed; None: they were not gathered

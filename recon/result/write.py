@@ -6,6 +6,7 @@ from pathlib import Path
 
 from splatnode.recon.result.export import viewer_safe, write_result
 from splatnode.recon.result.export.sources import SOURCES, encode_sources
+from splatnode.recon.result.landmarks_file import LANDMARKS, encode_landmarks
 from splatnode.recon.result.preview import contact_sheet
 from splatnode.recon.result.report import build_report, peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
@@ -17,5 +18,7 @@ def finish(snapshot: Snapshot, out: Path, *, seed: int, preset_name: str, **extr
     preview = contact_sheet(snapshot) if snapshot.verdict.publishable else None
     source_frame = viewer_safe(snapshot.gaussians).source_frame  # of those that scene.ply holds
     further = {SOURCES: encode_sources(source_frame)} if snapshot.verdict.publishable else {}
+    if snapshot.verdict.publishable and snapshot.landmarks is not None:
+        further[LANDMARKS] = encode_landmarks(snapshot.landmarks)
     write_result(snapshot, out, report, preview=preview, further=further)
     return report

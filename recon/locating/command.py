@@ -1,0 +1,86 @@
+"""The verb locate: where further photographs were taken, in a result that was saved."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+import msgspec
+
+from splatnode.capture.cameras import folder
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.process.config import read_yaml
+from splatnode.capture.process.terminal import say
+from splatnode.recon.locating.locate import locate as locate_photograph
+from splatnode.recon.locating.outcome import Located, NotLocated
+from splatnode.recon.result.export.staged import json_bytes, write_files
+from splatnode.recon.result.landmarks_file import read_landmarks
+
+EXIT_GOOD, EXIT_REFUSED = 0, 65
+
+
+def locate(args: argparse.Namespace) -> int:
+    """A line a photograph; EXIT_GOOD where all were placed."""
+    landmarks = read_landmarks(args.result)
+    given = None if args.calibration is None else _calibration(args.calibration)
+    records, refused = [], 0
+    for frame in _photographs(args.images, given):
+        if isinstance(frame, DroppedFrame):
+            found = None
+            say(f"{frame.name}: left out: {frame.reason}")
+            records.append({"name": frame.name, "placed": False, "code": "UNREADABLE", "message": frame.reason})
+        else:
+            found = locate_photograph(landmarks, frame.image, _lens(frame, args.fov))
+            say(f"{frame.name}: {found.sentence}")
+            records.append({"name": frame.name, **_record(found, frame)})
+        refused += not isinstance(found, Located)
+    say(f"{len(records) - refused} of {len(records)} photographs were placed in {args.result}")
+    if args.json is not None:
+        told = {"result": str(args.result), "scale": "metric" if landmarks.metric else "relative"}
+        write_files(args.json.parent, {args.json.name: json_bytes({**told, "photographs": records})})
+        say(f"results: {args.json}")
+    return EXIT_REFUSED if refused else EXIT_GOOD
+
+
+def _photographs(paths: Sequence[Path], given: Intrinsics | None) -> Iterator[Frame | DroppedFrame]:
+    """The photographs that the paths name, each a file or a folder, in their order."""
+    for path in paths:
+        if path.is_dir():
+            yield from folder.stream(folder.Config(folder=path, intrinsics=given))
+        elif path.is_file():
+            name = folder.frame_name(path)
+            yield from folder.stream(folder.Config(folder=path.parent, names=(name,), intrinsics=given))
+        else:
+            raise FileNotFoundError(f"{str(path)!r} is not there; give photographs, or folders that hold some")
+
+
+def _calibration(path: Path) -> Intrinsics:
+    """The lens that a file gives, as a camera's configuration does. Raises ValueError, which names the file."""
+    content = read_yaml(path)
+    told = content.get("intrinsics", content)
+    try:
+        return msgspec.convert({"source": "calibration", **told}, Intrinsics)
+    except (msgspec.ValidationError, TypeError) as error:
+        raise ValueError(
+            f"{path} must give width, height, fx, fy, cx and cy of a lens, as `intrinsics` of a camera does: {error}"
+        ) from error
+
+
+def _lens(frame: Frame, fov_deg: float | None) -> Intrinsics | None:
+    """What is known of the photograph's lens; an angle of view, across the longer side, is right to a few per cent."""
+    if fov_deg is None:
+        return frame.intrinsics
+    focal = max(frame.width, frame.height) / 2.0 / math.tan(math.radians(fov_deg) / 2.0)
+    middle = frame.width / 2.0, frame.height / 2.0
+    return Intrinsics(frame.width, frame.height, focal, focal, *middle, source="exif")
+
+
+def _record(found: Located | NotLocated, frame: Frame) -> dict[str, object]:
+    if isinstance(found, NotLocated):
+        return {"placed": False, "code": found.code.value, "message": found.message, "advice": found.advice}
+    arrays = {name: getattr(found, name).tolist() for name in ("T_world_camera", "K", "covariance")}
+    size = {"width": frame.width, "height": frame.height}
+    return {"placed": True, **arrays, **size, "claim": asdict(found.claim), "points": found.num_points}

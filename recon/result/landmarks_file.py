@@ -1,0 +1,138 @@
+"""landmarks.npz: the file of a result folder that holds its landmarks."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import LONGEST_NAME, printable
+from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.landmarks import KnownLenses, Landmarks
+
+LANDMARKS = "landmarks.npz"  # in the result folder
+DESCRIPTORS_A_PHOTOGRAPH = 2000  # kept at most, in the mean: 160 kB of the file
+MOST_DESCRIPTORS = 60_000  # in all: 5 MB
+MOST_BYTES = 64 << 20  # of the arrays in a file that is read
+_DESCRIPTOR_BYTES = 128
+_ROWS, _COLUMNS = np.triu_indices(3)  # of a symmetric matrix, which is kept by half
+
+
+def encode_landmarks(landmarks: Landmarks) -> bytes:
+    """landmarks.npz: NumPy arrays, which `numpy.load(..., allow_pickle=False)` reads."""
+    lenses, file = landmarks.lenses, io.BytesIO()
+    np.savez_compressed(
+        file,
+        points=landmarks.points.astype(np.float32),
+        covariances=landmarks.covariances[:, _ROWS, _COLUMNS].astype(np.float32),
+        descriptors=landmarks.descriptors,
+        point_of=landmarks.point_of.astype(np.uint32),
+        photograph_of=landmarks.photograph_of.astype(np.uint16),
+        names=np.array([name.encode() for name in landmarks.names], np.bytes_),
+        Ts_world_camera=landmarks.Ts_world_camera,
+        lenses=np.column_stack([lenses.focals, lenses.radials, lenses.shifts, lenses.shapes]),
+        bounds=np.column_stack([landmarks.rotation_bounds, landmarks.centre_bounds]),
+        scale=np.array([landmarks.noise_px, landmarks.unit, float(landmarks.metric)]),
+    )
+    return file.getvalue()
+
+
+def read_landmarks(folder: Path) -> Landmarks:
+    """The landmarks of the result in `folder`.
+
+    Raises FileNotFoundError, which says what to do, where the folder holds none, SceneFileError where the file is
+    damaged or is not ours, OSError.
+    """
+    path = folder / LANDMARKS
+    if not path.is_file():
+        raise FileNotFoundError(_missing(folder))
+    with foreign(SceneFileError, str(path)):
+        return decode_landmarks(path.read_bytes(), str(path))
+
+
+def decode_landmarks(data: bytes, name: str = LANDMARKS) -> Landmarks:
+    """Reads landmarks.npz. Raises SceneFileError, which names the file as `name`, where it is something else."""
+    with foreign(SceneFileError, name):
+        try:
+            with zipfile.ZipFile(io.BytesIO(data)) as archive:
+                size = sum(member.file_size for member in archive.infolist())
+            if size > MOST_BYTES:
+                raise SceneFileError(f"{name} holds {size} bytes; at most {MOST_BYTES} are read")
+            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+                found = {key: arrays[key] for key in _SHAPES}
+        except (KeyError, ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
+            raise SceneFileError(f"{name} is not a file of landmarks, or is damaged: {error}") from error
+        _check(found, name)
+        return _decoded(found)
+
+
+_SHAPES: dict[str, tuple[str, str, tuple[int, ...]]] = {  # kind, what its first axis counts, the other axes
+    "points": ("f", "P", (3,)),
+    "covariances": ("f", "P", (6,)),
+    "descriptors": ("u", "D", (_DESCRIPTOR_BYTES,)),
+    "point_of": ("u", "D", ()),
+    "photograph_of": ("u", "D", ()),
+    "names": ("S", "C", ()),
+    "Ts_world_camera": ("f", "C", (4, 4)),
+    "lenses": ("f", "C", (5,)),
+    "bounds": ("f", "C", (2,)),
+    "scale": ("f", "three", ()),
+}
+
+
+def _check(found: dict[str, npt.NDArray[Any]], name: str) -> None:
+    """Raises SceneFileError where shapes, types or numbers are not those of a file of ours."""
+    counts: dict[str, int] = {"three": 3}
+    for key, (kind, count, rest) in _SHAPES.items():
+        array = found[key]
+        known = counts.setdefault(count, len(array) if array.ndim else 0)
+        if array.dtype.kind != kind or array.ndim != 1 + len(rest) or array.shape != (known, *rest):
+            raise SceneFileError(f"{name}: {key} must be {('?', *rest)} of kind {kind!r}, got {array.shape}")
+        if kind == "f" and not np.isfinite(array).all():
+            raise SceneFileError(f"{name}: {key} must be finite")
+    if found["descriptors"].dtype != np.uint8 or counts["D"] > MOST_DESCRIPTORS or not counts["C"]:
+        raise SceneFileError(f"{name}: there must be cameras, and at most {MOST_DESCRIPTORS} descriptors of bytes")
+    if (found["point_of"] >= counts["P"]).any() or (found["photograph_of"] >= counts["C"]).any():
+        raise SceneFileError(f"{name}: descriptors must be of its points and photographs")
+    if (found["lenses"][:, [0, 4]] <= 0).any() or (found["scale"][:2] <= 0).any() or (found["bounds"] < 0).any():
+        raise SceneFileError(f"{name}: focal lengths, shapes, bounds and units must be positive")
+
+
+def _decoded(found: dict[str, npt.NDArray[Any]]) -> Landmarks:
+    covariances = np.empty((len(found["points"]), 3, 3))
+    covariances[:, _ROWS, _COLUMNS] = found["covariances"]
+    covariances[:, _COLUMNS, _ROWS] = found["covariances"]
+    lenses, bounds = found["lenses"], found["bounds"]
+    noise_px, unit, metric = found["scale"].tolist()
+    return Landmarks(
+        found["points"].astype(np.float64),
+        covariances,
+        found["descriptors"],
+        found["point_of"].astype(np.int64),
+        found["photograph_of"].astype(np.int64),
+        tuple(printable(name.decode(), LONGEST_NAME) for name in found["names"].tolist()),
+        found["Ts_world_camera"],
+        KnownLenses(lenses[:, 0], lenses[:, 1], lenses[:, 2:4], lenses[:, 4]),
+        bounds[:, 0],
+        bounds[:, 1],
+        noise_px,
+        unit,
+        bool(metric),
+    )
+
+
+def _missing(folder: Path) -> str:
+    """What to do where a folder has no landmarks."""
+    if (folder / "scene.ply").is_file():
+        return (
+            f"{folder / LANDMARKS} is not there: an earlier splatnode made this result, or it is a merged map or a "
+            "converted scene. Reconstruct the photographs again, or give the folder of one scene of the map"
+        )
+    if (folder / "report.json").is_file():
+        return f"{folder} holds no scene: its report.json says why. A photograph can be placed in a scene only"
+    return f"{folder} is not a result of splatnode; give the folder that splatnode replay --out wrote"
