@@ -15,6 +15,7 @@ Array = npt.NDArray[np.float64]
 _EXIF_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA = 0.05, 0.02, 0.004
 _SAME_LENS_SIGMA, _SAME_RADIAL_SIGMA = 0.01, 0.005  # focusing changes the lens of one camera
 _FREE_SIGMA = 0.3  # of log focal, of a lens of which nothing is known
+_CROP_SIGMA = 0.2  # of the principal point of a picture that was cropped
 _FOCALS = np.geomspace(0.45, 3.2, 9)  # over the longer side, 96 to 18 degrees of view: steps of 28 %
 _SAME_SHAPE = 0.01  # largest difference of two pictures' height over width
 _SAME_FOCAL = 0.15  # of log focals: an EXIF focal length that may be of the result's own lens
@@ -57,6 +58,6 @@ def any_lens(side: int) -> list[Lens]:
     ]
 
 
-def freed(lens: Lens, side: int) -> Lens:
-    """The lens, of which nothing is known but that it may be this one."""
-    return Lens(lens.focal, lens.radial, lens.shift, _FREE_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side)
+def cropped(lens: Lens, side: int) -> Lens:
+    """Any lens near this one, of a picture that may be a part of what the camera saw."""
+    return Lens(lens.focal, lens.radial, lens.shift, _FREE_SIGMA, _RADIAL_SIGMA, _CROP_SIGMA * side)

@@ -8,51 +8,71 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.frames.keyframe import REFERENCE_SIDE
 from splatnode.recon.locating import posing
+from splatnode.recon.locating.camera_model import CameraModel, Lens
 from splatnode.recon.locating.correspondences import Correspondences
 from splatnode.recon.locating.posing import Posed
 from splatnode.recon.matching.two_view import log10_number_of_false_alarms
 
 Array = npt.NDArray[np.float64]
 
-_SAMPLE = 4  # correspondences that define a pose and a focal length
+_SAMPLE = 5  # correspondences that define a pose, a focal length and a principal point
 _CELL = 4.0  # side of a cell in which features count as one, in limits of their errors
 _SHUFFLES = 20  # of the landmarks among the pixels, which tell how often chance agrees
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
-    """A photograph's correspondences, and the camera that explains most of them."""
+class Judged:
+    """What a camera of a photograph is judged by."""
 
     known: Correspondences
-    posed: Posed | None  # None: there is no camera
     width: int  # of the photograph, pixels
     height: int
-    scale: float  # pixels for one at REFERENCE_SIDE
-    noise_px: float  # of an observation, pixels of the photograph
+    reference_noise_px: float  # of an observation, pixels at REFERENCE_SIDE
     unit: float  # the median depth of the scene's points
     settings: posing.Config
+
+    @property
+    def scale(self) -> float:
+        """Pixels for one at REFERENCE_SIDE."""
+        return max(self.width, self.height) / REFERENCE_SIDE
+
+    @property
+    def noise_px(self) -> float:
+        """Of an observation, pixels of the photograph."""
+        return self.reference_noise_px * self.scale
+
+    def posed(self, *lenses: Lens) -> Posed | None:
+        """The camera with that of the lenses on which most correspondences agree."""
+        return posing.posed(self.known, lenses, self.scale, self.noise_px, self.settings)
+
+    def settled(self, camera: CameraModel, lens: Lens) -> Posed | None:
+        """The camera refined, with its inliers found again."""
+        return posing.settled(camera, self.known, lens, self.scale, self.noise_px, self.settings)
+
+    def case(self, posed: Posed | None) -> Case:
+        limit_px = self.settings.max_error_px * self.scale
+        log10_nfa = 0.0 if posed is None else _log10_nfa(self.known, posed, limit_px, self.width * self.height)
+        return Case(self, posed, log10_nfa)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A camera for a photograph."""
+
+    by: Judged
+    posed: Posed | None  # None: there is none
     log10_nfa: float  # log10 of the expected number of cameras that chance gives so much agreement
 
-    @classmethod
-    def of(
-        cls,
-        known: Correspondences,
-        posed: Posed | None,
-        width: int,
-        height: int,
-        scale: float,
-        noise_px: float,
-        unit: float,
-        settings: posing.Config,
-    ) -> Case:
-        log10_nfa = 0.0 if posed is None else _log10_nfa(known, posed, settings.max_error_px * scale, width * height)
-        return cls(known, posed, width, height, scale, noise_px, unit, settings, log10_nfa)
+    @property
+    def known(self) -> Correspondences:
+        return self.by.known
 
     @property
     def num_independent(self) -> int:
         """How many spots of the photograph agree with the camera."""
-        return independent(self.agreeing.pixels, self.settings.max_error_px * self.scale)
+        return independent(self.agreeing.pixels, self.by.settings.max_error_px * self.by.scale)
 
     @property
     def agreeing(self) -> Correspondences:

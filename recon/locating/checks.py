@@ -27,7 +27,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_elsewhere: float = 0.5  # agreement with a second camera, over that with the first
     max_apart: float = 4.0  # standard deviations between what two halves of the picture say of the camera
     focal_range: tuple[float, float] = (0.3, 6.0)  # over the longer side: 118 to 10 degrees of view
-    max_shift: float = 0.05  # of the principal point, over the longer side
+    max_shift: float = 0.5  # of the principal point, over the longer side: it is in the picture, or was before a crop
     max_rotation_deg: float = 5.0  # of the claim; beyond, a camera is far off (recon/evaluate/stability/claim.py)
     max_centre_percent: float = 10.0  # likewise
 
@@ -68,7 +68,7 @@ def _by_chance(case: Case, config: Config) -> NotLocated | None:
 
 
 def _in_one_patch(case: Case, config: Config) -> NotLocated | None:
-    share = _hull_area(case.agreeing.pixels) / (case.width * case.height)
+    share = _hull_area(case.agreeing.pixels) / (case.by.width * case.by.height)
     if share >= config.min_share_of_picture:
         return None
     return NotLocated(
@@ -88,7 +88,7 @@ def _hull_area(pixels: Array) -> float:
 
 def _with_an_impossible_lens(case: Case, config: Config) -> NotLocated | None:
     assert case.posed is not None
-    lens, side = case.posed.fit.camera.lens, max(case.width, case.height)
+    lens, side = case.posed.fit.camera.lens, max(case.by.width, case.by.height)
     least, most = config.focal_range
     shift = float(np.linalg.norm(lens.shift)) / side
     if least <= lens.focal / side <= most and shift <= config.max_shift:
@@ -107,9 +107,9 @@ def _as_well_elsewhere(case: Case, config: Config) -> NotLocated | None:
     fit = case.posed.fit
     explained = np.isin(case.known.feature_of, case.agreeing.feature_of)
     lens = fit.camera.lens
-    start = posing.searched(case.known.of(~explained), lens, case.scale, case.settings)
-    found = start and posing.settled(start, case.known, lens, case.scale, case.noise_px, case.settings)
-    if found is None or _near(fit.camera, found.fit.camera, case.unit):
+    start = posing.searched(case.known.of(~explained), lens, case.by.scale, case.by.settings)
+    found = start and case.by.settled(start, lens)
+    if found is None or _near(fit.camera, found.fit.camera, case.by.unit):
         return None
     count = int(found.agreeing.sum())
     if count <= max(config.max_elsewhere * len(case.agreeing), config.min_points):
@@ -137,7 +137,7 @@ def _halves_disagree(case: Case, config: Config) -> NotLocated | None:
     farthest = 0.0
     for axis in (0, 1):
         first = agreeing.pixels[:, axis] < np.median(agreeing.pixels[:, axis])
-        halves = [refined(fit.camera, fit.camera.lens, agreeing.of(half), case.noise_px) for half in (first, ~first)]
+        halves = [refined(fit.camera, fit.camera.lens, agreeing.of(half), case.by.noise_px) for half in (first, ~first)]
         T1, T2 = (half.camera.T_world_camera for half in halves)
         between = np.linalg.inv(T1) @ T2
         turn = np.array([between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1]])

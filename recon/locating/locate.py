@@ -6,6 +6,7 @@ speaks against it is asked (checks.py): being wrong is worse than refusing.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import msgspec
@@ -13,20 +14,20 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Features, longer_side, principal_point
+from splatnode.recon.frames.keyframe import Features, longer_side, principal_point
 from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.locating import candidates, checks, claims, posing
-from splatnode.recon.locating.case import Case
+from splatnode.recon.locating.case import Case, Judged
 from splatnode.recon.locating.correspondences import Correspondences, correspondences
 from splatnode.recon.locating.outcome import Located, NotLocated
-from splatnode.recon.locating.posing import Posed
 from splatnode.recon.matching import features, nearest_neighbours
 from splatnode.recon.result.landmarks import Landmarks
 
 Array = npt.NDArray[np.float64]
 
-_OWN_LENS_SIGMAS = 3.0  # standard deviations of the free focal length that still say that the lens is the result's own
-_OWN_LENS_LOG = 0.02  # and this much of its logarithm: nobody tells lenses apart by less
+# A lens is what it was taken for where, once it is free, it moves by no more than so many standard deviations, or so
+# much: of the logarithm of the focal length, and of the longer side for the principal point.
+_SAME_LENS_SIGMAS, _SAME_LENS_LOG, _SAME_LENS_SHIFT = 3.0, 0.02, 0.02
 _AMPLE_NFA = -30.0  # log10: so surely is no pose of another lens needed
 
 
@@ -91,42 +92,35 @@ def located(landmarks: Landmarks, photograph: Photograph, config: Config = Confi
 def _case(known: Correspondences, frame: Frame, landmarks: Landmarks, config: Config) -> Case:
     """The best camera, of the likeliest lens that explains enough."""
     side, given = longer_side(frame), frame.intrinsics
-    scale = side / REFERENCE_SIDE
-    noise_px = landmarks.noise_px * scale
-
-    def case(posed: Posed | None) -> Case:
-        return Case.of(known, posed, frame.width, frame.height, scale, noise_px, landmarks.unit, config.posing)
-
+    judged = Judged(known, frame.width, frame.height, landmarks.noise_px, landmarks.unit, config.posing)
     certain = None if given is None else candidates.given(given)
     if certain is not None:
-        return case(posing.posed(known, certain, scale, noise_px, config.posing))
-    best = case(None)
+        return judged.case(judged.posed(certain))
+    best = judged.case(None)
     for lens in candidates.own(landmarks.lenses, frame.width, frame.height, given):
-        found = case(posing.posed(known, lens, scale, noise_px, config.posing))
-        if found.log10_nfa < best.log10_nfa and _is_own(found, candidates.freed(lens, side), config.posing):
+        found = judged.case(judged.posed(lens))
+        if found.log10_nfa < best.log10_nfa and _as_uncropped(found, judged, side) is found:
             best = found
     if best.log10_nfa < _AMPLE_NFA:
         return best
     others = candidates.any_lens(side) if given is None else [candidates.nominal(given, side)]
-    cameras = [posing.searched(known, lens, scale, config.posing) for lens in others]
-    counted = [
-        0 if each is None else posing.agreement(each, known, config.posing.search_px * scale).sum() for each in cameras
-    ]
-    likeliest = int(np.argmax(counted))
-    camera = cameras[likeliest]
-    if camera is None:
-        return best
-    found = case(posing.settled(camera, known, others[likeliest], scale, noise_px, config.posing))
-    return found if found.log10_nfa < best.log10_nfa else best
+    found = judged.case(judged.posed(*others))
+    return min(best, _as_uncropped(found, judged, side), key=lambda each: each.log10_nfa)
 
 
-def _is_own(found: Case, free: candidates.Lens, config: posing.Config) -> bool:
-    """Whether the focal length stays where it is once it is free: else the picture is of another lens, or a crop."""
+def _as_uncropped(found: Case, judged: Judged, side: int) -> Case:
+    """The case as it is; or, where its lens does not stay what it is once it is free, with a free lens.
+
+    Such a picture is of another lens, or a part of what its camera saw.
+    """
     if found.posed is None:
-        return False
-    camera = found.posed.fit.camera
-    again = posing.settled(camera, found.known, free, found.scale, found.noise_px, config)
+        return found
+    lens = found.posed.fit.camera.lens
+    again = judged.settled(found.posed.fit.camera, candidates.cropped(lens, side))
     if again is None:
-        return False
-    moved = abs(np.log(again.fit.camera.lens.focal / free.focal))
-    return bool(moved < max(_OWN_LENS_LOG, _OWN_LENS_SIGMAS * np.sqrt(again.fit.covariance[6, 6])))
+        return found
+    free, sigmas = again.fit.camera.lens, np.sqrt(np.diag(again.fit.covariance)[6:])
+    of_focal = abs(math.log(free.focal / lens.focal)) / max(_SAME_LENS_LOG, _SAME_LENS_SIGMAS * sigmas[0])
+    of_shift = np.abs(free.shift - lens.shift) / np.maximum(_SAME_LENS_SHIFT * side, _SAME_LENS_SIGMAS * sigmas[2:])
+    same = max(of_focal, *of_shift) < 1.0
+    return found if same else judged.case(again)

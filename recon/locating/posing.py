@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -35,13 +36,19 @@ class Posed:
     agreeing: Flags  # (M,) of those that were given; at most one of a pixel, and of a landmark
 
 
-def posed(known: Correspondences, lens: Lens, scale: float, noise_px: float, config: Config) -> Posed | None:
-    """The camera that most correspondences agree with, refined; None where not even a sample does.
+def posed(
+    known: Correspondences, lenses: Sequence[Lens], scale: float, noise_px: float, config: Config
+) -> Posed | None:
+    """The camera that most correspondences agree with, of one of the `lenses`, refined; None where not a sample does.
 
     `scale` is pixels of the photograph for one at REFERENCE_SIDE; `noise_px` is of an observation, in its pixels.
     """
-    found = searched(known, lens, scale, config)
-    return None if found is None else settled(found, known, lens, scale, noise_px, config)
+    found = [(camera, lens) for lens in lenses if (camera := searched(known, lens, scale, config)) is not None]
+    if not found:
+        return None
+    limit_px = config.search_px * scale
+    camera, lens = max(found, key=lambda each: int(agreement(each[0], known, limit_px).sum()))
+    return settled(camera, known, lens, scale, noise_px, config)
 
 
 def searched(known: Correspondences, lens: Lens, scale: float, config: Config) -> CameraModel | None:
