@@ -27,7 +27,7 @@ Array = npt.NDArray[np.float64]
 
 # A lens is what it was taken for where, once it is free, it moves by no more than so many standard deviations, or so
 # much: of the logarithm of the focal length, and of the longer side for the principal point.
-_SAME_LENS_SIGMAS, _SAME_LENS_LOG, _SAME_LENS_SHIFT = 3.0, 0.02, 0.02
+_SAME_LENS_SIGMAS, _SAME_LENS_LOG, _SAME_LENS_SHIFT = 3.0, 0.02, 0.012
 _AMPLE_NFA = -30.0  # log10: so surely is no pose of another lens needed
 
 
@@ -115,12 +115,14 @@ def _as_uncropped(found: Case, judged: Judged, side: int) -> Case:
     """
     if found.posed is None:
         return found
-    lens = found.posed.fit.camera.lens
-    again = judged.settled(found.posed.fit.camera, candidates.cropped(lens, side))
+    prior = found.posed.prior
+    again = judged.settled(found.posed.fit.camera, candidates.cropped(found.posed.fit.camera.lens, side))
     if again is None:
         return found
-    free, sigmas = again.fit.camera.lens, np.sqrt(np.diag(again.fit.covariance)[6:])
-    of_focal = abs(math.log(free.focal / lens.focal)) / max(_SAME_LENS_LOG, _SAME_LENS_SIGMAS * sigmas[0])
-    of_shift = np.abs(free.shift - lens.shift) / np.maximum(_SAME_LENS_SHIFT * side, _SAME_LENS_SIGMAS * sigmas[2:])
+    free, sigmas = again.fit.camera.lens, _SAME_LENS_SIGMAS * np.sqrt(np.diag(again.fit.covariance)[6:])
+    of_focal = abs(math.log(free.focal / prior.focal)) / max(
+        _SAME_LENS_LOG, _SAME_LENS_SIGMAS * prior.log_focal_sigma, sigmas[0]
+    )
+    of_shift = np.abs(free.shift - prior.shift) / np.maximum(_SAME_LENS_SHIFT * side, sigmas[2:])
     same = max(of_focal, *of_shift) < 1.0
     return found if same else judged.case(again)

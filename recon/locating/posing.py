@@ -19,7 +19,7 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 _SAMPLE = 3  # correspondences that define a pose
-_ITERATIONS = {"min_iterations": 500, "max_iterations": 10_000, "seed": 0}  # of RANSAC: 10 000 do for 10 % inliers
+_ITERATIONS, _ITERATIONS_OF_MANY = 10_000, 3_000  # of RANSAC: they do for 9 and 13 % inliers; where lenses are tried
 _ROUNDS = 4  # of inliers and refinement; they have settled by then
 
 
@@ -33,6 +33,7 @@ class Posed:
     """A camera, and the correspondences that agree with it."""
 
     fit: Fit
+    prior: Lens  # that it was refined with
     agreeing: Flags  # (M,) of those that were given; at most one of a pixel, and of a landmark
 
 
@@ -43,7 +44,8 @@ def posed(
 
     `scale` is pixels of the photograph for one at REFERENCE_SIDE; `noise_px` is of an observation, in its pixels.
     """
-    found = [(camera, lens) for lens in lenses if (camera := searched(known, lens, scale, config)) is not None]
+    most = _ITERATIONS if len(lenses) == 1 else _ITERATIONS_OF_MANY
+    found = [(camera, lens) for lens in lenses if (camera := searched(known, lens, scale, config, most)) is not None]
     if not found:
         return None
     limit_px = config.search_px * scale
@@ -51,7 +53,9 @@ def posed(
     return settled(camera, known, lens, scale, noise_px, config)
 
 
-def searched(known: Correspondences, lens: Lens, scale: float, config: Config) -> CameraModel | None:
+def searched(
+    known: Correspondences, lens: Lens, scale: float, config: Config, most_iterations: int = _ITERATIONS
+) -> CameraModel | None:
     """The camera by random samples, with the lens as it is given; None where there are too few correspondences."""
     if len(known) <= _SAMPLE:
         return None
@@ -59,7 +63,12 @@ def searched(known: Correspondences, lens: Lens, scale: float, config: Config) -
         without_distortion(known.pixels, lens),
         known.points,
         epipolar.pinhole(lens.focal),
-        {"max_reproj_error": config.search_px * scale, **_ITERATIONS},
+        {
+            "max_reproj_error": config.search_px * scale,
+            "min_iterations": 500,
+            "max_iterations": most_iterations,
+            "seed": 0,
+        },
     )
     if sum(info["inliers"]) <= _SAMPLE:
         return None
@@ -78,7 +87,7 @@ def settled(
         fit = refined(camera, lens, known.of(agreeing), noise_px)
         camera = fit.camera
     assert fit is not None
-    return Posed(fit, agreement(camera, known, config.max_error_px * scale))
+    return Posed(fit, lens, agreement(camera, known, config.max_error_px * scale))
 
 
 def agreement(camera: CameraModel, known: Correspondences, limit_px: float) -> Flags:

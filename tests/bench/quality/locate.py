@@ -227,11 +227,16 @@ def main() -> None:
             largest[name] = decode_landmarks(data)
             own += trials(scene, views, largest[name], split.test)
         print(name, json.dumps(summary(own, [])), flush=True)
+    _write(args.out, sets, own, [])
     strangers = list(_strangers(scenes, splits, largest))
-    found = {"sets": sets, "trials": [asdict(t) for t in own], "strangers": [asdict(s) for s in strangers]}
-    head = {"command": shlex.join(["python", "-m", "tests.bench", "locate", *sys.argv[1:]]), "commit": _commit()}
-    args.out.write_text(json.dumps({**head, "summary": summary(own, strangers), **found}, indent=1) + "\n")
+    _write(args.out, sets, own, strangers)
     print(json.dumps(summary(own, strangers)))
+
+
+def _write(path: Path, sets: dict[str, str], own: Sequence[Trial], strangers: Sequence[Stranger]) -> None:
+    head = {"command": shlex.join(["python", "-m", "tests.bench", "locate", *sys.argv[1:]]), "commit": _commit()}
+    rows = {"trials": [asdict(trial) for trial in own], "strangers": [asdict(pair) for pair in strangers]}
+    path.write_text(json.dumps({**head, "summary": summary(own, strangers), "sets": sets, **rows}, indent=1) + "\n")
 
 
 def _strangers(
