@@ -26,7 +26,7 @@ def claimed(posed: Posed, known: Correspondences, landmarks: Landmarks) -> tuple
 
     The scene around the camera is as wrong as its cameras there: as those whose photographs it shares points with.
     """
-    shares = np.bincount(known.best_photograph[posed.agreeing], minlength=len(landmarks.centre_bounds))
+    shares = np.bincount(known.photograph_of[posed.agreeing], minlength=len(landmarks.centre_bounds))
     shares = shares / max(shares.sum(), 1)
     turn = np.radians(np.sqrt(shares @ landmarks.rotation_bounds**2)) / _BALL_95
     move = np.sqrt(shares @ landmarks.centre_bounds**2) / _BALL_95

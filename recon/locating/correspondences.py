@@ -15,6 +15,8 @@ Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
+_MIN_LENGTH = 1e-12
+
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
@@ -26,7 +28,8 @@ class Correspondences:
     covariances: Array  # (M, 3, 3) of the points
     landmark_of: Index  # (M,)
     support: Index  # (M,) how many known photographs say so
-    best_photograph: Index  # (M,) the one of them with the most distinct match
+    photograph_of: Index  # (M,) one of them
+    seen_along: Array  # (M, 3) the mean direction in which these see the landmark, of unit length, world
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -53,8 +56,13 @@ def correspondences(
         shown = features.point_of[matches[:, 0]]
         found.append(np.column_stack([shown, points, np.full(len(matches), photograph)]))
     every = np.concatenate(found)
-    pairs, first, support = np.unique(every[:, :2], axis=0, return_index=True, return_counts=True)
+    pairs, first, pair_of, support = np.unique(
+        every[:, :2], axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
     feature_of, landmark_of = pairs.T
+    along = _directions(landmarks.points[every[:, 1]] - landmarks.Ts_world_camera[every[:, 2], :3, 3])
+    seen_along = np.zeros((len(pairs), 3))
+    np.add.at(seen_along, pair_of.ravel(), along)
     return Correspondences(
         pixels=features.points[feature_of] - principal,
         feature_of=feature_of,
@@ -62,5 +70,11 @@ def correspondences(
         covariances=landmarks.covariances[landmark_of],
         landmark_of=landmark_of,
         support=support,
-        best_photograph=every[first, 2],
+        photograph_of=every[first, 2],
+        seen_along=_directions(seen_along),
     )
+
+
+def _directions(vectors: Array) -> Array:
+    """The vectors (M, 3) in unit length."""
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), _MIN_LENGTH)

@@ -20,6 +20,8 @@ Flags = npt.NDArray[np.bool_]
 
 _SAMPLE = 3  # correspondences that define a pose
 _ITERATIONS, _ITERATIONS_OF_MANY = 10_000, 3_000  # of RANSAC: they do for 9 and 13 % inliers; where lenses are tried
+_LEAST_COSINE = 0.5  # between two directions from which a feature looks alike: 60 degrees are beyond SIFT's reach
+_MIN_LENGTH = 1e-12
 _ROUNDS = 4  # of inliers and refinement; they have settled by then
 
 
@@ -91,9 +93,15 @@ def settled(
 
 
 def agreement(camera: CameraModel, known: Correspondences, limit_px: float) -> Flags:
-    """(M,) which correspondences the camera explains: of a pixel the best one alone, and of a landmark."""
+    """(M,) which correspondences the camera explains: of a pixel the best one alone, and of a landmark.
+
+    None is explained that the camera sees from elsewhere than the photographs that it was matched with: a feature does
+    not look alike from the side, and from behind, as where a pattern was mirrored, it is not seen.
+    """
     errors = camera.errors(known.points, known.pixels)
-    agreeing = errors < limit_px
+    along = known.points - camera.T_world_camera[:3, 3]
+    cosine = (along * known.seen_along).sum(1) / np.maximum(np.linalg.norm(along, axis=1), _MIN_LENGTH)
+    agreeing = (errors < limit_px) & (cosine > _LEAST_COSINE)
     for kind in (known.feature_of, known.landmark_of):
         order = np.lexsort((errors, ~agreeing, kind))
         first = np.ones(len(order), bool)

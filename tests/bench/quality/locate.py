@@ -206,6 +206,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", help="default: all of splits.json that have true cameras")
     parser.add_argument("--views", type=int, nargs="+", default=[6, 12])
     parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/")
+    parser.add_argument("--strangers", type=int, default=100, help="held-out photographs of a scene, for other scenes")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     args = parser.parse_args()
     cv2.setNumThreads(1)
@@ -228,7 +229,7 @@ def main() -> None:
             own += trials(scene, views, largest[name], split.test)
         print(name, json.dumps(summary(own, [])), flush=True)
     _write(args.out, sets, own, [])
-    strangers = list(_strangers(scenes, splits, largest))
+    strangers = list(_strangers(scenes, {name: splits[name]["test"][: args.strangers] for name in scenes}, largest))
     _write(args.out, sets, own, strangers)
     print(json.dumps(summary(own, strangers)))
 
@@ -240,10 +241,10 @@ def _write(path: Path, sets: dict[str, str], own: Sequence[Trial], strangers: Se
 
 
 def _strangers(
-    scenes: dict[str, EvaluationScene], splits: dict[str, dict[str, list[str]]], known: dict[str, Landmarks]
+    scenes: dict[str, EvaluationScene], photographs: dict[str, list[str]], known: dict[str, Landmarks]
 ) -> Iterator[Stranger]:
     for of, scene in scenes.items():
-        for name in splits[of]["test"]:
+        for name in photographs[of]:
             photograph: Photograph = described(scene.image(name))
             for other, landmarks in known.items():
                 if other != of:

@@ -1,0 +1,112 @@
+"""landmarks.npz is read as it was written, or refused with what to do."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.landmarks import KnownLenses, Landmarks
+from splatnode.recon.result.landmarks_file import LANDMARKS, decode_landmarks, encode_landmarks, read_landmarks
+
+
+@pytest.fixture
+def landmarks() -> Landmarks:
+    draw = np.random.default_rng(0)
+    half = draw.normal(size=(5, 3, 3))
+    return Landmarks(
+        points=draw.normal(size=(5, 3)),
+        covariances=half @ half.transpose(0, 2, 1),
+        descriptors=draw.integers(0, 128, (9, 128)).astype(np.uint8),
+        point_of=np.array([0, 0, 1, 1, 2, 2, 3, 4, 4]),
+        photograph_of=np.array([0, 1, 0, 1, 0, 1, 1, 0, 1]),
+        names=("a.jpg", "ü b.jpg"),
+        Ts_world_camera=np.tile(np.eye(4), (2, 1, 1)),
+        lenses=KnownLenses(np.full(2, 0.8), np.full(2, 0.01), np.full((2, 2), 0.001), np.full(2, 0.75)),
+        rotation_bounds=np.array([0.3, 0.5]),
+        centre_bounds=np.array([0.01, 0.02]),
+        noise_px=0.4,
+    )
+
+
+def changed(data: bytes, **arrays: np.ndarray) -> bytes:
+    """The file with other arrays in place of its own."""
+    with np.load(io.BytesIO(data)) as found:
+        content = {**{name: found[name] for name in found.files}, **arrays}
+    file = io.BytesIO()
+    np.savez(file, **content)  # pyright: ignore[reportArgumentType]
+    return file.getvalue()
+
+
+def test_what_was_written_is_read(landmarks):
+    found = decode_landmarks(encode_landmarks(landmarks))
+    for field in fields(Landmarks):
+        one, other = getattr(landmarks, field.name), getattr(found, field.name)
+        if isinstance(one, np.ndarray):
+            assert np.allclose(one, other, atol=1e-6), field.name
+        elif isinstance(one, KnownLenses):
+            assert np.allclose(one.focals, other.focals) and np.allclose(one.shifts, other.shifts)
+        else:
+            assert one == other, field.name
+
+
+def test_it_moves_into_another_world(landmarks):
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    moved = landmarks.moved(2.0, turn, np.array([1.0, 2.0, 3.0]))
+    assert np.allclose(moved.points, 2.0 * landmarks.points @ turn.T + [1, 2, 3])
+    assert np.allclose(moved.covariances[0], 4.0 * turn @ landmarks.covariances[0] @ turn.T)
+    assert np.allclose(moved.Ts_world_camera[0, :3, :3], turn) and np.allclose(
+        moved.Ts_world_camera[0, :3, 3], [1, 2, 3]
+    )
+    assert moved.unit == 2.0 and np.allclose(moved.centre_bounds, [0.02, 0.04]) and not moved.metric
+
+
+@pytest.mark.parametrize(
+    "wrong, said",
+    [
+        ({"points": np.full((5, 3), np.nan)}, "finite"),
+        ({"points": np.zeros((4, 3))}, "covariances must be"),
+        ({"points": np.array([["x"] * 3] * 5)}, "points must be"),
+        ({"point_of": np.full(9, 5, np.uint32)}, "of its points"),
+        ({"photograph_of": np.full(9, 2, np.uint16)}, "of its points and photographs"),
+        ({"descriptors": np.zeros((9, 64), np.uint8)}, "descriptors must be"),
+        ({"descriptors": np.zeros((9, 128), np.uint16)}, "bytes"),
+        ({"scale": np.array([0.4, 0.0, 0.0])}, "positive"),
+        ({"bounds": np.full((2, 2), -1.0)}, "positive"),
+        ({"names": np.array([{}, {}], object)}, "damaged"),
+    ],
+)
+def test_what_cannot_be_is_refused(landmarks, wrong, said):
+    with pytest.raises(SceneFileError, match=said):
+        decode_landmarks(changed(encode_landmarks(landmarks), **wrong), "given.npz")
+
+
+def test_a_damaged_file_is_named(landmarks, tmp_path):
+    data = encode_landmarks(landmarks)
+    for damaged in (b"", b"nothing of the kind", data[: len(data) // 2], data[:300] + b"xyz" + data[303:]):
+        (tmp_path / LANDMARKS).write_bytes(damaged)
+        with pytest.raises(SceneFileError, match=LANDMARKS):
+            read_landmarks(tmp_path)
+
+
+def test_a_file_that_would_fill_the_memory_is_not_unpacked(landmarks):
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("points.npy", bytes(65 << 20))
+    with pytest.raises(SceneFileError, match="at most"):
+        decode_landmarks(file.getvalue())
+
+
+def test_a_result_without_landmarks_says_what_to_do(tmp_path):
+    with pytest.raises(FileNotFoundError, match="not a result of splatnode"):
+        read_landmarks(tmp_path)
+    (tmp_path / "report.json").write_text("{}")
+    with pytest.raises(FileNotFoundError, match="holds no scene"):
+        read_landmarks(tmp_path)
+    (tmp_path / "scene.ply").write_text("")
+    with pytest.raises(FileNotFoundError, match="Reconstruct the photographs again"):
+        read_landmarks(tmp_path)

@@ -1,0 +1,51 @@
+"""A small scene of the built-in capture with its landmarks, in which further photographs are placed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from splatnode.capture.cameras import synthetic
+from splatnode.capture.diorama.cast import Camera
+from splatnode.recon.config import Config
+from splatnode.recon.estimation import Estimate, estimate_cameras
+from splatnode.recon.geometry import Similarity, align_cameras
+from splatnode.recon.locating.outcome import Located
+from splatnode.recon.result.landmarks import Landmarks
+from tests.support.synthetic import photographs, view_graph
+
+PLACE = synthetic.Config(views=6, width=480, height=360)
+
+
+@dataclass(frozen=True, eq=False)
+class KnownPlace:
+    estimate: Estimate
+    landmarks: Landmarks
+    to_scene: Similarity  # from the built-in capture's world
+
+
+@lru_cache(maxsize=1)
+def known_place() -> KnownPlace:
+    """Six photographs, registered and verified."""
+    estimate = estimate_cameras(view_graph(photographs(PLACE)), (), Config())
+    assert estimate.landmarks is not None
+    true = np.stack([T for T, _ in synthetic.scene_cameras(PLACE)])
+    landmarks = estimate.landmarks
+    return KnownPlace(estimate, landmarks, align_cameras(true, landmarks.Ts_world_camera))
+
+
+def photograph(index: int) -> tuple[np.ndarray, Camera]:
+    """Midway between two photographs of the scene, with its true camera."""
+    camera = synthetic.held_out_cameras(PLACE)[index]
+    return synthetic.photograph(PLACE, camera, 100 + index), camera
+
+
+def errors(found: Located, camera: Camera) -> tuple[float, float]:
+    """Degrees, and percent of the distance to the scene."""
+    place = known_place()
+    truth = place.to_scene.camera(camera[0])
+    turn = found.T_world_camera[:3, :3].T @ truth[:3, :3]
+    degrees = np.degrees(np.arccos(np.clip((np.trace(turn) - 1.0) / 2.0, -1.0, 1.0)))
+    return float(degrees), 100.0 * float(np.linalg.norm(found.T_world_camera[:3, 3] - truth[:3, 3]))
