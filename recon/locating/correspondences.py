@@ -27,9 +27,8 @@ class Correspondences:
     points: Array  # (M, 3) world
     covariances: Array  # (M, 3, 3) of the points
     landmark_of: Index  # (M,)
-    support: Index  # (M,) how many known photographs say so
-    photograph_of: Index  # (M,) one of them
-    seen_along: Array  # (M, 3) the mean direction in which these see the landmark, of unit length, world
+    photograph_of: Index  # (M,) a known photograph that says so
+    seen_along: Array  # (M, 3) the mean direction in which those that say so see the landmark, of unit length, world
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -56,9 +55,7 @@ def correspondences(
         shown = features.point_of[matches[:, 0]]
         found.append(np.column_stack([shown, points, np.full(len(matches), photograph)]))
     every = np.concatenate(found)
-    pairs, first, pair_of, support = np.unique(
-        every[:, :2], axis=0, return_index=True, return_inverse=True, return_counts=True
-    )
+    pairs, first, pair_of = np.unique(every[:, :2], axis=0, return_index=True, return_inverse=True)
     feature_of, landmark_of = pairs.T
     along = _directions(landmarks.points[every[:, 1]] - landmarks.Ts_world_camera[every[:, 2], :3, 3])
     seen_along = np.zeros((len(pairs), 3))
@@ -69,7 +66,6 @@ def correspondences(
         points=landmarks.points[landmark_of],
         covariances=landmarks.covariances[landmark_of],
         landmark_of=landmark_of,
-        support=support,
         photograph_of=every[first, 2],
         seen_along=_directions(seen_along),
     )

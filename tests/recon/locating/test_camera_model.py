@@ -31,7 +31,7 @@ def seen(noise_px: float, seed: int, count: int = 200) -> Correspondences:
     pixels = CAMERA.project(world)[0] + np.random.default_rng(seed).normal(0, noise_px, (count, 2))
     index = np.arange(count)
     exact = np.zeros((count, 3, 3))
-    return Correspondences(pixels, index, world, exact, index, index, index, world)
+    return Correspondences(pixels, index, world, exact, index, index, world)
 
 
 @pytest.mark.parametrize("parameter", range(NUM_PARAMETERS))
