@@ -54,6 +54,16 @@ def at_hand() -> list[Snapshot]:
     return list(reconstruct([frames[i] for i in (4, 1, 5, 0, 3, 2)], CONFIG))
 
 
+def test_the_last_snapshot_has_landmarks_in_the_world_of_its_cameras(at_hand, streamed):
+    for snapshots in (at_hand, streamed):
+        *before, last = snapshots
+        assert all(snapshot.landmarks is None for snapshot in before)
+        assert last.landmarks is not None and set(last.landmarks.names) == {camera.name for camera in last.cameras}
+        known = dict(zip(last.landmarks.names, last.landmarks.Ts_world_camera, strict=True))
+        for camera in last.cameras:  # refinement moves cameras within their bounds
+            assert np.linalg.norm(known[camera.name][:3, 3] - camera.T_world_camera[:3, 3]) < camera.bounds.centre
+
+
 def three() -> list[Frame]:
     return list(photographs()[1:4])
 

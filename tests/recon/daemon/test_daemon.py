@@ -32,10 +32,13 @@ from splatnode.recon.daemon.control import Answer, Retract
 from splatnode.recon.daemon.daemon import Daemon
 from splatnode.recon.daemon.tracking import Config as Tracking
 from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.locating.locate import locate
+from splatnode.recon.locating.outcome import Located
 from splatnode.recon.optimize import refinement
 from splatnode.recon.result.bounds_in_words import of_cameras
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.folder import FolderInUse
+from splatnode.recon.result.landmarks_file import read_landmarks
 from splatnode.recon.result.message import LiveScene, SceneHeader, from_message
 from splatnode.recon.result.scale import RELATIVE
 from splatnode.recon.result.verdict import Code
@@ -157,6 +160,8 @@ def test_keyframes_become_a_scene_that_survives_the_process_and_forgets_what_it_
         assert status["bounds"] == of_cameras(scene.snapshot.cameras, RELATIVE) != ""
     exported = read_cameras(config.out / "scene-0001" / "cameras.json")
     assert [camera.name for camera in exported] == [frame.name for frame in frames]
+    landmarks = read_landmarks(config.out / "scene-0001")
+    assert isinstance(locate(landmarks, frames[1].image), Located)
 
     with running(config):
         again = peer.wait(lambda scene: scene.session != first.session, "a new session")
