@@ -540,6 +540,51 @@ def span(ends: Sequence[float]) -> str:
     return " to ".join(part(end, 2) for end in ends)
 
 
+def test_further_photographs():
+    found = raw("locate")
+    sums, trials = found["summary"], found["trials"]
+    covered = [trial for trial in trials if trial["covered"]]
+    placed = [trial for trial in trials if trial["outcome"] == "placed"]
+    sets = {(trial["scene"], trial["views"]) for trial in trials}
+    says(f"photographs of {len(sets)} sets of 6 and 12 views from {len({scene for scene, _ in sets})} real scenes")
+    says(f"| {len(trials)}, of which {len(covered)} share 30 matches")
+
+    def right(trial: dict) -> bool:
+        return trial["outcome"] == "placed" and trial["rotation_deg"] <= 1 and trial["centre_percent"] <= 1
+
+    exact = sum(map(right, covered))
+    assert (exact, len(placed)) == (sums["covered_and_right"], sums["placed"])
+    says(f"of these {len(covered)}, placed within", f"| {exact} ({100 * exact / len(covered):.0f} %) |")
+    most = [max(trial[key] for trial in placed) for key in ("rotation_deg", "centre_percent")]
+    says(f"| {len(placed)}; {most[0]:.2f} degrees, {most[1]:.2f} % of the distance |")
+
+    def beyond(kind: str, unit: str, trial: dict) -> bool:
+        return trial[f"{kind}_{unit}"] > trial[f"{kind}_claim_{unit}"]
+
+    turned = sum(beyond("rotation", "deg", trial) for trial in placed)
+    moved = [trial["scene"] for trial in placed if beyond("centre", "percent", trial)]
+    shares = [100 * (1 - count / len(placed)) for count in (turned, len(moved))]
+    says(f"for {shares[0]:.0f} % of the rotations, {shares[1]:.0f} % of the centres")
+    kitti = moved.count("hard_kitti_forward1")
+    says(f"{kitti} of the {len(moved)} centres beyond their bounds are of hard_kitti_forward1")
+    elsewhere = sum(trial["scene"] != "hard_kitti_forward1" for trial in placed)
+    says(f"Elsewhere {len(moved) - kitti} of {elsewhere} is beyond its bound")
+    inexact = [trial for trial in covered if not right(trial)]
+    off = sorted(trial["centre_percent"] for trial in inexact if trial["outcome"] == "placed")
+    assert (len(inexact), len(off)) == (7, 6)
+    says("Of the 7 photographs", f"one was refused, and six are {off[0]:.1f} to {off[-1]:.1f} % off")
+
+
+def test_photographs_of_other_scenes():
+    found = raw("locate")
+    strangers = [pair["outcome"] == "placed" for pair in found["strangers"] if not pair["same_place"]]
+    courtyard = [pair["outcome"] == "placed" for pair in found["strangers"] if pair["same_place"]]
+    says(f"| photographs of other scenes | {sum(strangers)} of {len(strangers)} placed |")
+    says(f"Of their {len(courtyard)} pairs {sum(courtyard)} were placed")
+    seconds = [trial["seconds"] for trial in found["trials"] if trial["seconds"] is not None]
+    says(f"| {median(seconds):.2f} in the median, {max(seconds):.2f} at most |")
+
+
 def test_speed_of_parts():
     clock = raw("rasterize")["cases"]["50k_512x384_all"]["clock_ms"]
     says(f"| {clock['median']:.1f} ms in the median, {clock['min']:.1f} ms at best | `rasterize.json` |")
