@@ -57,6 +57,8 @@ def refined(camera: CameraModel, prior: Lens, known: Correspondences, noise_px: 
         if inverse is None:
             return Fit(camera, np.full_like(covariance, np.nan), spread)
         step = inverse @ gradient
+        if not np.isfinite(step).all():
+            return Fit(camera, np.full_like(covariance, np.nan), spread)
         camera, covariance = camera.moved(step), CORRELATED * inverse
         if step @ information @ step < _CONVERGED:
             break

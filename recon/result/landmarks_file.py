@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import LONGEST_NAME, printable
+from splatnode.recon.result.camera_check import MAX_COORDINATE, camera_problem
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.landmarks import KnownLenses, Landmarks
 
@@ -52,7 +54,7 @@ def read_landmarks(folder: Path) -> Landmarks:
     if not path.is_file():
         raise FileNotFoundError(_missing(folder))
     with foreign(SceneFileError, str(path)):
-        return decode_landmarks(path.read_bytes(), str(path))
+        return decode_landmarks(read_bounded(path, MOST_BYTES, SceneFileError, str(path)), str(path))
 
 
 def decode_landmarks(data: bytes, name: str = LANDMARKS) -> Landmarks:
@@ -93,12 +95,16 @@ def _check(found: dict[str, npt.NDArray[Any]], name: str) -> None:
         known = counts.setdefault(count, len(array) if array.ndim else 0)
         if array.dtype.kind != kind or array.ndim != 1 + len(rest) or array.shape != (known, *rest):
             raise SceneFileError(f"{name}: {key} must be {('?', *rest)} of kind {kind!r}, got {array.shape}")
-        if kind == "f" and not np.isfinite(array).all():
-            raise SceneFileError(f"{name}: {key} must be finite")
+        if kind == "f" and not (np.abs(array) <= MAX_COORDINATE).all():
+            raise SceneFileError(f"{name}: {key} must be finite, within ±{MAX_COORDINATE:g}")
     if found["descriptors"].dtype != np.uint8 or counts["D"] > MOST_DESCRIPTORS or not counts["C"]:
         raise SceneFileError(f"{name}: there must be cameras, and at most {MOST_DESCRIPTORS} descriptors of bytes")
     if (found["point_of"] >= counts["P"]).any() or (found["photograph_of"] >= counts["C"]).any():
         raise SceneFileError(f"{name}: descriptors must be of its points and photographs")
+    for T_world_camera, lens in zip(found["Ts_world_camera"], found["lenses"], strict=True):
+        problem = camera_problem(T_world_camera, np.diag([lens[0], lens[0], 1.0]), 1, 1)
+        if problem:
+            raise SceneFileError(f"{name}: {problem}")
     if (found["lenses"][:, [0, 4]] <= 0).any() or (found["scale"][:2] <= 0).any() or (found["bounds"] < 0).any():
         raise SceneFileError(f"{name}: focal lengths, shapes, bounds and units must be positive")
 
@@ -107,6 +113,8 @@ def _decoded(found: dict[str, npt.NDArray[Any]]) -> Landmarks:
     covariances = np.empty((len(found["points"]), 3, 3))
     covariances[:, _ROWS, _COLUMNS] = found["covariances"]
     covariances[:, _COLUMNS, _ROWS] = found["covariances"]
+    values, vectors = np.linalg.eigh(covariances)  # rounding, or a stranger, may have made one negative
+    covariances = (vectors * values.clip(0.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
     lenses, bounds = found["lenses"], found["bounds"]
     noise_px, unit, metric = found["scale"].tolist()
     return Landmarks(

@@ -8,6 +8,8 @@ import pytest
 
 from splatnode.capture.cameras import building
 from splatnode.capture.frame import Intrinsics
+from splatnode.recon import opencv_poses
+from splatnode.recon.locating import posing
 from splatnode.recon.locating.locate import Config, described, locate, located
 from splatnode.recon.locating.outcome import Located, NotLocated, Reason
 from tests.support.located import PLACE, errors, known_place, photograph
@@ -80,6 +82,15 @@ def test_what_shows_the_scene_in_one_patch_alone_is_refused():
     covered[140:220, 190:290] = image[140:220, 190:290]
     found = locate(known_place().landmarks, covered)
     assert isinstance(found, NotLocated)
+
+
+def test_without_poselib_it_is_placed_as_well(monkeypatch):
+    monkeypatch.setattr(posing.poselib, "estimate_absolute_pose", opencv_poses.estimate_absolute_pose)
+    image, camera = photograph(1)
+    found = locate(known_place().landmarks, image)
+    assert isinstance(found, Located) and max(errors(found, camera)) < 1.0
+    mirrored = np.ascontiguousarray(image[:, ::-1])
+    assert isinstance(locate(known_place().landmarks, mirrored), NotLocated)
 
 
 def test_a_photograph_is_described_once_for_several_scenes():

@@ -77,6 +77,8 @@ def test_it_moves_into_another_world(landmarks):
         ({"descriptors": np.zeros((9, 128), np.uint16)}, "bytes"),
         ({"scale": np.array([0.4, 0.0, 0.0])}, "positive"),
         ({"bounds": np.full((2, 2), -1.0)}, "positive"),
+        ({"Ts_world_camera": np.tile(2.0 * np.eye(4), (2, 1, 1))}, "rigid motion"),
+        ({"covariances": np.full((5, 6), 1e30)}, "within"),
         ({"names": np.array([{}, {}], object)}, "damaged"),
     ],
 )
@@ -91,6 +93,11 @@ def test_a_damaged_file_is_named(landmarks, tmp_path):
         (tmp_path / LANDMARKS).write_bytes(damaged)
         with pytest.raises(SceneFileError, match=LANDMARKS):
             read_landmarks(tmp_path)
+
+
+def test_a_covariance_that_is_none_does_no_harm(landmarks):
+    found = decode_landmarks(changed(encode_landmarks(landmarks), covariances=np.full((5, 6), -1.0)))
+    assert np.linalg.eigvalsh(found.covariances).min() > -1e-9
 
 
 def test_a_file_that_would_fill_the_memory_is_not_unpacked(landmarks):
