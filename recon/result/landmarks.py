@@ -43,6 +43,16 @@ class Landmarks:
     unit: float = 1.0  # the median depth of the scene's points: metres where the result is metric
     metric: bool = False  # lengths are metres
 
+    def seen_by(self, photographs: Index) -> Landmarks:
+        """With the descriptors of these photographs alone; everything keeps its number."""
+        own = np.isin(self.photograph_of, photographs)
+        return replace(
+            self,
+            descriptors=self.descriptors[own],
+            point_of=self.point_of[own],
+            photograph_of=self.photograph_of[own],
+        )
+
     def moved(self, scale: float, rotation: Array, translation: Array, *, metric: bool = False) -> Landmarks:
         """The same in the world to which x -> scale * rotation @ x + translation leads.
 

@@ -22,7 +22,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -38,6 +38,7 @@ from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.geometry import align_cameras, angles_deg
 from splatnode.recon.ladder.ladder import climbed
+from splatnode.recon.locating.follow import follow
 from splatnode.recon.locating.locate import Photograph, described, locate, located
 from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.matching.match import match
@@ -52,6 +53,8 @@ COURTYARD = {"castle_p30", "entry_p10", "fountain_p11", "hard_rotation_exact"}
 RIGHT_DEG, RIGHT_PERCENT = 1.0, 1.0
 SIDE = 800  # pixels, of the photographs that seconds and cover are of
 RATIO, SAMPSON_PX, MATCHES, PARTNERS = 0.8, 3.0, 30, 2
+_STEP = np.eye(4)
+_STEP[:3, :3] = cv2.Rodrigues(np.radians([0.0, 3.0, 0.0]))[0]
 EVERY = 4  # of the held-out photographs, one is timed
 
 
@@ -70,6 +73,9 @@ class Trial:
     rotation_claim_deg: float | None = None
     centre_claim_percent: float | None = None
     seconds: float | None = None  # of the processor, at 800 pixels; None: not measured
+    seconds_following: float | None = None  # likewise, once it is known where one was taken that it follows
+    rotation_following_deg: float | None = None  # the error then; None: it was refused, too
+    centre_following_percent: float | None = None
 
     @property
     def right(self) -> bool:
@@ -108,9 +114,10 @@ def trials(scene: EvaluationScene, views: int, landmarks: Landmarks, names: Sequ
         )
         image = scene.image(name)
         found = locate(landmarks, image)
-        seconds = _seconds(landmarks, image) if number % EVERY == 0 else None
-        errors = _errors(found, to_scene.camera(scene.cameras[name].T_world_camera), landmarks.unit)
-        yield Trial(scene.name, views, name, partners >= PARTNERS, outcome(found), **errors, seconds=seconds)
+        truth = to_scene.camera(scene.cameras[name].T_world_camera)
+        timed = _timed(landmarks, image, truth) if number % EVERY == 0 else {}
+        errors = _errors(found, truth, landmarks.unit)
+        yield Trial(scene.name, views, name, partners >= PARTNERS, outcome(found), **errors, **timed)
 
 
 def _errors(found: Located | NotLocated, truth: Array, unit: float) -> dict[str, float]:
@@ -130,10 +137,27 @@ def outcome(found: Located | NotLocated) -> str:
     return "placed" if isinstance(found, Located) else found.code.value
 
 
-def _seconds(landmarks: Landmarks, image: npt.NDArray[np.uint8]) -> float:
+def _timed(landmarks: Landmarks, image: npt.NDArray[np.uint8], truth: Array) -> dict[str, float]:
+    """Seconds at 800 pixels; then those of one that follows it: the same photograph, beside the nearest of the scene.
+
+    What it follows was taken a tenth of the distance to the scene, and 3 degrees, from it.
+    """
     small, begun = _shrunk(image), time.process_time()
-    locate(landmarks, small)
-    return time.process_time() - begun
+    first = locate(landmarks, small)
+    seconds = {"seconds": time.process_time() - begun}
+    if isinstance(first, NotLocated):
+        return seconds
+    before = first.T_world_camera @ _STEP
+    before[:3, 3] = first.T_world_camera[:3, 3] + 0.1 * landmarks.unit * first.T_world_camera[:3, 0]
+    begun = time.process_time()
+    found = follow(landmarks, small, replace(first, T_world_camera=before))
+    seconds["seconds_following"] = time.process_time() - begun
+    errors = _errors(found, truth, landmarks.unit)
+    return seconds | {
+        f"{kind}_following_{unit}": errors[f"{kind}_{unit}"]
+        for kind, unit in (("rotation", "deg"), ("centre", "percent"))
+        if errors
+    }
 
 
 def _shrunk(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
@@ -177,6 +201,7 @@ def summary(own: Sequence[Trial], strangers: Sequence[Stranger]) -> dict[str, ob
     covered, placed = [t for t in own if t.covered], [t for t in own if t.outcome == "placed"]
     apart = [s for s in strangers if not s.same_place]
     seconds = [t.seconds for t in own if t.seconds is not None]
+    following = [t.seconds_following for t in own if t.seconds_following is not None]
     within = {
         "rotation": [(t.rotation_deg or 0.0) <= (t.rotation_claim_deg or 0.0) for t in placed],
         "centre": [(t.centre_percent or 0.0) <= (t.centre_claim_percent or 0.0) for t in placed],
@@ -198,6 +223,8 @@ def summary(own: Sequence[Trial], strangers: Sequence[Stranger]) -> dict[str, ob
         "courtyard_placed": sum(s.outcome == "placed" for s in strangers if s.same_place),
         "seconds_median": float(np.median(seconds)) if seconds else None,
         "seconds_most": max(seconds, default=None),
+        "seconds_following_median": float(np.median(following)) if following else None,
+        "seconds_following_most": max(following, default=None),
     }
 
 
