@@ -1,4 +1,4 @@
-"""The example of docs/locate.md runs, on a small result, as it is printed."""
+"""The examples of docs/locate.md run, on a small result, as it is printed."""
 
 from __future__ import annotations
 
@@ -14,15 +14,17 @@ from tests.support.located import known_place, photograph
 PAGE = (ROOT / "docs" / "locate.md").read_text(encoding="utf-8")
 
 
-def test_the_example_in_python_places_a_photograph(tmp_path: Path, monkeypatch, capsys):
+def test_the_examples_in_python_place_photographs(tmp_path: Path, monkeypatch, capsys):
     images = tmp_path / "demo" / "capture" / "images"
     images.mkdir(parents=True)
     (tmp_path / "demo" / LANDMARKS).write_bytes(encode_landmarks(known_place().landmarks))
-    (images / "test_003.png").write_bytes(encode_png(photograph(3)[0]))
+    for index in (3, 4):
+        (images / f"test_00{index}.png").write_bytes(encode_png(photograph(index)[0]))
     monkeypatch.chdir(tmp_path)
-    (example,) = re.findall(r"^```python\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE)
-    exec(compile(example, "docs/locate.md", "exec"), {})
-    assert "Claim(rotation_deg=" in capsys.readouterr().out
+    names: dict[str, object] = {}
+    for example in re.findall(r"^```python\n(.*?)^```$", PAGE, re.DOTALL | re.MULTILINE):
+        exec(compile(example, "docs/locate.md", "exec"), names)
+        assert "Claim(rotation_deg=" in capsys.readouterr().out
 
 
 def test_the_page_has_every_refusal():
