@@ -31,7 +31,7 @@ class DiskSpace:
         checkpoint_bytes = further_keyframes * BYTES_A_KEYFRAME + most_gaussians * BYTES_A_GAUSSIAN
         try:
             problem = shortage(self._store.directory, checkpoint_bytes, "the checkpoint") or shortage(
-                self._config.out, result_bytes(most_gaussians), "the result"
+                self._config.out, result_bytes(most_gaussians, self._config.max_views), "the result"
             )
         except OSError as error:
             problem = f"the disk does not tell how much is free ({error.strerror or error})"

@@ -143,13 +143,14 @@ def _halves_disagree(case: Case, config: Config) -> NotLocated | None:
         turn = np.array([between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1]])
         apart = np.concatenate([between[:3, 3], turn / 2.0])
         covariance = sum(pose_covariance(half) for half in halves)
-        squared = float(apart @ np.linalg.pinv(covariance, hermitian=True) @ apart)
+        known = np.isfinite(covariance).all()  # what is not known fails
+        squared = float(apart @ np.linalg.pinv(covariance, hermitian=True) @ apart) if known else math.inf
         farthest = max(farthest, math.sqrt(max(squared, 0.0) / 6.0))
     if farthest <= config.max_apart:
         return None
     return NotLocated(
         Reason.INCONSISTENT,
-        f"two halves of it put the camera in different places, {farthest:.0f} times as far apart as they may.",
+        "two halves of it put the camera in different places, farther apart than their uncertainty allows.",
         "Something has moved, or its lens bends straight lines: give its calibration.",
     )
 

@@ -20,9 +20,9 @@ def largest_result_bytes(sizes: Iterable[tuple[int, int]], longer_side: int, mos
     pixels = sum(longer_side**2 * min(size) / max(size) for size in known)
     expected = round(pixels / PIXELS_A_GAUSSIAN)
     num_gaussians = expected if most_gaussians is None else min(expected, most_gaussians)
-    return result_bytes(num_gaussians) + LANDMARK_BYTES * len(known)
+    return result_bytes(num_gaussians, len(known))
 
 
-def result_bytes(num_gaussians: int) -> int:
-    """Bytes of a result folder with so many Gaussians, rounded up."""
-    return BYTES_A_GAUSSIAN * num_gaussians + OTHER_BYTES
+def result_bytes(num_gaussians: int, num_photographs: int = 0) -> int:
+    """Bytes of a result folder with so many Gaussians, and with the landmarks of so many photographs, rounded up."""
+    return BYTES_A_GAUSSIAN * num_gaussians + LANDMARK_BYTES * num_photographs + OTHER_BYTES
