@@ -157,5 +157,12 @@ def made_anew(work: IncrementalReconstruction, tell: Tell = told_to_nobody) -> I
     estimate = work.estimate_with_depth(_doing("finding and checking the cameras", tell))
     begun = begin_scene(estimate, work.config)
     yield from model(
-        estimate.conclusion_to_save, begun, work.dropped, work.config, work.clock, work.numbers, show_begun=False, tell=tell
+        estimate.conclusion_to_save,
+        begun,
+        work.dropped,
+        work.config,
+        work.clock,
+        work.numbers,
+        show_begun=False,
+        tell=tell,
     )
