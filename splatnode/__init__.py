@@ -15,13 +15,16 @@ if TYPE_CHECKING:
     from splatnode.api.session import Session, Update
     from splatnode.api.view import View
     from splatnode.capture.frame import Intrinsics
+    from splatnode.recon.locating.outcome import Located, NotLocated
     from splatnode.recon.result.verdict import Verdict
 
 __all__ = [
     "Camera",
     "Intrinsics",
+    "Located",
     "Node",
     "NodeUpdate",
+    "NotLocated",
     "Result",
     "Session",
     "Update",
@@ -35,8 +38,10 @@ __all__ = [
 _MODULES = {
     "Camera": "splatnode.api.camera",
     "Intrinsics": "splatnode.capture.frame",
+    "Located": "splatnode.recon.locating.outcome",
     "Node": "splatnode.api.node",
     "NodeUpdate": "splatnode.api.node",
+    "NotLocated": "splatnode.recon.locating.outcome",
     "Result": "splatnode.api.result",
     "Session": "splatnode.api.session",
     "Update": "splatnode.api.session",

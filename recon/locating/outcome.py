@@ -38,9 +38,7 @@ class Located:
 
     T_world_camera: Array  # (4, 4): p_world = T_world_camera @ p_camera
     K: Array  # (3, 3) for the photograph at full size, centre of the top-left pixel at (0.5, 0.5)
-    covariance: (
-        Array  # (6, 6) of a small motion in the camera's frame: translation (result's unit), then turn (radians)
-    )
+    covariance: Array  # (6, 6) of a small motion in the camera's frame: shift (result's unit), then turn (radians)
     claim: Claim
     num_points: int  # of the scene that agree with it
     metric: bool  # lengths are metres

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
 from splatnode.api.result import Result, result_of
 from splatnode.recon.result.export.result import copy_result
+from splatnode.recon.result.landmarks_file import LANDMARKS, read_landmarks
 from splatnode.recon.result.whole import is_whole
 from splatnode.viewer.sources import read_result
 
@@ -34,4 +35,7 @@ def load(folder: str | PathLike[str]) -> Result:
     if is_whole(place):
         scenes = ", ".join(sorted(path.parent.name for path in place.glob("*/report.json")))
         raise ValueError(f"{place} holds several results; give one of its folders: {scenes}")
-    return result_of(read_result(place)[0], Stored(place.resolve()))
+    snapshot = read_result(place)[0]
+    if (place / LANDMARKS).exists():
+        snapshot = replace(snapshot, landmarks=read_landmarks(place))
+    return result_of(snapshot, Stored(place.resolve()))

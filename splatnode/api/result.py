@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy.typing as npt
 
@@ -20,6 +20,10 @@ from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.sources import seen
 from splatnode.recon.result.spherical_harmonics import mean_colours
 from splatnode.recon.result.verdict import Verdict
+
+if TYPE_CHECKING:
+    from splatnode.api.photographs import Lens, Picture
+    from splatnode.recon.locating.outcome import Located, NotLocated
 
 
 class Files(Protocol):
@@ -95,6 +99,24 @@ class Result:
         if not self.verdict.publishable:
             raise ValueError(f"there is no scene to render: {self.verdict.code.value}. Ask verdict.publishable first")
         return view(self._snapshot.gaussians, T_world_camera, K, size, threads)
+
+    def localise(self, image: str | PathLike[str] | Picture, *, intrinsics: Lens | None = None) -> Located | NotLocated:
+        """Where a further photograph was taken, or why that cannot be said: a refusal is a value.
+
+        `image` is a file or a picture, of any camera; `intrinsics` is its lens, if that is known: `Intrinsics`, or K
+        (3, 3) in its pixels. `Located` has `T_world_camera`, `K`, `covariance`, and `claim`: how wrong it may be, with
+        95 %. `NotLocated` has `code`, `message` and `advice`. Raises ValueError where there is no scene to look in,
+        TypeError for other types, and FileNotFoundError.
+        """
+        from splatnode.api.locating import localised  # brings what matches photographs
+
+        landmarks = self._snapshot.landmarks
+        if landmarks is None:
+            why = "it has no landmarks: it is not final, or was written before there were any. Reconstruct it again"
+            if not self.verdict.publishable:
+                why = f"there is none: {self.verdict.code.value}. Ask verdict.publishable first"
+            raise ValueError(f"no scene to look for a photograph in: {why}")
+        return localised(landmarks, image, intrinsics)
 
     def save(self, folder: str | PathLike[str]) -> Path:
         """Writes the files that `splatnode replay --out FOLDER` writes, and returns the folder.

@@ -14,6 +14,7 @@ import splatnode
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.process.progress import Step
 from splatnode.capture.stamp import Stamp
+from splatnode.recon.locating.outcome import Claim
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.verdict import Verdict
 from tests.reference.comments import field_comments
@@ -30,9 +31,20 @@ can be pickled, and used by several threads.
 This page is made from the code by `python -m tests.reference`; change it there.
 """
 _FUNCTIONS = ("reconstruct", "load", "connect")
-_CLASSES = ("Result", "Camera", "View", "Session", "Update", "Node", "NodeUpdate", "Intrinsics")
+_CLASSES = (
+    "Result",
+    "Camera",
+    "View",
+    "Session",
+    "Update",
+    "Node",
+    "NodeUpdate",
+    "Located",
+    "NotLocated",
+    "Intrinsics",
+)
 _WIDE = 110  # characters
-_FURTHER = (Verdict, Bounds, DroppedFrame, Stamp, Step)  # what these lead to
+_FURTHER = (Verdict, Bounds, Claim, DroppedFrame, Stamp, Step)  # what these lead to
 
 
 def page() -> str:

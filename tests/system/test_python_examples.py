@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
@@ -36,6 +37,7 @@ PRINTED = {
     "What came back": r"(?s)\[\[.*\(\d+, 3\) float32 0\.\d+\n\[\] \d",
     "Metres, and a known lens": r"True 294(\.0)?\n",
     "A view from where no camera was": r"[1-9][\d.]* \d\d% of it two photographs have seen\n",
+    "Where a further photograph was taken": r"(?s)\[.*\] 0\.\d+ 0\.\d+\nrefused: NOT_FOUND: .*\n",
     "A refusal is a value": r"TOO_FEW_VIEWS 1 usable photograph: .*\n0 0\n",
     "A camera's loop": r"(?s)0000\.png first view.* OK 3\n.*All \d photographs were placed\. True\n",
     "A running node": r"kitchen OK 2\nthe live camera: ",
@@ -52,6 +54,10 @@ def reader(tmp_path_factory) -> Path:
     (folder / "photos").mkdir()
     for index, frame in enumerate(synthetic.stream(PLACE)):
         (folder / "photos" / f"{index:04d}.png").write_bytes(encode_png(frame.image))
+    further = {"further": (PLACE, 1.5), "elsewhere": (msgspec.structs.replace(PLACE, seed=1), 1.0)}
+    for name, (place, position) in further.items():
+        image = synthetic.photograph(place, synthetic._camera_on_path(place, position), 9)
+        (folder / f"{name}.png").write_bytes(encode_png(image))
     film = cv2.VideoWriter(str(folder / "film.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 8, (PLACE.width, PLACE.height))
     for position in np.linspace(0, PLACE.views - 1, FILMED):
         image = synthetic.photograph(PLACE, synthetic._camera_on_path(PLACE, float(position)), 0)
