@@ -39,7 +39,7 @@ class Located:
     T_world_camera: Array  # (4, 4): p_world = T_world_camera @ p_camera
     K: Array  # (3, 3) for the photograph at full size, centre of the top-left pixel at (0.5, 0.5)
     covariance: Array  # (6, 6) of a small motion in the camera's frame: shift (result's unit), then turn (radians)
-    claim: Claim
+    claim: Claim  # how wrong it may be
     num_points: int  # of the scene that agree with it
     metric: bool  # lengths are metres
 
@@ -59,9 +59,9 @@ class Located:
 class NotLocated:
     """Why a photograph was not placed, and what to do."""
 
-    code: Reason
-    message: str
-    advice: str
+    code: Reason  # NOT_FOUND, ONE_PATCH, ELSEWHERE, INCONSISTENT, LENS or UNCERTAIN
+    message: str  # why, in a sentence
+    advice: str  # what to do
 
     @property
     def sentence(self) -> str:

@@ -345,6 +345,18 @@ def test_a_walk_through_the_building():
     says(f"at most {walked:.2f} GB on the way, {cost['rss_mb']['most'] / 1e3:.2f} GB while scenes were finished")
 
 
+def test_memory_of_a_walk():
+    walk = raw("building_120")
+    cost, loops = walk["cost"], walk["loops"]
+    assert walk["in_a_scene"] == walk["keyframes"] == 120
+    assert not loops["wrong_loop_links"] and not loops["wrong_chain_links"]
+    says(f"all in a scene, in {walk['scenes']} scenes, {loops['loop_links']} loops, none wrong")
+    walked = max(sample["rss_mb"] for sample in cost["samples"] if sample["done"] < walk["keyframes"]) / 1e3
+    says(f"{walked:.2f} GB on the way, {cost['rss_mb']['most'] / 1e3:.2f} GB while scenes were finished; ")
+    seconds = cost["processor_s"]
+    says(f"{seconds['median']:.1f} s of processor a keyframe in the median, {seconds['percentile_95']:.1f} in the 95th")
+
+
 def test_a_film_of_the_building():
     film = raw("film")
     live, offline = film["live"], film["offline"]
