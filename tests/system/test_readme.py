@@ -345,6 +345,19 @@ def test_a_walk_through_the_building():
     says(f"at most {walked:.2f} GB on the way, {cost['rss_mb']['most'] / 1e3:.2f} GB while scenes were finished")
 
 
+def test_faults_on_a_walk():
+    walk = raw("walk_faults")
+    faults = walk["faults"].values()
+    tried = sum(fault["tried"] for fault in faults)
+    assert len(faults) == 12 and {fault["tried"] for fault in faults} == {5} == {fault["good"] for fault in faults}
+    assert not walk["in_no_list"] and walk["maps"] == 1 and not walk["loops"]["wrong_loop_links"]
+    says(f"one walk of {walk['photographs']} keyframes through the built-in building, five times each")
+    named = walk["photographs"] - walk["in_a_scene"]
+    says(f"after all {tried} the node went on; {walk['in_a_scene']} photographs in one map, the other {named} named")
+    says(f"{walk['loops']['loop_links']} loops, none wrong; cameras within ")
+    says(f"{walk['cameras']['position_percent_of_path']:.3f} % of the way | `walk_faults.json` |")
+
+
 def test_memory_of_a_walk():
     walk = raw("building_120")
     cost, loops = walk["cost"], walk["loops"]
