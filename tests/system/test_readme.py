@@ -370,6 +370,14 @@ def test_memory_of_a_walk():
     says(f"{seconds['median']:.1f} s of processor a keyframe in the median, {seconds['percentile_95']:.1f} in the 95th")
 
 
+def test_the_first_room():
+    room = raw("building_50")["first_room"]
+    alone = room["alone"]
+    assert alone["psnr"] - room["psnr"] < 0.3
+    says(f"{room['psnr']:.1f} dB with {room['gaussians']} Gaussians in its scene of the walk")
+    says(f"{alone['psnr']:.1f} dB with {alone['gaussians']} where the same photographs are reconstructed offline")
+
+
 def test_a_film_of_the_building():
     film = raw("film")
     live, offline = film["live"], film["offline"]
