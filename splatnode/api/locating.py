@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from os import PathLike
+from pathlib import Path
 
 from splatnode.api.photographs import Lens, Picture, photographs, with_lens
 from splatnode.capture.frame import Frame
@@ -14,10 +15,10 @@ from splatnode.recon.result.landmarks import Landmarks
 
 def localised(landmarks: Landmarks, image: str | PathLike[str] | Picture, lens: Lens | None) -> Located | NotLocated:
     """The camera of one photograph, a file or a picture. Raises TypeError, ValueError, FileNotFoundError."""
-    given = with_lens(photographs(image, None, False, told_to_nobody), lens).frames
-    if len(given) != 1:
-        raise ValueError(f"image must be one photograph, got {len(given)}. Ask for each alone")
-    (frame,) = given
+    if isinstance(image, (str, PathLike)) and not Path(image).is_file():
+        raise FileNotFoundError(f"no photograph {str(image)!r}; give a file, or a picture")
+    given = with_lens(photographs([image], None, False, told_to_nobody), lens).frames
+    (frame, *_) = given
     if not isinstance(frame, Frame):
         raise ValueError(f"image {frame.name} cannot be read: {frame.reason}")
     return locate(landmarks, frame.image, frame.intrinsics)
