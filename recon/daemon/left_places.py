@@ -177,6 +177,7 @@ class LeftPlaces:
         work = found.work
         if not found.final:
             event(log, logging.INFO, "finishing", scene=store.scene_id)
+            work.release_scene()  # it is made anew
             work.show(_last(work, self._config, pause))
             work.estimate_soon(pause)
             snapshot = work.snapshot(store.dropped, final=True)
