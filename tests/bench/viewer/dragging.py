@@ -14,9 +14,11 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.formats.ply import encode_ply
@@ -30,7 +32,8 @@ GAUSSIANS = 40_000
 WINDOW = 1280, 800
 WATCHED = 900, 300  # pixels from the top left: of the picture, without the panel
 DRAGS, MOVES, MOVE_S = 3, 300, 0.015
-SHOWN = 40.0  # the standard deviation of the screen's levels once a scene is there
+SPLASH = 0.5  # standard deviation of the screen's levels once a window is there
+SHOWN = 10.0  # levels by which the screen differs from the splash, in the mean, once a scene is there
 PATIENCE_S = 120.0
 
 
@@ -72,8 +75,9 @@ def watched(folder: Path) -> dict:
     command = [sys.executable, "-m", "splatnode", "view", str(folder), "--size", "x".join(map(str, WINDOW))]
     viewer = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        splash_s = wait_until(screen, 0.5, started)
-        scene_s = wait_until(screen, SHOWN, started)
+        splash_s = wait_until(screen, lambda picture: picture.std() > SPLASH, started)
+        splash = screen.picture(*WINDOW).astype(float)
+        scene_s = wait_until(screen, lambda picture: np.abs(picture - splash).mean() > SHOWN, started)
         time.sleep(3.0)
         drags = [dragged(screen, viewer.pid) for _ in range(DRAGS)]
     finally:
@@ -90,9 +94,9 @@ def watched(folder: Path) -> dict:
     }
 
 
-def wait_until(screen: Screen, deviation: float, started: float) -> float:
-    """Seconds until the screen shows something that varies as much. Raises SystemExit."""
-    while screen.picture(*WINDOW).std() < deviation:
+def wait_until(screen: Screen, there: Callable[[npt.NDArray], bool], started: float) -> float:
+    """Seconds until the screen shows what is waited for. Raises SystemExit."""
+    while not there(screen.picture(*WINDOW)):
         if time.monotonic() > started + PATIENCE_S:
             raise SystemExit("nothing is shown: is it a display of 1280 x 800 on which a window can be opened?")
         time.sleep(0.02)
