@@ -33,6 +33,12 @@ def test_a_page_is_short_enough(page):
     assert len(text(page).splitlines()) <= LINES[page]
 
 
+@pytest.mark.parametrize("page", [*DOCS, "README.md", "CHANGELOG.md", "CONVENTIONS.md", "CONTRIBUTING.md"])
+def test_no_page_is_of_two_versions(page):
+    marks = ("<" * 7, ">" * 7)  # of a merge that was not finished
+    assert not [line for line in text(page).splitlines() if line.startswith(marks)]
+
+
 def test_every_page_of_the_site_is_in_its_navigation():
     listed = re.findall(r"\w+\.md", str(yaml.safe_load(text("mkdocs.yml"))["nav"]))
     assert sorted(f"docs/{name}" for name in listed) == DOCS, "nav of mkdocs.yml must list every page of docs/, once"
