@@ -79,7 +79,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class _View:
-    """A keyframe as it is remembered."""
+    """A candidate as it is compared with others, and remembered where it becomes a keyframe."""
 
     name: str
     small: Image
@@ -112,11 +112,12 @@ class Selector:
         reason, adds = self._what_it_adds(grey, strictness=1 + waiting / self.config.backlog)
         if not adds:
             return Decision(False, reason, False)
-        fault = self._fault(frame, small)
+        view = _View(frame.name, small, _thumbnail(small), _digest(frame.encoded))
+        fault = self._fault(frame, view)
         if fault is not None:
             self._next_ns = frame.stamp_ns + round(1e9 * self.config.patience_s)
             return Decision(False, fault, True)
-        self._remember(frame, small, grey)
+        self._remember(view, grey)
         return Decision(True, reason, True)
 
     def forget_last(self) -> None:
@@ -138,15 +139,15 @@ class Selector:
         motion = measure(self._corners, self._now, tracked, max(grey.shape))
         return what_it_adds(motion, self.config, strictness)
 
-    def _fault(self, frame: Frame, small: Image) -> str | None:
+    def _fault(self, frame: Frame, seen: _View) -> str | None:
         """Why the frame is unusable, or a copy of a keyframe; None where it is neither."""
-        if _digest(frame.encoded) in self._files:
+        if seen.file in self._files:
             return "duplicate: this very file came before"
-        thumbnail = _thumbnail(small)
         for view in reversed(self._views):
-            if np.abs(thumbnail - view.thumbnail).mean() > MAX_THUMBNAIL_DIFFERENCE or view.small.shape != small.shape:
+            difference = np.abs(seen.thumbnail - view.thumbnail).mean()
+            if difference > MAX_THUMBNAIL_DIFFERENCE or view.small.shape != seen.small.shape:
                 continue
-            if why_redundant(novelty(small, view.small), self.limits):
+            if why_redundant(novelty(seen.small, view.small), self.limits):
                 return f"duplicate: it shows what {view.name} shows"
         quality, size = assess(frame.image), (frame.width, frame.height)
         of_this_size = [blur_px for each, blur_px in self._blurs_px if each == size]  # others are of another camera
@@ -155,8 +156,7 @@ class Selector:
             self._blurs_px.append((size, quality.blur_px))
         return fault
 
-    def _remember(self, frame: Frame, small: Image, grey: Image) -> None:
-        view = _View(frame.name, small, _thumbnail(small), _digest(frame.encoded))
+    def _remember(self, view: _View, grey: Image) -> None:
         self._views = [*self._views[1 - REMEMBERED_VIEWS :], view]
         if view.file is not None:
             self._files[view.file] = None

@@ -57,13 +57,11 @@ def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
     """The scene of all cameras that were placed, not optimised yet; None where the verdict forbids one."""
     if estimate.registration is None or not estimate.verdict.publishable:
         return None
-    scene = initial_scene(
+    return initial_scene(
         tuple(estimate.pointmaps.values()),
         {keyframe.name: keyframe.image for keyframe in estimate.graph.keyframes},
         config.initialisation,
     )
-    give_back_memory()
-    return scene
 
 
 def refined(
@@ -87,9 +85,9 @@ def refined(
     give_back_memory()
     work = refinement.refine(scene, steps, seed=config.seed, deadline=deadline, max_gaussians=limit, gone_on=gone_on)
     for later in work:
+        give_back_memory()
         verdict = None
         if later.losses or later.iterations in config.optimize.checkpoints:
-            give_back_memory()
             watching, verdict = examine(watching, later)
         if verdict is not None:
             best = shown(watching.best.on(_PROCESSOR), config).scene if verdict.publishable else None

@@ -12,7 +12,6 @@ import msgspec
 
 from splatnode.capture.process.logs import event
 from splatnode.recon.config import Config
-from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon import membership
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.incremental import IncrementalReconstruction, Pause
@@ -52,6 +51,5 @@ def refine(work: IncrementalReconstruction, config: Config, pause: Pause) -> Ite
     steps = msgspec.structs.replace(config.optimize, checkpoints=tuple(range(STEP, config.optimize.iterations, STEP)))
     work.rebuild(pause)
     for show in work.refine(work.begun, steps):
-        give_back_memory()
         pause()
         yield show

@@ -21,11 +21,8 @@ import cv2
 
 from splatnode.capture.cameras import building
 from splatnode.capture.status import heartbeats
-from tests.bench.node.building import scored
+from tests.bench.node.building import LOOK_S, RESTS, scored
 from tests.support.node import Node, at_rest, memory_mb, processor_s, running, taken
-
-LOOK_S = 1.0
-RESTS = 5  # looks in a row at which recon has nothing to do: then it is done
 
 
 def main() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -346,12 +347,17 @@ def test_a_death_while_a_place_is_left_leaves_it_as_it_was(open_store, monkeypat
     assert left.folders(store.directory) == [] and store.scene_id == "scene-0001"
 
 
-def test_a_part_of_a_place_that_was_left_is_a_place_of_its_own(open_store, tmp_path):
+def place_that_was_left(open_store, count: int) -> Path:
+    """Its checkpoint, with so many frames."""
     store = open_store()
-    for sequence in range(4):
+    for sequence in range(count):
         store.put(received(sequence))
-    store.leave_place(4)
-    folder = tmp_path / "checkpoint" / "left" / "scene-0001"
+    store.leave_place(count)
+    return store.directory / "left" / "scene-0001"
+
+
+def test_a_part_of_a_place_that_was_left_is_a_place_of_its_own(open_store, tmp_path):
+    folder = place_that_was_left(open_store, 4)
     place = Store(folder)
     assert place.part(["3.png", "2.png"]) == "scene-0001-3" and place.names == {"0.png", "1.png"}
     assert {each.reason for each in place.dropped} == {"it shows another place: scene-0001-3"}
@@ -363,22 +369,14 @@ def test_a_part_of_a_place_that_was_left_is_a_place_of_its_own(open_store, tmp_p
     part.close()
 
 
-def test_a_part_that_begins_with_the_very_first_frame_has_a_name_of_its_own(open_store, tmp_path):
-    store = open_store()
-    for sequence in range(2):
-        store.put(received(sequence))
-    store.leave_place(2)
-    place = Store(tmp_path / "checkpoint" / "left" / "scene-0001")
+def test_a_part_that_begins_with_the_very_first_frame_has_a_name_of_its_own(open_store):
+    place = Store(place_that_was_left(open_store, 2))
     assert place.part(["0.png"]) == "scene-0001-1" and place.names == {"1.png"}
     place.close()
 
 
 def test_a_part_whose_making_was_interrupted_is_made_once(open_store, tmp_path, monkeypatch):
-    store = open_store()
-    for sequence in range(4):
-        store.put(received(sequence))
-    store.leave_place(4)
-    folder = tmp_path / "checkpoint" / "left" / "scene-0001"
+    folder = place_that_was_left(open_store, 4)
     place = Store(folder)
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(Store, "forget", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
