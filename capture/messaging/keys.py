@@ -49,7 +49,7 @@ def create_keys(folder: Path) -> bytes:
         log.warning("the secret key in %s was cut short: this is a new pair, whose public key others need", folder)
     elif os.path.lexists(folder / SECRET):
         raise KeyFileError(f"{folder / SECRET} is there already; remove it to replace this machine's keys")
-    public, secret = zmq.curve_keypair()
+    public, secret = _key_pair()
     _write_key(folder / PUBLIC, public)
     _write_key(folder / SECRET, secret)  # last: where it is, the pair is
     return public
@@ -90,6 +90,14 @@ def checked_key(text: bytes, where: object) -> bytes:
     if not _Z85.fullmatch(key):
         raise KeyFileError(f"{where}: expected a key of 40 characters, got {len(key)} bytes. Run: splatnode keys")
     return key
+
+
+def _key_pair() -> tuple[bytes, bytes]:
+    """Public and secret. A command line takes a word with a leading `-` for an option: no public key has one."""
+    while True:
+        public, secret = zmq.curve_keypair()
+        if not public.startswith(b"-"):
+            return public, secret
 
 
 def _make(folder: Path) -> None:

@@ -19,6 +19,7 @@ from splatnode.capture.messaging.network import Network, NetworkError, NotAllowe
 from splatnode.capture.messaging.services import CAPTURE_PREVIEW, RECON_SCENE
 from splatnode.capture.messaging.state import StateClient, StateServer
 from splatnode.capture.messaging.wire import Numbering
+from splatnode.command_line import main
 from tests.capture.messaging.test_sockets import Note, heard, ipc, tcp, wait_for
 from tests.conftest import ROOT
 from tests.support.strays import STRAYS
@@ -132,6 +133,19 @@ def test_keys_are_private_and_not_overwritten(tmp_path):
     (tmp_path / "secret.key").chmod(0o644)
     with pytest.raises(keys.KeyFileError, match="chmod 600"):
         keys.read_keys(tmp_path)
+
+
+def test_a_public_key_is_never_taken_for_an_option(tmp_path, monkeypatch):
+    pairs = iter([(b"-" + b"a" * 39, b"s" * 40), (b"a" * 40, b"t" * 40)])
+    monkeypatch.setattr(keys.zmq, "curve_keypair", lambda: next(pairs))
+    assert keys.create_keys(tmp_path) == b"a" * 40
+    assert (tmp_path / keys.SECRET).read_bytes().strip() == b"t" * 40
+
+
+@pytest.mark.parametrize("option", [["--allow", "laptop"], ["--server"]], ids=" ".join)
+def test_an_older_key_that_begins_with_a_dash_is_given_after_a_space(tmp_path, option):
+    keys.create_keys(tmp_path)
+    assert main(["keys", str(tmp_path), *option, " -" + "a" * 39]) == 0
 
 
 @pytest.mark.parametrize("left", [b"", b"\n", b"abc"])
