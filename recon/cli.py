@@ -162,7 +162,9 @@ def bench(args: argparse.Namespace) -> int:
             Plan(tuple(args.scenes), args.views, chosen, tuple(range(args.seeds)), args.checkpoints),
             Entrants(partial(methods.by_name, device=wanted), methods.start_of),
             args.out,
-            scoring=Scoring(rasterizer(device.chosen(wanted)), load_networks(args.weights_dir), Settings()),
+            scoring=Scoring(
+                rasterizer(device.chosen(wanted)), load_networks(args.weights_dir), Settings(), args.by_region
+            ),
             command=shlex.join(["splatnode", *sys.argv[1:]]),
             resume=args.resume,
         )

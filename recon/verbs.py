@@ -168,6 +168,9 @@ def _bench_arguments(parser: argparse.ArgumentParser) -> None:
         help="by name, or the sets presets, rivals, ablation (default: balanced)",
     )
     parser.add_argument("--checkpoints", type=counts, default=(), metavar="N,N", help="iterations scored on the way")
+    parser.add_argument(
+        "--by-region", action="store_true", help="score also what two training photographs show, one, or none"
+    )
     parser.add_argument("--seeds", type=positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")
     _add_device(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")

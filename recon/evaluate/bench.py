@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,8 +18,10 @@ from splatnode.recon.evaluate.appearance import Rasterize
 from splatnode.recon.evaluate.process import call_alone, run_alone
 from splatnode.recon.evaluate.protocol import STAGES, Networks, Poses, Row, Run, Settings, evaluate, ignore_render
 from splatnode.recon.evaluate.records import Bench, bench_files, read_bench, run_of, this_machine
+from splatnode.recon.evaluate.regions import Counts
 from splatnode.recon.evaluate.renders import Renders
 from splatnode.recon.evaluate.report import report_files
+from splatnode.recon.evaluate.shown import Surface, shown_counts, surfaces
 from splatnode.recon.evaluate.splits import Split, load_split
 from splatnode.recon.evaluate.start import Start, find_start
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
@@ -61,6 +63,7 @@ class Scoring:
     rasterize: Rasterize
     networks: Networks
     settings: Settings
+    by_region: bool = False  # also of what two training photographs show, one, or none (shown.py)
 
 
 def run_bench(
@@ -91,6 +94,7 @@ def run_bench(
         command = f"{known.command}; {command}"
     bench = Bench(() if known is None else known.rows, scoring.settings, this_machine(), command)
     finished, started = bench.done(), time.monotonic()
+    seen = _Seen(scoring.settings.longer_side)
     jobs = [
         (scene, split, seed, [m for m in plan.methods if (scene.name, len(split.train), m, seed) not in finished])
         for (scene, split), seed in itertools.product(sets, plan.seeds)
@@ -98,9 +102,10 @@ def run_bench(
     total, number = sum(len(methods) for *_, methods in jobs), 0
     for scene, split, seed, methods in (job for job in jobs if job[-1]):
         starts = _Starts(entrants.start_of, scene.frames(split.train), seed, plan.timeout_s)
+        shown = seen.counts(scene, split) if scoring.by_region else {}
         for method in methods:
             number += 1
-            rows = _run(plan, entrants.reconstruct, starts, scene, split, method, out_dir, scoring)
+            rows = _run(plan, entrants.reconstruct, starts, scene, split, method, out_dir, scoring, shown)
             bench = msgspec.structs.replace(bench, rows=(*bench.rows, *rows))
             write_files(out_dir, bench_files(bench) | report_files(bench, out_dir))
             left = (time.monotonic() - started) / number * (total - number)
@@ -132,6 +137,21 @@ class _Starts:
         return start
 
 
+class _Seen:
+    """What the photographs of a scene see, by its true cameras, found once for all its sets of photographs."""
+
+    def __init__(self, longer_side: int) -> None:
+        self._longer_side = longer_side
+        self._scene, self._surfaces = "", dict[str, Surface]()
+
+    def counts(self, scene: EvaluationScene, split: Split) -> dict[str, Counts]:
+        """By test view, how many training photographs show each pixel."""
+        if scene.name != self._scene:
+            self._scene, self._surfaces = scene.name, surfaces(scene, self._longer_side)
+        training = [self._surfaces[name] for name in split.train if name in self._surfaces]
+        return {n: shown_counts(self._surfaces[n], training) for n in split.test if n in self._surfaces}
+
+
 def _run(
     plan: Plan,
     reconstruct: Reconstruct,
@@ -141,6 +161,7 @@ def _run(
     method: str,
     out_dir: Path,
     scoring: Scoring,
+    seen: Mapping[str, Counts],
 ) -> list[Row]:
     """The rows of one run: its checkpoints and its end, or its failure."""
     seed, views = starts.seed, len(split.train)
@@ -169,6 +190,7 @@ def _run(
             settings=scoring.settings,
             show=shown,
             found=poses,
+            shown=seen,
         )
         rows.insert(0, row)
     return rows if outcome.error is None else [*rows, _failed_row(scene, views, method, seed, outcome.error)]

@@ -21,8 +21,9 @@ from splatnode.recon.evaluate.tables import PSNR, SSIM, Measure, lpips, paired
 
 # Okabe and Ito's colours, which people with any colour vision tell apart, and a marker each for print without colour.
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000", "#7F7F7F")
+AHEAD, BEHIND = _COLOURS[0], _COLOURS[1]  # of what is better, and worse, than what it is compared with
 _MARKERS = "osD^vP*X"
-_INK, _MUTED, _GRID = "#222222", "#6B6B6B", "#E4E4E4"
+INK, _MUTED, _GRID = "#222222", "#6B6B6B", "#E4E4E4"
 _SMALLEST, _LARGEST = 20.0, 320.0  # bubble areas, in points^2
 
 
@@ -51,12 +52,12 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
         p for p in method_means(shared([row for row in rows if not is_variant(row.method)])) if p.psnr is not None
     ]
     if measured:
-        files["speed_accuracy.png"] = _png(speed_accuracy(measured))
+        files["speed_accuracy.png"] = png(speed_accuracy(measured))
     if sized := [p for p in measured if p.num_gaussians]:
-        files["parsimony.png"] = _png(parsimony(sized))
+        files["parsimony.png"] = png(parsimony(sized))
     scored = [row for row in rows if row.final and row.psnr is not None]
     if any(is_variant(row.method) for row in scored):
-        files["ablation.png"] = _png(ablation(scored))
+        files["ablation.png"] = png(ablation(scored))
     return files
 
 
@@ -90,14 +91,14 @@ def ablation(scored: Sequence[Row]) -> Figure:
         for place, variant in enumerate(shown):
             changes = paired(scored, variant.method, variant.against, measure)
             chart.barh(place, mean(changes) or 0.0, height=0.6, color=_COLOURS[_colour_of(changes, measure)], alpha=0.8)
-            chart.scatter(changes, [place] * len(changes), s=14, c=_INK, zorder=3)
-        chart.axvline(0.0, color=_INK, linewidth=1.0)
+            chart.scatter(changes, [place] * len(changes), s=14, c=INK, zorder=3)
+        chart.axvline(0.0, color=INK, linewidth=1.0)
         chart.set_title(f"{measure.name} ({'more' if measure.higher_is_better else 'less'} is better)", fontsize=10)
-        _plain(chart)
+        plain(chart)
     axes[0].set_yticks(range(len(shown)), [f"{v.method}  vs. {v.against}" for v in shown])
     axes[0].invert_yaxis()
     figure.suptitle(
-        "What each part changes on held-out views (blue: for the better; dots: runs)", fontsize=11, color=_INK
+        "What each part changes on held-out views (blue: for the better; dots: runs)", fontsize=11, color=INK
     )
     return figure
 
@@ -134,7 +135,7 @@ def _grid(
         for column, quality in enumerate(qualities):
             chart = axes[row][column]
             _chart(chart, here, methods, quality, x, area)
-            chart.set_title(f"{count} views" if column == 0 else "", loc="left", color=_INK, fontsize=11, weight="bold")
+            chart.set_title(f"{count} views" if column == 0 else "", loc="left", color=INK, fontsize=11, weight="bold")
             if row == len(views) - 1:
                 chart.set_xlabel(x_label, color=_MUTED)
     handles = [
@@ -184,10 +185,11 @@ def _chart(
     if not quality.higher_is_better:
         chart.invert_yaxis()
     chart.set_ylabel(quality.label if quality.higher_is_better else f"{quality.label} (axis turned)", color=_MUTED)
-    _plain(chart)
+    plain(chart)
 
 
-def _plain(chart: Axes) -> None:
+def plain(chart: Axes) -> None:
+    """A chart with a light grid and no frame."""
     chart.grid(color=_GRID, linewidth=0.7)
     chart.set_axisbelow(True)
     chart.spines[["top", "right"]].set_visible(False)
@@ -215,10 +217,11 @@ def _short(value: float, _position: int) -> str:
 
 def _head(figure: Figure, title: str, remark: str = "") -> None:
     remark += "Means over the runs that published a scene; up and left is better."
-    figure.suptitle(f"{title}\n{remark}", x=0.01, ha="left", color=_INK, fontsize=11)
+    figure.suptitle(f"{title}\n{remark}", x=0.01, ha="left", color=INK, fontsize=11)
 
 
-def _png(figure: Figure) -> bytes:
+def png(figure: Figure) -> bytes:
+    """The figure as the bytes of a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", facecolor="white")
     return buffer.getvalue()

@@ -81,7 +81,7 @@ _PIXELWISE = {
 DENSE_CONFIDENCE = 0.05  # from which on points are rendered and depths compared, where the depth has no holes
 
 
-def _with(config: Config, surroundings: Literal["shell", "fill"]) -> Config:
+def surrounded(config: Config, surroundings: Literal["shell", "fill"]) -> Config:
     """A start with what ours has around the pixels that stereo knows, where MASt3R would know all of them."""
     by_pixel = msgspec.structs.replace(config.pixelwise or pixelwise.Config(), surroundings=surroundings)
     if surroundings == "fill":
@@ -91,7 +91,7 @@ def _with(config: Config, surroundings: Literal["shell", "fill"]) -> Config:
 
 
 SURROUNDED: dict[str, Config] = {
-    f"{name}+{surroundings}": _with(config, surroundings)
+    f"{name}+{surroundings}": surrounded(config, surroundings)
     for name, config in _PIXELWISE.items()
     for surroundings in ("shell", "fill")
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 from splatnode.recon.evaluate.appearance import Appearance, Rasterize, appearance_of
 from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
 from splatnode.recon.evaluate.metrics import psnr, ssim
+from splatnode.recon.evaluate.regions import Counts, ErrorMaps, RegionScore, error_maps, region_scores
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import EvaluationScene
@@ -74,6 +75,7 @@ class Row:
     num_gaussians: int | None = None
     num_cameras: int | None = None  # of the training views, those with an estimated pose
     scene_bytes: int | None = None
+    regions: Mapping[str, RegionScore] = field(default_factory=dict)  # by regions.REGIONS; empty: not measured
     verdict: str  # a verdict's code; "FAILED" where the run ended without a result
     error: str | None = None  # why it did
 
@@ -114,12 +116,14 @@ def evaluate(
     settings: Settings,
     show: Show = ignore_render,
     found: Poses | None = None,
+    shown: Mapping[str, Counts] | None = None,
 ) -> Row:
     """Scores a snapshot on the scene's test views. The truth is used here and nowhere earlier.
 
     `show` gets the name of each test view, its photograph and what the scene looks like from there. `found` holds the
     test views' poses that another moment of the same run was given, from which the search then goes on; where it lacks
-    one, it gets it.
+    one, it gets it. `shown` tells of test views how many training photographs show each pixel (shown.py), at the size
+    at which they are scored: then the row has scores by region.
 
     A snapshot whose verdict forbids publishing it has no scene and is scored on nothing; its cameras are compared all
     the same, which tells whether the refusal was needed.
@@ -128,7 +132,9 @@ def evaluate(
     errors = _camera_errors(estimated, scene)
     appearance = appearance_of(snapshot, rasterize)
     found = {} if found is None else found
-    views = _score_test_views(appearance, snapshot.cameras, estimated, scene, split, networks, settings, show, found)
+    views = _score_test_views(
+        appearance, snapshot.cameras, estimated, scene, split, networks, settings, show, found, shown or {}
+    )
     return Row(
         scene=scene.name,
         views=len(split.train),
@@ -152,6 +158,7 @@ def evaluate(
         num_gaussians=0 if appearance is None else appearance.num_gaussians,
         num_cameras=len(snapshot.cameras),
         scene_bytes=0 if appearance is None else appearance.num_bytes,
+        regions=region_scores([view.maps for view in views if view.maps is not None]),
         verdict=snapshot.verdict.code.value,
     )
 
@@ -163,6 +170,7 @@ class _ViewScore:
     ssim: float
     lpips_alex: float | None
     lpips_vgg: float | None
+    maps: ErrorMaps | None  # None: nothing tells which training photographs show the pixels
 
 
 def _score_test_views(
@@ -175,6 +183,7 @@ def _score_test_views(
     settings: Settings,
     show: Show,
     found: Poses,
+    counts: Mapping[str, Counts],
 ) -> list[_ViewScore]:
     """Renders each test view from the pose that equation 18 finds, with the intrinsics of the training cameras.
 
@@ -215,6 +224,7 @@ def _score_test_views(
                 ssim=ssim(image, truth),
                 lpips_alex=networks.alex(image, truth) if networks.alex else None,
                 lpips_vgg=networks.vgg(image, truth) if networks.vgg else None,
+                maps=error_maps(image, truth, counts[name][rows, columns], networks.alex) if name in counts else None,
             )
         )
     return scores

@@ -73,13 +73,20 @@ def this_machine() -> dict[str, Any]:
 
 
 def _csv(records: Sequence[Mapping[str, Any]]) -> bytes:
-    """The rows with their seconds as columns of their own; empty where not measured."""
+    """The rows with their seconds and regions as columns of their own; empty where not measured."""
     flat = []
     for record in records:
         seconds = {f"seconds_{stage}": value for stage, value in record["seconds"].items()}
-        flat.append({name: value for name, value in record.items() if name != "seconds"} | seconds)
+        regions = {
+            f"{region}_{measure}": value
+            for region, scores in record["regions"].items()
+            for measure, value in scores.items()
+        }
+        plain = {name: value for name, value in record.items() if name not in ("seconds", "regions")}
+        flat.append(plain | seconds | regions)
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(flat[0]) if flat else [], lineterminator="\n")
+    columns = dict.fromkeys(name for row in flat for name in row)
+    writer = csv.DictWriter(text, list(columns), lineterminator="\n")
     writer.writeheader()
     writer.writerows(flat)
     return text.getvalue().encode()

@@ -10,6 +10,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from splatnode.capture.process.printable import escaped
+from splatnode.recon.evaluate.contest import case_tables
 from splatnode.recon.evaluate.protocol import Row
 from splatnode.recon.evaluate.records import Bench, bench_files
 from splatnode.recon.evaluate.renders import PHOTOGRAPH, kept
@@ -28,7 +29,7 @@ _STYLE = (
 
 def report_files(bench: Bench, out_dir: Path) -> dict[str, bytes]:
     """report.md and report.html; the latter shows the charts and renders that lie in `out_dir`."""
-    found = tables(bench.rows)
+    found = [*case_tables([row for row in bench.rows if row.final]), *tables(bench.rows)]
     return {"report.md": _markdown(bench, found).encode(), "report.html": _html(bench, found, out_dir).encode()}
 
 
@@ -41,11 +42,11 @@ def redraw(bench: Bench, out_dir: Path) -> None:
 def _charts(bench: Bench) -> dict[str, bytes]:
     """Those that there are numbers for; none without matplotlib to draw them."""
     try:
-        from splatnode.recon.evaluate import charts
+        from splatnode.recon.evaluate import case_chart, charts
     except ImportError:
         logger.warning("no charts: matplotlib is not installed. Run: pip install 'splatnode[bench]'")
         return {}
-    drawn = charts.draw(bench.rows)
+    drawn = charts.draw(bench.rows) | case_chart.draw(bench.rows)
     if not drawn:
         logger.warning("no charts: no run published a scene that could be scored")
     return drawn

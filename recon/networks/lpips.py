@@ -83,11 +83,22 @@ class Lpips:
         found = self.features(image)
         if [layer.shape for layer in found] != [layer.shape for layer in truth]:
             raise ValueError(f"images must have equal sizes, got features {found[0].shape} and {truth[0].shape}")
-        parts = [
-            functional.conv2d((mine - true) ** 2, self.weights[f"lin{head}.weight"].float()).mean()
+        return torch.stack([layer.mean() for layer in self._differences(found, truth)]).sum()
+
+    @torch.no_grad()
+    def map(self, image: Tensor, truth: Tensor) -> Tensor:
+        """(H, W) where two images (H, W, 3) differ: the layers' differences, brought to the images' size and added."""
+        layers = self._differences(self.features(image), self.features(truth))
+        size = (image.shape[0], image.shape[1])
+        grown = [functional.interpolate(layer, size, mode="bilinear", align_corners=False) for layer in layers]
+        return torch.stack([layer[0, 0] for layer in grown]).sum(0)
+
+    def _differences(self, found: Sequence[Tensor], truth: Sequence[Tensor]) -> list[Tensor]:
+        """(1, 1, h, w) for each tapped layer."""
+        return [
+            functional.conv2d((mine - true) ** 2, self.weights[f"lin{head}.weight"].float())
             for head, (mine, true) in enumerate(zip(found, truth, strict=True))
         ]
-        return torch.stack(parts).sum()
 
 
 def load_lpips(network: str, weights_dir: Path | None = None) -> Lpips | None:

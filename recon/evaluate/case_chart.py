@@ -1,0 +1,52 @@
+"""The chart of the cases: how far ours is ahead of, or behind, the best other method on each set of photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from matplotlib.figure import Figure
+
+from splatnode.recon.evaluate.charts import AHEAD, BEHIND, INK, plain, png
+from splatnode.recon.evaluate.contest import OURS, SHOWN, WHOLE, Margin, margins
+from splatnode.recon.evaluate.protocol import Row
+
+
+def draw(rows: Sequence[Row]) -> dict[str, bytes]:
+    """cases.png; nothing where ours and another method have no case in common."""
+    ends = [row for row in rows if row.final]
+    figure = cases(ends) if margins(ends, WHOLE[0]) else None
+    return {} if figure is None else {"cases.png": png(figure)}
+
+
+def cases(ends: Sequence[Row]) -> Figure:
+    """A chart a measure, a line a case: filled for whole photographs, hollow for what training photographs show."""
+    pairs = [(margins(ends, whole), margins(ends, shown)) for whole, shown in zip(WHOLE, SHOWN, strict=True)]
+    pairs = [pair for pair in pairs if pair[0]]
+    names = [_name(each) for each in pairs[0][0]]
+    figure = Figure(figsize=(3.6 * len(pairs) + 1.6, 0.32 * len(names) + 2.2), dpi=150, layout="constrained")
+    axes = figure.subplots(1, len(pairs), squeeze=False, sharey=True)[0]
+    for chart, (whole, shown) in zip(axes, pairs, strict=True):
+        for found, hollow in ((whole, False), (shown, True)):
+            for each in (each for each in found if _name(each) in names):
+                colour = AHEAD if each.lead >= 0 else BEHIND
+                face = "none" if hollow else colour
+                chart.scatter(each.lead, names.index(_name(each)), s=34, edgecolors=colour, facecolors=face, zorder=3)
+        chart.axvline(0.0, color=INK, linewidth=1.0)
+        chart.set_title(f"{whole[0].measure.name}: lead over the best other", fontsize=10)
+        plain(chart)
+    axes[0].set_yticks(range(len(names)), names)
+    axes[0].invert_yaxis()
+    figure.suptitle(
+        f"{OURS} against the best other method, case by case (right of the line: ours is better; filled: whole held-out"
+        " photographs, hollow: what training photographs show of them)",
+        x=0.01,
+        ha="left",
+        color=INK,
+        fontsize=10,
+        wrap=True,
+    )
+    return figure
+
+
+def _name(margin: Margin) -> str:
+    return f"{margin.scene}, {margin.views} views"

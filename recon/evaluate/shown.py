@@ -1,0 +1,154 @@
+"""Which pixels of a held-out photograph the training photographs show: by no method that is measured.
+
+The depth of every photograph of the scene, those held out included, is that of stereo with the true cameras. A pixel's
+surface is shown by a training photograph where it lies within it and nothing that this photograph sees stands before
+it. Made once for each scene; it is read by nothing but the scores.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.evaluate.regions import UNKNOWN, Counts
+from splatnode.recon.evaluate.true_cameras import TrueCamera
+from splatnode.recon.evaluate.truth import EvaluationScene
+from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.geometry import project, to_camera
+from splatnode.recon.priors import stereo
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
+
+_AGREEING = 1  # further photographs that see a pixel's depth as well
+_OFF = 0.1  # of a surface's depth: what is nearer by more stands before it
+_REACH_PX = 16.0  # a pixel without depth takes that of the nearest that has one, if it is so near
+_NEIGHBOURS = 4  # photographs that each is matched with, to know how far stereo has to search
+_RATIO = 0.8  # of a match's distance to the second best (Lowe 2004)
+_EPIPOLAR_PX = 2.0
+_RANGE_MARGIN = 2.0  # times what matched points reach, nearer and farther, is searched
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What a photograph sees, by its true camera."""
+
+    T_world_camera: Array  # (4, 4)
+    K: Array  # (3, 3), of a photograph of this size
+    depth: npt.NDArray[np.float32]  # (h, w) z, 0 where unknown
+
+
+def surfaces(scene: EvaluationScene, longer_side: int) -> dict[str, Surface]:
+    """The surfaces that the photographs with a true camera see, at `longer_side` pixels, by name."""
+    images = {name: modelled_image(scene.image(name), longer_side) for name in scene.cameras}
+    ranges = _depth_ranges(images, scene.cameras)
+    views = {
+        name: stereo.StereoView(image, _K(scene.cameras[name], image), scene.cameras[name].T_world_camera, ranges[name])
+        for name, image in images.items()
+        if name in ranges
+    }
+    maps = stereo.depth_maps(list(views.values()), stereo.Config())
+    return {
+        name: Surface(view.T_world_camera, view.K, _closed(each.depth * (each.num_consistent >= _AGREEING)))
+        for (name, view), each in zip(views.items(), maps, strict=True)
+    }
+
+
+def shown_counts(view: Surface, training: Sequence[Surface]) -> Counts:
+    """(h, w) how many of the training photographs show each pixel of `view`: 0, 1, 2 for more; UNKNOWN."""
+    rows, columns = np.nonzero(view.depth > 0)
+    z = np.asarray(view.depth[rows, columns], np.float64)
+    rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], 1) @ np.linalg.inv(view.K).T
+    points = (rays * z[:, None]) @ view.T_world_camera[:3, :3].T + view.T_world_camera[:3, 3]
+    shown = np.zeros(len(points), int)
+    for each in training:
+        shown += _shows(each, points)
+    counts = np.full(view.depth.shape, UNKNOWN, np.uint8)
+    counts[rows, columns] = np.minimum(shown, 2)
+    return counts
+
+
+def _shows(camera: Surface, points: Array) -> npt.NDArray[np.bool_]:
+    """(M,) which points (M, 3) lie within a photograph and are not hidden there."""
+    height, width = camera.depth.shape
+    in_camera = to_camera(points, camera.T_world_camera)
+    z = in_camera[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = np.nan_to_num(project(in_camera, camera.K), nan=-1.0, posinf=-1.0, neginf=-1.0).T
+    inside = (z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    row, column = np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int)
+    before = camera.depth[row, column]
+    return inside & ((before == 0) | (z <= (1 + _OFF) * before))
+
+
+def _closed(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    """With small holes filled by the nearest depth."""
+    known = depth > 0
+    if not known.any():
+        return depth.astype(np.float32)
+    away, labels = cv2.distanceTransformWithLabels(
+        (~known).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = np.asarray(labels, np.int64)
+    by_label = np.zeros(int(nearest.max()) + 1, np.float32)
+    by_label[nearest[known]] = depth[known]
+    return np.where(away <= _REACH_PX, by_label[nearest], 0).astype(np.float32)
+
+
+def _depth_ranges(images: Mapping[str, Image], cameras: Mapping[str, TrueCamera]) -> dict[str, tuple[float, float]]:
+    """Nearest and farthest depth to search in each photograph that shares enough points with others."""
+    sift, matcher = cv2.SIFT.create(4000), cv2.BFMatcher(cv2.NORM_L2)
+    found = {name: sift.detectAndCompute(image, None) for name, image in images.items()}
+    depths: dict[str, list[Array]] = {name: [] for name in images}
+    for first, second in _pairs(cameras, list(images)):
+        (points, codes), (others, other_codes) = found[first], found[second]
+        if min(len(points), len(others)) < 2:
+            continue
+        pairs = [best for best, next_best in matcher.knnMatch(codes, other_codes, k=2)
+                 if best.distance < _RATIO * next_best.distance]  # fmt: skip
+        a = np.array([points[match.queryIdx].pt for match in pairs]).reshape(-1, 2) + 0.5
+        b = np.array([others[match.trainIdx].pt for match in pairs]).reshape(-1, 2) + 0.5
+        world = _triangulated(a, b, *(_projection(cameras[name], images[name]) for name in (first, second)))
+        fits = np.ones(len(world), bool)
+        for name, pixels in ((first, a), (second, b)):
+            in_camera = to_camera(world, cameras[name].T_world_camera)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                off = np.linalg.norm(project(in_camera, _K(cameras[name], images[name])) - pixels, axis=1)
+            fits &= (in_camera[:, 2] > 0) & (off < _EPIPOLAR_PX)
+        for name in (first, second):
+            depths[name].append(to_camera(world[fits], cameras[name].T_world_camera)[:, 2])
+    known = {name: np.concatenate(each) for name, each in depths.items() if each}
+    return {name: stereo.depth_range(z, _RANGE_MARGIN) for name, z in known.items() if len(z) >= 20}
+
+
+def _pairs(cameras: Mapping[str, TrueCamera], names: Sequence[str]) -> list[tuple[str, str]]:
+    """Each photograph with those that look most alike in direction, of which the nearest."""
+    axes = np.stack([cameras[name].T_world_camera[:3, 2] for name in names])
+    centres = np.stack([cameras[name].T_world_camera[:3, 3] for name in names])
+    apart = np.linalg.norm(centres[:, None] - centres, axis=2)
+    cost = apart / max(float(np.median(apart)), 1e-12) + 2.0 * (1.0 - axes @ axes.T)
+    np.fill_diagonal(cost, np.inf)
+    chosen = {frozenset((i, int(j))) for i in range(len(names)) for j in np.argsort(cost[i])[:_NEIGHBOURS]}
+    return [(names[i], names[j]) for i, j in combinations(range(len(names)), 2) if frozenset((i, j)) in chosen]
+
+
+def _triangulated(a: Array, b: Array, P: Array, Q: Array) -> Array:
+    """(M, 3) the points of pixels (M, 2) in two photographs with projections (3, 4)."""
+    if not len(a):
+        return np.zeros((0, 3))
+    homogeneous = cv2.triangulatePoints(P, Q, a.T, b.T)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.nan_to_num((homogeneous[:3] / homogeneous[3]).T)
+
+
+def _projection(camera: TrueCamera, image: Image) -> Array:
+    return _K(camera, image) @ np.linalg.inv(camera.T_world_camera)[:3]
+
+
+def _K(camera: TrueCamera, image: Image) -> Array:
+    return camera.K_for(image.shape[1], image.shape[0])

@@ -1,0 +1,130 @@
+"""The race on sets that nothing was tuned on: `python -m tests.bench race --out DIR [--seeds N] [--methods A,B]`.
+
+race_cases.json names the sets: scenes that no default or preset was chosen on, and other windows of photographs of
+scenes on which some were. Presets run against the recipes of others, as published and in a start with our filled depths
+and far shell (`+fill`), from the same cameras and points; `mcmc` has as many Gaussians as `balanced` chose. Every
+held-out view is scored whole and by what the training photographs show of it. DIR holds what `splatnode bench` writes;
+runs that it holds already are not run again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import msgspec
+
+from splatnode.capture.frame import Frame
+from splatnode.capture.process.progress import say
+from splatnode.recon.config import Config
+from splatnode.recon.evaluate import methods
+from splatnode.recon.evaluate.bench import Entrants, Plan, Scoring, run_bench
+from splatnode.recon.evaluate.protocol import Settings, load_networks
+from splatnode.recon.evaluate.records import Bench
+from splatnode.recon.evaluate.report import redraw
+from splatnode.recon.evaluate.start import Start, continued, foundation
+from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.result.snapshot import Snapshot
+from tests.bench.quality.parsimony import configurations
+from tests.bench.quality.parsimony_chart import PIXEL, RIVAL
+
+CASES = Path(__file__).with_name("race_cases.json")
+REFERENCE = "balanced"  # run first: others get as many Gaussians as it chose
+METHODS = (
+    *(REFERENCE, "fast", "instantsplat-xl+fill", "instantsplat-xl", "pixel+fill", "mcmc+fill"),
+    *("instantsplat-s+fill", "instantsplat-s", "paper+fill", "paper", "pixel", "mcmc", "quality"),
+)
+
+
+class Case(msgspec.Struct, frozen=True):
+    name: str
+    scene: str
+    train: tuple[str, ...]
+    test: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Field:
+    """Who runs, where `chosen` is the number of Gaussians for `mcmc`."""
+
+    chosen: int
+
+    def config(self, name: str) -> Config | None:
+        """Of a method that only this bench has."""
+        base, _, fill = name.partition("+")
+        if base not in ("pixel", "mcmc"):
+            return None
+        config = configurations(self.chosen)[PIXEL if base == "pixel" else RIVAL]
+        return methods.surrounded(config, "fill") if fill else config
+
+    def reconstruct(self, frames: Sequence[Frame], name: str, seed: int, start: Start | None) -> Iterator[Snapshot]:
+        config = self.config(name)
+        if config is None or start is None:
+            return methods.by_name(frames, name, seed, start)
+        return continued(start, msgspec.structs.replace(config, seed=seed))
+
+    def start_of(self, name: str) -> Config | None:
+        config = self.config(name)
+        return methods.start_of(name) if config is None else foundation(config)
+
+
+def cases() -> list[Case]:
+    return msgspec.json.decode(CASES.read_bytes(), type=list[Case])
+
+
+def linked(case: Case, scenes: Path, folder: Path) -> Path:
+    """A folder of the case's own name that shows the scene, beside the splits.json that lists its photographs."""
+    place = folder / f"{case.name}_{len(case.train)}"
+    place.mkdir(parents=True, exist_ok=True)
+    link = place / case.name
+    if not link.is_symlink():
+        link.symlink_to((scenes / case.scene).resolve())
+    split = {case.name: {f"train{len(case.train)}": case.train, "test": case.test}}
+    (place / "splits.json").write_text(json.dumps(split))
+    return link
+
+
+def run(case: Case, wanted: Sequence[str], seeds: int, scenes: Path, out: Path, scoring: Scoring) -> Bench:
+    """Adds the runs of a case to what `out` holds."""
+    plan = partial(Plan, (linked(case, scenes, out / "scenes"),), (len(case.train),), seeds=tuple(range(seeds)))
+    go_on = partial(run_bench, out_dir=out, scoring=scoring, command=command(), resume=True)
+    bench = go_on(plan((REFERENCE,)), Entrants(methods.by_name, methods.start_of))
+    mine = [row for row in bench.rows if (row.scene, row.views, row.method) == (case.name, len(case.train), REFERENCE)]
+    if mine[0].psnr is None:
+        return bench  # refused: the others start from the same cameras, so there is nothing to compare
+    entrants = Field(mine[0].num_gaussians or 1)
+    return go_on(plan(tuple(wanted)), Entrants(entrants.reconstruct, entrants.start_of))
+
+
+def command() -> str:
+    return shlex.join(["python", "-m", "tests.bench", "race"])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", help="of cases (default: all)")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--methods", type=lambda text: text.split(","), default=METHODS)
+    parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
+    args = parser.parse_args()
+    scoring = Scoring(rasterize, load_networks(args.shared / "weights").quickest, Settings(), by_region=True)
+    if scoring.networks.alex is None:
+        parser.error(f"{args.shared}/weights must hold LPIPS's weights for AlexNet. Run: splatnode weights")
+    chosen = [case for case in cases() if not args.names or case.name in args.names]
+    if not chosen:
+        sys.exit(f"no such case; there are {', '.join(dict.fromkeys(case.name for case in cases()))}")
+    for case in chosen:
+        bench = run(case, args.methods, args.seeds, args.shared / "scenes", args.out, scoring)
+        redraw(bench, args.out)
+        say(f"{case.name}, {len(case.train)} views: done")
+
+
+if __name__ == "__main__":
+    main()
