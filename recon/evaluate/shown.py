@@ -24,6 +24,8 @@ from splatnode.recon.priors import stereo
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+Indices = npt.NDArray[np.intp]
 
 _AGREEING = 1  # further photographs that see a pixel's depth as well
 _OFF = 0.1  # of a surface's depth: what is nearer by more stands before it
@@ -41,6 +43,16 @@ class Surface:
     T_world_camera: Array  # (4, 4)
     K: Array  # (3, 3), of a photograph of this size
     depth: npt.NDArray[np.float32]  # (h, w) z, 0 where unknown
+
+    def pixels(self, points: Array) -> tuple[Mask, Indices, Indices, Array]:
+        """(M,) which points (M, 3) lie within the photograph; the row and column of each, 0 beyond it; its depth z."""
+        height, width = self.depth.shape
+        in_camera = to_camera(points, self.T_world_camera)
+        z = in_camera[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            x, y = np.nan_to_num(project(in_camera, self.K), nan=-1.0, posinf=-1.0, neginf=-1.0).T
+        inside = (z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+        return inside, np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int), z
 
 
 def surfaces(scene: EvaluationScene, longer_side: int) -> dict[str, Surface]:
@@ -73,15 +85,9 @@ def shown_counts(view: Surface, training: Sequence[Surface]) -> Counts:
     return counts
 
 
-def _shows(camera: Surface, points: Array) -> npt.NDArray[np.bool_]:
+def _shows(camera: Surface, points: Array) -> Mask:
     """(M,) which points (M, 3) lie within a photograph and are not hidden there."""
-    height, width = camera.depth.shape
-    in_camera = to_camera(points, camera.T_world_camera)
-    z = in_camera[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x, y = np.nan_to_num(project(in_camera, camera.K), nan=-1.0, posinf=-1.0, neginf=-1.0).T
-    inside = (z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    row, column = np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int)
+    inside, row, column, z = camera.pixels(points)
     before = camera.depth[row, column]
     return inside & ((before == 0) | (z <= (1 + _OFF) * before))
 

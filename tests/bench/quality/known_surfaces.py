@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.cameras import synthetic
+from splatnode.recon.evaluate.shown import Surface
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.frames.keyframe import modelled_image
-from splatnode.recon.geometry import Similarity, project, to_camera
+from splatnode.recon.geometry import Similarity, to_camera
 from splatnode.recon.priors import reprojection, stereo
 from splatnode.recon.priors.pointmap import Pointmap
 
@@ -31,12 +32,8 @@ RANGE_MARGIN = 4.0  # times what registration's points reach, nearer and farther
 
 
 @dataclass(frozen=True, eq=False)
-class KnownView:
-    """A true camera and the depths that it is sure of."""
-
-    T_world_camera: Array  # (4, 4)
-    K: Array  # (3, 3)
-    depth: npt.NDArray[np.float32]  # (h, w) z, 0 where nobody is sure
+class KnownView(Surface):
+    """A true camera and the depths that it is sure of; 0 where nobody is."""
 
     def moved(self, to: Similarity) -> KnownView:
         """The same in another world."""
@@ -81,13 +78,7 @@ def lines_of_sight(view: KnownView, points: Array) -> tuple[Mask, Mask]:
     window = np.ones((WINDOW_PX, WINDOW_PX), np.uint8)
     nearest = cv2.erode(np.where(known, view.depth, np.float32(np.inf)).astype(np.float32), window)
     share = cv2.blur(known.astype(np.float32), (WINDOW_PX, WINDOW_PX))
-    height, width = view.depth.shape
-    in_camera = to_camera(points, view.T_world_camera)
-    z = in_camera[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x, y = np.nan_to_num(project(in_camera, view.K), nan=-1.0, posinf=-1.0, neginf=-1.0).T
-    inside = (z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    row, column = np.where(inside, y, 0).astype(int), np.where(inside, x, 0).astype(int)
+    inside, row, column, z = view.pixels(points)
     sure = inside & known[row, column]
     through = sure & (share[row, column] >= KNOWN_SHARE) & (z < (1 - OFF) * nearest[row, column])
     on = sure & (np.abs(z - view.depth[row, column]) <= OFF * view.depth[row, column])
