@@ -24,7 +24,7 @@ from splatnode.recon.evaluate import methods
 from splatnode.recon.evaluate.bench import Entrants, Plan, Scoring, run_bench, run_line
 from splatnode.recon.evaluate.demo import largest_capture_bytes, write_held_out, write_photographs
 from splatnode.recon.evaluate.metrics import psnr
-from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
+from splatnode.recon.evaluate.protocol import INTERPOLATED_START, Networks, Run, Settings, evaluate, load_networks
 from splatnode.recon.evaluate.records import merged, read_bench
 from splatnode.recon.evaluate.report import redraw
 from splatnode.recon.evaluate.splits import Split
@@ -163,7 +163,10 @@ def bench(args: argparse.Namespace) -> int:
             Entrants(partial(methods.by_name, device=wanted), methods.start_of),
             args.out,
             scoring=Scoring(
-                rasterizer(device.chosen(wanted)), load_networks(args.weights_dir), Settings(), args.by_region
+                rasterizer(device.chosen(wanted)),
+                load_networks(args.weights_dir),
+                INTERPOLATED_START if args.interpolated_start else Settings(),
+                args.by_region,
             ),
             command=shlex.join(["splatnode", *sys.argv[1:]]),
             resume=args.resume,

@@ -169,6 +169,11 @@ def _bench_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--checkpoints", type=counts, default=(), metavar="N,N", help="iterations scored on the way")
     parser.add_argument(
+        "--interpolated-start",
+        action="store_true",
+        help="seek a held-out view's pose from between its neighbours, not from the true one: 300 steps, three sizes",
+    )
+    parser.add_argument(
         "--by-region", action="store_true", help="score also what two training photographs show, one, or none"
     )
     parser.add_argument("--seeds", type=positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")

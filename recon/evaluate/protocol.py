@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +17,7 @@ from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
 from splatnode.recon.evaluate.metrics import psnr, ssim
 from splatnode.recon.evaluate.regions import Counts, ErrorMaps, RegionScore, error_maps, region_scores
 from splatnode.recon.evaluate.splits import Split
+from splatnode.recon.evaluate.start_pose import between_neighbours
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.frames import border
@@ -36,6 +38,10 @@ class Settings:
     alignment_steps: int = 120
     alignment_levels: int = 1
     continued_steps: int = 60  # from the pose that was found in another moment of the same run, at full size
+    start: Literal["true", "interpolated"] = "true"  # of the search: start_pose.py
+
+
+INTERPOLATED_START = Settings(alignment_steps=300, alignment_levels=3, start="interpolated")
 
 
 @dataclass(frozen=True)
@@ -188,7 +194,7 @@ def _score_test_views(
     """Renders each test view from the pose that equation 18 finds, with the intrinsics of the training cameras.
 
     The search starts from the pose that was `found` before, or else from the true one, carried into the estimated world
-    by the similarity that aligns the training cameras. No view can be scored with fewer than two of them. Photographs
+    by the similarity that aligns the training cameras; or from between its neighbours, if `settings` says so. No view can be scored with fewer than two of them. Photographs
     are compared where they show the scene: a black rim that undistortion left is cut off, for the search too.
     """
     if appearance is None or len(estimated) < 2:
@@ -210,6 +216,8 @@ def _score_test_views(
             start, steps, levels, rate = found[name], settings.continued_steps, 1, _CONTINUED_RATE
         else:
             start = true_to_estimated.camera(scene.cameras[name].T_world_camera)
+            if settings.start == "interpolated":
+                start = between_neighbours(name, list(scene.paths), {c.name: c.T_world_camera for c in estimated})
             steps, levels, rate = settings.alignment_steps, settings.alignment_levels, _FIRST_RATE
         aligned = find_test_pose(appearance, truth, start, K, steps=steps, levels=levels, learning_rate=rate)
         T_world_camera = aligned.T_world_camera

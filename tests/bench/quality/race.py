@@ -25,7 +25,7 @@ from splatnode.capture.process.progress import say
 from splatnode.recon.config import Config
 from splatnode.recon.evaluate import methods
 from splatnode.recon.evaluate.bench import Entrants, Plan, Scoring, run_bench
-from splatnode.recon.evaluate.protocol import Settings, load_networks
+from splatnode.recon.evaluate.protocol import INTERPOLATED_START, Settings, load_networks
 from splatnode.recon.evaluate.records import Bench
 from splatnode.recon.evaluate.report import redraw
 from splatnode.recon.evaluate.start import Start, continued, foundation
@@ -112,9 +112,11 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--seeds", type=int, default=1)
     parser.add_argument("--methods", type=lambda text: text.split(","), default=METHODS)
+    parser.add_argument("--interpolated-start", action="store_true", help="as `splatnode bench` has it")
     parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
     args = parser.parse_args()
-    scoring = Scoring(rasterize, load_networks(args.shared / "weights").quickest, Settings(), by_region=True)
+    settings = INTERPOLATED_START if args.interpolated_start else Settings()
+    scoring = Scoring(rasterize, load_networks(args.shared / "weights").quickest, settings, by_region=True)
     if scoring.networks.alex is None:
         parser.error(f"{args.shared}/weights must hold LPIPS's weights for AlexNet. Run: splatnode weights")
     chosen = [case for case in cases() if not args.names or case.name in args.names]

@@ -196,3 +196,9 @@ def test_a_result_is_itself_a_scene_with_known_cameras(scene_folder, tmp_path):
     os.symlink(scene_folder / "images", tmp_path / "images")
     row = score(snapshot, tmp_path)
     assert row.rotation_error_deg == pytest.approx(0, abs=1e-6)
+
+
+def test_a_search_from_between_the_neighbours_finds_the_view_too(scene_folder):
+    row = score(perfect_snapshot(), scene_folder, start="interpolated", alignment_steps=200, alignment_levels=3)
+    untouched = score(perfect_snapshot(), scene_folder, start="interpolated", alignment_steps=1)
+    assert row.psnr is not None and untouched.psnr is not None and row.psnr > 40 > untouched.psnr
