@@ -54,6 +54,15 @@ class Keyframe:
         """Modelled width over full width, and modelled height over full height."""
         return self.image.shape[1] / self.frame.width, self.image.shape[0] / self.frame.height
 
+    @property
+    def mask(self) -> npt.NDArray[np.bool_] | None:
+        """(h, w) at modelled size, True where all that a pixel is made of is used; None: all pixels are."""
+        if self.frame.mask is None:
+            return None
+        height, width = self.image.shape[:2]
+        share = cv2.resize(self.frame.mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+        return share > 0.999
+
 
 def content_key(keyframe: Keyframe) -> bytes:
     """A key to sort keyframes by what they show, so that an answer does not depend on the order in which they came."""
