@@ -18,7 +18,7 @@ from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.frames import border
-from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.frames.keyframe import modelled_image, modelled_mask
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.networks.lpips import Lpips, load_lpips
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
@@ -180,7 +180,8 @@ def _score_test_views(
 
     The search starts from the pose that was `found` before, or else from the true one, carried into the estimated world
     by the similarity that aligns the training cameras. No view can be scored with fewer than two of them. Photographs
-    are compared where they show the scene: a black rim that undistortion left is cut off, for the search too.
+    are compared where they show the scene: a black rim that undistortion left is cut off, for the search too, and what
+    a mask hides counts as well rendered in SSIM and LPIPS, and not at all in PSNR.
     """
     if appearance is None or len(estimated) < 2:
         return []
@@ -189,9 +190,11 @@ def _score_test_views(
         np.stack([camera.T_world_camera for camera in estimated]),
     )
     names = [name for name in split.test if name in scene.cameras]
-    photographs = [modelled_image(scene.image(name), settings.longer_side) for name in names]
+    given = [scene.masked_image(name) for name in names]
+    photographs = [modelled_image(image, settings.longer_side) for image, _ in given]
+    rims = border.valid_masks(photographs)
     scores = []
-    for name, photograph, shown in zip(names, photographs, border.valid_masks(photographs), strict=True):
+    for name, photograph, shown, (_, mask) in zip(names, photographs, rims, given, strict=True):
         whole = torch.from_numpy(photograph).float() / 255.0
         whole_K = mean_intrinsics(cameras, photograph.shape[1], photograph.shape[0])
         rows, columns = border.valid_rectangle(shown)
@@ -206,18 +209,25 @@ def _score_test_views(
         T_world_camera = aligned.T_world_camera
         found.setdefault(name, T_world_camera)
         with_rim = appearance.render(T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
-        image = with_rim[rows, columns]
-        show(name, truth, image)
-        scores.append(
-            _ViewScore(
-                psnr=psnr(image, truth),
-                psnr_with_rim=psnr(with_rim, whole),
-                ssim=ssim(image, truth),
-                lpips_alex=networks.alex(image, truth) if networks.alex else None,
-                lpips_vgg=networks.vgg(image, truth) if networks.vgg else None,
-            )
-        )
+        show(name, truth, with_rim[rows, columns])
+        used = torch.from_numpy(modelled_mask(mask, *photograph.shape[:2]))
+        scores.append(_view_score(with_rim, whole, used, (rows, columns), networks))
     return scores
+
+
+def _view_score(
+    with_rim: Tensor, whole: Tensor, used: Tensor, shown: tuple[slice, slice], networks: Networks
+) -> _ViewScore:
+    """A render against a photograph, both (H, W, 3), where `used` (H, W) says so, within the rows and columns shown."""
+    whole = torch.where(used[..., None], whole, with_rim)
+    image, truth = with_rim[shown], whole[shown]
+    return _ViewScore(
+        psnr=psnr(image, truth, used[shown]),
+        psnr_with_rim=psnr(with_rim, whole, used),
+        ssim=ssim(image, truth),
+        lpips_alex=networks.alex(image, truth) if networks.alex else None,
+        lpips_vgg=networks.vgg(image, truth) if networks.vgg else None,
+    )
 
 
 def mean_intrinsics(cameras: Sequence[CameraEstimate], width: int, height: int) -> npt.NDArray[np.float64]:

@@ -24,7 +24,7 @@ BENCHMARKS = {
         "guided",
         "capture",
     ),
-    "quality": ("poses", "windows", "fit", "priors", "parsimony", "budgets", "spz", "needles", "locate"),
+    "quality": ("poses", "windows", "fit", "priors", "parsimony", "budgets", "spz", "needles", "locate", "movers"),
     "speed": ("rasterize", "stereo", "growth"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),
 }
