@@ -122,7 +122,8 @@ def read_mask(path: Path, frame: Frame) -> Mask:
     try:
         image = decode_photograph(read_image_file(path)).image
     except (UnusableImage, OSError) as error:
-        raise UnusableMask(f"the mask {printable_name(path.name)} cannot be read: {error}") from error
+        why = error.strerror if isinstance(error, OSError) else error
+        raise UnusableMask(f"the mask {printable_name(path.name)} cannot be read: {why}") from error
     level = LOSSY_LEVEL if path.suffix.lower() in _LOSSY else 1
     mask = image.max(2) >= level
     if mask.shape != (frame.height, frame.width) and mask.shape == (frame.width, frame.height):
