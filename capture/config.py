@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import msgspec
 
 from splatnode.capture import preview, reader, selection
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.masks import all_masked, constant
 from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import Plugin
@@ -28,11 +30,17 @@ class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     preview: preview.Config = preview.Config()
     spool: spool.Config = spool.Config()
     network: Network = Network()  # how the processes reach each other
+    # An image of the camera's size: black is never used, as where the camera sees the robot itself; white is used
+    body_mask: Path | None = None
 
 
-def open_stream(camera: Camera) -> Iterator[Frame | DroppedFrame]:
-    """The frames of the camera that is configured. Raises CameraUnavailable, when it is opened or later."""
-    return camera.module.stream(camera.config)
+def open_stream(camera: Camera, body_mask: Path | None = None) -> Iterator[Frame | DroppedFrame]:
+    """The frames of the camera that is configured, without what `body_mask` hides.
+
+    Raises CameraUnavailable, when it is opened or later; UnusableMask, FileNotFoundError.
+    """
+    frames = camera.module.stream(camera.config)
+    return frames if body_mask is None else all_masked(frames, constant(body_mask))
 
 
 def is_live(camera: Camera) -> bool:

@@ -7,6 +7,7 @@ import math
 import os
 import time
 from contextlib import ExitStack
+from functools import partial
 
 import cv2
 
@@ -54,7 +55,8 @@ def capture(config: CaptureConfig) -> None:
         server = resources.enter_context(KeyframeServer(config.network, Spool(config.spool)))
         session = _Session(config, server, resources)
         camera = config.camera
-        reader = resources.enter_context(Reader(lambda: open_stream(camera), is_live(camera), config.reader))
+        opened = partial(open_stream, camera, config.body_mask)
+        reader = resources.enter_context(Reader(opened, is_live(camera), config.reader))
         resources.callback(manager.stopping)
         begin_run(config.network)
         if why := server.spool.shortage():

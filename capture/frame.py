@@ -77,6 +77,7 @@ class Frame:
     intrinsics: Intrinsics | None  # None: nothing is known about this camera
     encoded: bytes | None = field(default=None, repr=False)  # the JPEG or PNG that `image` was decoded from, if any
     captured_at: Stamp | None = None  # None: nobody knows
+    mask: npt.NDArray[np.bool_] | None = field(default=None, repr=False)  # (H, W), False: not used; None: all is used
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", printable(self.name, LONGEST_NAME))
@@ -86,6 +87,8 @@ class Frame:
             raise ValueError(f"image must have 1 to {LARGEST_SIDE} pixels a side, got {self.width} x {self.height}")
         if self.width * self.height > LARGEST_IMAGE:
             raise ValueError(f"image must have at most {LARGEST_IMAGE} pixels, got {self.width} x {self.height}")
+        if self.mask is not None and (self.mask.shape != self.image.shape[:2] or self.mask.dtype != np.bool_):
+            raise ValueError(f"mask must be {self.image.shape[:2]} bool, got {self.mask.shape} {self.mask.dtype}")
         if not self.name:
             raise ValueError("a frame must have a name")
         for what, number in (("frame_id", self.frame_id), ("stamp_ns", self.stamp_ns)):
@@ -135,14 +138,15 @@ def framed(
     intrinsics: Intrinsics | None,
     encoded: bytes | None = None,
     captured_at: Stamp | None = None,
+    mask: npt.NDArray[np.bool_] | None = None,
 ) -> Frame | DroppedFrame:
     """What a camera or a file gave as a Frame; left out, with the reason, where it keeps a Frame's bounds not."""
     try:
-        return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at)
+        return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at, mask)
     except ValueError as error:
         return DroppedFrame(name, f"it cannot be used: {error}")
 
 
 def renamed(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame | DroppedFrame:
     """The same image as another frame, which may be beyond a Frame's bounds."""
-    return framed(frame_id, name, stamp_ns, frame.image, frame.intrinsics, frame.encoded, frame.captured_at)
+    return framed(frame_id, name, stamp_ns, frame.image, frame.intrinsics, frame.encoded, frame.captured_at, frame.mask)

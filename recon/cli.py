@@ -52,7 +52,7 @@ def replay(args: argparse.Namespace) -> int:
     """Reconstructs a folder of photographs, some photographs of one, a recording, or a video."""
     config = _config(args)
     path, listed = asked_for(args.source)
-    request = Request(path, listed, args.views, args.frames or (), args.every_frame)
+    request = Request(path, listed, args.views, args.frames or (), args.every_frame, args.masks)
     _check_apart(args.out, path)
     if args.map and args.only_seen:
         raise ValueError("--only-seen is for one scene: a merged map does not tell what two photographs confirm")

@@ -13,7 +13,7 @@ from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.locating.gathering import gathered
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.priors.prior import Prior
+from splatnode.recon.priors.prior import Prior, without_hidden
 from splatnode.recon.registration import continuation
 from splatnode.recon.registration.register import Registration, register
 from splatnode.recon.result.bounds import Bounds
@@ -42,6 +42,7 @@ class Conclusion:
     evidence_record: dict[str, object] | None  # for reports; None where nothing was verified
     captured_at: Mapping[str, Stamp] = field(default_factory=dict)  # by keyframe, where it is known
     landmarks: Landmarks | None = None  # of a scene that is to be saved
+    masked: Mapping[str, float] = field(default_factory=dict)  # share that a mask hides, by keyframe that has one
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +87,9 @@ class Estimate:
         """What snapshots tell of it."""
         stamps = {keyframe.name: keyframe.frame.captured_at for keyframe in self.graph.keyframes}
         known = {name: stamp for name, stamp in stamps.items() if stamp is not None}
-        return Conclusion(self.verdict, self.bounds, self.evidence_record, known)
+        masks = {keyframe.name: keyframe.frame.mask for keyframe in self.graph.keyframes}
+        masked = {name: 1.0 - float(mask.mean()) for name, mask in masks.items() if mask is not None}
+        return Conclusion(self.verdict, self.bounds, self.evidence_record, known, masked=masked)
 
     @property
     def conclusion_to_save(self) -> Conclusion:
@@ -141,7 +144,7 @@ def estimate_depth(
     pause = pausing_until(until, pause) if prior.ends_early else pause
     pointmaps = prior.pointmaps(estimate.graph, estimate.registration, pause)
     give_back_memory()
-    return replace(estimate, pointmaps={pointmap.name: pointmap for pointmap in pointmaps})
+    return replace(estimate, pointmaps=without_hidden(pointmaps, estimate.graph))
 
 
 def continued(known: Estimate, graph: ViewGraph, config: Config) -> Estimate | None:

@@ -26,6 +26,7 @@ from splatnode.recon.modelling import Shown, begin_scene, in_words, refined, sho
 from splatnode.recon.optimize import refinement
 from splatnode.recon.preparation import check_device, load_prior, prepare
 from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.priors.prior import without_hidden
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import growth, warping
 from splatnode.recon.scene.scene import Scene
@@ -251,8 +252,7 @@ class IncrementalReconstruction:
         moved = warping.warped_scene(scene, pointmaps, carried, MAX_CAMERA_SHIFT)
         if placed is None or moved is None:
             return False
-        further = self._prior.further_pointmaps(graph, placed, carried)
-        pointmaps = carried | {pointmap.name: pointmap for pointmap in further}
+        pointmaps = carried | without_hidden(self._prior.further_pointmaps(graph, placed, carried), graph)
         grown = growth.grow(moved, pointmaps, graph, placed, self.config.initialisation)
         self._known = replace(self._known, pointmaps=pointmaps, show=shown(grown, self.config))
         self.clock.lap("points")

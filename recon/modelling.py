@@ -61,6 +61,7 @@ def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
         tuple(estimate.pointmaps.values()),
         {keyframe.name: keyframe.image for keyframe in estimate.graph.keyframes},
         config.initialisation,
+        {keyframe.name: keyframe.mask for keyframe in estimate.graph.keyframes},
     )
 
 
@@ -125,6 +126,7 @@ def snapshot(
         served_by=scene.served_by if scene else {},
         evidence=conclusion.evidence_record,
         landmarks=conclusion.landmarks if scene and final else None,
+        masked=conclusion.masked,
     )
 
 

@@ -36,5 +36,5 @@ def prepare(frame: Frame, config: Config, found: Features | None = None) -> Keyf
     No other frame is needed. Raises ValueError where the given intrinsics cannot be used.
     """
     frame = replace(undistorted(frame), encoded=None)  # recordings alone want the file as it came
-    found = found or features.extract(frame.image, config.matching.features)
+    found = found or features.used(features.extract(frame.image, config.matching.features), frame.mask)
     return Keyframe(frame, modelled_image(frame.image, config.size), found)

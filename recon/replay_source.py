@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -14,6 +14,7 @@ from splatnode.capture.cameras import folder, video
 from splatnode.capture.choosing import Choice, choose
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
+from splatnode.capture.masks import Find, all_masked, in_files
 from splatnode.capture.process.printable import printable_name
 from splatnode.capture.process.progress import Tell, counted, told_to_nobody
 from splatnode.capture.quality import Limits
@@ -37,6 +38,7 @@ class Request:
     views: int | None = None  # so many of them, evenly spread
     frames: tuple[str, ...] = ()  # those of the folder with these names
     every_frame: bool = False  # all that are sharp and no copies
+    masks: Path | None = None  # a folder of masks, or one for all; None: photographs are used whole
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +78,7 @@ class Recording:
     path: Path
     listed: tuple[str, ...]  # the photographs of the folder that were named; none: all
     choice: Choice
+    masks: Path | None = None
 
     @property
     def is_video(self) -> bool:
@@ -88,14 +91,16 @@ class Recording:
         """
         written_ns = self.path.stat().st_mtime_ns if self.is_video else 0
         known = [str(self.path.resolve()), written_ns, self.choice.names, config]
+        if self.masks is not None:
+            known.append(str(self.masks.resolve()))
         return hashlib.sha256(msgspec.json.encode(known)).hexdigest()[:32]
 
     def frames(self) -> Iterator[Frame | DroppedFrame]:
         """The keyframes in their order, and what the recording could not give."""
         names = set(self.choice.names)
-        return (
-            each for each in _stream(self.path, self.listed) if isinstance(each, DroppedFrame) or each.name in names
-        )
+        streamed = _stream(self.path, self.listed)
+        chosen = (each for each in streamed if isinstance(each, DroppedFrame) or each.name in names)
+        return chosen if self.masks is None else all_masked(chosen, in_files(self.masks))
 
 
 def asked_for(paths: Sequence[Path]) -> tuple[Path, tuple[str, ...]]:
@@ -133,7 +138,7 @@ def recording(request: Request, tell: Tell = told_to_nobody) -> Recording:
     """As `source`, without a limit to the number of keyframes."""
     _check_there(request.source)
     choice = choose(_looked_through(request, tell), _selection(request), Limits(), None, _what(request))
-    return Recording(request.source, request.listed, choice)
+    return Recording(request.source, request.listed, choice, request.masks)
 
 
 def source(request: Request, tell: Tell = told_to_nobody) -> Source:
@@ -142,6 +147,16 @@ def source(request: Request, tell: Tell = told_to_nobody) -> Source:
     Raises FileNotFoundError and ValueError where there is nothing that can be used.
     """
     _check_there(request.source)
+    found = _unmasked(request, tell)
+    return found if request.masks is None else with_masks(found, in_files(request.masks), tell)
+
+
+def with_masks(given: Source, find: Find, tell: Tell = told_to_nobody) -> Source:
+    """The frames, each with the mask that is found for it. Raises UnusableMask where one cannot be its mask."""
+    return replace(given, frames=tuple(all_masked(given.frames, find, tell)))
+
+
+def _unmasked(request: Request, tell: Tell) -> Source:
     if request.source.is_file():
         if request.frames:
             raise ValueError("--frames names photographs of a folder; of a video, give --views N or nothing")

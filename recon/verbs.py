@@ -84,6 +84,7 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)")
     add_only_seen(parser)
+    _add_masks(parser)
     parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
     chosen = parser.add_mutually_exclusive_group()
     chosen.add_argument(
@@ -101,6 +102,16 @@ def _replay_arguments(parser: argparse.ArgumentParser) -> None:
         help="of a long recording: use all keyframes, however many; they become linked scenes, and one merged map",
     )
     add_json(parser)
+
+
+def _add_masks(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--masks",
+        type=Path,
+        metavar="FOLDER",
+        help="masks, of the names of their photographs: white (any value above 0) is used, black is ignored; or one "
+        "file, for all photographs",
+    )
 
 
 def add_only_seen(parser: argparse.ArgumentParser) -> None:

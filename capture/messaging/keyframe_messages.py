@@ -13,6 +13,7 @@ import msgspec
 import zmq
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.messaging.mask_bits import arrays_of, mask_in
 from splatnode.capture.messaging.spool import Key
 from splatnode.capture.messaging.values import Name, Sequential, SessionId, Text
 from splatnode.capture.messaging.wire import (
@@ -34,7 +35,7 @@ DELIVERY_PARTS = 2  # that come before a frame's own
 
 
 class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="frame"):
-    """A Frame; its image is the only array."""
+    """A Frame; its arrays are its image and, where it has one, its mask (mask_bits.py)."""
 
     frame_id: Sequential
     name: Name
@@ -116,7 +117,7 @@ def to_message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
         intrinsics=frame.intrinsics,
         captured_at=frame.captured_at,
     )
-    return encode(header, [frame.image])
+    return encode(header, arrays_of(frame))
 
 
 def delivered(key: Key, message: list[Part]) -> list[Part]:
@@ -134,9 +135,8 @@ def received(key: Key, parts: list[zmq.Frame], limits: Limits) -> ReceivedFrame:
         if message.arrays:
             raise WireError("a dropped frame has no image")
         return ReceivedFrame(*key, DroppedFrame(header.name, header.reason))
-    if len(message.arrays) != 1:
-        raise WireError(f"a frame has one image, got {len(message.arrays)}")
     try:
+        mask = mask_in(message.arrays)
         frame = Frame(
             header.frame_id,
             header.name,
@@ -144,6 +144,7 @@ def received(key: Key, parts: list[zmq.Frame], limits: Limits) -> ReceivedFrame:
             message.arrays[0],
             header.intrinsics,
             captured_at=header.captured_at,
+            mask=mask,
         )
     except ValueError as error:
         raise WireError(str(error)) from error

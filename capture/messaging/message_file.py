@@ -16,8 +16,8 @@ LARGEST = 4 << 30  # bytes of a body, unless the reader knows better
 _HEAD = struct.Struct("<8sIQI")  # magic, parts, bytes of the body, its CRC-32
 _MAGIC = b"SPLSPOOL"
 _SIZE = struct.Struct("<Q")
-# Of files that versions 1 and 2 wrote: what they lack in today's headers has a default.
-_EARLIER = (MAGIC[:-1] + b"\x01", MAGIC[:-1] + b"\x02")
+# Of files that versions 1 to 3 wrote: what they lack in today's headers has a default.
+_EARLIER = tuple(MAGIC[:-1] + bytes([version]) for version in (1, 2, 3))
 
 
 def size_in_file(parts: Sequence[Part]) -> int:

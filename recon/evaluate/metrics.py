@@ -8,10 +8,14 @@ from torch import Tensor
 from splatnode.recon.optimize import photometric_reference
 
 
-def psnr(image: Tensor, truth: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB, for a peak of 1; at most 100, which equal images get."""
+def psnr(image: Tensor, truth: Tensor, used: Tensor | None = None) -> float:
+    """Peak signal-to-noise ratio in dB, for a peak of 1; at most 100, which equal images get.
+
+    `used` (H, W) says which pixels count; None: all.
+    """
     _check_same_shape(image, truth)
-    error = torch.mean((image.double() - truth.double()) ** 2)
+    squares = (image.double() - truth.double()) ** 2
+    error = torch.mean(squares if used is None else squares[used])
     return float(-10.0 * torch.log10(error.clamp(min=1e-10)))
 
 

@@ -15,13 +15,13 @@ from torch import Tensor
 from splatnode.recon.evaluate.appearance import Appearance, Rasterize, appearance_of
 from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
 from splatnode.recon.evaluate.metrics import psnr, ssim
-from splatnode.recon.evaluate.regions import Counts, ErrorMaps, RegionScore, error_maps, region_scores
+from splatnode.recon.evaluate.regions import UNKNOWN, Counts, ErrorMaps, RegionScore, error_maps, region_scores
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.start_pose import between_neighbours
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.frames import border
-from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.frames.keyframe import modelled_image, modelled_mask
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.networks.lpips import Lpips, load_lpips
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
@@ -194,8 +194,10 @@ def _score_test_views(
     """Renders each test view from the pose that equation 18 finds, with the intrinsics of the training cameras.
 
     The search starts from the pose that was `found` before, or else from the true one, carried into the estimated world
-    by the similarity that aligns the training cameras; or from between its neighbours, if `settings` says so. No view can be scored with fewer than two of them. Photographs
-    are compared where they show the scene: a black rim that undistortion left is cut off, for the search too.
+    by the similarity that aligns the training cameras; or from between its neighbours, if `settings` says so. No view
+    can be scored with fewer than two of them. Photographs are compared where they show the scene: a black rim that
+    undistortion left is cut off, for the search too, and what a mask hides counts as well rendered in SSIM and LPIPS,
+    and not at all in PSNR and in the scores by region.
     """
     if appearance is None or len(estimated) < 2:
         return []
@@ -204,9 +206,11 @@ def _score_test_views(
         np.stack([camera.T_world_camera for camera in estimated]),
     )
     names = [name for name in split.test if name in scene.cameras]
-    photographs = [modelled_image(scene.image(name), settings.longer_side) for name in names]
+    given = [scene.masked_image(name) for name in names]
+    photographs = [modelled_image(image, settings.longer_side) for image, _ in given]
+    rims = border.valid_masks(photographs)
     scores = []
-    for name, photograph, shown in zip(names, photographs, border.valid_masks(photographs), strict=True):
+    for name, photograph, shown, (_, mask) in zip(names, photographs, rims, given, strict=True):
         whole = torch.from_numpy(photograph).float() / 255.0
         whole_K = mean_intrinsics(cameras, photograph.shape[1], photograph.shape[0])
         rows, columns = border.valid_rectangle(shown)
@@ -223,19 +227,35 @@ def _score_test_views(
         T_world_camera = aligned.T_world_camera
         found.setdefault(name, T_world_camera)
         with_rim = appearance.render(T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
-        image = with_rim[rows, columns]
-        show(name, truth, image)
-        scores.append(
-            _ViewScore(
-                psnr=psnr(image, truth),
-                psnr_with_rim=psnr(with_rim, whole),
-                ssim=ssim(image, truth),
-                lpips_alex=networks.alex(image, truth) if networks.alex else None,
-                lpips_vgg=networks.vgg(image, truth) if networks.vgg else None,
-                maps=error_maps(image, truth, counts[name][rows, columns], networks.alex) if name in counts else None,
-            )
-        )
+        show(name, truth, with_rim[rows, columns])
+        used = torch.from_numpy(modelled_mask(mask, *photograph.shape[:2]))
+        scores.append(_view_score(with_rim, whole, used, (rows, columns), networks, counts.get(name)))
     return scores
+
+
+def _view_score(
+    with_rim: Tensor,
+    whole: Tensor,
+    used: Tensor,
+    shown: tuple[slice, slice],
+    networks: Networks,
+    counts: Counts | None,
+) -> _ViewScore:
+    """A render against a photograph, both (H, W, 3), where `used` (H, W) says so, within the rows and columns shown."""
+    whole = torch.where(used[..., None], whole, with_rim)
+    image, truth = with_rim[shown], whole[shown]
+    maps = None
+    if counts is not None:
+        judged = np.where(used.numpy(), counts, np.uint8(UNKNOWN))[shown]
+        maps = error_maps(image, truth, judged, networks.alex)
+    return _ViewScore(
+        psnr=psnr(image, truth, used[shown]),
+        psnr_with_rim=psnr(with_rim, whole, used),
+        ssim=ssim(image, truth),
+        lpips_alex=networks.alex(image, truth) if networks.alex else None,
+        lpips_vgg=networks.vgg(image, truth) if networks.vgg else None,
+        maps=maps,
+    )
 
 
 def mean_intrinsics(cameras: Sequence[CameraEstimate], width: int, height: int) -> npt.NDArray[np.float64]:

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import SUFFIXES, UnusableImage, decode_photograph, read_image_file
+from splatnode.capture.masks import all_masked, in_files
 from splatnode.recon.evaluate.json_file import EvaluationFileError
 from splatnode.recon.evaluate.true_cameras import TrueCamera, read_true_cameras
 
@@ -25,6 +26,7 @@ class EvaluationScene:
     name: str
     paths: Mapping[str, Path]
     cameras: Mapping[str, TrueCamera]
+    masks: Path | None = None  # a folder; None: all of every image is used
 
     def image(self, name: str) -> npt.NDArray[np.uint8]:
         """(H, W, 3) RGB. Raises EvaluationFileError where the file is not an image, OSError."""
@@ -36,7 +38,15 @@ class EvaluationScene:
 
     def frames(self, names: Sequence[str]) -> list[Frame]:
         """What a reconstruction gets: images in the given order, and nothing known about the camera."""
-        return [Frame(i, name, i, self.image(name), None) for i, name in enumerate(names)]
+        found = [Frame(i, name, i, self.image(name), None) for i, name in enumerate(names)]
+        if self.masks is None:
+            return found
+        return [each for each in all_masked(found, in_files(self.masks)) if isinstance(each, Frame)]
+
+    def masked_image(self, name: str) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
+        """(H, W, 3) RGB, filled where it is not used, and (H, W) where it is. Raises as `image`, and UnusableMask."""
+        (frame,) = self.frames([name]) or (Frame(0, name, 0, self.image(name), None),)
+        return frame.image, np.ones(frame.image.shape[:2], bool) if frame.mask is None else frame.mask
 
 
 def load_scene(folder: Path) -> EvaluationScene:
@@ -44,7 +54,8 @@ def load_scene(folder: Path) -> EvaluationScene:
 
     cameras.json is ours ("cameras": T_world_camera) or that of recorded data sets ("images": R, t); transforms.json is
     nerfstudio's; sparse/0 is a COLMAP model, text or binary. Tanks and Temples and MVImgNet as InstantSplat gives them
-    have all that in a folder 24_views of the scene's, which is found from either. Images must be undistorted. Raises
+    have all that in a folder 24_views of the scene's, which is found from either. Images must be undistorted. What a
+    folder masks/ hides of them (black; white is used) is neither reconstructed nor scored. Raises
     FileNotFoundError where a part is missing, EvaluationFileError or SceneFileError (both ValueErrors, which name the
     file) where it cannot be what it should be.
     """
@@ -57,9 +68,9 @@ def load_scene(folder: Path) -> EvaluationScene:
     for source in sources:
         if (data / source).exists():
             cameras = read_true_cameras(data / source)
-            return EvaluationScene(
-                place.name, paths, {name: cameras[path.name] for name, path in paths.items() if path.name in cameras}
-            )
+            known = {name: cameras[path.name] for name, path in paths.items() if path.name in cameras}
+            masks = data / "masks" if (data / "masks").is_dir() else None
+            return EvaluationScene(place.name, paths, known, masks)
     raise FileNotFoundError(f"{data} must hold the true cameras as one of {', '.join(sources)}; there is none")
 
 

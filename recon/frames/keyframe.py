@@ -54,6 +54,13 @@ class Keyframe:
         """Modelled width over full width, and modelled height over full height."""
         return self.image.shape[1] / self.frame.width, self.image.shape[0] / self.frame.height
 
+    @property
+    def mask(self) -> npt.NDArray[np.bool_] | None:
+        """(h, w) at modelled size, True where all that a pixel is made of is used; None: all pixels are."""
+        if self.frame.mask is None:
+            return None
+        return modelled_mask(self.frame.mask, *self.image.shape[:2])
+
 
 def content_key(keyframe: Keyframe) -> bytes:
     """A key to sort keyframes by what they show, so that an answer does not depend on the order in which they came."""
@@ -76,6 +83,11 @@ def modelled_size(width: int, height: int, longer_side: int) -> tuple[int, int]:
     """(width, height) with the longer side at most `longer_side`; images are never enlarged."""
     scale = min(1.0, longer_side / max(width, height))
     return max(1, round(width * scale)), max(1, round(height * scale))
+
+
+def modelled_mask(mask: npt.NDArray[np.bool_], height: int, width: int) -> npt.NDArray[np.bool_]:
+    """(height, width) of a mask (H, W): True where all that a pixel is made of is used."""
+    return cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA) > 0.999
 
 
 def modelled_image(image: npt.NDArray[np.uint8], longer_side: int) -> npt.NDArray[np.uint8]:

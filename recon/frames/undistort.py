@@ -52,7 +52,13 @@ def undistorted(frame: Frame) -> Frame:
         cv2.CV_32FC1,
     )
     image = cv2.remap(frame.image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    return replace(frame, image=image.astype(np.uint8), intrinsics=pinhole)
+    mask = None if frame.mask is None else _carried(frame.mask, columns, rows)
+    return replace(frame, image=image.astype(np.uint8), intrinsics=pinhole, mask=mask)
+
+
+def _carried(mask: npt.NDArray[np.bool_], columns: npt.NDArray, rows: npt.NDArray) -> npt.NDArray[np.bool_]:
+    """The mask (H, W) as its photograph is resampled; a pixel is used where all that it is made of is."""
+    return cv2.remap(mask.astype(np.float32), columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) > 0.999
 
 
 def _coefficients(given: Intrinsics) -> Array:

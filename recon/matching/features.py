@@ -18,6 +18,7 @@ Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
 
 _TILT_BLUR = 0.8  # sigma over sqrt(tilt^2 - 1), pixels: against aliasing when a side shrinks (Morel and Yu, 2009)
+MASK_MARGIN = 0.008  # of the longer side: nearer to what a mask hides, a feature describes its edge
 _NO_BLUR = 0.01  # sigma, pixels, along the other side: OpenCV takes 0 for "as along the width"
 
 
@@ -34,6 +35,28 @@ def extract(image: Image, config: Config) -> Features:
     """Features of `image` (H, W, 3) RGB, the strongest first, with one descriptor a point."""
     points, descriptors = _detect(image, 1.0, config)
     return Features(points, descriptors, np.arange(len(points)), np.ones(len(points)))
+
+
+def used(features: Features, mask: npt.NDArray[np.bool_] | None) -> Features:
+    """Those that lie well inside of what `mask` (H, W) of their image uses; None: all."""
+    if mask is None:
+        return features
+    inside = well_inside(mask)
+    keep = inside[tuple(np.minimum(features.points.astype(np.int64), np.array(mask.shape)[::-1] - 1).T[::-1])]
+    number = np.cumsum(keep) - 1
+    described = keep[features.point_of]
+    return Features(
+        features.points[keep],
+        features.descriptors[described],
+        number[features.point_of[described]],
+        features.tilt[described],
+    )
+
+
+def well_inside(mask: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """(H, W) the pixels farther than the margin from what `mask` hides."""
+    side = 2 * max(1, round(MASK_MARGIN * max(mask.shape))) + 1
+    return cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8)) > 0
 
 
 def add_tilted(features: Features, image: Image, tilts: Sequence[float], config: Config) -> Features:

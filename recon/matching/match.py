@@ -198,10 +198,21 @@ def _of(keyframes: Sequence[Keyframe], pair: Sequence[int]) -> tuple[Keyframe, K
 
 def _with_tilted_features(keyframe: Keyframe, tilts: Sequence[float], config: Config) -> Keyframe:
     found = features.add_tilted(keyframe.features, keyframe.frame.image, tilts, config.features)
-    return replace(keyframe, features=found)
+    return replace(keyframe, features=features.used(found, keyframe.frame.mask))
 
 
 def _with_matcher(
     first: Keyframe, second: Keyframe, found: MatchedPair, matcher: Matcher, config: Config
 ) -> MatchedPair:
-    return pair_matching.add_proposed(first, second, found, matcher.match(first, second), config.pair_matching)
+    proposed = matcher.match(first, second)
+    proposed = proposed[_shown(first, proposed[:, 0]) & _shown(second, proposed[:, 1])]
+    return pair_matching.add_proposed(first, second, found, proposed, config.pair_matching)
+
+
+def _shown(keyframe: Keyframe, points: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """(M,) which of the points with these numbers no mask hides."""
+    if keyframe.frame.mask is None:
+        return np.ones(len(points), bool)
+    inside = features.well_inside(keyframe.frame.mask)
+    x, y = np.clip(keyframe.features.points[points].astype(np.int64), 0, np.array(inside.shape)[::-1] - 1).T
+    return inside[y, x]

@@ -7,13 +7,12 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames import border
 from splatnode.recon.optimize.refinement import PARAMETERS
 from splatnode.recon.optimize.torch_threads import single_torch_thread
 from splatnode.recon.optimize.training_image import training_image
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.result.verdict import Verdict
-from splatnode.recon.scene.scene import Scene, TrainingView
+from splatnode.recon.scene.scene import Scene, TrainingView, fitted_pixels
 from splatnode.recon.verification import refusals
 
 WORSE = 1.1  # times the misfit that the scene began with; refinements that work end between .2 and .8 of it
@@ -38,7 +37,7 @@ def misfit(scene: Scene) -> float:
     """
     if not all(bool(getattr(scene.gaussians, name).isfinite().all()) for name in PARAMETERS):
         return math.inf
-    valid = border.valid_masks([view.image for view in scene.views])
+    valid = fitted_pixels(scene.views)
     compared = list(zip(scene.views, valid, strict=True))[:: math.ceil(len(scene.views) / _VIEWS)]
     with single_torch_thread():
         return sum(_misfit(scene, *each) for each in compared) / len(compared)

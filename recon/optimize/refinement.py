@@ -13,7 +13,6 @@ import torch
 from msgspec import Meta
 from torch import Tensor
 
-from splatnode.recon.frames import border
 from splatnode.recon.geometry import exp_se3, twist_gradient
 from splatnode.recon.optimize import dropout, regularise
 from splatnode.recon.optimize.adam import Adam, Moments, adam_direction
@@ -26,7 +25,7 @@ from splatnode.recon.optimize.training_image import TrainingImage, training_imag
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.rasterize.render import Render
 from splatnode.recon.scene.gaussians import Gaussians
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene.scene import Scene, fitted_pixels
 
 Share = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(ge=0, le=1)]
@@ -123,7 +122,7 @@ class _Fit:
         self._Ts_world_camera = [view.T_world_camera.clone() for view in scene.views]
         self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
         self._pose_moments = [Moments(torch.zeros(6), torch.zeros(6)) for _ in scene.views]
-        shown = border.valid_masks([view.image for view in scene.views])
+        shown = fitted_pixels(scene.views)
         few = sum(view.width * view.height for view in scene.views) <= _KEPT_PIXELS
         self._images = {
             half: [

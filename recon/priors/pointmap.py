@@ -36,6 +36,13 @@ class Pointmap:
             return self
         return replace(self, depth=self.depth * keep, confidence=self.confidence * keep)
 
+    def hidden(self, mask: npt.NDArray[np.bool_] | None) -> Pointmap:
+        """As `masked` by the mask (h, w) of the photograph, whose pixels confirm and deny nothing either."""
+        if mask is None:
+            return self
+        unchecked = None if self.unchecked is None else self.unchecked * mask
+        return replace(self.masked(mask), unchecked=unchecked)
+
 
 def world_points(
     depth: npt.NDArray[np.float32],  # (h, w) z in the camera frame

@@ -6,7 +6,7 @@ module with learned weights has beside them. The weights need an entry in recon/
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Protocol
 
 from splatnode.recon.matching.match import Matcher
@@ -42,3 +42,9 @@ class Prior(Protocol):
         A prior that can add one view to others does better than this default, which computes all anew.
         """
         return tuple(found for found in self.pointmaps(graph, registration) if found.name not in known)
+
+
+def without_hidden(pointmaps: Iterable[Pointmap], graph: ViewGraph) -> dict[str, Pointmap]:
+    """The point maps by name, where nothing is known of what a mask hides."""
+    masks = {keyframe.name: keyframe.mask for keyframe in graph.keyframes}
+    return {pointmap.name: pointmap.hidden(masks[pointmap.name]) for pointmap in pointmaps}

@@ -48,6 +48,7 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
         "cameras": [camera_record(camera) for camera in snapshot.cameras],
         "frames_used": [camera.name for camera in snapshot.cameras],
         "frames_dropped": [{"name": frame.name, "reason": frame.reason} for frame in snapshot.dropped],
+        "masked": {name: round(share, 4) for name, share in snapshot.masked.items()},
         "seed": seed,
         "preset": preset,
         "versions": versions(),

@@ -74,3 +74,4 @@ class Snapshot:
     evidence: Mapping[str, object] | None = None  # recon.verification.likelihood.record; None: nothing to verify
     scale: Scale = RELATIVE  # the unit of all lengths
     landmarks: Landmarks | None = None  # by which further photographs are placed; None: they were not gathered
+    masked: Mapping[str, float] = field(default_factory=dict)  # share that a mask hides, by photograph that has one

@@ -50,8 +50,13 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     occlusion_tolerance: float = 0.03  # relative depth by which a filled point may lie before a known surface
 
 
-def complete(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Config) -> list[Pointmap]:
-    """The point maps with unknown pixels filled or, where that would contradict another view, empty."""
+def complete(
+    pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Config, masks: Sequence[Mask | None] = ()
+) -> list[Pointmap]:
+    """The point maps with unknown pixels filled or, where that would contradict another view, empty.
+
+    What one of `masks` (h, w) hides has no colour that tells: it is filled only where no other view's points fall.
+    """
     known = [pointmap.masked(pointmap.confidence >= config.min_confidence) for pointmap in pointmaps]
     blurred = [np.asarray(cv2.GaussianBlur(image, (BLUR_PX, BLUR_PX), 0), np.uint8) for image in images]
     partners = reprojection.overlapping(known, config.most_partners)
@@ -64,6 +69,8 @@ def complete(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Con
         # Single pixels of another colour are noise and edges; an object that only this view sees is larger.
         object_size = np.ones((config.min_object_px, config.min_object_px), np.uint8)
         occluder = cv2.morphologyEx((unknown & covered & ~explained).astype(np.uint8), cv2.MORPH_OPEN, object_size) > 0
+        if masks and (mask := masks[j]) is not None:
+            occluder &= mask
         hole = unknown & (~covered | occluder)
         filling = smooth[j]
         if filling is None or not hole.any():

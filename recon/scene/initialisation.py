@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 import msgspec
 import numpy as np
@@ -16,6 +17,7 @@ from splatnode.recon.scene.gaussians import Gaussians, concatenate
 from splatnode.recon.scene.scene import Scene, TrainingView
 
 Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
 
 SHELL_PARTS = 10  # with a limit on the Gaussians, one part in this many may be the far shell
 
@@ -34,31 +36,34 @@ def initial_scene(
     pointmaps: Sequence[Pointmap],
     images: Mapping[str, Image],
     config: Config,
+    masks: Mapping[str, Mask | None] = MappingProxyType({}),
 ) -> Scene:
     """The scene with a training view for each point map, and Gaussians seeded from all of them.
 
     `images` (h, w, 3) are found by the point maps' names. Pixels of a dark rim, which do not show the
-    scene, seed nothing.
+    scene, seed nothing. Nor do those that `masks` (h, w) hide, of which the point maps know nothing; where no view
+    sees behind them, the fill goes on there.
     """
     pictures = [images[pointmap.name] for pointmap in pointmaps]
     valid = border.valid_masks(pictures)
-    pointmaps = tuple(map(Pointmap.masked, pointmaps, valid))
+    known_masks = [masks.get(pointmap.name) for pointmap in pointmaps]
+    pointmaps = tuple(map(Pointmap.hidden, map(Pointmap.masked, pointmaps, valid), known_masks))
     usable = [each.masked(each.confidence >= config.completion.min_usable_confidence) for each in pointmaps]
     surroundings = "fill" if config.pixelwise is None else config.pixelwise.surroundings
     shells = [] if surroundings == "none" else [_shell(usable, pictures, config)]
     limit = None if config.max_gaussians is None else config.max_gaussians - sum(map(len, shells))
     dense = pointmaps
     if surroundings == "fill":
-        dense = list(map(Pointmap.masked, completion.complete(usable, pictures, config.completion), valid))
+        dense = list(map(Pointmap.masked, completion.complete(usable, pictures, config.completion, known_masks), valid))
     del usable
     if config.pixelwise is not None:
         surfaces = pixelwise.pixelwise_gaussians(dense, pictures, config.pixelwise, limit)
-        return Scene(_views(dense, images), concatenate([surfaces, *shells]))
+        return Scene(_views(dense, images, masks), concatenate([surfaces, *shells]))
     surfaces = seeding.initial_gaussians(dense, pictures, config.seeding)
     num_unlimited = len(surfaces) + sum(map(len, shells))
     if limit is not None and len(surfaces) > limit:
         surfaces = seeding.initial_gaussians(dense, pictures, config.seeding, limit)
-    return Scene(_views(pointmaps, images), concatenate([surfaces, *shells]), num_unlimited=num_unlimited)
+    return Scene(_views(pointmaps, images, masks), concatenate([surfaces, *shells]), num_unlimited=num_unlimited)
 
 
 def _shell(pointmaps: Sequence[Pointmap], pictures: Sequence[Image], config: Config) -> Gaussians:
@@ -66,7 +71,9 @@ def _shell(pointmaps: Sequence[Pointmap], pictures: Sequence[Image], config: Con
     return background.far_shell(pointmaps, pictures, config.background, limit)
 
 
-def _views(pointmaps: Sequence[Pointmap], images: Mapping[str, Image]) -> tuple[TrainingView, ...]:
+def _views(
+    pointmaps: Sequence[Pointmap], images: Mapping[str, Image], masks: Mapping[str, Mask | None]
+) -> tuple[TrainingView, ...]:
     return tuple(
         TrainingView(
             name=pointmap.name,
@@ -75,6 +82,7 @@ def _views(pointmaps: Sequence[Pointmap], images: Mapping[str, Image]) -> tuple[
             T_world_camera=torch.tensor(pointmap.T_world_camera, dtype=torch.float32),
             K=torch.tensor(pointmap.K, dtype=torch.float32),
             pointmap=pointmap,
+            mask=masks.get(pointmap.name),
         )
         for pointmap in pointmaps
     )

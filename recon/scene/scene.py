@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from splatnode.capture.stamp import Stamp
+from splatnode.recon.frames import border
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
@@ -28,6 +29,7 @@ class TrainingView:
     T_world_camera: Tensor  # (4, 4)
     K: Tensor  # (3, 3) at modelled size
     pointmap: Pointmap | None = None  # with the camera as registered; None: there is none
+    mask: npt.NDArray[np.bool_] | None = None  # (h, w), True: the scene is fitted to it; None: to all pixels
 
     @property
     def width(self) -> int:
@@ -36,6 +38,12 @@ class TrainingView:
     @property
     def height(self) -> int:
         return self.image.shape[0]
+
+
+def fitted_pixels(views: Sequence[TrainingView]) -> list[npt.NDArray[np.bool_]]:
+    """Of each view (h, w) the pixels that the scene is fitted to: neither in a dark rim nor hidden by a mask."""
+    shown = border.valid_masks([view.image for view in views])
+    return [rim if view.mask is None else rim & view.mask for view, rim in zip(views, shown, strict=True)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ texture nor exposure nor the size of the search decides.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import msgspec
@@ -57,6 +57,10 @@ class Picture:
     T_world_camera: Array  # (4, 4)
     pixels: Array  # (M, 2) middles of the patches
     planes: Array  # (M, 3) inverse depth there, and its change by a pixel right and down
+
+    def hidden(self, mask: npt.NDArray[np.bool_]) -> Picture:
+        """With nothing known where `mask` (h, w) is False: what is looked for there, or from there, is not tried."""
+        return replace(self, grey=np.where(mask, self.grey, np.float32(np.nan)))
 
 
 def picture(grey: Grey, K: Array, T_world_camera: Array, points: Array, depths: Array, config: Config) -> Picture:

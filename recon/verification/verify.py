@@ -224,7 +224,7 @@ def _picture(
     mine = registration.observed_by == camera.index
     to_camera = np.linalg.inv(camera.T_world_camera)
     points = registration.points[registration.observed_point[mine]]
-    return epipolar_consistency.picture(
+    found = epipolar_consistency.picture(
         cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY).astype(np.float32),
         np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
         camera.T_world_camera,
@@ -232,3 +232,4 @@ def _picture(
         points @ to_camera[2, :3] + to_camera[2, 3],
         config,
     )
+    return found if (mask := keyframe.mask) is None else found.hidden(mask)

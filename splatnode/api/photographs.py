@@ -15,16 +15,12 @@ from splatnode.capture.cameras.folder import same_aspect
 from splatnode.capture.exif import exif_intrinsics, read_tags
 from splatnode.capture.exif_time import exif_time
 from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.orientation import ORIENTATION, upright
 from splatnode.capture.process.progress import Tell
 from splatnode.capture.stamp import Stamp
 from splatnode.recon.replay_source import Request, Source, asked_for, at_hand, source
 
 STEP_NS = 100_000_000  # between two photographs that have no time, as in a folder
-ORIENTATION = 0x0112  # of EXIF
-# By what EXIF says, quarters of a turn to the left, and whether it is mirrored then.
-_TURNS = {
-    1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (3, True), 6: (3, False), 7: (1, True), 8: (1, False),
-}  # fmt: skip
 _EXIF = b"Exif\0\0"  # before the TIFF structure
 
 # Of the pictures, NumPy arrays (H, W, 3) uint8 RGB, or PIL images; other shapes are told at `pixels`.
@@ -35,15 +31,20 @@ Lens: TypeAlias = "Intrinsics | npt.NDArray[np.floating]"
 
 def photographs(images: Images, views: int | None, every_frame: bool, tell: Tell) -> Source:
     """The frames of a folder, of files, of a video, or of pictures. Raises TypeError, ValueError, FileNotFoundError."""
-    given = _as_list(images)
+    given = as_list(images)
     paths = [isinstance(each, (str, PathLike)) for each in given]
     if all(paths):
         path, listed = asked_for([Path(each) for each in given])
         return source(Request(path, listed, views, every_frame=every_frame), tell)
     if any(paths):
         raise TypeError("images must be all paths or all pictures, got both. Read the files, or write the pictures")
-    frames = [frame(each, index, f"{index:04d}.png", index * STEP_NS) for index, each in enumerate(given)]
+    frames = [frame(each, index, picture_name(index), index * STEP_NS) for index, each in enumerate(given)]
     return at_hand(frames, views, every_frame, tell)
+
+
+def picture_name(index: int) -> str:
+    """The name of the picture in this place of a list."""
+    return f"{index:04d}.png"
 
 
 def frame(picture: Picture, frame_id: int, name: str, stamp_ns: int, captured_at: Stamp | None = None) -> Frame:
@@ -122,7 +123,8 @@ def lenses(frames: Iterable[Any]) -> dict[str, Intrinsics]:
     return {name: lens for name, lens in known.items() if lens.source in ("given", "calibration")}
 
 
-def _as_list(images: Any) -> list[Any]:
+def as_list(images: Any) -> list[Any]:
+    """What `images` names, one or several. Raises TypeError, ValueError."""
     one = isinstance(images, (str, PathLike)) or _is_pil(images)
     if one or (isinstance(images, np.ndarray) and images.ndim < 4):
         return [images]
@@ -141,14 +143,7 @@ def _is_pil(picture: Any) -> bool:
 
 def _of_pil(picture: Any) -> npt.NDArray:
     deep = picture.mode.startswith("I;16")
-    return _upright(np.asarray(picture if deep else picture.convert("RGB")), picture.getexif().get(ORIENTATION, 1))
-
-
-def _upright(image: npt.NDArray, orientation: int) -> npt.NDArray:
-    """The image turned as EXIF says; `orientation` is 1 to 8."""
-    quarters, mirrored = _TURNS.get(orientation, _TURNS[1])
-    turned = np.rot90(image, quarters)
-    return turned[:, ::-1] if mirrored else turned
+    return upright(np.asarray(picture if deep else picture.convert("RGB")), picture.getexif().get(ORIENTATION, 1))
 
 
 def _tiff(picture: Any) -> bytes:

@@ -7,6 +7,7 @@ from os import PathLike, fspath
 from pathlib import Path
 from typing import Any
 
+from splatnode.api.masks import Masks, finder
 from splatnode.api.photographs import Images, Lens, lenses, photographs, with_lens
 from splatnode.api.result import Result, result_of
 from splatnode.capture.cameras.folder import frame_name
@@ -15,6 +16,7 @@ from splatnode.capture.process.progress import Tell, told_to_nobody
 from splatnode.recon.config import Config, overlaid
 from splatnode.recon.config import preset as named
 from splatnode.recon.offline import check_baseline, reconstructed
+from splatnode.recon.replay_source import with_masks
 
 Baseline = tuple[str | int, str | int, float]
 Changes = Mapping[str, Any] | str | PathLike[str]
@@ -24,6 +26,7 @@ def reconstruct(
     images: Images,
     *,
     intrinsics: Lens | None = None,
+    masks: Masks | None = None,
     scale: Baseline | None = None,
     budget_s: float | None = None,
     preset: str = "balanced",
@@ -44,6 +47,9 @@ def reconstruct(
       and of more than 30 photographs, keyframes are chosen.
     - `intrinsics`: the lens of all photographs of its aspect ratio: `Intrinsics`, or K (3, 3) in pixels of the
       photographs without distortion. None: what EXIF tells, else it is estimated.
+    - `masks`: what of the photographs is used: white (any value above 0) is used, black is ignored. A folder of masks
+      with the photographs' names, one file for all, or a list, for each photograph an array (H, W), a path, or None
+      for one that is used whole. None: all is used.
     - `scale`: two photographs and the metres between their cameras: `("a.jpg", "b.jpg", 0.5)`, of pictures their
       places in the list: `(0, 3, 0.5)`. None: lengths have no unit.
     - `budget_s`: the best scene within so many seconds. None: as long as it takes.
@@ -61,7 +67,9 @@ def reconstruct(
     telling = tell or told_to_nobody
     check_count("views", views)
     check_count("threads", threads)
-    source = with_lens(photographs(images, views, every_frame, telling), intrinsics)
+    source = photographs(images, views, every_frame, telling)
+    source = source if masks is None else with_masks(source, finder(masks, images), telling)
+    source = with_lens(source, intrinsics)
     flags = {"budget_s": budget_s, "seed": seed}
     chosen = configured(preset, config, flags, scale, of_pictures=source.photographs is None)
     check_baseline(chosen, [frame.name for frame in source.frames])

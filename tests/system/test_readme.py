@@ -693,3 +693,17 @@ def test_needles():
         values = (covered.get((scene, label)) for label in ("main", "only-seen"))
         rows.append(f"| {scene} | " + " | ".join("–" if value is None else part(value, 2) for value in values) + " |")
     says(*rows, on="docs/clean_scenes.md")
+
+
+def test_things_that_move():
+    found = {(row["scene"], row["share"], row["masks"]): row for row in raw("movers")["results"]}
+
+    def told(*case) -> str:
+        psnr = found[case]["psnr"]
+        return found[case]["verdict"] if psnr is None else f"{psnr:.1f}"
+
+    cases = [(scene, share) for scene, share, masks in found if masks]
+    assert len(cases) == 9
+    for scene, share in cases:
+        with_masks, without = (told(scene, share, masks) for masks in (True, False))
+        says(f"| {scene} | {share:.0%} | {told(scene, 0.0, False)} | {with_masks} | {without} |")

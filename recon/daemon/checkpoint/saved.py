@@ -93,6 +93,7 @@ def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe])
             image=keyframes[name].image,
             T_world_camera=T_world_camera,
             K=K,
+            mask=keyframes[name].mask,
         )
         for name, T_world_camera, K in zip(header.views, Ts_world_camera, Ks, strict=True)
     )

@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.messaging.mask_bits import arrays_of, mask_in
 from splatnode.capture.messaging.message_file import read_message, write_message
 from splatnode.capture.messaging.wire import WireError, decode, encode
 from splatnode.capture.stamp import Stamp
@@ -18,7 +19,7 @@ FILE = re.compile(r"[0-9]{12,18}\.frame")
 
 
 class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A stored keyframe; its image is the only array."""
+    """A stored keyframe; its arrays are its image and, where it has one, its mask."""
 
     version: int
     session: str
@@ -43,15 +44,16 @@ def file_name(number: int) -> str:
 def write_frame(path: Path, key: tuple[str, int], frame: Frame) -> None:
     """Whole or not at all; `key` is its session and sequence. Raises OSError."""
     header = FrameRecord(VERSION, *key, frame.name, frame.stamp_ns, frame.intrinsics, frame.captured_at)
-    write_message(path, encode(header, [frame.image]))
+    write_message(path, encode(header, arrays_of(frame)))
 
 
 def read_frame(path: Path) -> StoredFrame:
     """The keyframe in a file that is named by its number. Raises OSError and ValueError."""
     number, message = int(path.stem), decode(read_message(path), FrameRecord, LIMITS)
     header = message.header
-    if not is_readable(header.version) or len(message.arrays) != 1:
-        raise WireError(f"frame {number} is of version {header.version} with {len(message.arrays)} images")
+    if not is_readable(header.version):
+        raise WireError(f"frame {number} is of version {header.version}")
+    mask = mask_in(message.arrays)
     known = header.stamp_ns, message.arrays[0], header.intrinsics
-    frame = Frame(number, header.name, *known, captured_at=header.captured_at)
+    frame = Frame(number, header.name, *known, captured_at=header.captured_at, mask=mask)
     return StoredFrame(number, (header.session, header.sequence), frame)

@@ -31,7 +31,7 @@ def test_parts_come_back(tmp_path_factory, parts):
     assert [bytes(each) for each in read_message(path)] == parts
 
 
-@pytest.mark.parametrize("version", [1, 2])
+@pytest.mark.parametrize("version", [1, 2, 3])
 def test_a_file_of_an_earlier_version_is_a_message_of_today(tmp_path, version):
     write_message(tmp_path / "one", [MAGIC[:-1] + bytes([version]), b"head"])
     assert [bytes(each) for each in read_message(tmp_path / "one")] == [MAGIC, b"head"]

@@ -11,7 +11,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
+from splatnode.recon.evaluate.metrics import psnr
 from splatnode.recon.evaluate.protocol import Run, evaluate, mean_intrinsics
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import load_scene
@@ -167,6 +169,29 @@ def test_what_photographs_do_not_show_is_not_scored(scene_folder, tmp_path, monk
     row = score(perfect_snapshot(), spoilt / scene_folder.name)
     assert row.psnr is not None and row.psnr > 50
     assert row.psnr_with_rim is not None and row.psnr_with_rim < 20
+
+
+def test_what_masks_hide_is_neither_given_nor_scored(scene_folder, tmp_path):
+    folder = tmp_path / "masked"
+    shutil.copytree(scene_folder, folder)
+    (folder / "masks").mkdir()
+    for path in (folder / "images").iterdir():
+        image = cv2.imread(str(path))
+        mask = np.full(image.shape[:2], 255, np.uint8)
+        mask[: len(mask) // 4] = 0
+        image[: len(mask) // 4] = (255, 0, 255)
+        cv2.imwrite(str(path), image)
+        cv2.imwrite(str(folder / "masks" / f"{path.stem}.png"), mask)
+    frames = load_scene(folder).frames(SPLIT.train)
+    assert all(each.mask is not None and not each.mask[: each.height // 4].any() for each in frames)
+    name = SPLIT.test[0]
+    image, mask = load_scene(folder).masked_image(name)
+    assert np.array_equal(image[mask], load_scene(scene_folder).image(name)[mask])
+    assert not (image == (255, 0, 255)).all(2).any()
+    used = torch.from_numpy(mask)
+    truth = torch.from_numpy(load_scene(scene_folder).image(name)).float() / 255
+    spoilt = torch.where(used[..., None], truth, 1 - truth)
+    assert psnr(spoilt, truth, used) == 100.0 and psnr(spoilt, truth) < 20.0
 
 
 def test_refused_scene_is_not_scored_but_its_cameras_are(scene_folder):

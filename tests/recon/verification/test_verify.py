@@ -156,3 +156,17 @@ def test_the_share_of_points_on_a_plane():
     relief = wall + (0.0, 0.0, 1.0) * rng.choice([0.0, 0.2], (300, 1), p=[0.7, 0.3])
     assert flatness.share_on_plane(relief) == pytest.approx(0.7, abs=0.06)
     assert flatness.share_on_plane(wall[:2]) == 0.0
+
+
+def test_what_masks_hide_is_neither_looked_for_nor_looked_at():
+    graph, found = placed()
+    asked = [camera.index for camera in found.cameras]
+    seen = verify.pictures(graph, found, CONFIG.epipolar_consistency, asked)
+    height, width = seen[0].grey.shape
+    mask = np.ones((height, width), bool)
+    mask[:, : width // 2] = False
+    whole = epipolar_consistency.score(seen[0], seen[1], CONFIG.epipolar_consistency)
+    from_half = epipolar_consistency.score(seen[0].hidden(mask), seen[1], CONFIG.epipolar_consistency)
+    in_half = epipolar_consistency.score(seen[0], seen[1].hidden(mask), CONFIG.epipolar_consistency)
+    assert 10 < from_half.tried < whole.tried and 10 < in_half.tried < whole.tried
+    assert min(from_half.share, in_half.share) > whole.share - 0.15

@@ -62,6 +62,15 @@ def test_a_frame_survives_the_process_with_all_that_it_had(open_store):
     assert np.array_equal(stored.frame.image, image(5))
 
 
+def test_a_mask_is_kept(open_store):
+    store = open_store()
+    mask = np.random.default_rng(0).random(image(1).shape[:2]) < 0.5
+    received = ReceivedFrame(SESSION, 1, Frame(1, "1.png", 10, image(1), LENS, mask=mask))
+    assert store.put(received) is not None
+    (stored,) = open_store().frames()
+    assert np.array_equal(stored.frame.mask, mask)
+
+
 def test_a_checkpoint_of_the_version_before_is_gone_on_with_and_becomes_one_of_this(open_store):
     store = open_store()
     header = {"version": 1, "session": SESSION, "sequence": 4, "name": "a.png", "stamp_ns": 40, "intrinsics": LENS}
