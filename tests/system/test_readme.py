@@ -14,6 +14,7 @@ from statistics import mean, median
 import pytest
 
 from tests.conftest import ROOT
+from tests.system import race_page
 
 RESULTS = ROOT / "tests" / "bench" / "results"
 MEASUREMENT, README = "docs/measurement.md", "README.md"
@@ -693,6 +694,13 @@ def test_needles():
         values = (covered.get((scene, label)) for label in ("main", "only-seen"))
         rows.append(f"| {scene} | " + " | ".join("–" if value is None else part(value, 2) for value in values) + " |")
     says(*rows, on="docs/clean_scenes.md")
+
+
+def test_the_race():
+    lines = race_page.lines()
+    assert len(lines) >= 14
+    says(*lines, race_page.summary())
+    says(race_page.headline(), on="README.md")
 
 
 def test_things_that_move():

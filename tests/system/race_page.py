@@ -1,0 +1,83 @@
+"""What docs/measurement.md says of the race, from its raw numbers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from splatnode.recon.evaluate.contest import OURS, SHOWN, WHOLE, Margin, margins
+from splatnode.recon.evaluate.protocol import Row
+from splatnode.recon.evaluate.records import read_bench
+
+RAW = Path(__file__).parents[1] / "bench" / "results" / "race.json"
+DIGITS = (1, 3, 3)
+
+
+def ends() -> list[Row]:
+    return [row for row in read_bench(RAW).rows if row.final]
+
+
+def lines() -> list[str]:
+    """A line of the table for each case; those that were refused are told with their verdict."""
+    by_measure = [{(each.scene, each.views): each for each in margins(ends(), measure)} for measure in WHOLE]
+    found = []
+    for row in (row for row in ends() if row.method == OURS):
+        case = row.scene, row.views
+        if row.psnr is None:
+            found.append(f"| {row.scene}, {row.views} | refused: {row.verdict} | – | – | – | – | – |")
+            continue
+        cells = [_cells(by_case[case], digits) for by_case, digits in zip(by_measure, DIGITS, strict=True)]
+        found.append(f"| {row.scene}, {row.views} | {' | '.join(cells)} |")
+    return found
+
+
+def summary() -> str:
+    """What is lost, then what is won."""
+    whole, shown = ([margins(ends(), measure) for measure in measures] for measures in (WHOLE, SHOWN))
+    lost = [_lost(each, digits) for each, digits in zip(whole, DIGITS, strict=True)]
+    means = [f"{_mean(each):+.{digits}f}" for each, digits in zip(whole, (2, 3, 3), strict=True)]
+    seen = [f"{_mean(each):+.{digits}f}" for each, digits in zip(shown, (2, 3, 3), strict=True)]
+    sizes = _mean_ratio("instantsplat-xl+fill")
+    text = (
+        f"Of {len(whole[0])} cases that were published, `{OURS}` is behind the best other in PSNR in {lost[0]}, "
+        f"in SSIM in {lost[1]}, in LPIPS in {lost[2]}. Its mean lead is {means[0]} dB, {means[1]} in SSIM and {means[2]} "
+        "in LPIPS (positive is better); on the pixels that a training photograph shows "
+        f"{seen[0]} dB, {seen[1]} and {seen[2]}. InstantSplat-XL has {sizes:.0f} times as many Gaussians."
+    )
+    return text.replace("-0.", "−.").replace("+0.", "+.")
+
+
+def headline() -> str:
+    """The line of the README's table."""
+    found = margins(ends(), WHOLE[0])
+    ahead = sum(each.lead >= 0 for each in found)
+    lead = f"{_mean(found):+.2f}".replace("-0.", "−.").replace("+0.", "+.")
+    share = f"a {_mean_ratio('instantsplat-xl+fill'):.0f}th of InstantSplat-XL's Gaussians"
+    return (
+        f"| held-out PSNR on {len(found)} sets that nothing was tuned on, "
+        "against the best of four other recipes\\* in each "
+        f"| better in {ahead}; {lead} dB in the mean, with {share} | better in {len(found) - ahead} |"
+    )
+
+
+def _lost(found: Sequence[Margin], digits: int) -> str:
+    behind = [each for each in found if each.lead < 0]
+    most = f" (by {abs(min(each.lead for each in behind)):.{digits}f} at most)" if behind else ""
+    return f"{len(behind)}{most}".replace("0.", ".")
+
+
+def _cells(margin: Margin, digits: int) -> str:
+    ours, best = (re.sub(r"^0\.", ".", f"{value:.{digits}f}") for value in (margin.ours, margin.best))
+    return f"{f'**{ours}**' if margin.lead >= 0 else ours} | {best} {margin.by}"
+
+
+def _mean(found: Sequence[Margin]) -> float:
+    return sum(each.lead for each in found) / len(found)
+
+
+def _mean_ratio(method: str) -> float:
+    """How many times as many Gaussians a method has, in the mean over the cases."""
+    sizes = {(row.scene, row.views, row.method): row.num_gaussians or 0 for row in ends() if row.psnr is not None}
+    ratios = [size / sizes[case[0], case[1], OURS] for (*case, name), size in sizes.items() if name == method]
+    return sum(ratios) / len(ratios)
