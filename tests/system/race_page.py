@@ -41,8 +41,8 @@ def summary() -> str:
     sizes = _mean_ratio("instantsplat-xl+fill")
     text = (
         f"Of {len(whole[0])} cases that were published, `{OURS}` is behind the best other in PSNR in {lost[0]}, "
-        f"in SSIM in {lost[1]}, in LPIPS in {lost[2]}. Its mean lead is {means[0]} dB, {means[1]} in SSIM and {means[2]} "
-        "in LPIPS (positive is better); on the pixels that a training photograph shows "
+        f"in SSIM in {lost[1]}, in LPIPS in {lost[2]}. Its mean lead is {means[0]} dB, {means[1]} in SSIM and "
+        f"{means[2]} in LPIPS (positive is better); on the pixels that a training photograph shows "
         f"{seen[0]} dB, {seen[1]} and {seen[2]}. InstantSplat-XL has {sizes:.0f} times as many Gaussians."
     )
     return text.replace("-0.", "−.").replace("+0.", "+.")
