@@ -169,8 +169,9 @@ def test_the_verb_decides_the_exit_code(monkeypatch, code):
 @pytest.mark.parametrize("number, code", [(signal.SIGTERM, 0), (signal.SIGINT, 130)])
 def test_signals_end_a_verb_cleanly(number, code):
     program = (
-        "import sys, time\nfrom splatnode import command_line\n"
+        "import signal, sys, time\nfrom splatnode import command_line\n"
         "from splatnode.capture.process.verb import Verb\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's background jobs inherit it ignored
         "def wait(args):\n"
         "    try:\n"
         "        print('ready', flush=True)\n"
