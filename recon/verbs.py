@@ -14,15 +14,14 @@ from splatnode.capture.process.arguments import (
     add_json,
     angle,
     box,
-    counts,
     megabytes,
-    names,
     natural,
-    percent,
     positive,
-    seconds,
 )
 from splatnode.capture.process.verb import Verb, lazily
+from splatnode.recon.evaluate.verbs import BENCH, STABILITY
+from splatnode.recon.replay_verb import REPLAY
+from splatnode.recon.shared_arguments import add_device, add_only_seen
 
 _FORMATS_FOLDER = Path(__file__).parent / "result" / "export" / "formats"
 EXPORT_FORMATS = tuple(
@@ -33,93 +32,8 @@ EXPORT_FORMATS = tuple(
 def _demo_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="default: out/demo")
     parser.add_argument("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)")
-    _add_device(parser)
+    add_device(parser)
     add_json(parser)
-
-
-def _add_device(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--device",
-        choices=("cpu", "cuda", "auto"),
-        help="that Gaussians are refined on (default: cpu; auto: a GPU where one can be used)",
-    )
-
-
-def _replay_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "source",
-        type=Path,
-        nargs="+",
-        metavar="SOURCE",
-        help="a folder with photographs of one place, in any order, or some photographs of a folder, or a video, or "
-        "what `splatnode record` wrote; of a video, and of more than 30 photographs, keyframes are chosen as a live "
-        "camera's are",
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with what differs from the defaults")
-    parser.add_argument("--preset", metavar="P", help="a named set of parameters (default: balanced)")
-    parser.add_argument("--prior", metavar="K", help="what gives poses and first points (default: classical)")
-    _add_device(parser)
-    parser.add_argument("--size", type=positive, metavar="PIXELS", help="longer side as modelled (default: 512)")
-    parser.add_argument(
-        "--budget-s",
-        type=seconds,
-        metavar="S",
-        help="the best scene within this many seconds from the first photograph on; starting the program, reading "
-        "photographs and writing files come on top, and cameras and first points take what they take",
-    )
-    parser.add_argument(
-        "--quick", action="store_true", help="refuse at once: try nothing that takes longer before the answer is no"
-    )
-    parser.add_argument(
-        "--require",
-        type=percent,
-        metavar="PERCENT",
-        help="refuse what is rougher: positions must be known to so much of the distance to the scene (95 %% bound)",
-    )
-    parser.add_argument("--max-gaussians", type=positive, metavar="N", help="and with at most so many Gaussians")
-    parser.add_argument("--max-mb", type=megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes")
-    parser.add_argument(
-        "--baseline", nargs=3, metavar=("A", "B", "METRES"), help="how far apart photographs A and B were taken"
-    )
-    parser.add_argument("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)")
-    add_only_seen(parser)
-    _add_masks(parser)
-    parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
-    chosen = parser.add_mutually_exclusive_group()
-    chosen.add_argument(
-        "--views", type=positive, metavar="N", help="use N photographs (of a video: keyframes), evenly spread"
-    )
-    chosen.add_argument("--frames", type=names, metavar="A,B,C", help="use these photographs, by name")
-    chosen.add_argument(
-        "--every-frame",
-        action="store_true",
-        help="use all photographs, or frames of a video, that are sharp and no copies",
-    )
-    parser.add_argument(
-        "--map",
-        action="store_true",
-        help="of a long recording: use all keyframes, however many; they become linked scenes, and one merged map",
-    )
-    add_json(parser)
-
-
-def _add_masks(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--masks",
-        type=Path,
-        metavar="FOLDER",
-        help="masks, of the names of their photographs: white (any value above 0) is used, black is ignored; or one "
-        "file, for all photographs",
-    )
-
-
-def add_only_seen(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--only-seen",
-        action="store_true",
-        help="leave out what no two photographs confirm, and the far background: holes in place of guesses",
-    )
 
 
 def _recon_arguments(parser: argparse.ArgumentParser) -> None:
@@ -166,71 +80,6 @@ def _merge_arguments(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
 
 
-def _bench_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scenes", type=Path, nargs="*", metavar="SCENE", help="folders with images and true cameras")
-    parser.add_argument(
-        "--views", type=counts, default=(3, 6, 12), metavar="N,N,N", help="training views (default: 3,6,12)"
-    )
-    parser.add_argument(
-        "--methods",
-        type=names,
-        default=("balanced",),
-        metavar="A,B,C",
-        help="by name, or the sets presets, rivals, ablation (default: balanced)",
-    )
-    parser.add_argument("--checkpoints", type=counts, default=(), metavar="N,N", help="iterations scored on the way")
-    parser.add_argument(
-        "--interpolated-start",
-        action="store_true",
-        help="seek a held-out view's pose from between its neighbours, not from the true one: 300 steps, three sizes",
-    )
-    parser.add_argument(
-        "--by-region", action="store_true", help="score also what two training photographs show, one, or none"
-    )
-    parser.add_argument("--seeds", type=positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")
-    _add_device(parser)
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--resume", action="store_true", help="go on: runs that --out holds are not run again")
-    parser.add_argument(
-        "--redraw", type=Path, nargs="+", metavar="BENCH.json", help="measure nothing: tables and charts of these"
-    )
-    parser.add_argument("--weights-dir", type=Path, metavar="DIR", help="LPIPS networks (default: $SPLATNODE_WEIGHTS)")
-
-
-def _stability_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "scenes", type=Path, nargs="*", metavar="SCENE", help="folders with images and true cameras (default: built in)"
-    )
-    parser.add_argument("--rows", type=counts, default=(), metavar="N,N", help="rows of the matrix (default: all)")
-    parser.add_argument("--seeds", type=positive, default=4, metavar="N", help="trials of each row (default: 4)")
-    parser.add_argument(
-        "--methods",
-        type=names,
-        metavar="A,B,C",
-        help="splatnode, colmap, glomap (default: splatnode; with --windows all that are installed)",
-    )
-    parser.add_argument(
-        "--counts", type=counts, default=(3, 6, 12), metavar="N,N,N", help="photographs of a window (default: 3,6,12)"
-    )
-    parser.add_argument(
-        "--given-lens", action="store_true", help="windows of a calibrated camera: splatnode is told the true lens"
-    )
-    parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="trials at a time (default: 1)")
-    parser.add_argument("--timeout-s", type=seconds, default=120.0, metavar="S", help="of one trial (default: 120)")
-    parser.add_argument(
-        "--windows", action="store_true", help="instead of the matrix: windows of 3, 6 and 12 consecutive photographs"
-    )
-    parser.add_argument(
-        "--per-kind", type=positive, default=2, metavar="N", help="windows of a scene, count and stride (default: 2)"
-    )
-    parser.add_argument(
-        "--fresh",
-        action="store_true",
-        help="time each window from its photographs on, too, with nothing kept of others",
-    )
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="trials that it holds are not run again")
-
-
 def _weights_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=("list", "fetch", "verify"))
     parser.add_argument("names", nargs="*", metavar="NAME", help="which (list and verify: all, if none is named)")
@@ -242,12 +91,7 @@ def _weights_arguments(parser: argparse.ArgumentParser) -> None:
 
 VERBS = (
     Verb("demo", "reconstruct the built-in capture", _demo_arguments, lazily("splatnode.recon.cli", "demo")),
-    Verb(
-        "replay",
-        "reconstruct a folder of photographs, or a video",
-        _replay_arguments,
-        lazily("splatnode.recon.cli", "replay"),
-    ),
+    REPLAY,
     Verb(
         "export",
         "write a scene in another format",
@@ -270,15 +114,8 @@ VERBS = (
         "recon", "reconstruct what comes, for ever", _recon_arguments, lazily("splatnode.recon.daemon.daemon", "recon")
     ),
     Verb("retract", "take a keyframe back", _retract_arguments, lazily("splatnode.recon.daemon.control", "retract")),
-    Verb(
-        "bench", "measure held-out quality, poses and seconds", _bench_arguments, lazily("splatnode.recon.cli", "bench")
-    ),
-    Verb(
-        "stability",
-        "measure how often the answer is wrong",
-        _stability_arguments,
-        lazily("splatnode.recon.evaluate.stability.command", "stability"),
-    ),
+    BENCH,
+    STABILITY,
     Verb(
         "weights",
         "get and check the weights of optional networks",

@@ -1,0 +1,87 @@
+"""The verbs of the command line that measure: their arguments, and what runs them."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from splatnode.capture.process.arguments import counts, names, positive, seconds
+from splatnode.capture.process.verb import Verb, lazily
+from splatnode.recon.shared_arguments import add_device
+
+
+def _bench_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scenes", type=Path, nargs="*", metavar="SCENE", help="folders with images and true cameras")
+    parser.add_argument(
+        "--views", type=counts, default=(3, 6, 12), metavar="N,N,N", help="training views (default: 3,6,12)"
+    )
+    parser.add_argument(
+        "--methods",
+        type=names,
+        default=("balanced",),
+        metavar="A,B,C",
+        help="by name, or the sets presets, rivals, ablation (default: balanced)",
+    )
+    parser.add_argument("--checkpoints", type=counts, default=(), metavar="N,N", help="iterations scored on the way")
+    parser.add_argument(
+        "--interpolated-start",
+        action="store_true",
+        help="seek a held-out view's pose from between its neighbours, not from the true one: 300 steps, three sizes",
+    )
+    parser.add_argument(
+        "--by-region", action="store_true", help="score also what two training photographs show, one, or none"
+    )
+    parser.add_argument("--seeds", type=positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")
+    add_device(parser)
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser.add_argument("--resume", action="store_true", help="go on: runs that --out holds are not run again")
+    parser.add_argument(
+        "--redraw", type=Path, nargs="+", metavar="BENCH.json", help="measure nothing: tables and charts of these"
+    )
+    parser.add_argument("--weights-dir", type=Path, metavar="DIR", help="LPIPS networks (default: $SPLATNODE_WEIGHTS)")
+
+
+def _stability_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "scenes", type=Path, nargs="*", metavar="SCENE", help="folders with images and true cameras (default: built in)"
+    )
+    parser.add_argument("--rows", type=counts, default=(), metavar="N,N", help="rows of the matrix (default: all)")
+    parser.add_argument("--seeds", type=positive, default=4, metavar="N", help="trials of each row (default: 4)")
+    parser.add_argument(
+        "--methods",
+        type=names,
+        metavar="A,B,C",
+        help="splatnode, colmap, glomap (default: splatnode; with --windows all that are installed)",
+    )
+    parser.add_argument(
+        "--counts", type=counts, default=(3, 6, 12), metavar="N,N,N", help="photographs of a window (default: 3,6,12)"
+    )
+    parser.add_argument(
+        "--given-lens", action="store_true", help="windows of a calibrated camera: splatnode is told the true lens"
+    )
+    parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="trials at a time (default: 1)")
+    parser.add_argument("--timeout-s", type=seconds, default=120.0, metavar="S", help="of one trial (default: 120)")
+    parser.add_argument(
+        "--windows", action="store_true", help="instead of the matrix: windows of 3, 6 and 12 consecutive photographs"
+    )
+    parser.add_argument(
+        "--per-kind", type=positive, default=2, metavar="N", help="windows of a scene, count and stride (default: 2)"
+    )
+    parser.add_argument(
+        "--fresh",
+        action="store_true",
+        help="time each window from its photographs on, too, with nothing kept of others",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="trials that it holds are not run again")
+
+
+BENCH = Verb(
+    "bench", "measure held-out quality, poses and seconds", _bench_arguments, lazily("splatnode.recon.cli", "bench")
+)
+
+STABILITY = Verb(
+    "stability",
+    "measure how often the answer is wrong",
+    _stability_arguments,
+    lazily("splatnode.recon.evaluate.stability.command", "stability"),
+)

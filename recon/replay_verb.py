@@ -1,0 +1,90 @@
+"""`splatnode replay` on the command line: its arguments, and what runs it.
+
+A flag that is not given is None, so that the configuration file, then the preset, decides.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from splatnode.capture.process.arguments import add_json, megabytes, names, natural, percent, positive, seconds
+from splatnode.capture.process.verb import Verb, lazily
+from splatnode.recon.shared_arguments import add_device, add_only_seen
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "source",
+        type=Path,
+        nargs="+",
+        metavar="SOURCE",
+        help="a folder with photographs of one place, in any order, or some photographs of a folder, or a video, or "
+        "what `splatnode record` wrote; of a video, and of more than 30 photographs, keyframes are chosen as a live "
+        "camera's are",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with what differs from the defaults")
+    parser.add_argument("--preset", metavar="P", help="a named set of parameters (default: balanced)")
+    parser.add_argument("--prior", metavar="K", help="what gives poses and first points (default: classical)")
+    add_device(parser)
+    parser.add_argument("--size", type=positive, metavar="PIXELS", help="longer side as modelled (default: 512)")
+    parser.add_argument(
+        "--budget-s",
+        type=seconds,
+        metavar="S",
+        help="the best scene within this many seconds from the first photograph on; starting the program, reading "
+        "photographs and writing files come on top, and cameras and first points take what they take",
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="refuse at once: try nothing that takes longer before the answer is no"
+    )
+    parser.add_argument(
+        "--require",
+        type=percent,
+        metavar="PERCENT",
+        help="refuse what is rougher: positions must be known to so much of the distance to the scene (95 %% bound)",
+    )
+    parser.add_argument("--max-gaussians", type=positive, metavar="N", help="and with at most so many Gaussians")
+    parser.add_argument("--max-mb", type=megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes")
+    parser.add_argument(
+        "--baseline", nargs=3, metavar=("A", "B", "METRES"), help="how far apart photographs A and B were taken"
+    )
+    parser.add_argument("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)")
+    add_only_seen(parser)
+    _add_masks(parser)
+    parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
+    chosen = parser.add_mutually_exclusive_group()
+    chosen.add_argument(
+        "--views", type=positive, metavar="N", help="use N photographs (of a video: keyframes), evenly spread"
+    )
+    chosen.add_argument("--frames", type=names, metavar="A,B,C", help="use these photographs, by name")
+    chosen.add_argument(
+        "--every-frame",
+        action="store_true",
+        help="use all photographs, or frames of a video, that are sharp and no copies",
+    )
+    parser.add_argument(
+        "--map",
+        action="store_true",
+        help="of a long recording: use all keyframes, however many; they become linked scenes, and one merged map",
+    )
+    add_json(parser)
+
+
+def _add_masks(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--masks",
+        type=Path,
+        metavar="FOLDER",
+        help="masks, of the names of their photographs: white (any value above 0) is used, black is ignored; or one "
+        "file, for all photographs",
+    )
+
+
+REPLAY = Verb(
+    "replay",
+    "reconstruct a folder of photographs, or a video",
+    _arguments,
+    lazily("splatnode.recon.cli", "replay"),
+)
