@@ -28,6 +28,7 @@ OPTIONAL = {  # Import name, which is the distribution's too -> what it is for.
     "matplotlib": "charts of splatnode bench",
     "pycolmap": "true cameras in COLMAP's format, and COLMAP as a rival",
     "open3d": "the viewer",
+    "pyarrow": "the table of splatnode batch as Parquet",
     "depthai": "Luxonis cameras",
     "pi_heif": "photographs in HEIC and AVIF",
     "gsplat": "the rasteriser for NVIDIA processors",

@@ -24,52 +24,70 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "camera's are",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
-    parser.add_argument("--config", type=Path, metavar="FILE", help="YAML with what differs from the defaults")
-    parser.add_argument("--preset", metavar="P", help="a named set of parameters (default: balanced)")
-    parser.add_argument("--prior", metavar="K", help="what gives poses and first points (default: classical)")
-    add_device(parser)
-    parser.add_argument("--size", type=positive, metavar="PIXELS", help="longer side as modelled (default: 512)")
-    parser.add_argument(
-        "--budget-s",
-        type=seconds,
-        metavar="S",
-        help="the best scene within this many seconds from the first photograph on; starting the program, reading "
-        "photographs and writing files come on top, and cameras and first points take what they take",
-    )
-    parser.add_argument(
-        "--quick", action="store_true", help="refuse at once: try nothing that takes longer before the answer is no"
-    )
-    parser.add_argument(
-        "--require",
-        type=percent,
-        metavar="PERCENT",
-        help="refuse what is rougher: positions must be known to so much of the distance to the scene (95 %% bound)",
-    )
-    parser.add_argument("--max-gaussians", type=positive, metavar="N", help="and with at most so many Gaussians")
-    parser.add_argument("--max-mb", type=megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes")
+    add_way(parser)
     parser.add_argument(
         "--baseline", nargs=3, metavar=("A", "B", "METRES"), help="how far apart photographs A and B were taken"
     )
-    parser.add_argument("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)")
-    add_only_seen(parser)
     _add_masks(parser)
     parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
     chosen = parser.add_mutually_exclusive_group()
-    chosen.add_argument(
-        "--views", type=positive, metavar="N", help="use N photographs (of a video: keyframes), evenly spread"
-    )
+    add_choice(chosen)
     chosen.add_argument("--frames", type=names, metavar="A,B,C", help="use these photographs, by name")
-    chosen.add_argument(
-        "--every-frame",
-        action="store_true",
-        help="use all photographs, or frames of a video, that are sharp and no copies",
-    )
     parser.add_argument(
         "--map",
         action="store_true",
         help="of a long recording: use all keyframes, however many; they become linked scenes, and one merged map",
     )
     add_json(parser)
+
+
+def add_way(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
+    """The options that say how any photographs are reconstructed, whatever they show."""
+    add = parser.add_argument
+    return (
+        add("--config", type=Path, metavar="FILE", help="YAML with what differs from the defaults"),
+        add("--preset", metavar="P", help="a named set of parameters (default: balanced)"),
+        add("--prior", metavar="K", help="what gives poses and first points (default: classical)"),
+        add_device(parser),
+        add("--size", type=positive, metavar="PIXELS", help="longer side as modelled (default: 512)"),
+        add(
+            "--budget-s",
+            type=seconds,
+            metavar="S",
+            help="the best scene within this many seconds from the first photograph on; starting the program, reading "
+            "photographs and writing files come on top, and cameras and first points take what they take",
+        ),
+        add(
+            "--quick",
+            action="store_true",
+            help="refuse at once: try nothing that takes longer before the answer is no",
+        ),
+        add(
+            "--require",
+            type=percent,
+            metavar="PERCENT",
+            help="refuse what is rougher: positions must be known to so much of the distance to the scene (95 %% "
+            "bound)",
+        ),
+        add("--max-gaussians", type=positive, metavar="N", help="and with at most so many Gaussians"),
+        add("--max-mb", type=megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes"),
+        add("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)"),
+        add_only_seen(parser),
+    )
+
+
+def add_choice(group: argparse._MutuallyExclusiveGroup) -> tuple[argparse.Action, ...]:
+    """The options that say how many of a recording's photographs are used, whatever their names."""
+    return (
+        group.add_argument(
+            "--views", type=positive, metavar="N", help="use N photographs (of a video: keyframes), evenly spread"
+        ),
+        group.add_argument(
+            "--every-frame",
+            action="store_true",
+            help="use all photographs, or frames of a video, that are sharp and no copies",
+        ),
+    )
 
 
 def _add_masks(parser: argparse.ArgumentParser) -> None:

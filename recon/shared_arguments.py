@@ -5,16 +5,16 @@ from __future__ import annotations
 import argparse
 
 
-def add_device(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+def add_device(parser: argparse.ArgumentParser) -> argparse.Action:
+    return parser.add_argument(
         "--device",
         choices=("cpu", "cuda", "auto"),
         help="that Gaussians are refined on (default: cpu; auto: a GPU where one can be used)",
     )
 
 
-def add_only_seen(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
+def add_only_seen(parser: argparse.ArgumentParser) -> argparse.Action:
+    return parser.add_argument(
         "--only-seen",
         action="store_true",
         help="leave out what no two photographs confirm, and the far background: holes in place of guesses",

@@ -19,6 +19,7 @@ from splatnode.capture.process.arguments import (
     positive,
 )
 from splatnode.capture.process.verb import Verb, lazily
+from splatnode.recon.batch.verb import BATCH
 from splatnode.recon.evaluate.verbs import BENCH, STABILITY
 from splatnode.recon.replay_verb import REPLAY
 from splatnode.recon.shared_arguments import add_device, add_only_seen
@@ -92,6 +93,7 @@ def _weights_arguments(parser: argparse.ArgumentParser) -> None:
 VERBS = (
     Verb("demo", "reconstruct the built-in capture", _demo_arguments, lazily("splatnode.recon.cli", "demo")),
     REPLAY,
+    BATCH,
     Verb(
         "export",
         "write a scene in another format",

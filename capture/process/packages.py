@@ -21,6 +21,7 @@ EXTRAS = {
     "onnxruntime": "xfeat",
     "open3d": "viewer",
     "pi_heif": "heic",
+    "pyarrow": "batch",
     "pycolmap": "bench",
     "safetensors": "learned",
 }

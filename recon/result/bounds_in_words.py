@@ -28,18 +28,18 @@ def of_cameras(cameras: Sequence[CameraEstimate], scale: Scale) -> str:
 def _parts(direction: str, position: str, bounds: Bounds, scale: Scale) -> str:
     length = f" ({_length(bounds.centre)})" if scale.metric else ""
     return (
-        f"{direction} to {_rounded_up(bounds.rotation_deg)} degrees, "
-        f"{position} to {_rounded_up(bounds.centre_percent)} % of the distance to the scene{length}, "
-        f"focal length to {_rounded_up(bounds.focal_percent)} % (95 % bounds)"
+        f"{direction} to {rounded_up(bounds.rotation_deg)} degrees, "
+        f"{position} to {rounded_up(bounds.centre_percent)} % of the distance to the scene{length}, "
+        f"focal length to {rounded_up(bounds.focal_percent)} % (95 % bounds)"
     )
 
 
 def _length(metres: float) -> str:
     unit, sign = next((each for each in _LENGTHS if metres >= each[0]), _LENGTHS[-1])
-    return f"{_rounded_up(metres / unit)} {sign}"
+    return f"{rounded_up(metres / unit)} {sign}"
 
 
-def _rounded_up(value: float) -> str:
+def rounded_up(value: float) -> str:
     """With two significant digits, the smallest number that is not below `value`; no exponent."""
     if not (math.isfinite(value) and value > 0):
         return "0" if value == 0 else "an unknown number of"

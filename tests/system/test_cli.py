@@ -63,6 +63,7 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.capture.process.verb",
         "splatnode.capture.verbs",
         "splatnode.command_line",
+        "splatnode.recon.batch.verb",
         "splatnode.recon.evaluate.verbs",
         "splatnode.recon.replay_verb",
         "splatnode.recon.shared_arguments",

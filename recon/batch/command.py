@@ -1,0 +1,117 @@
+"""The verb batch."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from splatnode.capture.process.folders import LOCK
+from splatnode.capture.process.packages import remedy
+from splatnode.capture.process.printable import printable
+from splatnode.capture.process.progress import Step, Tell, telling, times, waiting
+from splatnode.capture.process.terminal import in_place, say, taken_away
+from splatnode.recon.batch.answer import FAILED
+from splatnode.recon.batch.child import Limits
+from splatnode.recon.batch.engine import Plan, Work, run_all
+from splatnode.recon.batch.ledger import LEDGER, Ledger
+from splatnode.recon.batch.page import PAGE, write_page
+from splatnode.recon.batch.sources import Recording, recordings
+from splatnode.recon.batch.tables import CSV, PARQUET, write_csv, write_parquet
+from splatnode.recon.batch.verb import replay_options
+from splatnode.recon.result.folder import result_folder
+
+EXIT_GOOD, EXIT_SOME_FAILED = 0, 65
+_OWN_NAMES = frozenset((LEDGER, CSV, PARQUET, PAGE))
+
+
+def batch(args: argparse.Namespace) -> int:
+    """Reconstructs every recording of the sources; EXIT_GOOD where each has an answer, be it that there is no scene."""
+    with waiting("looking for recordings"):
+        found = recordings(args.sources, args.out, _OWN_NAMES)
+    options = replay_options(args)
+
+    def replay(recording: Recording, folder: Path) -> Sequence[str]:
+        return [sys.executable, "-m", "splatnode", "replay", recording.source, "--out", str(folder), *options]
+
+    return run_batch(args, found, replay, ["splatnode", "replay", *options])
+
+
+def run_batch(args: argparse.Namespace, found: list[Recording], work: Work, told_command: list[str]) -> int:
+    """Runs `work` for the recordings that have not come to an end, then writes the tables of all.
+
+    `args` has out, resume, retry, cores, max_memory, timeout_s and json; `told_command` is what the ledger says of it.
+    Raises ValueError, OtherBatch, OSError.
+    """
+    cores = _cores(args.cores)
+    with result_folder(args.out):
+        _check_new(args.out, args.resume or args.retry)
+        with Ledger(args.out, told_command) as ledger, telling(quiet=args.json) as tell:
+            run_again = {None, FAILED} if args.retry else {None}
+            todo = [recording for recording in found if ledger.verdict(recording) in run_again]
+            if len(todo) < len(found):
+                tell(f"{len(found) - len(todo)} of {len(found)} recordings came to an end before")
+            plan = Plan(args.out, cores, Limits(args.max_memory, args.timeout_s))
+            for told in _run(todo, work, plan, ledger, tell):
+                if not args.json:
+                    taken_away()
+                    say(told)
+            tell(Step("writing the tables"))
+            counts = _write_tables(args.out, found, ledger, tell)
+    if args.json:
+        print(json.dumps({"recordings": len(found), "verdicts": counts}))
+    else:
+        say("; ".join(f"{code}: {count}" for code, count in counts.items()))
+        say(f"results: {args.out}/ ({PAGE}, {CSV}, {LEDGER}, a folder for each recording)")
+    return EXIT_SOME_FAILED if counts.get(FAILED) else EXIT_GOOD
+
+
+def _run(todo: Sequence[Recording], work: Work, plan: Plan, ledger: Ledger, tell: Tell) -> Iterator[str]:
+    """A line for each recording that has come to its end and has been written down."""
+    doing, began_s = "reconstructing", time.monotonic()
+    if todo:
+        tell(Step(doing, 0, len(todo), "recording"))
+    for done, found in enumerate(run_all(todo, work, plan), start=1):
+        ledger.append(found)
+        step = Step(doing, done, len(todo), "recording")
+        left = "" if in_place() else f"{done} of {len(todo)} ({times(step, time.monotonic() - began_s)}): "
+        yield f"{left}{found.name}: {found.verdict}, {found.seconds:.1f} s{f': {found.message}' * found.failed}"
+        tell(step)
+
+
+def _write_tables(out: Path, found: Sequence[Recording], ledger: Ledger, tell: Tell) -> dict[str, int]:
+    """How many recordings have which verdict, the most frequent first; the tables are in the order of these."""
+    verdicts = {recording: verdict for recording in found if (verdict := ledger.verdict(recording)) is not None}
+    counts = dict(sorted(Counter(verdicts.values()).items(), key=lambda each: (-each[1], each[0])))
+    places = {code: place for place, code in enumerate(counts)}
+    ended = sorted(verdicts, key=lambda recording: (places[verdicts[recording]], recording.name))
+    write_csv(out / CSV, ledger.rows(ended))
+    try:
+        write_parquet(out / PARQUET, ledger.rows(ended))
+    except ModuleNotFoundError as error:
+        (out / PARQUET).unlink(missing_ok=True)  # an earlier one, which is not of these recordings
+        tell(f"no {PARQUET}: {error.name} is not installed. {remedy(error.name or '')}")
+    write_page(out / PAGE, ledger.rows(ended), counts)
+    return counts
+
+
+def _cores(wanted: int | None) -> tuple[int, ...]:
+    """Those that recordings are run on. Raises ValueError where there are fewer than are wanted."""
+    allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    if wanted is not None and wanted > len(allowed):
+        raise ValueError(f"--cores must be at most {len(allowed)}, which this process may use; got {wanted}")
+    return tuple(allowed)[:wanted]
+
+
+def _check_new(out: Path, goes_on: bool) -> None:
+    """Raises ValueError where `out` holds anything, unless it is a batch that goes on."""
+    if (out / LEDGER).exists():
+        if not goes_on:
+            raise ValueError(f"{out} holds a batch already; --resume goes on with it, or give another --out")
+    elif strangers := sorted(path.name for path in out.iterdir() if path.name != LOCK):
+        raise ValueError(f"--out must be a new or an empty folder, {out} holds {printable(strangers[0])}; give another")

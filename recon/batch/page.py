@@ -1,0 +1,101 @@
+"""index.html: counts by verdict, and a row with a picture for each recording. It needs no other file to be shown."""
+
+from __future__ import annotations
+
+import html
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from urllib.parse import quote
+
+from splatnode.capture.process.printable import escaped
+from splatnode.recon.batch.answer import Outcome
+from splatnode.recon.batch.pictures import address
+from splatnode.recon.batch.tables import replacing
+from splatnode.recon.result.bounds_in_words import rounded_up
+
+PAGE = "index.html"
+_MOST_PICTURES = 2000  # of about 10 kB; the recordings after them are shown without
+_HEADS = (
+    "",
+    "recording",
+    "verdict",
+    "directions to",
+    "positions to",
+    "photographs",
+    "Gaussians",
+    "seconds",
+    "MB of memory",
+)
+_STYLE = (
+    "body{font:15px/1.45 sans-serif;margin:2em auto;max-width:1500px;padding:0 1em;color:#222}"
+    "table{border-collapse:collapse;margin:1em 0}td,th{border-bottom:1px solid #ddd;padding:.3em .7em;"
+    "text-align:right;vertical-align:top}td.text,th.text{text-align:left}td.text{max-width:32em;overflow-wrap:anywhere}"
+    "img{display:block;width:240px}small{color:#666}tr:target{background:#fffbe0}"
+)
+
+
+def write_page(path: Path, rows: Iterable[Outcome], verdicts: Mapping[str, int]) -> None:
+    """`rows` in the order of `verdicts`, which counts them; their results lie beside `path`. Raises OSError."""
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.writelines(_lines(rows, verdicts, path.parent))
+
+
+def _lines(rows: Iterable[Outcome], verdicts: Mapping[str, int], folder: Path) -> Iterator[str]:
+    yield f'<!DOCTYPE html><html lang="en"><head><meta charset="utf-8"><title>Batch</title><style>{_STYLE}</style>'
+    yield f"</head><body><h1>{sum(verdicts.values())} recordings</h1>\n<table><tr>"
+    yield '<th class="text">verdict</th><th>recordings</th></tr>\n'
+    for code, count in verdicts.items():
+        yield f'<tr><td class="text"><a href="#{_text(code)}">{_text(code)}</a></td><td>{count}</td></tr>\n'
+    yield "</table>\n<p>Each claim holds for 95 % of all cameras: directions in degrees, positions in percent of the "
+    yield "distance to the scene. Seconds are of one core, from the start of the process to its end.</p>\n<table><tr>"
+    yield "".join(f"<th{_of_text(head)}>{head}</th>" for head in _HEADS) + "</tr>\n"
+    last = None
+    for number, row in enumerate(rows):
+        picture = address(folder / row.name, Path(row.source)) if number < _MOST_PICTURES else None
+        yield _row(row, picture, begins=row.verdict != last)
+        last = row.verdict
+    yield "</table></body></html>\n"
+
+
+def _row(row: Outcome, picture: str | None, begins: bool) -> str:
+    target = f"{row.name}.log" if row.failed else f"{row.name}/"
+    image = f'<img src="{picture}" alt="" loading="lazy">' if picture else ""
+    link = f'<a href="./{_path(target)}">{_text(row.name)}</a>'
+    cells = [
+        f"<td>{image}</td>",
+        f'<td class="text">{link}<br><small>{_text(row.source)}</small></td>',
+        f'<td class="text"><b>{_text(row.verdict)}</b><br>{_text(row.message)}</td>',
+        _cell(None if row.rotation_deg is None else f"{rounded_up(row.rotation_deg)}°"),
+        _cell(None if row.centre_percent is None else f"{rounded_up(row.centre_percent)} %"),
+        _cell(_of(row.photographs, row.left_out)),
+        _cell(row.gaussians),
+        _cell(f"{row.seconds:.1f}"),
+        _cell(f"{row.memory_mb:.0f}"),
+    ]
+    mark = f' id="{_text(row.verdict)}"' if begins else ""
+    return f"<tr{mark}>{''.join(cells)}</tr>\n"
+
+
+def _of(placed: int | None, left_out: int | None) -> str | None:
+    if placed is None:
+        return None
+    return f"{placed} of {placed + left_out}" if left_out else str(placed)
+
+
+def _of_text(head: str) -> str:
+    return ' class="text"' if head in ("recording", "verdict") else ""
+
+
+def _cell(value: object) -> str:
+    return f"<td>{'' if value is None else value}</td>"
+
+
+def _text(raw: str) -> str:
+    """What somebody named, as a page shows it: neither markup nor a character that does more than show."""
+    return html.escape(escaped(raw))
+
+
+def _path(name: str) -> str:
+    """A file's name as an address relative to the page; no byte of it is markup, a scheme or a question."""
+    return quote(os.fsencode(name))

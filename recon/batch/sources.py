@@ -1,0 +1,107 @@
+"""The recordings that are named on the command line, or that lie in the folders that are."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatnode.capture import recording
+from splatnode.capture.cameras.folder import image_paths, natural_order
+from splatnode.capture.process.printable import printable_name
+
+VIDEOS = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".webm"}
+LIST = ".txt"
+REPORT = "report.json"  # a folder that has one is a result, whose pictures are no photographs
+_PHOTOGRAPHS = "images"  # the name of a folder that says nothing of what the photographs show
+_LONGEST = 150  # characters of a result folder's name
+_MARKED = 8  # hexadecimal digits that tell recordings of one name apart
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One run of `splatnode replay`."""
+
+    name: str  # of its result folder; no other recording of the batch has it
+    source: str  # the absolute path of a folder of photographs, or of a video
+
+
+def recordings(sources: Sequence[Path], out: Path, own_names: frozenset[str] = frozenset()) -> list[Recording]:
+    """All recordings, once each, in the order of the sources; results that lie in `out` are none.
+
+    A source is a folder of photographs, a folder that holds such folders and videos at any depth, a video, or a text
+    file that names sources, one a line. What a list names need not be there: its recording fails, and the others go on.
+    Raises FileNotFoundError and ValueError for what the command line itself names. Names of `own_names` are not given.
+    """
+    found: dict[Path, str] = {}
+    for source in sources:
+        if not source.exists():
+            raise FileNotFoundError(f"{str(source)!r} is not there; give a folder, a video, or a list of them (.txt)")
+        before = len(found)
+        for path, label in _found(source, out.resolve()):
+            found.setdefault(path.resolve(), label)
+        if len(found) == before:
+            raise ValueError(f"no photographs and no videos in {str(source)!r}, or only some that were named already")
+    times = Counter(found.values())
+    return [
+        Recording(_marked(label, path) if times[label] > 1 or label in own_names else label, str(path))
+        for path, label in found.items()
+    ]
+
+
+def _found(source: Path, out: Path) -> Iterator[tuple[Path, str]]:
+    """Paths of recordings, each with what it is called."""
+    if source.is_dir():
+        for path in _walked(source, out, set()):
+            yield path, _label(path, source)
+    elif source.suffix.lower() == LIST:
+        for path in _listed(source):
+            yield from _found(path, out) if path.is_dir() or path.suffix.lower() == LIST else [(path, _label(path))]
+    else:
+        yield source, _label(source)
+
+
+def _listed(path: Path) -> Iterator[Path]:
+    """The paths that a list names, which are relative to its own folder; empty lines and those of a # say nothing."""
+    for line in path.read_bytes().splitlines():
+        name = os.fsdecode(line.strip())
+        if name and not name.startswith("#"):
+            yield path.parent / name
+
+
+def _walked(folder: Path, out: Path, seen: set[Path]) -> Iterator[Path]:
+    real = folder.resolve()
+    if real in seen or real == out or (folder / REPORT).is_file():
+        return
+    seen.add(real)  # links may lead in a circle
+    if recording.is_recording(folder) or image_paths(folder):
+        yield folder
+        return
+    for path in sorted(folder.iterdir(), key=natural_order):
+        if path.name.startswith("."):
+            continue
+        if path.is_dir():
+            yield from _walked(path, out, seen)
+        elif path.suffix.lower() in VIDEOS and path.is_file():
+            yield path
+
+
+def _label(path: Path, source: Path | None = None) -> str:
+    """What a recording is called: its place below the source that was named, or its own name; `images` says nothing."""
+    own = path.resolve()
+    below = [] if source is None else list(path.relative_to(source).parts)
+    if not below or below == [_PHOTOGRAPHS]:
+        below = [own.parent.name] if own.name == _PHOTOGRAPHS else [own.name]
+    elif below[-1] == _PHOTOGRAPHS:
+        below.pop()
+    if own.suffix.lower() in VIDEOS:
+        below[-1] = Path(below[-1]).stem
+    return printable_name("_".join(below), _LONGEST).lstrip(".") or "recording"
+
+
+def _marked(label: str, path: Path) -> str:
+    digest = hashlib.sha256(os.fsencode(path)).hexdigest()[:_MARKED]
+    return f"{label}~{digest}"

@@ -1,0 +1,50 @@
+"""batch.csv, and batch.parquet where pyarrow is installed: a row for each recording, written row by row."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import msgspec
+
+from splatnode.capture.process.printable import escaped
+from splatnode.recon.batch.answer import Outcome
+
+CSV, PARQUET = "batch.csv", "batch.parquet"
+COLUMNS = Outcome.__struct_fields__
+
+
+def write_csv(path: Path, rows: Iterable[Outcome]) -> None:
+    """What is not known is empty. Raises OSError."""
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(COLUMNS)
+        for row in rows:
+            writer.writerow(msgspec.structs.astuple(shown(row)))
+
+
+def write_parquet(path: Path, rows: Iterable[Outcome]) -> None:
+    """Raises ModuleNotFoundError without pyarrow, OSError."""
+    from splatnode.recon.batch import pyarrow  # takes half a second, and is an extra
+
+    with replacing(path) as temporary:
+        pyarrow.write(temporary, map(shown, rows))
+
+
+def shown(row: Outcome) -> Outcome:
+    """With a source that is text: bytes of a file's name that are no UTF-8 are escapes."""
+    return msgspec.structs.replace(row, source=escaped(row.source))
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file that takes the place of `path` at the end; what is left of one that was not finished is removed."""
+    temporary = path.with_name(f".{path.name}.partial")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,59 @@
+"""`splatnode batch` on the command line: its arguments, what of them each replay gets, and what runs it."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from splatnode.capture.process.arguments import add_json, megabytes, positive, seconds
+from splatnode.capture.process.verb import Verb, lazily
+from splatnode.recon.replay_verb import add_choice, add_way
+
+
+def replay_options(args: argparse.Namespace) -> list[str]:
+    """The options of `args` that say how each recording is reconstructed, as the command line of a replay has them."""
+    parser = argparse.ArgumentParser()
+    options = []
+    for action in _options_of_replay(parser):
+        given = getattr(args, action.dest)
+        if given == action.default:
+            continue
+        options += action.option_strings if action.nargs == 0 else [action.option_strings[0], str(given)]
+    return options
+
+
+def _options_of_replay(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
+    return *add_way(parser), *add_choice(parser.add_mutually_exclusive_group())
+
+
+def _arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "sources",
+        type=Path,
+        nargs="+",
+        metavar="SOURCE",
+        help="a folder of photographs, or a folder that holds such folders and videos, or a video, or a text file "
+        "that names them, one a line",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for all results")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on with what is in --out: recordings that came to an end stay"
+    )
+    parser.add_argument("--retry", action="store_true", help="and run those again that failed")
+    parser.add_argument(
+        "--cores", type=positive, metavar="N", help="recordings at a time, each on one core (default: all cores)"
+    )
+    parser.add_argument(
+        "--max-memory", type=megabytes, metavar="MB", help="end a recording that takes more, in 10^6 bytes"
+    )
+    parser.add_argument("--timeout-s", type=seconds, metavar="S", help="end a recording that takes longer")
+    add_json(parser)
+    _options_of_replay(parser)
+
+
+BATCH = Verb(
+    "batch",
+    "reconstruct many folders of photographs and videos",
+    _arguments,
+    lazily("splatnode.recon.batch.command", "batch"),
+)

@@ -1,0 +1,84 @@
+"""Which recordings there are, and what they are called."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from splatnode.recon.batch.sources import recordings
+
+
+def put(path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.touch()
+
+
+def names(*sources: Path, out: Path = Path("out"), **own) -> list[str]:
+    return [recording.name for recording in recordings(sources, out, **own)]
+
+
+def test_a_folder_of_photographs_is_one_recording(tmp_path):
+    put(tmp_path / "fox" / "images" / "1.jpg")
+    put(tmp_path / "fox" / "images" / "masks" / "1.png")
+    assert names(tmp_path / "fox" / "images") == names(tmp_path / "fox") == ["fox"]
+    assert recordings([tmp_path / "fox"], Path("out"))[0].source == str(tmp_path / "fox" / "images")
+
+
+def test_folders_and_videos_are_found_at_any_depth_in_natural_order(tmp_path):
+    for name in ("scene10/images/1.jpg", "scene2/1.png", "day/film.MP4", "day/cam0/1.jpg", ".hidden/1.jpg", "notes.md"):
+        put(tmp_path / name)
+    assert names(tmp_path) == ["day_cam0", "day_film", "scene2", "scene10"]
+
+
+def test_results_are_no_recordings(tmp_path):
+    for name in ("a/1.jpg", "out/a/preview.png", "earlier/preview.png", "earlier/report.json"):
+        put(tmp_path / name)
+    assert names(tmp_path, out=tmp_path / "out") == ["a"]
+
+
+def test_links_in_a_circle_end(tmp_path):
+    put(tmp_path / "a" / "1.jpg")
+    (tmp_path / "b").symlink_to(tmp_path)
+    assert names(tmp_path) == ["a"]
+
+
+def test_a_list_names_sources_beside_it_that_need_not_be_there(tmp_path):
+    put(tmp_path / "a" / "1.jpg")
+    put(tmp_path / "many" / "b" / "1.jpg")
+    put(tmp_path / "film.mkv")
+    (tmp_path / "list.txt").write_text("# of the third of May\na\n\nfilm.mkv\nmany\nlost.mp4\n")
+    found = recordings([tmp_path / "list.txt"], Path("out"))
+    assert [recording.name for recording in found] == ["a", "film", "b", "lost"]
+    assert found[3].source == str(tmp_path / "lost.mp4")
+
+
+def test_recordings_of_one_name_are_told_apart_whatever_their_order(tmp_path):
+    for name in ("a/x/1.jpg", "b/x/1.jpg", "b/y/1.jpg", "index.html/1.jpg"):
+        put(tmp_path / name)
+    found = names(tmp_path / "a", tmp_path / "b")
+    assert found[2] == "y" and all(name.startswith("x~") for name in found[:2]) and len(set(found)) == 3
+    assert sorted(names(tmp_path / "b", tmp_path / "a")) == sorted(found)
+    (own,) = names(tmp_path / "index.html", own_names=frozenset({"index.html"}))
+    assert own.startswith("index.html~")
+
+
+def test_the_same_recording_is_found_once(tmp_path):
+    put(tmp_path / "a" / "1.jpg")
+    (tmp_path / "list.txt").write_text("a\na/../a\n")
+    assert names(tmp_path / "list.txt") == ["a"]
+
+
+def test_what_is_named_must_be_there_and_hold_something(tmp_path):
+    with pytest.raises(FileNotFoundError, match="is not there; give a folder, a video, or a list"):
+        names(tmp_path / "lost")
+    with pytest.raises(ValueError, match="no photographs and no videos in"):
+        names(tmp_path)
+
+
+def test_any_file_name_makes_a_folder_name_of_one_line(tmp_path):
+    strange = tmp_path / os.fsdecode(b"a\nb\xff")
+    put(strange / "1.jpg")
+    (found,) = recordings([strange], Path("out"))
+    assert found.name.isprintable() and os.fsdecode(b"a\nb\xff") in found.source
