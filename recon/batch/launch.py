@@ -28,7 +28,7 @@ def main() -> None:
     try:
         os.execvp(command[0], command)
     except OSError as error:
-        print(f"splatnode: {command[0]} cannot be run: {error.strerror}", file=sys.stderr)
+        sys.stderr.write(f"splatnode: {command[0]} cannot be run: {error.strerror}\n")
         sys.exit(CANNOT_RUN)
 
 
