@@ -194,8 +194,8 @@ def _config(args: argparse.Namespace) -> Config:
     if args.prior is not None and args.prior != config.prior.kind:
         config = overlaid(config, {"prior": {"kind": args.prior}})
     if args.baseline is not None:
-        first, second, metres = args.baseline
-        config = overlaid(config, {"metric": {"baseline": [first, second, _metres(metres)]}})
+        first, *further = ([*names, _metres(metres)] for *names, metres in args.baseline)
+        config = overlaid(config, {"metric": {"baseline": first, "further_baselines": further}})
     flags = {
         "size": args.size,
         "device": args.device,
