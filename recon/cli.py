@@ -221,6 +221,8 @@ def _tell(snapshot: Snapshot, out: Path) -> None:
         say(f"{snapshot.seconds['total']:.1f} s, {counts}")
         if known := bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale):
             say(f"how well the cameras are known: {known}")
+        if snapshot.scale.source is not None:
+            say(f"lengths: {snapshot.scale.sentence}")
     further = snapshot.seconds.get("ladder", 0.0)
     if further >= 0.1:
         say(f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches (--quick leaves them out)")
