@@ -46,12 +46,12 @@ def follow(source: Source, recording: RecordingStream) -> None:
     """Each moment of the source is a step of the recording's timeline; returns when nothing more will come."""
     from splatnode.recon.result.export import rerun
 
-    step, tracked = 0, None
+    step, tracked, drawn = 0, None, frozenset()
     while True:
         moment = source.take()
         if moment is not None:
             step += 1
-            rerun.draw(recording, moment.snapshot, step)
+            drawn = rerun.draw(recording, moment.snapshot, step, drawn)
         if source.tracked is not tracked:
             tracked = source.tracked
             rerun.draw_tracked(recording, tracked, step)

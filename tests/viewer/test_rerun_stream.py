@@ -41,17 +41,18 @@ def test_each_update_is_a_step_in_which_what_was_before_is_gone(tmp_path):
     follow(Node(), recording)
     recording.disconnect()
     steps: dict[str, set[int]] = {}
-    cleared = set()
+    cleared: dict[str, list[int]] = {}
     for chunk in chunks.RrdReader(str(tmp_path / "live.rrd")).stream():
         batch = chunk.to_record_batch()
         if "step" in batch.schema.names:
             found = batch.column("step").to_pylist()
             steps.setdefault(chunk.entity_path, set()).update(found)
             if any(name.startswith("Clear:") for name in batch.schema.names):
-                cleared.update(found)
-    assert steps["/world/cameras/0000.jpg"] == {1, 2} and steps["/world/cameras/0002.jpg"] == {1}
-    assert steps["/world/gaussians"] == steps["/verdict"] == cleared == {1, 2}
-    assert steps["/live_camera"] == {2}
+                cleared[chunk.entity_path] = found
+    assert steps["/world/cameras/0000.jpg"] == {1, 2} and steps["/world/cameras/0002.jpg"] == {1, 2}
+    assert steps["/world/gaussians"] == steps["/verdict"] == {1, 2}
+    assert cleared == {"/world/cameras/0002.jpg": [2]}
+    assert steps["/world/live_camera"] == {2}
 
 
 def test_a_viewer_that_is_not_there_is_told_of():

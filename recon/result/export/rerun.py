@@ -8,10 +8,9 @@ The only file that imports rerun, which is an extra and takes a second to load.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 import numpy as np
-import numpy.typing as npt
 import rerun as rr
 from rerun import RecordingStream
 
@@ -23,6 +22,7 @@ from splatnode.recon.result.stored_snapshot import photograph_of
 
 WORLD = "world"
 STEP = "step"  # the timeline of a live scene: the number of the update
+LIVE = f"{WORLD}/live_camera"
 _APPLICATION = "splatnode"
 _HIGHER_BASES = 15  # spherical harmonics of the degrees 1 to 3
 _IMAGE_PLANE = 0.1  # how far before its camera a photograph is drawn, in the scene's median depths
@@ -44,43 +44,54 @@ def connected(url: str) -> RecordingStream:
     return recording
 
 
-def draw(recording: RecordingStream, snapshot: Snapshot, step: int | None = None) -> None:
-    """Replaces what the recording shows. `step` is the number of an update; None: the scene holds for all times."""
+def draw(
+    recording: RecordingStream,
+    snapshot: Snapshot,
+    step: int | None = None,
+    before: frozenset[str] = frozenset(),
+) -> frozenset[str]:
+    """Shows the snapshot in place of what was drawn `before`; returns the paths of what is drawn now.
+
+    `step` is the number of an update; None: the scene holds for all times.
+    """
     static = step is None
     if step is not None:
         recording.set_time(STEP, sequence=step)
-        recording.log(WORLD, rr.Clear(recursive=True))
     recording.log(WORLD, rr.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
-    unit = snapshot.landmarks.unit if snapshot.landmarks is not None else 1.0
-    for path, content in _contents(snapshot.cameras, snapshot.images, _IMAGE_PLANE * unit):
+    drawn = list(_contents(snapshot))
+    for path, content in drawn:
         recording.log(path, content, static=static)
-    if len(snapshot.gaussians):
-        recording.log(f"{WORLD}/gaussians", _gaussians(snapshot.gaussians), static=static)
-    if snapshot.landmarks is not None:
-        recording.log(f"{WORLD}/landmarks", _landmarks(snapshot.landmarks), static=static)
-    recording.log("verdict", rr.TextDocument(_text(snapshot), media_type="text/markdown"), static=static)
+    now = frozenset(path for path, _ in drawn)
+    for path in sorted(before - now):  # only these: rerun 0.41 loses a pinhole that is cleared and drawn at one time
+        recording.log(path, rr.Clear(recursive=True))
+    return now
 
 
 def draw_tracked(recording: RecordingStream, camera: CameraEstimate | None, step: int) -> None:
     """The live camera in the scene of update `step`; None: it is not known where it is."""
     recording.set_time(STEP, sequence=step)
     if camera is None:
-        recording.log("live_camera", rr.Clear(recursive=True))
+        recording.log(LIVE, rr.Clear(recursive=True))
         return
     for content in _camera(camera, _IMAGE_PLANE):
-        recording.log("live_camera", content)
+        recording.log(LIVE, content)
 
 
-def _contents(
-    cameras: tuple[CameraEstimate, ...], images: Mapping[str, npt.NDArray[np.uint8]], plane: float
-) -> Iterator[tuple[str, object]]:
-    for camera in cameras:
+def _contents(snapshot: Snapshot) -> Iterator[tuple[str, object]]:
+    """What is drawn, each with its path."""
+    plane = _IMAGE_PLANE * (snapshot.landmarks.unit if snapshot.landmarks is not None else 1.0)
+    for camera in snapshot.cameras:
         path = f"{WORLD}/cameras/{rr.escape_entity_path_part(camera.name)}"
         for content in _camera(camera, plane):
             yield path, content
-        photograph = photograph_of(camera, images)
+        photograph = photograph_of(camera, snapshot.images)
         if photograph is not None:
             yield path, rr.EncodedImage(contents=photograph, media_type="image/jpeg")
+    if len(snapshot.gaussians):
+        yield f"{WORLD}/gaussians", _gaussians(snapshot.gaussians)
+    if snapshot.landmarks is not None:
+        yield f"{WORLD}/landmarks", _landmarks(snapshot.landmarks)
+    yield "verdict", rr.TextDocument(_text(snapshot), media_type="text/markdown")
 
 
 def _camera(camera: CameraEstimate, plane: float) -> tuple[object, object]:
