@@ -43,7 +43,7 @@ def stream(source: Source, url: str = URL) -> None:
 
 
 def follow(source: Source, recording: RecordingStream) -> None:
-    """Each moment of the source is a step of the recording's timeline; returns when nothing more will come."""
+    """Each moment, and each move of the live camera, is a step of the recording; returns when nothing more will come."""
     from splatnode.recon.result.export import rerun
 
     step, tracked, drawn = 0, None, frozenset()
@@ -53,7 +53,7 @@ def follow(source: Source, recording: RecordingStream) -> None:
             step += 1
             drawn = rerun.draw(recording, moment.snapshot, step, drawn)
         if source.tracked is not tracked:
-            tracked = source.tracked
+            step, tracked = step + 1, source.tracked
             rerun.draw_tracked(recording, tracked, step)
         if source.age_s is None:
             return

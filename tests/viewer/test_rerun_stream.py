@@ -52,7 +52,7 @@ def test_each_update_is_a_step_in_which_what_was_before_is_gone(tmp_path):
     assert steps["/world/cameras/0000.jpg"] == {1, 2} and steps["/world/cameras/0002.jpg"] == {1, 2}
     assert steps["/world/gaussians"] == steps["/verdict"] == {1, 2}
     assert cleared == {"/world/cameras/0002.jpg": [2]}
-    assert steps["/world/live_camera"] == {2}
+    assert steps["/world/live_camera"] == {3}
 
 
 def test_a_viewer_that_is_not_there_is_told_of():

@@ -68,7 +68,7 @@ def draw(
 
 
 def draw_tracked(recording: RecordingStream, camera: CameraEstimate | None, step: int) -> None:
-    """The live camera in the scene of update `step`; None: it is not known where it is."""
+    """The live camera from `step` on; None: it is not known where it is."""
     recording.set_time(STEP, sequence=step)
     if camera is None:
         recording.log(LIVE, rr.Clear(recursive=True))
