@@ -43,7 +43,7 @@ def stream(source: Source, url: str = URL) -> None:
 
 
 def follow(source: Source, recording: RecordingStream) -> None:
-    """Each moment, and each move of the live camera, is a step of the recording; returns when nothing more will come."""
+    """Each moment, and each move of the live camera, is a step; returns when nothing more will come."""
     from splatnode.recon.result.export import rerun
 
     step, tracked, drawn = 0, None, frozenset()
