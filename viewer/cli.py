@@ -16,13 +16,15 @@ from splatnode.capture.process.config import read_yaml, typed
 from splatnode.capture.process.progress import telling, waiting
 from splatnode.capture.process.terminal import say
 from splatnode.recon.result.rendering import use_threads
+from splatnode.recon.result.stored_snapshot import found_photographs
 from splatnode.recon.result.whole import is_whole
 from splatnode.viewer.map_source import BUDGET, Maps, MapSource, map_moment
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.pictures import keep_picture, write_movie, write_series
 from splatnode.viewer.probe import open3d_installed, probe_window
+from splatnode.viewer.rerun_stream import URL, stream
 from splatnode.viewer.session import Session
-from splatnode.viewer.sources import Finished, Live, Source, found_photographs, load_result
+from splatnode.viewer.sources import Finished, Live, Source, load_result
 from splatnode.viewer.splash import splash
 from splatnode.viewer.state import State
 from splatnode.viewer.web import stage as web
@@ -41,13 +43,17 @@ _PICTURE = 960, 720  # pixels, where no window is opened
 def view(args: argparse.Namespace) -> int:
     """Shows what `args.what` names. Raises what opening it raises."""
     _check_web(args)
-    if not (args.web or args.headless or args.export is not None):
+    if not (args.web or args.rerun or args.headless or args.export is not None):
         return _in_window(args)
     with waiting("reading the scene"):
         finished, network = _finished(args), _network(args)
     if args.web:
         where = web.place(args.listen, web.PORT if args.port is None else args.port, args.key)
         web.show(_source(finished, network), where, _give_way, say)
+    if args.rerun:
+        _give_way()
+        stream(_source(finished, network), args.rerun_url or URL)
+        return EXIT_GOOD
     if args.export is None:
         return _as_pictures(args, finished, network)
     if finished is None or args.export.suffix.lower() != ".mp4":
@@ -111,6 +117,10 @@ def _check_web(args: argparse.Namespace) -> None:
     alone = [name for name in ("port", "listen", "key") if getattr(args, name) is not None]
     if alone and not args.web:
         raise ValueError(f"--{alone[0]} needs --web")
+    if args.rerun_url is not None and not args.rerun:
+        raise ValueError("--rerun-url needs --rerun")
+    if args.rerun and (args.web or args.headless or args.export is not None):
+        raise ValueError("--rerun shows it in the rerun viewer; leave out --web, --headless and --export")
     if args.web and (args.headless or args.export is not None):
         raise ValueError("--web shows it in a browser; --headless and --export write pictures: one of them at a time")
 

@@ -45,6 +45,13 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="with --web: ask for the key in FILE, made if it is not there; otherwise each start has a new one",
     )
+    parser.add_argument(
+        "--rerun",
+        action="store_true",
+        help="show it in the rerun viewer that runs on this machine, or that ssh -R leads to; of a node each "
+        "update, until Ctrl-C",
+    )
+    parser.add_argument("--rerun-url", metavar="URL", help="of --rerun, where the viewer is elsewhere")
     parser.add_argument("--headless", action="store_true", help="write pictures instead of opening a window")
     parser.add_argument("--export", type=Path, metavar="FILE.mp4", help="write a turntable, without a window")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where pictures go (default: view, beside the scene)")

@@ -18,11 +18,13 @@ EXTRAS = {
     "depthai": "oak",
     "gsplat": "cuda",
     "matplotlib": "bench",
+    "mcap": "mcap",
     "onnxruntime": "xfeat",
     "open3d": "viewer",
     "pi_heif": "heic",
     "pyarrow": "batch",
     "pycolmap": "bench",
+    "rerun": "rerun",
     "safetensors": "learned",
 }
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from splatnode.api.result import Result, result_of
 from splatnode.recon.result.export.result import copy_result
 from splatnode.recon.result.landmarks_file import LANDMARKS, read_landmarks
+from splatnode.recon.result.stored_snapshot import read_result
 from splatnode.recon.result.whole import is_whole
-from splatnode.viewer.sources import read_result
 
 
 @dataclass(frozen=True)

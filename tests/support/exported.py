@@ -11,6 +11,7 @@ from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.export import write_result
+from splatnode.recon.result.landmarks import KnownLenses, Landmarks
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
@@ -62,6 +63,25 @@ def make_snapshot(code: Code = Code.OK, publishable: bool = True) -> Snapshot:
 def write(snapshot: Snapshot, folder: Path, **extra) -> Path:
     report = build_report(snapshot, seed=1, preset="fast", peak_rss_mb=100.0)
     return write_result(snapshot, folder, report, **extra)
+
+
+def make_landmarks() -> Landmarks:
+    """Five points with nine descriptors in two photographs."""
+    draw = np.random.default_rng(0)
+    half = draw.normal(size=(5, 3, 3))
+    return Landmarks(
+        points=draw.normal(size=(5, 3)),
+        covariances=half @ half.transpose(0, 2, 1),
+        descriptors=draw.integers(0, 128, (9, 128)).astype(np.uint8),
+        point_of=np.array([0, 0, 1, 1, 2, 2, 3, 4, 4]),
+        photograph_of=np.array([0, 1, 0, 1, 0, 1, 1, 0, 1]),
+        names=("a.jpg", "ü b.jpg"),
+        Ts_world_camera=np.tile(np.eye(4), (2, 1, 1)),
+        lenses=KnownLenses(np.full(2, 0.8), np.full(2, 0.01), np.full((2, 2), 0.001), np.full(2, 0.75)),
+        rotation_bounds=np.array([0.3, 0.5]),
+        centre_bounds=np.array([0.01, 0.02]),
+        noise_px=0.4,
+    )
 
 
 def same_rotations(a: np.ndarray, b: np.ndarray, degrees: float) -> bool:

@@ -124,7 +124,10 @@ def test_what_brings_a_module_is_what_the_project_says():
             extras.setdefault(re.split(r"[<>=!~ \[;]", line)[0].lower(), set()).add(
                 line.split("extra ==")[1].strip(" '\"")
             )
-    distributions = {module: {"PIL": "pillow"}.get(module, module.replace("_", "-")) for module in packages.EXTRAS}
+    distributions = {
+        module: {"PIL": "pillow", "rerun": "rerun-sdk"}.get(module, module.replace("_", "-"))
+        for module in packages.EXTRAS
+    }
     bringing = {module: extras.get(name, set()) - {"dev"} for module, name in distributions.items()}
     assert bringing == {module: {extra} for module, extra in packages.EXTRAS.items()}
     # No module of splatnode needs what makes the site of docs/.

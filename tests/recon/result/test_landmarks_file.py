@@ -12,25 +12,12 @@ import pytest
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.landmarks import KnownLenses, Landmarks
 from splatnode.recon.result.landmarks_file import LANDMARKS, decode_landmarks, encode_landmarks, read_landmarks
+from tests.support.exported import make_landmarks
 
 
 @pytest.fixture
 def landmarks() -> Landmarks:
-    draw = np.random.default_rng(0)
-    half = draw.normal(size=(5, 3, 3))
-    return Landmarks(
-        points=draw.normal(size=(5, 3)),
-        covariances=half @ half.transpose(0, 2, 1),
-        descriptors=draw.integers(0, 128, (9, 128)).astype(np.uint8),
-        point_of=np.array([0, 0, 1, 1, 2, 2, 3, 4, 4]),
-        photograph_of=np.array([0, 1, 0, 1, 0, 1, 1, 0, 1]),
-        names=("a.jpg", "ü b.jpg"),
-        Ts_world_camera=np.tile(np.eye(4), (2, 1, 1)),
-        lenses=KnownLenses(np.full(2, 0.8), np.full(2, 0.01), np.full((2, 2), 0.001), np.full(2, 0.75)),
-        rotation_bounds=np.array([0.3, 0.5]),
-        centre_bounds=np.array([0.01, 0.02]),
-        noise_px=0.4,
-    )
+    return make_landmarks()
 
 
 def changed(data: bytes, **arrays: np.ndarray) -> bytes:

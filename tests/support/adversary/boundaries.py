@@ -207,7 +207,7 @@ _IMAGES = Reader(
     (UnusableImage,), tuple(f"splatnode.capture.{name}" for name in ("image_file", "image_header", "exif", "exif_time"))
 )
 _CAMERAS = Reader((SceneFileError,), (f"{_EXPORT}.cameras",))
-_RESULTS = Reader((SceneFileError, FileNotFoundError), ("splatnode.viewer.sources",))
+_RESULTS = Reader((SceneFileError, FileNotFoundError), ("splatnode.recon.result.stored_snapshot",))
 _TRUTH = Reader((EvaluationFileError, SceneFileError, FileNotFoundError), (f"{_TRUE}.truth", f"{_TRUE}.true_cameras"))
 _RECORDINGS = Reader((ValueError,), ("splatnode.capture.recording",))
 _YAML = Reader((ConfigError,), ("splatnode.capture.process.config", "splatnode.capture.process.config_text"))

@@ -1,0 +1,15 @@
+"""A rerun recording: cameras with their photographs, Gaussians, landmarks, and the verdict as text."""
+
+from __future__ import annotations
+
+from splatnode.recon.result.export.stored import StoredResult
+from splatnode.recon.result.stored_snapshot import recorded_snapshot
+
+DEFAULT_NAME = "scene.rrd"
+
+
+def export(result: StoredResult) -> bytes:
+    """Raises ModuleNotFoundError without rerun."""
+    from splatnode.recon.result.export import rerun  # takes a second, and is an extra
+
+    return rerun.recorded(recorded_snapshot(result))
