@@ -11,7 +11,7 @@ import numpy.typing as npt
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import opencv
 from splatnode.capture.lenses.lens import project
-from splatnode.capture.masks import filled
+from splatnode.capture.masks import Mask, filled
 from splatnode.recon.frames.wide_pinhole import wide_pinhole
 
 Array = npt.NDArray[np.float64]
@@ -73,14 +73,14 @@ def _without_fisheye(frame: Frame, given: Intrinsics) -> Frame:
     pinhole = wide_pinhole(frame.name, given)
     across, down = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
     slopes = (across - pinhole.cx) / pinhole.fx, (down - pinhole.cy) / pinhole.fy
-    rays = np.stack([*slopes, np.ones_like(across)], -1).reshape(-1, 3)
+    rays = np.asarray(np.stack([*slopes, np.ones_like(across)], -1).reshape(-1, 3), np.float64)
     pixels = project(rays, given).reshape(*across.shape, 2)
     size = frame.width, frame.height
-    used = ((pixels >= -_EDGE_PX) & (pixels <= np.array(size) + _EDGE_PX)).all(-1)
+    used: Mask = np.all((pixels >= -_EDGE_PX) & (pixels <= np.array(size) + _EDGE_PX), axis=-1)
     columns, rows = np.moveaxis(np.nan_to_num(pixels - 0.5, nan=-1.0), -1, 0).astype(np.float32)
     image = cv2.remap(frame.image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8)
     if frame.mask is not None:
-        used &= _carried(frame.mask, columns, rows)
+        used = used & _carried(frame.mask, columns, rows)
     if used.all():
         return replace(frame, image=image, intrinsics=pinhole, mask=None)
     return replace(frame, image=filled(image, used), intrinsics=pinhole, mask=used)
