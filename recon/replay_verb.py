@@ -29,6 +29,13 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--baseline", nargs=3, metavar=("A", "B", "METRES"), help="how far apart photographs A and B were taken"
     )
     _add_masks(parser)
+    parser.add_argument(
+        "--intrinsics",
+        type=Path,
+        metavar="FILE",
+        help="the lens of all photographs: YAML as a camera's configuration has it, COLMAP's cameras.txt, or Kalibr's "
+        "camchain",
+    )
     parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
     chosen = parser.add_mutually_exclusive_group()
     add_choice(chosen)

@@ -36,6 +36,7 @@ BENCHMARKS = {
         "locate",
         "race",
         "movers",
+        "fisheyes",
     ),
     "speed": ("rasterize", "stereo", "growth"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),
