@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import Frame, Intrinsics
 
 
 def same_aspect(intrinsics: Intrinsics, width: int, height: int) -> bool:
@@ -21,11 +21,10 @@ def seen_through(each: Any, known: Intrinsics) -> Any:
     return replace(each, intrinsics=known.resized(each.width, each.height))
 
 
-def check_fits(known: Intrinsics, frames: Iterable[Frame | DroppedFrame]) -> None:
-    """Raises ValueError where there are frames, and the lens can be of none of them."""
-    sizes = {(each.width, each.height) for each in frames if isinstance(each, Frame)}
+def check_fits(known: Intrinsics, sizes: Collection[tuple[int, int]]) -> None:
+    """Raises ValueError where there are photographs, of these sizes, and the lens can be of none of them."""
     if sizes and not any(same_aspect(known, *size) for size in sizes):
-        shown = ", ".join(f"{width} x {height}" for width, height in sorted(sizes))
+        shown = ", ".join(f"{width} x {height}" for width, height in sorted(set(sizes)))
         raise ValueError(
             f"intrinsics must be of images of the photographs' aspect ratio, got those of {known.width} x "
             f"{known.height} for {shown}. Give the size of the images that were calibrated"

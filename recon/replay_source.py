@@ -145,9 +145,11 @@ def at_hand(
 def recording(request: Request, tell: Tell = told_to_nobody) -> Recording:
     """As `source`, without a limit to the number of keyframes."""
     _check_there(request.source)
-    choice = choose(_looked_through(request, tell), _selection(request), Limits(), None, _what(request))
+    sizes: set[tuple[int, int]] = set()
+    looked_through = _noted(_looked_through(request, tell), sizes)
+    choice = choose(looked_through, _selection(request), Limits(), None, _what(request))
     if request.lens is not None:
-        check_fits(request.lens, choice.keyframes)
+        check_fits(request.lens, sizes)
     return Recording(request.source, request.listed, choice, request.masks, request.lens)
 
 
@@ -159,7 +161,7 @@ def source(request: Request, tell: Tell = told_to_nobody) -> Source:
     _check_there(request.source)
     found = _unmasked(request, tell)
     if request.lens is not None:
-        check_fits(request.lens, found.frames)
+        check_fits(request.lens, found.sizes)
         found = replace(found, frames=tuple(seen_through(each, request.lens) for each in found.frames))
     return found if request.masks is None else with_masks(found, in_files(request.masks), tell)
 
@@ -203,6 +205,14 @@ def _looked_through(request: Request, tell: Tell) -> Iterator[Frame | DroppedFra
     of = 0 if request.source.is_file() else len(_there(request))
     doing = f"choosing keyframes of {printable_name(request.source.name)}"
     return counted(_stream(request.source, request.listed), tell, doing, of, _what(request))
+
+
+def _noted(frames: Iterator[Frame | DroppedFrame], sizes: set[tuple[int, int]]) -> Iterator[Frame | DroppedFrame]:
+    """The frames, whose sizes are added to `sizes` as they pass."""
+    for each in frames:
+        if isinstance(each, Frame):
+            sizes.add((each.width, each.height))
+        yield each
 
 
 def _what(request: Request) -> str:

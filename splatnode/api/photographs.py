@@ -89,7 +89,7 @@ def with_lens(given: Source, lens: Lens | None) -> Source:
     if not frames:
         return given
     known = intrinsics_of(lens, frames[0].width, frames[0].height)
-    check_fits(known, frames)
+    check_fits(known, given.sizes)
     return replace(given, frames=tuple(seen_through(each, known) for each in given.frames))
 
 
