@@ -66,7 +66,7 @@ def fisheye(sampler: Sampler) -> Case:
         image = synthetic.photograph(config, cameras[index], index)
         camera = TrueCamera(T_world_camera, pinhole.K, pinhole.width, pinhole.height)
         photos.append(Photo(synthetic.frame_name(index), image, camera, "built-in", lens))
-    return accepted(photos, f"{across_deg:g} degrees, {views} frames")
+    return accepted(photos, f"through {across_deg:g} degrees")
 
 
 @row(21, "rolling shutter")
