@@ -31,7 +31,12 @@ class PriorChoice(Plugin):
 
 # After each keyframe, for a look at once: nothing is pruned or left out.
 PREVIEW = refinement.Config(
-    iterations=20, half_resolution_share=1.0, dssim=0.2, dropout=dropout.Config(share=0.0), control=None
+    iterations=20,
+    half_resolution_share=1.0,
+    dssim=0.2,
+    dropout=dropout.Config(share=0.0),
+    rates=refinement.CAUTIOUS,
+    control=None,
 )
 
 

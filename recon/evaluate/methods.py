@@ -32,6 +32,7 @@ CHECKPOINTS = (50, 150, 500)  # iterations at which a configuration shows its sc
 # ten times as fast as in 3DGS; steps that do not fall, but for the poses', which fall to a hundredth.
 _INSTANTSPLAT_RATES = refinement.Rates(
     means=1.6e-4,
+    means_unit="depth",
     quats=1e-2,
     log_scales=5e-2,
     logit_opacities=5e-2,

@@ -70,7 +70,7 @@ def fitted(
 
 
 def _rates() -> refinement.Rates:
-    whole = refinement.Rates()
+    whole = refinement.CAUTIOUS
     slower = {name: RATE * getattr(whole, name) for name in ("means", "quats", "log_scales", "sh")}
     return msgspec.structs.replace(whole, **slower)
 

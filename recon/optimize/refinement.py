@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -18,6 +18,7 @@ from splatnode.recon.optimize import dropout, regularise
 from splatnode.recon.optimize.adam import Adam, Moments, adam_direction
 from splatnode.recon.optimize.control import prune
 from splatnode.recon.optimize.control.control import Control, ControlChoice, Step
+from splatnode.recon.optimize.own_axes import Shifts
 from splatnode.recon.optimize.pseudo_views import PseudoView
 from splatnode.recon.optimize.regularise import Regularisation
 from splatnode.recon.optimize.torch_threads import single_torch_thread
@@ -39,7 +40,9 @@ _POSE_BETAS = (0.9, 0.99)  # of Adam for the cameras: each gets one gradient in 
 class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Adam's step sizes at the start. Lengths are relative to the median depth of the scene, which is 1."""
 
-    means: Rate = 8e-4  # of positions
+    means: Rate = 0.4  # of positions, in `means_unit`
+    # extent: standard deviations of each Gaussian along its axes; depth: the median depth, in every direction alike
+    means_unit: Literal["extent", "depth"] = "extent"
     quats: Rate = 2e-2  # of orientations, as quaternions
     log_scales: Rate = 1e-1  # of the logarithms of the standard deviations
     logit_opacities: Rate = 1e-1  # of the logits of the opacities
@@ -49,6 +52,10 @@ class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     final_means: Share = 0.1  # part to which the rate of the means has fallen at the end, exponentially
     final: Share = 0.3  # part to which the other rates of the Gaussians have fallen
     final_pose: Share = 0.1  # part to which those of the cameras have fallen
+
+
+# Of few steps: steps of a share of a Gaussian's extent take some hundred to settle. Chosen for a refinement of 500.
+CAUTIOUS = Rates(means=8e-4, means_unit="depth")
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -114,7 +121,9 @@ class _Fit:
         rates = config.rates
         self._rates = {name: getattr(rates, name) for name in PARAMETERS}
         self._finals = dict.fromkeys(PARAMETERS, rates.final) | {"means": rates.final_means}
-        self._adam = Adam(_leaves(gaussians), self._rates)
+        self._shifts = Shifts(gaussians) if rates.means_unit == "extent" else None  # who moves the means; None: Adam
+        moved = _leaves(gaussians, self._shifts)
+        self._adam = Adam(moved, {name: self._rates[name] for name in moved})
         self._control: Control | None = None
         if config.control is not None:
             self._control = config.control.module.load(config.control.config, seed)
@@ -152,14 +161,22 @@ class _Fit:
         if self._regularisation is not None:
             loss = loss + self._further_losses(self._regularisation, index, render, progress).to(loss)
         loss.backward()
-        self._adam.lrs = {name: rate * self._finals[name] ** progress for name, rate in self._rates.items()}
-        self._adam.step()
+        self._move_gaussians(progress)
         if refine_pose and T_world_camera.grad is not None:
             gradient = twist_gradient(T_world_camera.detach(), T_world_camera.grad)
             self._move_camera(index, gradient, self._config.rates.final_pose**progress)
         self._iterations += 1
         self._control_density(index, self._images[half], progress)
         self._adam.zero_grad()
+        self._gaussians.means.grad = None
+
+    def _move_gaussians(self, progress: float) -> None:
+        """An Adam step of all parameters of the Gaussians."""
+        rates = {name: rate * self._finals[name] ** progress for name, rate in self._rates.items()}
+        if self._shifts is not None:
+            self._shifts.step(self._gaussians, rates.pop("means"))
+        self._adam.lrs = rates
+        self._adam.step()
 
     def _control_density(self, index: int, images: Sequence[TrainingImage], progress: float) -> None:
         if self._control is None:
@@ -179,7 +196,9 @@ class _Fit:
         )
         if change is not None:
             self._gaussians = change.gaussians
-            self._adam.follow(_leaves(change.gaussians), change.origin)
+            self._adam.follow(_leaves(change.gaussians, self._shifts), change.origin)
+            if self._shifts is not None:
+                self._shifts.follow(change.gaussians, change.origin)
             self._dropout.follow(change.gaussians)
 
     def _further_losses(self, regularisation: Regularisation, index: int, render: Render, progress: float) -> Tensor:
@@ -212,9 +231,12 @@ class _Fit:
         return Scene(views, learnt, self._iterations, served_by=served_by)
 
 
-def _leaves(gaussians: Gaussians) -> dict[str, Tensor]:
-    """What Adam moves, by name."""
-    return {name: getattr(gaussians, name).requires_grad_(True) for name in PARAMETERS}
+def _leaves(gaussians: Gaussians, shifts: Shifts | None) -> dict[str, Tensor]:
+    """What Adam moves, by name: all parameters, but for the means where `shifts` moves them."""
+    leaves = {name: getattr(gaussians, name).requires_grad_(True) for name in PARAMETERS}
+    if shifts is not None:
+        del leaves["means"]
+    return leaves
 
 
 def _regularisation(scene: Scene, config: regularise.Config, seed: int) -> Regularisation | None:

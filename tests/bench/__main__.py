@@ -8,6 +8,7 @@ import sys
 # Folder -> its benchmarks; its other files are parts of theirs.
 BENCHMARKS = {
     "node": (
+        "batch_simulation",
         "queue",
         "live",
         "stream",

@@ -715,3 +715,37 @@ def test_things_that_move():
     for scene, share in cases:
         with_masks, without = (told(scene, share, masks) for masks in (True, False))
         says(f"| {scene} | {share:.0%} | {told(scene, 0.0, False)} | {with_masks} | {without} |")
+
+
+def test_a_simulated_batch():
+    row = raw("batch_simulation")
+    last, count = row["last_life"], f"{row['recordings']:,}".replace(",", " ")
+    assert row["rows"] == row["as_expected"] == row["recordings"] == 10_000 and row["hidden_files_left"] == 0
+    assert row["results_whole"] == row["rows"] - row["verdicts"]["FAILED"]
+    memory = last["memory_mb_after_a_tenth"], last["memory_mb_at_the_last_recording"]
+    says(
+        f"a batch of {count} simulated recordings, its driver killed with -9 {row['kills_of_the_driver']} times",
+        f"{row['repeated']} were repeated ({row['repeated_percent']:.2f} %); the driver's memory {memory[0]:.1f} MB "
+        f"after a tenth, {memory[1]:.1f} MB at the end",
+    )
+    assert memory[1] < 1.05 * memory[0] and row["repeated_percent"] < 1
+    says(
+        f"In a simulation of {count} recordings whose batch was killed {row['kills_of_the_driver']} times, "
+        f"{row['repeated']} were repeated, and the process that starts them took {memory[0]:.0f} MB "
+        f"after a tenth and {memory[1]:.0f} MB at the end",
+        on="docs/batch.md",
+    )
+
+
+def test_what_a_thousand_recordings_take():
+    own = [row["seconds"]["total"] for row in ends("bench_7sets", method="balanced")]
+    seconds = round(mean(own))
+    hours = 1000 * seconds / 3600
+    says(
+        f"| {seconds} s |",
+        f"3600 / {seconds} = {int(3600 / seconds)} recordings",
+        f"1000 × {seconds} / 3600 = {hours:.1f} core-hours",
+        on="docs/batch.md",
+    )
+    most_mb = max(row["peak_rss_mb"] for row in raw("replay")["rows"])
+    says(f"`fast` and `balanced`) | {most_mb / 1000:.1f} GB", on="docs/batch.md")

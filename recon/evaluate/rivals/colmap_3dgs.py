@@ -32,6 +32,7 @@ _OPACITY = 0.1  # of a Gaussian that starts from a point
 
 RATES = refinement.Rates(
     means=1.6e-4,  # times the extent of the scene
+    means_unit="depth",
     quats=1e-3,
     log_scales=5e-3,
     logit_opacities=5e-2,

@@ -204,7 +204,7 @@ def test_a_result_that_could_not_be_written_is_written_by_the_next_process(confi
 
 
 def test_a_scene_that_its_refinement_ruined_is_neither_shown_nor_kept(config, peer):
-    wild = replace(QUICK.optimize, rates=refinement.Rates(means=1.0, log_scales=1.0))
+    wild = replace(QUICK.optimize, rates=refinement.Rates(means=1.0, means_unit="depth", log_scales=1.0))
     config = replace(config, reconstruction=replace(QUICK, optimize=wild))
     for frame in photographs()[:3]:
         peer.server.offer(frame)
