@@ -11,7 +11,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 import tempfile
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -81,6 +83,12 @@ def measured(across_deg: float, views: int, pinhole: bool, chosen: str, folder: 
     return Result(across_deg, views, name, chosen, scored.verdict, scored.psnr, *errors, scored.num_gaussians)
 
 
+def write(path: Path, found: Sequence[Result]) -> None:
+    """All that was measured, with the command that did it or added to it."""
+    command = " ".join(["python -m tests.bench fisheyes", *sys.argv[1:]])
+    path.write_text(json.dumps({"command": command, "results": [asdict(each) for each in found]}, indent=1) + "\n")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m tests.bench fisheyes", description=__doc__)
     parser.add_argument("--across", nargs="+", type=float, default=[120.0, 170.0], metavar="DEGREES")
@@ -100,5 +108,6 @@ def main() -> None:
                     continue
                 with tempfile.TemporaryDirectory() as folder:
                     found.append(measured(across_deg, views, pinhole, args.preset, Path(folder)))
-                args.out.write_text(json.dumps({"results": [asdict(each) for each in found]}, indent=1) + "\n")
+                write(args.out, found)
                 print(found[-1], flush=True)
+    write(args.out, found)
