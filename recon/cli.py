@@ -201,8 +201,8 @@ def _config(args: argparse.Namespace) -> Config:
     if args.prior is not None and args.prior != config.prior.kind:
         config = overlaid(config, {"prior": {"kind": args.prior}})
     if args.baseline is not None:
-        first, second, metres = args.baseline
-        config = overlaid(config, {"metric": {"baseline": [first, second, _metres(metres)]}})
+        first, *further = ([*names, _metres(metres)] for *names, metres in args.baseline)
+        config = overlaid(config, {"metric": {"baseline": first, "further_baselines": further}})
     flags = {
         "size": args.size,
         "device": args.device,
@@ -228,6 +228,8 @@ def _tell(snapshot: Snapshot, out: Path) -> None:
         say(f"{snapshot.seconds['total']:.1f} s, {counts}")
         if known := bounds_in_words.of_cameras(snapshot.cameras, snapshot.scale):
             say(f"how well the cameras are known: {known}")
+        if snapshot.scale.source is not None:
+            say(f"lengths: {snapshot.scale.sentence}")
     further = snapshot.seconds.get("ladder", 0.0)
     if further >= 0.1:
         say(f"{further:.1f} s of {snapshot.seconds['total']:.1f} s went into more matches (--quick leaves them out)")

@@ -9,9 +9,9 @@ import msgspec
 from msgspec import Meta
 
 from splatnode.capture.process.config import Plugin, merged, typed
-from splatnode.recon import metric
 from splatnode.recon.frames import screening
 from splatnode.recon.matching import config as matching
+from splatnode.recon.metric import config as metric
 from splatnode.recon.optimize import dropout, refinement
 from splatnode.recon.priors import classical
 from splatnode.recon.rasterize.device import Device

@@ -15,7 +15,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.progress import Tell, told_to_nobody
 from splatnode.recon import threads
 from splatnode.recon.config import Config
-from splatnode.recon.metric import in_metres
+from splatnode.recon.metric.metres import in_metres
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.replay_source import Source
 from splatnode.recon.result.only_seen import only_seen
@@ -88,7 +88,7 @@ def run(
 
 def check_baseline(config: Config, names: Sequence[str]) -> None:
     """Raises ValueError before the work where a measured distance names a photograph that is not there."""
-    missing = [name for name in (config.metric.baseline or ())[:2] if name not in names]
+    missing = [name for baseline in config.metric.baselines for name in baseline[:2] if name not in names]
     if missing:
         raise ValueError(f"the baseline's photograph {missing[0]!r} is not there; there are: {', '.join(names)}")
 

@@ -26,7 +26,11 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
     add_way(parser)
     parser.add_argument(
-        "--baseline", nargs=3, metavar=("A", "B", "METRES"), help="how far apart photographs A and B were taken"
+        "--baseline",
+        nargs=3,
+        action="append",
+        metavar=("A", "B", "METRES"),
+        help="how far apart photographs A and B were taken; given again, the distances check one another",
     )
     _add_masks(parser)
     parser.add_argument(

@@ -14,7 +14,7 @@ from splatnode.recon.daemon.config import Config
 from splatnode.recon.daemon.places import Place, Places, State, described
 from splatnode.recon.estimation import Estimate
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.metric import in_metres
+from splatnode.recon.metric.metres import in_metres
 from splatnode.recon.modelling import with_landmarks
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.export import remove_result

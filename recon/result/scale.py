@@ -11,6 +11,8 @@ class Scale:
 
     metric: bool = False  # lengths are metres
     source: str | None = None  # of the metres, or why there are none although they were asked for
+    # Of metres: a true length is at least and at most so many times the stated one, with a probability of 95 %
+    interval_95: tuple[float, float] | None = None
 
     @property
     def word(self) -> str:
@@ -23,7 +25,7 @@ class Scale:
 
     def record(self) -> dict[str, object]:
         """As JSON files state it."""
-        return {"scale": self.word, "scale_source": self.source}
+        return {"scale": self.word, "scale_source": self.source, "scale_interval_95": self.interval_95}
 
 
 RELATIVE = Scale()

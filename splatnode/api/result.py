@@ -84,6 +84,11 @@ class Result:
         return self._snapshot.scale.metric
 
     @property
+    def scale_interval(self) -> tuple[float, float] | None:
+        """A true length is at least and at most so many times the stated one: 95 %. None where that is not known."""
+        return self._snapshot.scale.interval_95
+
+    @property
     def final(self) -> bool:
         """Whether all photographs were judged with all evidence, and the scene is refined."""
         return self._snapshot.final

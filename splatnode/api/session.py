@@ -17,7 +17,7 @@ from splatnode.capture.selection import Selector
 from splatnode.capture.stamp import Stamp
 from splatnode.recon import threads as limits
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.metric import in_metres
+from splatnode.recon.metric.metres import in_metres
 from splatnode.recon.offline import Reconstructed
 from splatnode.recon.pipeline import made_anew
 from splatnode.recon.replay_source import Source

@@ -85,7 +85,9 @@ def test_the_terminal_tells_how_well_the_cameras_are_known(replayed, capsys):
     found = replace(make_snapshot(), images=images, seconds={"total": 3.5}, scale=Scale(True, "a ruler"))
     assert replayed(lambda: [found]) == 0
     known = "directions to 0.1 degrees, positions to 2 % of the distance to the scene (2 cm), focal length to 1.5 %"
-    assert f"\nhow well the cameras are known: {known} (95 % bounds)\n" in capsys.readouterr().out
+    assert f"\nhow well the cameras are known: {known} (95 % bounds)\nlengths: metric (metres: a ruler)\n" in (
+        capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize(("error", "code"), [(KeyboardInterrupt(), 130), (SystemExit(0), None), (OSError(5, "x"), 74)])

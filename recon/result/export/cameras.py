@@ -27,6 +27,8 @@ from splatnode.recon.result.snapshot import CameraEstimate
 Number = Annotated[float, msgspec.Meta(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
 Row3: TypeAlias = tuple[Number, Number, Number]
 Row4: TypeAlias = tuple[Number, Number, Number, Number]
+Low = Annotated[float, msgspec.Meta(gt=0, le=1)]
+High = Annotated[float, msgspec.Meta(ge=1, le=MAX_COORDINATE)]
 Text = Annotated[str, msgspec.Meta(max_length=LONGEST_TEXT)]
 
 STAMP_MEANING = "nanoseconds when the photograph was captured, or null; clock says of what time: " + "; ".join(
@@ -97,6 +99,7 @@ class _File(msgspec.Struct, frozen=True):
     cameras: Annotated[tuple[_Camera, ...], msgspec.Meta(max_length=MAX_CAMERAS)]
     scale: Text | None = None
     scale_source: Text | None = None
+    scale_interval_95: tuple[Low, High] | None = None
 
 
 def decode_cameras(data: bytes, name: str = "cameras.json") -> tuple[CameraEstimate, ...]:
@@ -115,7 +118,7 @@ def decode_scale(data: bytes, name: str = "cameras.json") -> Scale:
     """The scale that a cameras.json of ours states. Raises SceneFileError."""
     with foreign(SceneFileError, name):
         parsed = _parsed(data, name)
-        return Scale(parsed.scale == "metric", parsed.scale_source)
+        return Scale(parsed.scale == "metric", parsed.scale_source, parsed.scale_interval_95)
 
 
 def _parsed(data: bytes, name: str) -> _File:

@@ -12,10 +12,14 @@ import pytest
 from splatnode.capture.process.config import ConfigError
 from splatnode.recon.config import Config as ReconConfig
 from splatnode.recon.config import overlaid
-from splatnode.recon.metric import Baseline, Config, MetricDepth, by_network, in_metres
+from splatnode.recon.metric.config import Baseline, Config
+from splatnode.recon.metric.measurement import Measurement
+from splatnode.recon.metric.metres import in_metres
+from splatnode.recon.metric.network import MetricDepth, by_network
 from splatnode.recon.networks.crop import crop
 from splatnode.recon.result.bounds import Bounds, ball
 from splatnode.recon.result.export import export_scene
+from splatnode.recon.result.export.cameras import decode_scale
 from splatnode.recon.result.export.formats.ply import decode as decode_ply
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.report import build_report
@@ -50,7 +54,7 @@ def test_a_known_distance_gives_the_unit(seen):
     assert metric.cameras[0].bounds == Bounds(1.0, 0.02, 0.5, 1.0, ball(0.02))
     np.testing.assert_allclose(metric.gaussians.means, 4.0 * seen.gaussians.means, rtol=1e-6)
     np.testing.assert_allclose(metric.gaussians.scales, 4.0 * seen.gaussians.scales, rtol=1e-6)
-    assert metric.scale.metric and metric.scale.source == "2 m between a.jpg and b.jpg, known to 1 %"
+    assert metric.scale.metric and metric.scale.source == "2 m between a.jpg and b.jpg, known to 2.5 %"
     looks = [
         render_arrays(each.gaussians, camera.T_world_camera, camera.K, camera.width, camera.height).rgb
         for each, camera in ((seen, seen.cameras[1]), (metric, metric.cameras[1]))
@@ -86,12 +90,35 @@ def test_a_network_gives_the_unit_where_its_views_agree(seen):
 
         return MetricDepth("a network", depth)
 
-    factor, source = by_network(seen, metres_of([3.0, 3.1]))
-    assert factor == pytest.approx(3.05, rel=0.01) and source.startswith("a network, 2 views that agree to")
-    factor, source = by_network(seen, metres_of([1.0, 3.0]))
-    assert factor is None and "disagree" in source
-    factor, source = by_network(seen, metres_of([0.0, 0.0]))
-    assert factor is None and "no view shows enough" in source
+    told = by_network(seen, metres_of([3.0, 3.1]), 0.15)
+    assert isinstance(told, Measurement) and told.metres_per_unit == pytest.approx(3.05, rel=0.01)
+    assert told.source.startswith("a network, 2 views that agree to") and 0.15 < told.sigma < 0.17
+    told = by_network(seen, metres_of([1.0, 3.0]), 0.15)
+    assert isinstance(told, str) and "disagree" in told
+    told = by_network(seen, metres_of([0.0, 0.0]), 0.15)
+    assert isinstance(told, str) and "no view shows enough" in told
+
+
+def test_distances_that_agree_are_averaged_and_those_that_do_not_give_no_metres(seen):
+    alone = in_metres(seen, Config(baseline=Baseline("a.jpg", "b.jpg", 2.0)))
+    again = in_metres(
+        seen, Config(baseline=Baseline("a.jpg", "b.jpg", 2.0), further_baselines=(Baseline("b.jpg", "a.jpg", 2.04),))
+    )
+    lengths = [np.linalg.norm(each.cameras[1].T_world_camera[:3, 3]) for each in (alone, again)]
+    assert lengths[0] < lengths[1] < 1.02 * lengths[0]
+    assert again.scale.interval_95 and alone.scale.interval_95
+    assert 1.0 < again.scale.interval_95[1] < alone.scale.interval_95[1]
+    wrong = (Baseline("b.jpg", "a.jpg", 2.4),)
+    torn = in_metres(seen, Config(baseline=Baseline("a.jpg", "b.jpg", 2.0), further_baselines=wrong))
+    assert not torn.scale.metric and torn.scale.interval_95 is None
+    assert "2 m between a.jpg and b.jpg, contradicts 2.4 m between b.jpg and a.jpg" in (torn.scale.source or "")
+    np.testing.assert_array_equal(torn.gaussians.means, seen.gaussians.means)
+
+
+def test_a_distance_that_says_nothing_does_not_take_the_metres_of_another(seen):
+    lost = (Baseline("a.jpg", "z.jpg", 2.0),)
+    told = in_metres(seen, Config(baseline=Baseline("a.jpg", "b.jpg", 2.0), further_baselines=lost))
+    assert told.scale.metric and "z.jpg is not among" in (told.scale.source or "")
 
 
 def test_every_file_says_which_scale_it_has(seen, tmp_path):
@@ -103,6 +130,8 @@ def test_every_file_says_which_scale_it_has(seen, tmp_path):
         for name in ("report.json", "manifest.json", "cameras.json", "transforms.json"):
             content = json.loads((out / name).read_text())
             assert (content["scale"], content["scale_source"]) == (word, snapshot.scale.source), name
+            assert content["scale_interval_95"] == (snapshot.scale.interval_95 and [*snapshot.scale.interval_95]), name
+        assert decode_scale((out / "cameras.json").read_bytes()) == snapshot.scale
         texts = [out / "trajectory.tum", *(out / "colmap").glob("*.txt")]
         assert len(texts) == 4 and all(f"# scale: {word} (" in path.read_text() for path in texts)
         assert f"scale {word}".encode() in (out / "scene.ply").read_bytes()

@@ -1,0 +1,61 @@
+"""A scene in metres, by all that was measured; where that cannot be had it stays relative, and its scale says why."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from splatnode.recon.metric.config import Config
+from splatnode.recon.metric.distances import by_distance
+from splatnode.recon.metric.measurement import Measurement, together
+from splatnode.recon.metric.network import MetricDepth, by_network
+from splatnode.recon.networks.depth_anything import load_metric
+from splatnode.recon.result.bounds_in_words import rounded_up
+from splatnode.recon.result.scale import Scale
+from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
+
+
+def in_metres(snapshot: Snapshot, config: Config) -> Snapshot:
+    """The snapshot with lengths in metres where `config` gives them a unit; as it is where nothing was asked for.
+
+    A source that can say nothing is left out where another can. Where sources contradict each other the scene stays
+    relative.
+    """
+    if not len(snapshot.cameras) or not (config.baselines or config.network):
+        return snapshot
+    said = [by_distance(snapshot.cameras, baseline, config.baseline_sigma) for baseline in config.baselines]
+    if config.network:
+        said.append(_by_the_network(snapshot, config.network_sigma))
+    measurements = [each for each in said if isinstance(each, Measurement)]
+    silent = [each for each in said if isinstance(each, str)]
+    agreed = together(measurements) if measurements else "; ".join(silent)
+    if isinstance(agreed, str):
+        return replace(snapshot, scale=Scale(False, agreed))
+    low, high = agreed.interval_95
+    source = "; ".join([f"{agreed.source}, known to {rounded_up(100 * (high - 1.0))} %", *silent])
+    return replace(_scaled(snapshot, agreed.metres_per_unit), scale=Scale(True, source, (low, high)))
+
+
+def _by_the_network(snapshot: Snapshot, sigma: float) -> Measurement | str:
+    loaded = load_metric()
+    if loaded is None:
+        return "no weights of the metric network: splatnode weights list tells where they are had"
+    return by_network(snapshot, MetricDepth(loaded.name, loaded), sigma)
+
+
+def _scaled(snapshot: Snapshot, factor: float) -> Snapshot:
+    def moved(camera: CameraEstimate) -> CameraEstimate:
+        T_world_camera = camera.T_world_camera.copy()
+        T_world_camera[:3, 3] *= factor
+        bounds = camera.bounds and camera.bounds.scaled(factor)
+        return replace(camera, T_world_camera=T_world_camera, bounds=bounds)
+
+    gaussians = snapshot.gaussians
+    larger = replace(
+        gaussians,
+        means=(gaussians.means * factor).astype(np.float32),
+        scales=(gaussians.scales * factor).astype(np.float32),
+    )
+    landmarks = snapshot.landmarks and snapshot.landmarks.moved(factor, np.eye(3), np.zeros(3), metric=True)
+    return replace(snapshot, cameras=tuple(map(moved, snapshot.cameras)), gaussians=larger, landmarks=landmarks)
