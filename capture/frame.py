@@ -15,17 +15,21 @@ from splatnode.capture.stamp import Stamp
 LARGEST_NUMBER = 2**62  # of ids and stamps
 LARGEST_SIDE = 65_535  # pixels, as of a JPEG
 LARGEST_IMAGE = 1 << 30  # pixels
-MOST_COEFFICIENTS = 14  # of OpenCV's lens model
+COEFFICIENTS = {  # of each lens model: the most that it takes, and what they are
+    "opencv": (14, "OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]]"),
+    "fisheye": (4, "k1 k2 k3 k4 of OpenCV's fisheye"),
+}
 SOURCES = ("exif", "given", "calibration", "estimated")
 _SMALLEST_FOCAL, _LARGEST_LENS = 1e-6, 1e9  # pixels, and the coefficients' size
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """A pinhole camera's calibration, in pixels of an image `width` x `height`.
+    """A camera's calibration, in pixels of an image `width` x `height`.
 
-    The centre of the top-left pixel is (0.5, 0.5), as in COLMAP. `distortion` are OpenCV's coefficients
-    (k1 k2 p1 p2 ...), empty for none. `source` tells where the numbers come from: "exif" (nominal, a few per cent),
+    The centre of the top-left pixel is (0.5, 0.5), as in COLMAP. `distortion` are the coefficients of the lens'
+    `model`: "opencv" (radial and tangential, k1 k2 p1 p2 ...; a pinhole where there are none) or "fisheye"
+    (equidistant, k1 k2 k3 k4). `source` tells where the numbers come from: "exif" (nominal, a few per cent),
     "given" or "calibration" (trusted), "estimated" (by the reconstruction).
     """
 
@@ -36,7 +40,8 @@ class Intrinsics:
     cx: float  # principal point from the left border, pixels: OpenCV's plus 0.5
     cy: float  # principal point from the upper border, pixels: OpenCV's plus 0.5
     source: str  # calibration or given: the lens is trusted; exif: it is right to a few per cent
-    distortion: tuple[float, ...] = ()  # OpenCV's coefficients k1 k2 p1 p2 k3 ...; none: the images have no distortion
+    distortion: tuple[float, ...] = ()  # of its model, as OpenCV's k1 k2 p1 p2 k3 ...; none: all are 0
+    model: str = "opencv"  # of the lens: opencv (a pinhole where there are no coefficients), fisheye (k1 k2 k3 k4)
 
     def __post_init__(self) -> None:
         lens = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
@@ -46,10 +51,14 @@ class Intrinsics:
             raise ValueError(f"intrinsics must be of at most {LARGEST_SIDE} pixels a side; got {self}")
         if min(self.fx, self.fy) < _SMALLEST_FOCAL or max(map(abs, lens)) > _LARGEST_LENS:
             raise ValueError(f"intrinsics must be within {_SMALLEST_FOCAL:g} and {_LARGEST_LENS:g}; got {self}")
-        if len(self.distortion) > MOST_COEFFICIENTS:
+        if self.model not in COEFFICIENTS:
+            known = ", ".join(COEFFICIENTS)
+            raise ValueError(f"the model of a lens in intrinsics must be one of {known}, got {self.model[:40]!a}")
+        most, what = COEFFICIENTS[self.model]
+        if len(self.distortion) > most:
             raise ValueError(
-                "distortion must be OpenCV's k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]], "
-                f"got {len(self.distortion)} numbers. Calibrate with cv2.calibrateCamera."
+                f"distortion must be {what}, got {len(self.distortion)} numbers for the model {self.model}. "
+                "Calibrate with cv2.calibrateCamera, or cv2.fisheye.calibrate and model: fisheye."
             )
         if self.source not in SOURCES:
             raise ValueError(f"the source of intrinsics must be one of {', '.join(SOURCES)}, got {self.source[:40]!a}")

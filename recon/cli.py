@@ -15,6 +15,8 @@ from torch import Tensor
 
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.choosing import THINNED
+from splatnode.capture.frame import Intrinsics
+from splatnode.capture.lens_file import read_lens
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.progress import Step, Tell, telling
 from splatnode.capture.process.terminal import say
@@ -52,7 +54,7 @@ def replay(args: argparse.Namespace) -> int:
     """Reconstructs a folder of photographs, some photographs of one, a recording, or a video."""
     config = _config(args)
     path, listed = asked_for(args.source)
-    request = Request(path, listed, args.views, args.frames or (), args.every_frame, args.masks)
+    request = Request(path, listed, args.views, args.frames or (), args.every_frame, args.masks, _lens(args))
     _check_apart(args.out, path)
     if args.map and args.only_seen:
         raise ValueError("--only-seen is for one scene: a merged map does not tell what two photographs confirm")
@@ -184,6 +186,11 @@ def _metres(text: str) -> float:
         return float(text)
     except ValueError as error:
         raise ValueError(f"--baseline must end with a distance in metres, got {text!r}") from error
+
+
+def _lens(args: argparse.Namespace) -> Intrinsics | None:
+    """The lens that is given for all photographs."""
+    return None if args.intrinsics is None else read_lens(args.intrinsics)
 
 
 def _config(args: argparse.Namespace) -> Config:

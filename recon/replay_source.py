@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -12,7 +13,8 @@ import numpy as np
 
 from splatnode.capture.cameras import folder, video
 from splatnode.capture.choosing import Choice, choose
-from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.given_lens import check_fits, seen_through
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.masks import Find, all_masked, in_files
 from splatnode.capture.process.printable import printable_name
@@ -39,6 +41,7 @@ class Request:
     frames: tuple[str, ...] = ()  # those of the folder with these names
     every_frame: bool = False  # all that are sharp and no copies
     masks: Path | None = None  # a folder of masks, or one for all; None: photographs are used whole
+    lens: Intrinsics | None = None  # of all photographs of its aspect ratio, in place of what their EXIF tells
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +82,7 @@ class Recording:
     listed: tuple[str, ...]  # the photographs of the folder that were named; none: all
     choice: Choice
     masks: Path | None = None
+    lens: Intrinsics | None = None
 
     @property
     def is_video(self) -> bool:
@@ -93,6 +97,8 @@ class Recording:
         known = [str(self.path.resolve()), written_ns, self.choice.names, config]
         if self.masks is not None:
             known.append(str(self.masks.resolve()))
+        if self.lens is not None:
+            known.append(self.lens)
         return hashlib.sha256(msgspec.json.encode(known)).hexdigest()[:32]
 
     def frames(self) -> Iterator[Frame | DroppedFrame]:
@@ -100,6 +106,8 @@ class Recording:
         names = set(self.choice.names)
         streamed = _stream(self.path, self.listed)
         chosen = (each for each in streamed if isinstance(each, DroppedFrame) or each.name in names)
+        if self.lens is not None:
+            chosen = map(partial(seen_through, known=self.lens), chosen)
         return chosen if self.masks is None else all_masked(chosen, in_files(self.masks))
 
 
@@ -137,8 +145,12 @@ def at_hand(
 def recording(request: Request, tell: Tell = told_to_nobody) -> Recording:
     """As `source`, without a limit to the number of keyframes."""
     _check_there(request.source)
-    choice = choose(_looked_through(request, tell), _selection(request), Limits(), None, _what(request))
-    return Recording(request.source, request.listed, choice, request.masks)
+    sizes: set[tuple[int, int]] = set()
+    looked_through = _noted(_looked_through(request, tell), sizes)
+    choice = choose(looked_through, _selection(request), Limits(), None, _what(request))
+    if request.lens is not None:
+        check_fits(request.lens, sizes)
+    return Recording(request.source, request.listed, choice, request.masks, request.lens)
 
 
 def source(request: Request, tell: Tell = told_to_nobody) -> Source:
@@ -148,6 +160,9 @@ def source(request: Request, tell: Tell = told_to_nobody) -> Source:
     """
     _check_there(request.source)
     found = _unmasked(request, tell)
+    if request.lens is not None:
+        check_fits(request.lens, found.sizes)
+        found = replace(found, frames=tuple(seen_through(each, request.lens) for each in found.frames))
     return found if request.masks is None else with_masks(found, in_files(request.masks), tell)
 
 
@@ -190,6 +205,14 @@ def _looked_through(request: Request, tell: Tell) -> Iterator[Frame | DroppedFra
     of = 0 if request.source.is_file() else len(_there(request))
     doing = f"choosing keyframes of {printable_name(request.source.name)}"
     return counted(_stream(request.source, request.listed), tell, doing, of, _what(request))
+
+
+def _noted(frames: Iterator[Frame | DroppedFrame], sizes: set[tuple[int, int]]) -> Iterator[Frame | DroppedFrame]:
+    """The frames, whose sizes are added to `sizes` as they pass."""
+    for each in frames:
+        if isinstance(each, Frame):
+            sizes.add((each.width, each.height))
+        yield each
 
 
 def _what(request: Request) -> str:

@@ -33,6 +33,13 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="how far apart photographs A and B were taken; given again, the distances check one another",
     )
     _add_masks(parser)
+    parser.add_argument(
+        "--intrinsics",
+        type=Path,
+        metavar="FILE",
+        help="the lens of all photographs: YAML as a camera's configuration has it, COLMAP's cameras.txt, or Kalibr's "
+        "camchain",
+    )
     parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
     chosen = parser.add_mutually_exclusive_group()
     add_choice(chosen)

@@ -8,6 +8,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from datetime import timedelta
 from types import ModuleType
 from typing import Annotated, Any
@@ -138,10 +139,15 @@ def _intrinsics(transformation: Any, width: int, height: int) -> Intrinsics | No
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] < _MIN_FOCAL * max(width, height):
         return None
     distortion = tuple(float(value) for value in transformation.getDistortionCoefficients())
-    if any(distortion) and "Perspective" not in str(transformation.getDistortionModel()):
-        return None  # a fisheye's coefficients mean something else; `undistort` has the camera take them out
+    model = str(transformation.getDistortionModel())
+    fisheye = "Fisheye" in model and any(distortion)
+    if any(distortion[4:] if fisheye else distortion) and "Perspective" not in model:
+        return None  # coefficients that mean something else; `undistort` has the camera take them out
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2] + 0.5, K[1, 2] + 0.5  # OpenCV's origin is a pixel's centre
-    return Intrinsics(width, height, fx, fy, cx, cy, "calibration", distortion if any(distortion) else ())
+    pinhole = Intrinsics(width, height, fx, fy, cx, cy, "calibration")
+    if fisheye:
+        return replace(pinhole, distortion=distortion[:4], model="fisheye")
+    return replace(pinhole, distortion=distortion if any(distortion) else ())
 
 
 def _chosen(dai: ModuleType, device: str) -> Any:

@@ -12,6 +12,7 @@ import msgspec
 
 from splatnode.capture import heif_file, recording
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed, renamed
+from splatnode.capture.given_lens import same_aspect
 from splatnode.capture.image_file import (
     MAX_PIXELS,
     SUFFIXES,
@@ -166,8 +167,3 @@ def natural_order(path: Path) -> tuple:
     """Sort key by which numbers count as numbers: img2 before img10. Ties (img2, img02) fall back to the name."""
     parts = re.split(r"([0-9]+)", path.name.lower())
     return tuple((int(part), "") if part.isdecimal() else (-1, part) for part in parts if part), path.name
-
-
-def same_aspect(intrinsics: Intrinsics, width: int, height: int) -> bool:
-    """Whether an image of this size can be one of the camera's, resized."""
-    return abs(intrinsics.width * height - intrinsics.height * width) <= max(width, height)

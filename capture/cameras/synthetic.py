@@ -1,7 +1,8 @@
 """The built-in capture: rendered hand-held photographs of a procedural place, with known cameras and depth.
 
-The frames carry no intrinsics, as those of an unknown camera do. What is known is for tests and benchmarks:
-scene_cameras, held_out_cameras and depth. The place is made by splatnode.capture.diorama; this file photographs it.
+The frames carry no intrinsics, as those of an unknown camera do, unless a lens is given, which they are then taken
+through. What is known is for tests and benchmarks: scene_cameras, held_out_cameras and depth. The place is made by
+splatnode.capture.diorama; this file photographs it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from splatnode.capture.diorama.cast import Camera, Matrix, cast
 from splatnode.capture.diorama.layout import place
 from splatnode.capture.diorama.look_at import look_at
 from splatnode.capture.diorama.solids import Solid
-from splatnode.capture.frame import Frame
+from splatnode.capture.diorama.through_lens import cast_through
+from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.pace import FramesPerSecond
 from splatnode.capture.stamp import Clock, Stamp
 
@@ -36,6 +38,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     noise: float = 1.0  # standard deviation of the sensor noise, grey levels
     samples: Count = 2  # rays a pixel in each direction
     frames_per_second: FramesPerSecond = 2.0  # by the stamps
+    lens: Intrinsics | None = None  # that photographs are taken through, and carry; nothing: a pinhole's, unknown
 
 
 def stream(config: Config) -> Iterator[Frame]:
@@ -43,7 +46,12 @@ def stream(config: Config) -> Iterator[Frame]:
     for index, camera in enumerate(scene_cameras(config)):
         stamp_ns = round(index / config.frames_per_second * 1e9)
         image, captured_at = photograph(config, camera, index), Stamp(stamp_ns, Clock.RECORDING)
-        yield Frame(index, frame_name(index), stamp_ns, image, intrinsics=None, captured_at=captured_at)
+        yield Frame(index, frame_name(index), stamp_ns, image, lens_of(config), captured_at=captured_at)
+
+
+def lens_of(config: Config) -> Intrinsics | None:
+    """The lens of the photographs, for their size; None where none is given."""
+    return None if config.lens is None else config.lens.resized(config.width, config.height)
 
 
 def frame_name(index: int) -> str:
@@ -63,8 +71,12 @@ def held_out_cameras(config: Config) -> list[Camera]:
 def photograph(config: Config, camera: Camera, noise_seed: int = 0) -> npt.NDArray[np.uint8]:
     """(H, W, 3) RGB as `camera` sees the place of `config`: antialiased, with sensor noise."""
     T_world_camera, K = camera
-    dense = T_world_camera, np.diag([config.samples, config.samples, 1.0]) @ K
-    colours, _ = cast(solids(config), dense, config.width * config.samples, config.height * config.samples)
+    dense = config.width * config.samples, config.height * config.samples
+    if (lens := lens_of(config)) is not None and (lens.distortion or lens.model != "opencv"):
+        colours, _ = cast_through(solids(config), T_world_camera, lens.resized(*dense))
+    else:
+        scale = np.diag([config.samples, config.samples, 1.0])
+        colours, _ = cast(solids(config), (T_world_camera, scale @ K), *dense)
     image = cv2.resize(colours, (config.width, config.height), interpolation=cv2.INTER_AREA)
     grain = np.random.default_rng([config.seed, noise_seed]).normal(scale=config.noise, size=image.shape)
     return np.clip(np.rint(image + grain), 0, 255).astype(np.uint8)
@@ -77,6 +89,8 @@ def depth(config: Config, index: int) -> npt.NDArray[np.float32]:
 
 def depth_map(config: Config, camera: Camera) -> npt.NDArray[np.float32]:
     """(H, W) true z in the frame of `camera`, metres, at pixel centres; inf where nothing is."""
+    if (lens := lens_of(config)) is not None and (lens.distortion or lens.model != "opencv"):
+        return cast_through(solids(config), camera[0], lens)[1]
     return cast(solids(config), camera, config.width, config.height)[1]
 
 
@@ -103,7 +117,8 @@ def _camera_on_path(config: Config, position: float) -> Camera:
     height = 1.55 + 0.22 * sway[2]
     centre = np.array([TARGET[0] + distance * np.cos(azimuth), TARGET[1] + distance * np.sin(azimuth), height])
     target = TARGET + 0.07 * sway[3:6]
-    return look_at(centre, target, roll_deg=2.5 * sway[4]), intrinsic_matrix(config, focal)
+    lens = lens_of(config)
+    return look_at(centre, target, roll_deg=2.5 * sway[4]), intrinsic_matrix(config, focal) if lens is None else lens.K
 
 
 def intrinsic_matrix(config: Config, focal: float) -> Matrix:

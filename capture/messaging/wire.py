@@ -25,8 +25,8 @@ import zmq
 from splatnode.capture.messaging.values import Sequential, SessionId, check
 from splatnode.capture.process.foreign import foreign
 
-# Of the messages: 1 knew no answer to a keyframe that cannot be taken, 2 no time of capture, 3 no masks.
-VERSION = 4
+# Of the messages: 1 knew no answer to a keyframe that cannot be taken, 2 no time of capture, 3 no masks, 4 no fisheyes.
+VERSION = 5
 MAGIC = b"SPLAT" + bytes([VERSION])
 DTYPES = {name: np.dtype(f"<{name}") for name in ("u1", "u2", "u4", "i4", "i8", "f4", "f8")}
 

@@ -9,12 +9,16 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.lenses import opencv
+from splatnode.capture.lenses.lens import project
+from splatnode.capture.masks import Mask, filled
+from splatnode.recon.frames.wide_pinhole import wide_pinhole
 
 Array = npt.NDArray[np.float64]
 
 SQUARE_TOLERANCE = 0.002  # relative difference of fx and fy below which pixels are square: a pixel in 500
-_NUM_COEFFICIENTS = (4, 5, 8, 12, 14)  # that OpenCV's lens model takes
 _MIN_SIDE = 0.3  # shorter side of the rectangle that is kept, over the undistorted one's: less is no picture
+_EDGE_PX = 0.01  # beyond the picture's border that still counts as seen: what rounding moves
 _POINTS_A_SIDE = 33  # of the picture's border that are undistorted, to find the rectangle between them
 _MAX_ROUND_TRIP_PX = 0.5  # from a border point to its ray and back: a model that folds over misses by many pixels
 
@@ -23,16 +27,19 @@ def undistorted(frame: Frame) -> Frame:
     """The frame without its lens' distortion and with fx = fy; the frame itself where there is nothing to undo.
 
     It has the same size in pixels and shows the largest rectangle without unseen corners, whose pixels would be
-    invented. Raises ValueError for coefficients that fold the picture over.
+    invented. A fisheye's has as many pixels in another shape, and a mask where the fisheye saw nothing
+    (wide_pinhole.py). Raises ValueError for coefficients that fold the picture over.
     """
     given = frame.intrinsics
     if given is None:
         return frame
     given = given.resized(frame.width, frame.height)
+    if given.model == "fisheye":
+        return _without_fisheye(frame, given)
     straight = not any(given.distortion)
     if straight and abs(given.fx / given.fy - 1.0) < SQUARE_TOLERANCE:
         return frame if given == frame.intrinsics else replace(frame, intrinsics=given)
-    coefficients = _coefficients(given)
+    coefficients = opencv.coefficients(given)
     left, top, right, bottom = _seen_rectangle(frame.name, given, coefficients)
     focal = max(frame.width / (right - left), frame.height / (bottom - top))
     pinhole = replace(
@@ -44,10 +51,10 @@ def undistorted(frame: Frame) -> Frame:
         distortion=(),
     )
     columns, rows = cv2.initUndistortRectifyMap(
-        _opencv_matrix(given),
+        opencv.centred(given),
         coefficients,
         np.eye(3),
-        _opencv_matrix(pinhole),
+        opencv.centred(pinhole),
         (frame.width, frame.height),
         cv2.CV_32FC1,
     )
@@ -61,16 +68,22 @@ def _carried(mask: npt.NDArray[np.bool_], columns: npt.NDArray, rows: npt.NDArra
     return cv2.remap(mask.astype(np.float32), columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) > 0.999
 
 
-def _coefficients(given: Intrinsics) -> Array:
-    """The lens' coefficients, filled up with zeros to a number that OpenCV takes."""
-    values = given.distortion or (0.0,)
-    wanted = next(count for count in _NUM_COEFFICIENTS if count >= len(values))
-    return np.array([*values, *[0.0] * (wanted - len(values))])
-
-
-def _opencv_matrix(intrinsics: Intrinsics) -> Array:
-    """K with the centre of the top-left pixel at (0, 0)."""
-    return intrinsics.K - np.array([[0.0, 0.0, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0]])
+def _without_fisheye(frame: Frame, given: Intrinsics) -> Frame:
+    """The frame as a pinhole would have seen it; what the fisheye did not see is filled and masked."""
+    pinhole = wide_pinhole(frame.name, given)
+    across, down = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    slopes = (across - pinhole.cx) / pinhole.fx, (down - pinhole.cy) / pinhole.fy
+    rays = np.asarray(np.stack([*slopes, np.ones_like(across)], -1).reshape(-1, 3), np.float64)
+    pixels = project(rays, given).reshape(*across.shape, 2)
+    size = frame.width, frame.height
+    used: Mask = np.all((pixels >= -_EDGE_PX) & (pixels <= np.array(size) + _EDGE_PX), axis=-1)
+    columns, rows = np.moveaxis(np.nan_to_num(pixels - 0.5, nan=-1.0), -1, 0).astype(np.float32)
+    image = cv2.remap(frame.image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8)
+    if frame.mask is not None:
+        used = used & _carried(frame.mask, columns, rows)
+    if used.all():
+        return replace(frame, image=image, intrinsics=pinhole, mask=None)
+    return replace(frame, image=filled(image, used), intrinsics=pinhole, mask=used)
 
 
 def _seen_rectangle(name: str, given: Intrinsics, coefficients: Array) -> tuple[float, float, float, float]:
@@ -85,7 +98,7 @@ def _seen_rectangle(name: str, given: Intrinsics, coefficients: Array) -> tuple[
         np.stack([np.full_like(down, across[-1]), down], 1),
         np.stack([across, np.full_like(across, down[-1])], 1),
     ]
-    matrix = _opencv_matrix(given)
+    matrix = opencv.centred(given)
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)
     straight = [
         cv2.undistortPoints(side[:, None], matrix, coefficients, None, np.eye(3), np.eye(3), criteria)[:, 0]

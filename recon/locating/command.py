@@ -8,11 +8,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-import msgspec
-
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.process.config import read_yaml
+from splatnode.capture.lens_file import read_lens
 from splatnode.capture.process.terminal import say
 from splatnode.recon.locating.locate import locate as locate_photograph
 from splatnode.recon.locating.outcome import Located, NotLocated
@@ -25,7 +23,7 @@ EXIT_GOOD, EXIT_REFUSED = 0, 65
 def locate(args: argparse.Namespace) -> int:
     """A line a photograph; EXIT_GOOD where all were placed."""
     landmarks = read_landmarks(args.result)
-    given = None if args.calibration is None else _calibration(args.calibration)
+    given = None if args.calibration is None else read_lens(args.calibration)
     records, refused = [], 0
     for frame in _photographs(args.images, given):
         if isinstance(frame, DroppedFrame):
@@ -55,18 +53,6 @@ def _photographs(paths: Sequence[Path], given: Intrinsics | None) -> Iterator[Fr
             yield from folder.stream(folder.Config(folder=path.parent, names=(name,), intrinsics=given))
         else:
             raise FileNotFoundError(f"{str(path)!r} is not there; give photographs, or folders that hold some")
-
-
-def _calibration(path: Path) -> Intrinsics:
-    """The lens that a file gives, as a camera's configuration does. Raises ValueError, which names the file."""
-    content = read_yaml(path)
-    told = content.get("intrinsics", content)
-    try:
-        return msgspec.convert({"source": "calibration", **told}, Intrinsics)
-    except (msgspec.ValidationError, TypeError) as error:
-        raise ValueError(
-            f"{path} must give width, height, fx, fy, cx and cy of a lens, as `intrinsics` of a camera does: {error}"
-        ) from error
 
 
 def _lens(frame: Frame, fov_deg: float | None) -> Intrinsics | None:

@@ -11,10 +11,10 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.cameras.folder import same_aspect
 from splatnode.capture.exif import exif_intrinsics, read_tags
 from splatnode.capture.exif_time import exif_time
 from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.given_lens import check_fits, seen_through
 from splatnode.capture.orientation import ORIENTATION, upright
 from splatnode.capture.process.progress import Tell
 from splatnode.capture.stamp import Stamp
@@ -89,20 +89,8 @@ def with_lens(given: Source, lens: Lens | None) -> Source:
     if not frames:
         return given
     known = intrinsics_of(lens, frames[0].width, frames[0].height)
-    if not any(same_aspect(known, each.width, each.height) for each in frames):
-        sizes = ", ".join(sorted({f"{each.width} x {each.height}" for each in frames}))
-        raise ValueError(
-            f"intrinsics must be of images of the photographs' aspect ratio, got those of {known.width} x "
-            f"{known.height} for {sizes}. Give the size of the images that were calibrated"
-        )
+    check_fits(known, given.sizes)
     return replace(given, frames=tuple(seen_through(each, known) for each in given.frames))
-
-
-def seen_through(each: Any, known: Intrinsics) -> Any:
-    """The frame with this lens, if it can be one of its images."""
-    if not isinstance(each, Frame) or not same_aspect(known, each.width, each.height):
-        return each
-    return replace(each, intrinsics=known.resized(each.width, each.height))
 
 
 def intrinsics_of(lens: Lens, width: int, height: int) -> Intrinsics:

@@ -37,6 +37,7 @@ BENCHMARKS = {
         "locate",
         "race",
         "movers",
+        "fisheyes",
     ),
     "speed": ("rasterize", "stereo", "growth"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),

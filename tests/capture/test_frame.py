@@ -41,12 +41,15 @@ def test_a_frame_refuses_what_is_no_rgb_image(image):
     "change",
     [
         {"width": 65_536}, {"height": 2**62}, {"fx": 1e-300}, {"fy": 1e10}, {"cy": -1e10}, {"distortion": (0.0,) * 15},
-        {"distortion": (1e300,)}, {"source": "\x1b[2J"}, {"source": ""},
+        {"distortion": (1e300,)}, {"source": "\x1b[2J"}, {"source": ""}, {"model": "\x1b[2J"},
+        {"model": "fisheye", "distortion": (0.0,) * 5},
     ],
     ids=str,
 )  # fmt: skip
 def test_what_no_camera_of_ours_has_is_refused(change):
-    with pytest.raises(ValueError, match="intrinsics must be|distortion must be|the source of intrinsics"):
+    with pytest.raises(
+        ValueError, match="intrinsics must be|distortion must be|the source of intrinsics|the model of a lens"
+    ):
         replace(Intrinsics(640, 480, 500.0, 510.0, 320.0, 236.0, source="given"), **change)
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.image_file import decode_image, encode_png
 from splatnode.recon import replay_source
 from splatnode.recon.config import Config
@@ -168,3 +169,18 @@ def test_a_folder_a_recording_and_a_video_stand_alone(film, tmp_path):
         source(Request(path, listed=listed))
     with pytest.raises(ValueError, match="they are listed already, so leave it out"):
         source(Request(tmp_path, frames=("a",), listed=("a.jpg", "b.jpg")))
+
+
+def test_a_lens_is_of_all_photographs_or_refused(walk, tmp_path):
+    folder = folder_of(walk[:3], tmp_path / "few")
+    height, width = walk[0].shape[:2]
+    lens = Intrinsics(2 * width, 2 * height, 900, 900, width, height, "calibration", (0.1,), "fisheye")
+    given = source(Request(folder, lens=lens)).frames
+    of_map = recording(Request(folder, lens=lens))
+    for frames in (given, of_map.frames()):
+        known = {frame.intrinsics for frame in frames if isinstance(frame, Frame)}
+        assert known == {lens.resized(width, height)}
+    assert of_map.identity(Config()) != recording(Request(folder)).identity(Config())
+    for read in (source, recording):
+        with pytest.raises(ValueError, match="photographs' aspect ratio, got those of 500 x 100"):
+            read(Request(folder, lens=replace(lens, width=500, height=100)))

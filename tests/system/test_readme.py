@@ -717,6 +717,17 @@ def test_things_that_move():
         says(f"| {scene} | {share:.0%} | {told(scene, 0.0, False)} | {with_masks} | {without} |")
 
 
+def test_fisheyes():
+    found = {(row["across_deg"], row["views"], row["lens"]): row for row in raw("fisheyes")["results"]}
+    cases = [(across, views) for across, views, lens in found if lens == "fisheye"]
+    assert len(cases) >= 2
+    for across, views in cases:
+        row, other = (found[across, views, lens] for lens in ("fisheye", "pinhole"))
+        errors = f"{row['rotation_error_deg']:.3f} | {row['centre_error_pct']:.3f}"
+        psnr = f"{row['psnr']:.1f} | {other['psnr']:.1f}"
+        says(f"| {across:.0f} degrees | {views} | {row['verdict']} | {errors} | {psnr} |")
+
+
 def test_a_simulated_batch():
     row = raw("batch_simulation")
     last, count = row["last_life"], f"{row['recordings']:,}".replace(",", " ")

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.evaluate.stability import warps
 from splatnode.recon.evaluate.stability.case import Case, accepted, either, refused, row
 from splatnode.recon.evaluate.stability.places import Photo, Sampler
+from splatnode.recon.evaluate.truth import TrueCamera
+from splatnode.recon.frames.wide_pinhole import wide_pinhole
 from splatnode.recon.result.verdict import Code
 
+_SIDES = 640, 480  # pixels, of photographs through a fisheye
 _DOUBTS = (Code.FOCAL_SUSPECT, Code.MIXED_CAMERAS, Code.AMBIGUOUS, Code.BASELINE_TOO_SMALL)
 
 
@@ -46,6 +51,22 @@ def strong_distortion(sampler: Sampler) -> Case:
     k1 = (-0.3, 0.3)[sampler.seed % 2]
     photos = [warps.distorted(photo, k1) for photo in sampler.photos(5)]
     return either(photos, f"k1 {k1:+}", *_DOUBTS)
+
+
+@row(20, "calibrated fisheye")
+def fisheye(sampler: Sampler) -> Case:
+    """The built-in place, through a fisheye: no recorded scene has one whose cameras are known."""
+    across_deg, views = (120.0, 170.0)[sampler.seed % 2], (6, 8)[sampler.seed // 2 % 2]
+    focal = _SIDES[0] / math.radians(across_deg)
+    lens = Intrinsics(*_SIDES, focal, focal, _SIDES[0] / 2, _SIDES[1] / 2, "calibration", model="fisheye")
+    config = synthetic.Config(views=views, seed=sampler.seed, lens=lens)
+    pinhole = wide_pinhole("the photograph", lens)
+    photos = []
+    for index, (T_world_camera, _) in enumerate(cameras := synthetic.scene_cameras(config)):
+        image = synthetic.photograph(config, cameras[index], index)
+        camera = TrueCamera(T_world_camera, pinhole.K, pinhole.width, pinhole.height)
+        photos.append(Photo(synthetic.frame_name(index), image, camera, "built-in", lens))
+    return accepted(photos, f"through {across_deg:g} degrees")
 
 
 @row(21, "rolling shutter")

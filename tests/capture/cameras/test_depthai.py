@@ -134,11 +134,13 @@ def test_a_frame_has_its_own_calibration():
     expected = Intrinsics(1280, 720, 800.0, 801.0, 640.0, 360.0, "calibration", (0.1, -0.2, 0, 0, 0.05))
     assert frame.intrinsics == expected
     assert framed(message(distortion=(0.0,) * 14), 0).intrinsics.distortion == ()
+    fisheye = framed(message(distortion=(0.1, 0.02, 0, 0) + (0.0,) * 10, model="CameraModel.Fisheye"), 0).intrinsics
+    assert (fisheye.model, fisheye.distortion) == ("fisheye", (0.1, 0.02, 0, 0))
 
 
 @pytest.mark.parametrize(
     ("K", "distortion", "model"),
-    [(np.eye(3).tolist(), (), PERSPECTIVE), ([], (), PERSPECTIVE), (LENS, (0.1, 0, 0, 0), "CameraModel.Fisheye")],
+    [(np.eye(3).tolist(), (), PERSPECTIVE), ([], (), PERSPECTIVE), (LENS, (0.1, 0, 0, 0), "CameraModel.Radial")],
 )
 def test_what_is_no_pinhole_calibration_is_unknown(K, distortion, model):
     assert framed(message(K=K, distortion=distortion, model=model), 0).intrinsics is None

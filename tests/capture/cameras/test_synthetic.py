@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import synthetic
+from splatnode.capture.cameras.synthetic import Config
 from splatnode.capture.diorama.layout import place
 from splatnode.capture.diorama.solids import Shape, face_points, ray_interval, surface_coordinates
+from splatnode.capture.frame import Intrinsics
+from splatnode.capture.lenses.lens import unproject
 from splatnode.capture.stamp import Clock, Stamp
 from tests.support.synthetic import SMALL, photographs, planar, pure_rotation, pure_rotation_cameras, tiny_scene
 
@@ -164,3 +167,25 @@ def test_tiny_scene_is_in_front_of_its_cameras():
         (pixels[..., 0] > 0) & (pixels[..., 0] < scene.width) & (pixels[..., 1] > 0) & (pixels[..., 1] < scene.height)
     )
     assert inside.float().mean() > 0.8
+
+
+def test_through_a_fisheye_each_pixel_shows_what_a_pinhole_sees_along_its_ray():
+    lens = Intrinsics(120, 90, 41, 41, 60, 45, "calibration", (), "fisheye")  # 168 degrees across
+    config = Config(width=120, height=90, views=2, noise=0.0, lens=lens)
+    frame = next(iter(synthetic.stream(config)))
+    assert frame.intrinsics == lens
+    straight = Config(width=256, height=192, views=2, noise=0.0, samples=1)  # of a place with as many texels
+    T_world_camera = synthetic.scene_cameras(config)[0][0]
+    K = np.array([[64.0, 0, 128], [0, 64, 96], [0, 0, 1]])
+    seen, depth = (make(straight, (T_world_camera, K)) for make in (synthetic.photograph, synthetic.depth_map))
+    pixels = np.stack(np.meshgrid(np.arange(120) + 0.5, np.arange(90) + 0.5), -1).reshape(-1, 2)
+    rays = unproject(pixels, lens)
+    at = rays[:, :2] / rays[:, 2:] * 64 + (128, 96)
+    both = np.flatnonzero((rays[:, 2] > 0.3) & (at > 1).all(1) & (at < (255, 191)).all(1))
+    columns, rows = at[both].astype(int).T
+    assert len(both) > 3000
+    assert np.corrcoef(frame.image.reshape(-1, 3)[both].ravel(), seen[rows, columns].ravel())[0, 1] > 0.9
+    expected = depth[rows, columns]
+    found = synthetic.depth(config, 0).ravel()[both]
+    there = np.isfinite(expected) & np.isfinite(found)
+    assert there.mean() > 0.4 and np.median(np.abs(found[there] / expected[there] - 1)) < 0.01

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
 import os
 from pathlib import Path
@@ -24,7 +25,7 @@ from splatnode.recon.daemon.checkpoint.stored_frame import file_name
 from tests.support.strays import STRAYS
 
 SESSION = "0123456789abcdef" * 2
-LENS = Intrinsics(8, 6, 7.0, 7.1, 4.0, 3.0, "calibration", (0.1, 0.0))
+LENS = Intrinsics(8, 6, 7.0, 7.1, 4.0, 3.0, "calibration", (0.1, 0.0), "fisheye")
 
 
 def image(sequence: int) -> np.ndarray:
@@ -73,13 +74,15 @@ def test_a_mask_is_kept(open_store):
 
 def test_a_checkpoint_of_the_version_before_is_gone_on_with_and_becomes_one_of_this(open_store):
     store = open_store()
-    header = {"version": 1, "session": SESSION, "sequence": 4, "name": "a.png", "stamp_ns": 40, "intrinsics": LENS}
+    lens = {name: value for name, value in dataclasses.asdict(LENS).items() if name != "model"}
+    header = {"version": 1, "session": SESSION, "sequence": 4, "name": "a.png", "stamp_ns": 40, "intrinsics": lens}
     _, *parts = encode(header, [image(4)])
     write_message(store.directory / "frames" / file_name(0), [MAGIC[:-1] + b"\x02", *parts])
     store._write(msgspec.structs.replace(store.ledger, version=1))
     again = open_store()
     (stored,) = again.frames()
     assert (stored.key, stored.frame.name, stored.frame.stamp_ns) == ((SESSION, 4), "a.png", 40)
+    assert stored.frame.intrinsics == dataclasses.replace(LENS, model="opencv")
     assert stored.frame.captured_at is None and again.identity == store.identity
     assert read_ledger(again.directory).version == VERSION
 
