@@ -720,7 +720,7 @@ def test_things_that_move():
 def test_fisheyes():
     found = {(row["across_deg"], row["views"], row["lens"]): row for row in raw("fisheyes")["results"]}
     cases = [(across, views) for across, views, lens in found if lens == "fisheye"]
-    assert len(cases) >= 2
+    assert len(cases) == 4
     for across, views in cases:
         row, other = (found[across, views, lens] for lens in ("fisheye", "pinhole"))
         errors = f"{row['rotation_error_deg']:.3f} | {row['centre_error_pct']:.3f}"
