@@ -85,7 +85,8 @@ ENDLESS = ([0, 2**62, 4], [2**62, 0], [0, 2**31, 2**31], [0, 2**27, 1], [2**32, 
         [b"SPLAT\x01", parts_of()[1]],
         [b"SPLAT\x02", parts_of()[1]],
         [b"SPLAT\x03", parts_of()[1]],
-        [b"SPLAT\x05", parts_of()[1]],
+        [b"SPLAT\x04", parts_of()[1]],
+        [b"SPLAT\x06", parts_of()[1]],
         [parts_of()[1], MAGIC],
         [MAGIC, b""],
         [MAGIC, parts_of()[1] + b"\0"],
@@ -116,7 +117,7 @@ def test_malformed_messages_are_refused(parts):
 
 
 def test_another_version_is_told_what_to_do():
-    with pytest.raises(WireError, match="of version 1, and this splatnode speaks version 4: update the older one"):
+    with pytest.raises(WireError, match="of version 1, and this splatnode speaks version 5: update the older one"):
         decode([b"SPLAT\x01", parts_of()[1]], Pear)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.process.packages import remedy
+from splatnode.recon.result import export
 from splatnode.recon.result.export.convert import export_scene
 from splatnode.recon.result.landmarks_file import LANDMARKS, encode_landmarks
 from tests.support.exported import make_gaussians, make_landmarks, make_snapshot, write
@@ -39,6 +40,7 @@ def read(path) -> dict[str, dict[str, Any]]:
 def test_without_rerun_it_says_what_to_install(folder, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rerun", None)
     monkeypatch.delitem(sys.modules, "splatnode.recon.result.export.rerun", raising=False)
+    monkeypatch.delattr(export, "rerun", raising=False)  # a test that ran before may have loaded it
     with pytest.raises(ModuleNotFoundError) as lacking:
         export_scene(folder, "rrd", tmp_path / "scene.rrd")
     assert remedy(lacking.value.name) == "Run: pip install 'splatnode[rerun]'"
