@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 from splatnode.viewer.sources import Source
 
 if TYPE_CHECKING:
-    from splatnode.recon.result.export.rerun import RecordingStream  # pyright: ignore[reportAttributeAccessIssue]
+    from splatnode.recon.result.export.rerun import Recording
 
 URL = "rerun+http://127.0.0.1:9876/proxy"  # where rerun listens on this machine
 _PORT = 9876
@@ -42,7 +42,7 @@ def stream(source: Source, url: str = URL) -> None:
             recording.flush()
 
 
-def follow(source: Source, recording: RecordingStream) -> None:
+def follow(source: Source, recording: Recording) -> None:
     """Each moment, and each move of the live camera, is a step; returns when nothing more will come."""
     from splatnode.recon.result.export import rerun
 

@@ -3,22 +3,21 @@
 The only file that imports rerun, which is an extra and takes a second to load.
 """
 
-# pyright: reportAttributeAccessIssue=false, reportMissingImports=false
-# for it is rarely installed where types are checked, and gathers its names as it is loaded
-
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
+from typing import Any, Protocol
 
 import numpy as np
-import rerun as rr
-from rerun import RecordingStream
 
 from splatnode.capture.process.printable import escaped
 from splatnode.recon.result.export.prepare import base_rgb
 from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.stored_snapshot import photograph_of
+
+rr: Any = importlib.import_module("rerun")  # by its name: where it is not installed, pyright takes this file for it
 
 WORLD = "world"
 STEP = "step"  # the timeline of a live scene: the number of the update
@@ -29,23 +28,33 @@ _IMAGE_PLANE = 0.1  # how far before its camera a photograph is drawn, in the sc
 _LANDMARK_RGB = (255, 170, 0)
 
 
+class Recording(Protocol):
+    """What is used of rerun's RecordingStream."""
+
+    def log(self, entity_path: str, entity: object, *, static: bool = False) -> None: ...
+
+    def set_time(self, timeline: str, *, sequence: int) -> None: ...
+
+    def flush(self) -> None: ...
+
+
 def recorded(snapshot: Snapshot) -> bytes:
     """The content of an .rrd file."""
-    recording = RecordingStream(_APPLICATION)
+    recording = rr.RecordingStream(_APPLICATION)
     stream = recording.binary_stream()
     draw(recording, snapshot)
     return stream.read() or b""
 
 
-def connected(url: str) -> RecordingStream:
+def connected(url: str) -> Recording:
     """A recording whose content goes to the rerun viewer at `url`."""
-    recording = RecordingStream(_APPLICATION)
+    recording = rr.RecordingStream(_APPLICATION)
     recording.connect_grpc(url)
     return recording
 
 
 def draw(
-    recording: RecordingStream,
+    recording: Recording,
     snapshot: Snapshot,
     step: int | None = None,
     before: frozenset[str] = frozenset(),
@@ -67,7 +76,7 @@ def draw(
     return now
 
 
-def draw_tracked(recording: RecordingStream, camera: CameraEstimate | None, step: int) -> None:
+def draw_tracked(recording: Recording, camera: CameraEstimate | None, step: int) -> None:
     """The live camera from `step` on; None: it is not known where it is."""
     recording.set_time(STEP, sequence=step)
     if camera is None:
