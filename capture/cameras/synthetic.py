@@ -54,6 +54,12 @@ def lens_of(config: Config) -> Intrinsics | None:
     return None if config.lens is None else config.lens.resized(config.width, config.height)
 
 
+def _bending_lens(config: Config) -> Intrinsics | None:
+    """The lens of the photographs, where it bends lines; None for a pinhole."""
+    lens = lens_of(config)
+    return lens if lens is not None and (lens.distortion or lens.model != "opencv") else None
+
+
 def frame_name(index: int) -> str:
     return f"view_{index:03d}.png"
 
@@ -72,7 +78,7 @@ def photograph(config: Config, camera: Camera, noise_seed: int = 0) -> npt.NDArr
     """(H, W, 3) RGB as `camera` sees the place of `config`: antialiased, with sensor noise."""
     T_world_camera, K = camera
     dense = config.width * config.samples, config.height * config.samples
-    if (lens := lens_of(config)) is not None and (lens.distortion or lens.model != "opencv"):
+    if (lens := _bending_lens(config)) is not None:
         colours, _ = cast_through(solids(config), T_world_camera, lens.resized(*dense))
     else:
         scale = np.diag([config.samples, config.samples, 1.0])
@@ -89,7 +95,7 @@ def depth(config: Config, index: int) -> npt.NDArray[np.float32]:
 
 def depth_map(config: Config, camera: Camera) -> npt.NDArray[np.float32]:
     """(H, W) true z in the frame of `camera`, metres, at pixel centres; inf where nothing is."""
-    if (lens := lens_of(config)) is not None and (lens.distortion or lens.model != "opencv"):
+    if (lens := _bending_lens(config)) is not None:
         return cast_through(solids(config), camera[0], lens)[1]
     return cast(solids(config), camera, config.width, config.height)[1]
 
