@@ -67,10 +67,28 @@ def _locate_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "images", type=Path, nargs="+", metavar="IMAGE", help="photographs, or folders of them, by any camera"
     )
+    _add_lens(parser)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write what was found into this file, too")
+
+
+def _audit_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("result", type=Path, metavar="RESULT", help="the folder that replay wrote, with landmarks.npz")
+    parser.add_argument(
+        "recordings",
+        type=Path,
+        nargs="+",
+        metavar="RECORDING",
+        help="folders in the order of time: a photograph a camera, of the camera's name, or a folder a camera",
+    )
+    _add_lens(parser)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write what was found into this file, too")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw it into this file (SVG)")
+
+
+def _add_lens(parser: argparse.ArgumentParser) -> None:
     lens = parser.add_mutually_exclusive_group()
     lens.add_argument("--calibration", type=Path, metavar="FILE", help="YAML with their lens: width, height, fx, ...")
     lens.add_argument("--fov", type=angle, metavar="DEGREES", help="their angle of view, across the longer side")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write what was found into this file, too")
 
 
 def _merge_arguments(parser: argparse.ArgumentParser) -> None:
@@ -105,6 +123,12 @@ VERBS = (
         "tell where further photographs of a scene were taken",
         _locate_arguments,
         lazily("splatnode.recon.locating.command", "locate"),
+    ),
+    Verb(
+        "audit",
+        "tell which camera of a station moved, when and by how much",
+        _audit_arguments,
+        lazily("splatnode.recon.auditing.command", "audit"),
     ),
     Verb(
         "merge",

@@ -142,7 +142,7 @@ def _halves_disagree(case: Case, config: Config) -> NotLocated | None:
         between = np.linalg.inv(T1) @ T2
         turn = np.array([between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1]])
         apart = np.concatenate([between[:3, 3], turn / 2.0])
-        covariance = sum(pose_covariance(half) for half in halves)
+        covariance = sum(pose_covariance(half.camera, half.covariance) for half in halves)
         known = np.isfinite(covariance).all()  # what is not known fails
         squared = float(apart @ np.linalg.pinv(covariance, hermitian=True) @ apart) if known else math.inf
         farthest = max(farthest, math.sqrt(max(squared, 0.0) / 6.0))

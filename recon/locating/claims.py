@@ -30,7 +30,7 @@ def claimed(posed: Posed, known: Correspondences, landmarks: Landmarks) -> tuple
     shares = shares / max(shares.sum(), 1)
     turn = np.radians(np.sqrt(shares @ landmarks.rotation_bounds**2)) / _BALL_95
     move = np.sqrt(shares @ landmarks.centre_bounds**2) / _BALL_95
-    covariance = pose_covariance(posed.fit) + np.diag([move**2] * 3 + [turn**2] * 3)
+    covariance = pose_covariance(posed.fit.camera, posed.fit.covariance) + np.diag([move**2] * 3 + [turn**2] * 3)
     centre = length_95(covariance[:3, :3])
     focal = _NORMAL_95 * math.sqrt(max(posed.fit.covariance[6, 6], 0.0))
     claim = Claim(

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import math
-from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from pathlib import Path
 
-from splatnode.capture.cameras import folder
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.process.terminal import say
 from splatnode.recon.locating.locate import locate as locate_photograph
 from splatnode.recon.locating.outcome import Located, NotLocated
+from splatnode.recon.locating.photographs import assumed_lens, photographs
 from splatnode.recon.result.export.staged import json_bytes, write_files
 from splatnode.recon.result.landmarks_file import read_landmarks
 
@@ -25,13 +22,13 @@ def locate(args: argparse.Namespace) -> int:
     landmarks = read_landmarks(args.result)
     given = None if args.calibration is None else read_lens(args.calibration)
     records, refused = [], 0
-    for frame in _photographs(args.images, given):
+    for frame in photographs(args.images, given):
         if isinstance(frame, DroppedFrame):
             found = None
             say(f"{frame.name}: left out: {frame.reason}")
             records.append({"name": frame.name, "placed": False, "code": "UNREADABLE", "message": frame.reason})
         else:
-            found = locate_photograph(landmarks, frame.image, _lens(frame, args.fov))
+            found = locate_photograph(landmarks, frame.image, assumed_lens(frame, args.fov))
             say(f"{frame.name}: {found.sentence}")
             records.append({"name": frame.name, **_record(found, frame)})
         refused += not isinstance(found, Located)
@@ -41,27 +38,6 @@ def locate(args: argparse.Namespace) -> int:
         write_files(args.json.parent, {args.json.name: json_bytes({**told, "photographs": records})})
         say(f"results: {args.json}")
     return EXIT_REFUSED if refused else EXIT_GOOD
-
-
-def _photographs(paths: Sequence[Path], given: Intrinsics | None) -> Iterator[Frame | DroppedFrame]:
-    """The photographs that the paths name, each a file or a folder, in their order."""
-    for path in paths:
-        if path.is_dir():
-            yield from folder.stream(folder.Config(folder=path, intrinsics=given))
-        elif path.is_file():
-            name = folder.frame_name(path)
-            yield from folder.stream(folder.Config(folder=path.parent, names=(name,), intrinsics=given))
-        else:
-            raise FileNotFoundError(f"{str(path)!r} is not there; give photographs, or folders that hold some")
-
-
-def _lens(frame: Frame, fov_deg: float | None) -> Intrinsics | None:
-    """What is known of the photograph's lens; an angle of view, across the longer side, is right to a few per cent."""
-    if fov_deg is None:
-        return frame.intrinsics
-    focal = max(frame.width, frame.height) / 2.0 / math.tan(math.radians(fov_deg) / 2.0)
-    middle = frame.width / 2.0, frame.height / 2.0
-    return Intrinsics(frame.width, frame.height, focal, focal, *middle, source="exif")
 
 
 def _record(found: Located | NotLocated, frame: Frame) -> dict[str, object]:

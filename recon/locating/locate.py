@@ -17,6 +17,7 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.frames.keyframe import Features, longer_side, principal_point
 from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.locating import candidates, checks, claims, posing
+from splatnode.recon.locating.camera_model import CameraModel
 from splatnode.recon.locating.case import Case, Judged
 from splatnode.recon.locating.correspondences import Correspondences, correspondences
 from splatnode.recon.locating.outcome import Located, NotLocated
@@ -46,6 +47,16 @@ class Photograph:
     features: Features
 
 
+@dataclass(frozen=True, eq=False)
+class Placed:
+    """A photograph that was placed, with what placed it."""
+
+    located: Located
+    camera: CameraModel
+    seen: Correspondences  # what agrees with the camera: each landmark, and each of the photograph's features, once
+    size: tuple[int, int]  # (width, height) of the photograph, pixels
+
+
 def locate(
     landmarks: Landmarks,
     image: npt.NDArray[np.uint8],  # (H, W, 3) RGB
@@ -73,6 +84,12 @@ def described(
 
 def located(landmarks: Landmarks, photograph: Photograph, config: Config = Config()) -> Located | NotLocated:  # noqa: B008
     """As `locate`."""
+    found = placed(landmarks, photograph, config)
+    return found.located if isinstance(found, Placed) else found
+
+
+def placed(landmarks: Landmarks, photograph: Photograph, config: Config = Config()) -> Placed | NotLocated:  # noqa: B008
+    """As `locate`, with the landmarks that the photograph shows."""
     frame = photograph.frame
     known = correspondences(photograph.features, principal_point(frame), landmarks, config.neighbours)
     case = _case(known, frame, landmarks, config)
@@ -86,7 +103,8 @@ def located(landmarks: Landmarks, photograph: Photograph, config: Config = Confi
     camera = case.posed.fit.camera
     K = np.diag([camera.lens.focal, camera.lens.focal, 1.0])
     K[:2, 2] = principal_point(frame) + camera.lens.shift
-    return Located(camera.T_world_camera, K, covariance, claim, int(case.posed.agreeing.sum()), landmarks.metric)
+    at = Located(camera.T_world_camera, K, covariance, claim, int(case.posed.agreeing.sum()), landmarks.metric)
+    return Placed(at, camera, case.agreeing, (frame.width, frame.height))
 
 
 def _case(known: Correspondences, frame: Frame, landmarks: Landmarks, config: Config) -> Case:

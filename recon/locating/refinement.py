@@ -85,10 +85,13 @@ def _inverse(information: Array) -> Array | None:
         return None
 
 
-def pose_covariance(fit: Fit) -> Array:
-    """(6, 6) of a small motion in the camera's frame: translation (3), then rotation vector (3), radians."""
+def pose_covariance(camera: CameraModel, covariance: Array) -> Array:
+    """(6, 6) of a small motion in the camera's frame: translation (3), then rotation vector (3), radians.
+
+    `covariance` (POSE, POSE or more) is of a step of `CameraModel.moved`.
+    """
     change = np.zeros((POSE, POSE))
-    change[:3, :3] = -cross_matrix(fit.camera.translation[None])[0]
+    change[:3, :3] = -cross_matrix(camera.translation[None])[0]
     change[:3, 3:] = -np.eye(3)
     change[3:, :3] = -np.eye(3)
-    return change @ fit.covariance[:POSE, :POSE] @ change.T
+    return change @ covariance[:POSE, :POSE] @ change.T

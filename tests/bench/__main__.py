@@ -35,6 +35,7 @@ BENCHMARKS = {
         "spz",
         "needles",
         "locate",
+        "audit",
         "race",
         "movers",
         "fisheyes",

@@ -71,7 +71,7 @@ def test_the_covariance_is_that_of_the_errors_times_the_observations_that_count_
         fit = refined(CAMERA, CAMERA.lens, seen(0.5, seed), 0.5)
         between = np.linalg.inv(CAMERA.T_world_camera) @ fit.camera.T_world_camera
         twists.append([*between[:3, 3], *Rotation.from_matrix(between[:3, :3]).as_rotvec()])
-        claimed = pose_covariance(fit) / CORRELATED
+        claimed = pose_covariance(fit.camera, fit.covariance) / CORRELATED
     ratio = np.sqrt(np.diag(np.cov(np.array(twists).T)) / np.diag(claimed))
     assert ratio.min() > 0.75 and ratio.max() < 1.35
     correlation = np.corrcoef(np.array(twists).T)[0, 4], (claimed / np.sqrt(np.outer(*2 * [np.diag(claimed)])))[0, 4]

@@ -1,0 +1,141 @@
+"""How a camera moved between two photographs, by the landmarks that both show.
+
+Each photograph by itself is placed as well as the landmarks are known. What is wrong with a landmark moves it alike in
+both pictures, so that the difference tells of a move far smaller than that: here the shift in the picture, of each
+landmark that both show, is explained by a turn and a shift of the camera.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from splatnode.recon.geometry import angles_deg
+from splatnode.recon.locating.camera_model import POSE
+from splatnode.recon.locating.locate import Placed
+from splatnode.recon.locating.refinement import CORRELATED, pose_covariance
+from splatnode.recon.registration.cross_product import cross_matrix
+
+Array = npt.NDArray[np.float64]
+
+# Chi-squared with 6 degrees of freedom that chance exceeds once in a million: the move is no chance beyond it.
+UNLIKELY = 38.26
+MIN_COMMON = 30  # landmarks that both photographs must show; with fewer, what is known of each by itself decides
+_STEPS = 15
+_CONVERGED = 1e-10  # squared length of a step, in standard deviations
+_ROBUST = 3.0  # scale of the Cauchy loss, in standard deviations
+_LEAST_NOISE = 2.5e-4  # of the longer side: no shift of a feature is known better than an eighth of 512 pixels' one
+_RAYLEIGH_MEDIAN = 1.1774  # median length of a 2D error whose components have sigma 1
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Of a camera, from one photograph to another, in the frame of the first: x right, y down, z forward."""
+
+    T_before_after: Array  # (4, 4): p_before = T_before_after @ p_after
+    covariance: Array  # (6, 6) of a small motion in that frame: shift (result's unit), then turn (radians)
+    common: int  # landmarks that both show and that it was measured by; 0: each photograph was placed by itself
+
+    @property
+    def degrees(self) -> float:
+        """By how much it turned."""
+        return float(angles_deg(self.T_before_after[None, :3, :3], np.eye(3)[None])[0])
+
+    @property
+    def distance(self) -> float:
+        """By how much it was shifted, in the result's unit."""
+        return float(np.linalg.norm(self.T_before_after[:3, 3]))
+
+    @property
+    def degrees_sigma(self) -> float:
+        """The standard deviation of the turn along the axis about which it is known worst."""
+        return float(np.degrees(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1])))
+
+    @property
+    def distance_sigma(self) -> float:
+        """The standard deviation of the shift in the direction in which it is known worst."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is more than chance."""
+        step = twist(self.T_before_after)
+        return float(step @ np.linalg.solve(self.covariance, step)) > UNLIKELY
+
+    @property
+    def least_turn_deg(self) -> float:
+        """The smallest turn alone that would be significant, about the axis about which the least is known."""
+        information = np.linalg.inv(self.covariance)[3:, 3:]
+        return float(np.degrees(np.sqrt(UNLIKELY / np.linalg.eigvalsh(information)[0])))
+
+    @property
+    def least_shift(self) -> float:
+        """The smallest shift alone that would be significant, in the direction in which the least is known."""
+        information = np.linalg.inv(self.covariance)[:3, :3]
+        return float(np.sqrt(UNLIKELY / np.linalg.eigvalsh(information)[0]))
+
+
+def motion(before: Placed, after: Placed) -> Motion:
+    """How the camera of the photograph `before` moved until `after`, if both are of one camera with one lens."""
+    own, other = _common(before, after)
+    if len(own) >= MIN_COMMON and before.size == after.size:
+        measured = _measured(before, own, after.seen.pixels[other] - before.seen.pixels[own])
+        if measured is not None:
+            return measured
+    T = np.linalg.inv(before.camera.T_world_camera) @ after.camera.T_world_camera
+    return Motion(T, before.located.covariance + _carried(after.located.covariance, T), 0)
+
+
+def _common(before: Placed, after: Placed) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """The places of the landmarks that both show, among those that each shows."""
+    _, own, other = np.intersect1d(before.seen.landmark_of, after.seen.landmark_of, return_indices=True)
+    return own, other
+
+
+def _measured(before: Placed, own: npt.NDArray[np.int64], shifts: Array) -> Motion | None:
+    """The motion that explains the `shifts` (M, 2) of the landmarks in the picture; None where they do not tell it."""
+    start, points = before.camera, before.seen.points[own]
+    seen = start.project(points)[0] + shifts
+    least = _LEAST_NOISE * max(before.size)
+    camera, covariance = start, np.full((POSE, POSE), np.nan)
+    for _ in range(_STEPS):
+        residuals = seen - camera.project(points)[0]
+        lengths = np.linalg.norm(residuals, axis=1)
+        sigma = max(float(np.median(lengths)) / _RAYLEIGH_MEDIAN, least)
+        weights = 1.0 / (1.0 + (lengths / (_ROBUST * sigma)) ** 2) / sigma**2
+        rows = camera.derivatives(points)[0][:, :, :POSE]
+        information = np.einsum("m,mij,mik->jk", weights, rows, rows)
+        try:
+            covariance = np.linalg.inv(information)
+        except np.linalg.LinAlgError:
+            return None
+        step = covariance @ np.einsum("m,mij,mi->j", weights, rows, residuals)
+        if not np.isfinite(step).all():
+            return None
+        camera = camera.moved(np.concatenate([step, np.zeros(4)]))
+        if step @ information @ step < _CONVERGED:
+            break
+    T = np.linalg.inv(start.T_world_camera) @ camera.T_world_camera
+    return Motion(T, _carried(pose_covariance(camera, CORRELATED * covariance), T), len(own))
+
+
+def adjoint(T: Array) -> Array:
+    """(6, 6) what makes of a small motion, shift then turn, the same in the frame that T (4, 4) leads to."""
+    result = np.zeros((POSE, POSE))
+    result[:3, :3] = result[3:, 3:] = T[:3, :3]
+    result[:3, 3:] = cross_matrix(T[None, :3, 3])[0] @ T[:3, :3]
+    return result
+
+
+def twist(T: Array) -> Array:
+    """(6,) the shift and the rotation vector of a motion (4, 4)."""
+    return np.concatenate([T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_rotvec()])
+
+
+def _carried(covariance: Array, T_before_after: Array) -> Array:
+    """The covariance (6, 6) of a small motion in the frame of the second photograph, along the axes of the first."""
+    turn = np.kron(np.eye(2), T_before_after[:3, :3])
+    return turn @ covariance @ turn.T

@@ -1,0 +1,114 @@
+"""An audit in words, and as values for JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from splatnode.recon.auditing.audit import Audit
+from splatnode.recon.auditing.history import Period
+from splatnode.recon.auditing.motion import Motion
+
+
+def lines(audit: Audit) -> Iterator[str]:
+    """What moved first, then what stood still, then what is not known."""
+    for move in audit.moves:
+        when = f"moved between {audit.recordings[move.after]} and {audit.recordings[move.before]}"
+        if len(move.cameras) > 1:
+            together = f"{', '.join(move.cameras[:-1])} and {move.cameras[-1]}"
+            all_of_them = set(move.cameras) == set(audit.periods)
+            what = ": all cameras, or the scene before them" if all_of_them else ""
+            yield f"{together} {when} as one body{what}"
+        for camera in move.cameras:
+            later = next(each for each in audit.periods[camera][1:] if each.recordings[0] >= move.before)
+            assert later.came_by is not None  # it is not the first period
+            yield f"{camera} {when} by {amount(audit, later.came_by)}"
+    for camera, history in audit.periods.items():
+        if len(history) == 1:
+            yield f"{camera} {_stood(audit, history[0])}"
+    for camera, problems in sorted(audit.not_seen.items()):
+        for number, problem in sorted(problems.items()):
+            yield f"{camera} was not compared in {audit.recordings[number]}: {problem.code}: {problem.message}"
+
+
+def amount(audit: Audit, motion: Motion) -> str:
+    """How far, with two standard deviations."""
+    turn = f"{motion.degrees:.2g} degrees (± {2 * motion.degrees_sigma:.1g})"
+    distance, sigma = motion.distance, 2 * motion.distance_sigma
+    if audit.metric:
+        return f"{turn} and {100 * distance:.2g} cm (± {100 * sigma:.1g})"
+    return f"{turn} and {100 * distance / audit.unit:.2g} % of the distance (± {100 * sigma / audit.unit:.1g})"
+
+
+def _stood(audit: Audit, period: Period) -> str:
+    if period.last_motion is None:
+        return f"was placed in {audit.recordings[period.recordings[0]]} alone: there is nothing to compare it with"
+    noticed = period.last_motion
+    shift = noticed.least_shift
+    length = f"{100 * shift:.2g} cm" if audit.metric else f"{100 * shift / audit.unit:.2g} % of the distance"
+    return (
+        f"stood still in {len(period.recordings)} recordings: "
+        f"a turn of {noticed.least_turn_deg:.2g} degrees or a shift of {length} would have been noticed"
+    )
+
+
+def values(audit: Audit) -> dict[str, object]:
+    """For a file: poses are T_world_camera (4, 4) in the world of the result, turns in degrees, lengths in its unit."""
+    return {
+        "scale": "metric" if audit.metric else "relative",
+        "distance": audit.unit,
+        "recordings": list(audit.recordings),
+        "moves": [
+            {
+                "after": audit.recordings[move.after],
+                "before": audit.recordings[move.before],
+                "cameras": list(move.cameras),
+            }
+            for move in audit.moves
+        ],
+        "cameras": {
+            camera: {
+                "periods": [_period(audit, each) for each in audit.periods.get(camera, ())],
+                "not_compared": [
+                    {
+                        "recording": audit.recordings[number],
+                        "photograph": problem.photograph,
+                        "code": problem.code,
+                        "message": problem.message,
+                    }
+                    for number, problem in sorted(audit.not_seen.get(camera, {}).items())
+                ],
+            }
+            for camera in sorted({*audit.periods, *audit.not_seen})
+        },
+    }
+
+
+def _period(audit: Audit, period: Period) -> dict[str, object]:
+    located, noticed = period.sighting.placed.located, period.last_motion
+    return {
+        "recordings": [audit.recordings[number] for number in period.recordings],
+        "T_world_camera": located.T_world_camera.tolist(),
+        "K": located.K.tolist(),
+        "claim": {"rotation_deg": located.claim.rotation_deg, "centre": located.claim.centre},
+        "came_by": None if period.came_by is None else _motion(period.came_by),
+        "noticed_from": None if noticed is None else {"turn_deg": noticed.least_turn_deg, "shift": noticed.least_shift},
+    }
+
+
+def _motion(motion: Motion) -> dict[str, object]:
+    return {
+        "T_before_after": motion.T_before_after.tolist(),
+        "covariance": motion.covariance.tolist(),
+        "turn_deg": motion.degrees,
+        "shift": motion.distance,
+        "common_points": motion.common,
+    }
+
+
+def summary(audit: Audit) -> str:
+    """How many moved, in one line."""
+    cameras, moved = {*audit.periods, *audit.not_seen}, {name for move in audit.moves for name in move.cameras}
+    return (
+        f"{len(moved)} of {len(cameras)} cameras moved in {len(audit.recordings)} recordings; "
+        f"{len(audit.compared)} could be compared"
+    )

@@ -1,0 +1,101 @@
+"""Moves of cameras are found, dated, measured, and grouped by what moved as one; noise moves nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from splatnode.recon.auditing.history import Move, moves, periods
+from splatnode.recon.auditing.motion import MIN_COMMON, motion
+from splatnode.recon.auditing.sighting import Sighting
+from splatnode.recon.locating.camera_model import CameraModel, Lens
+from splatnode.recon.locating.correspondences import Correspondences
+from splatnode.recon.locating.locate import Placed
+from splatnode.recon.locating.outcome import Claim, Located
+
+LENS = Lens(500.0, 0.0, np.zeros(2), 0.0, 0.0, 0.0)
+SIZE = (640, 480)
+NOISE_PX = 0.3
+LEFT, RIGHT = np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.1, 0.0])
+
+
+def rigid(turn_deg=(0.0, 0.0, 0.0), shift=(0.0, 0.0, 0.0)) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", turn_deg, degrees=True).as_matrix(), shift
+    return T
+
+
+def placed(T_world_camera: np.ndarray, seed: int, count: int = 300) -> Placed:
+    """A photograph of `count` of the same points, each seen with noise of its own."""
+    points = np.random.default_rng(0).uniform([-0.8, -0.6, 0.7], [0.8, 0.6, 1.6], (300, 3))[:count]
+    inverse = np.linalg.inv(T_world_camera)
+    camera = CameraModel(inverse[:3, :3], inverse[:3, 3], LENS)
+    noise = np.random.default_rng(seed).normal(scale=NOISE_PX, size=(count, 2))
+    number, zero = np.arange(count), np.zeros((count, 3, 3))
+    seen = Correspondences(camera.project(points)[0] + noise, number, points, zero, number, number, points)
+    covariance = 1e-6 * np.eye(6)
+    located = Located(T_world_camera, np.eye(3), covariance, Claim(0.1, 0.01, 1.0, 1.0), count, False)
+    return Placed(located, camera, seen, SIZE)
+
+
+def history(*Ts: np.ndarray, first_seed: int = 1) -> dict[int, Sighting]:
+    return {i: Sighting(f"{i}.png", placed(T, first_seed + i)) for i, T in enumerate(Ts)}
+
+
+def test_noise_moves_nothing():
+    T = rigid((3.0, -5.0, 2.0), LEFT)
+    for seed in range(200):
+        found = motion(placed(T, 2 * seed), placed(T, 2 * seed + 1))
+        assert found.common == 300 and not found.significant
+
+
+@pytest.mark.parametrize(
+    "turn, shift", [((0.3, 0, 0), (0, 0, 0)), ((0, 0, 0), (0, 0, 0.005)), ((20, 5, 0), (0.1, 0, 0))]
+)
+def test_a_move_is_measured(turn, shift):
+    T, move = rigid((3.0, -5.0, 2.0), LEFT), rigid(turn, shift)
+    found = motion(placed(T, 1), placed(T @ move, 2))
+    assert found.significant
+    assert np.degrees(Rotation.from_matrix(move[:3, :3]).magnitude()) == pytest.approx(found.degrees, abs=0.06)
+    assert np.linalg.norm(found.T_before_after[:3, 3] - shift) < 0.001
+    assert found.degrees_sigma < 0.06 and found.distance_sigma < 0.002
+
+
+def test_what_is_the_least_to_be_noticed_is_noticed_and_half_of_it_is_not():
+    T = rigid((3.0, -5.0, 2.0), LEFT)
+    least = motion(placed(T, 1), placed(T, 2)).least_shift
+    shifted = [motion(placed(T, 3), placed(T @ rigid(shift=(0.0, 0.0, factor * least)), 4)) for factor in (1.5, 0.3)]
+    assert [each.significant for each in shifted] == [True, False]
+
+
+def test_with_few_common_points_each_photograph_stands_for_itself():
+    T = rigid((3.0, -5.0, 2.0), LEFT)
+    found = motion(placed(T, 1), placed(T @ rigid((0.0, 5.0, 0.0)), 2, count=MIN_COMMON - 1))
+    assert found.common == 0 and found.significant and found.degrees == pytest.approx(5.0, abs=1e-6)
+
+
+def test_periods_end_where_the_camera_moves_and_slow_drift_adds_up():
+    T, aside = rigid(shift=LEFT), rigid((0.0, 1.0, 0.0))
+    found = periods(history(T, T, T @ aside, T @ aside, T))
+    assert [period.recordings for period in found] == [(0, 1), (2, 3), (4,)]
+    assert found[0].came_by is None and found[1].came_by is not None
+    assert found[1].came_by.degrees == pytest.approx(1.0, abs=0.05)
+    drifting = periods(history(*(T @ rigid((0.0, 0.05 * i, 0.0)) for i in range(12))))
+    assert 2 <= len(drifting) < 12
+
+
+def test_cameras_that_move_alike_in_the_world_moved_as_one():
+    body = rigid((0.0, 3.0, 1.0), (0.05, 0.0, 0.02))
+    left, right = rigid((0.0, 5.0, 0.0), LEFT), rigid((0.0, -5.0, 0.0), RIGHT)
+    together = {
+        "left": periods(history(left, left, body @ left)),
+        "right": periods(history(right, right, body @ right, first_seed=50)),
+    }
+    assert moves(together) == [Move(1, 2, ("left", "right"))]
+    apart = together | {"right": periods(history(right, right, right @ body, first_seed=50))}
+    assert moves(apart) == [Move(1, 2, ("left",)), Move(1, 2, ("right",))]
+    one_only = together | {"right": periods(history(right, right, right, first_seed=50))}
+    assert moves(one_only) == [Move(1, 2, ("left",))]
+    at_another_time = together | {"right": periods(history(right, body @ right, body @ right, first_seed=50))}
+    assert moves(at_another_time) == [Move(0, 1, ("right",)), Move(1, 2, ("left",))]
