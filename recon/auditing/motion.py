@@ -7,7 +7,7 @@ landmark that both show, is explained by a turn and a shift of the camera.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -81,12 +81,23 @@ class Motion:
 def motion(before: Placed, after: Placed) -> Motion:
     """How the camera of the photograph `before` moved until `after`, if both are of one camera with one lens."""
     own, other = _common(before, after)
+    T = np.linalg.inv(before.camera.T_world_camera) @ after.camera.T_world_camera
+    apart = before.located.covariance + _carried(after.located.covariance, T)
     if len(own) >= MIN_COMMON and before.size == after.size:
         measured = _measured(before, own, after.seen.pixels[other] - before.seen.pixels[own])
         if measured is not None:
-            return measured
-    T = np.linalg.inv(before.camera.T_world_camera) @ after.camera.T_world_camera
-    return Motion(T, before.located.covariance + _carried(after.located.covariance, T), 0)
+            depth = float(np.median(before.camera.project(before.seen.points[own])[1]))
+            return replace(measured, covariance=measured.covariance + _seen_otherwise(measured, depth) ** 2 * apart)
+    return Motion(T, apart, 0)
+
+
+def _seen_otherwise(motion: Motion, depth: float) -> float:
+    """The share of what is wrong with the scene that is not the same for both cameras, in [0, 1].
+
+    It grows with the angle between the directions in which they see it, and between those in which they look; `depth`
+    is the scene's, in its unit.
+    """
+    return min(1.0, motion.distance / depth + np.radians(motion.degrees))
 
 
 def _common(before: Placed, after: Placed) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
