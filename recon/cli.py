@@ -8,6 +8,7 @@ import json
 import shlex
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -167,7 +168,7 @@ def bench(args: argparse.Namespace) -> int:
             scoring=Scoring(
                 rasterizer(device.chosen(wanted)),
                 load_networks(args.weights_dir),
-                INTERPOLATED_START if args.interpolated_start else Settings(),
+                replace(INTERPOLATED_START if args.interpolated_start else Settings(), best_gain=args.best_gain),
                 args.by_region,
             ),
             command=shlex.join(["splatnode", *sys.argv[1:]]),

@@ -20,7 +20,7 @@ from splatnode.recon.optimize.watch import examine, watch
 from splatnode.recon.rasterize.device import chosen
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Verdict
-from splatnode.recon.scene import growth
+from splatnode.recon.scene import growth, light
 from splatnode.recon.scene.first_look import first_look
 from splatnode.recon.scene.initialisation import initial_scene
 from splatnode.recon.scene.scene import Scene
@@ -54,15 +54,20 @@ def looked_at_first(estimate: Estimate, config: Config) -> Shown | None:
 
 @single_torch_thread()
 def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
-    """The scene of all cameras that were placed, not optimised yet; None where the verdict forbids one."""
+    """The scene of all cameras that were placed, not optimised yet; None where the verdict forbids one.
+
+    Photographs that were exposed differently are brought to one light first.
+    """
     if estimate.registration is None or not estimate.verdict.publishable:
         return None
-    return initial_scene(
-        tuple(estimate.pointmaps.values()),
-        {keyframe.name: keyframe.image for keyframe in estimate.graph.keyframes},
-        config.initialisation,
-        {keyframe.name: keyframe.mask for keyframe in estimate.graph.keyframes},
-    )
+    pointmaps = tuple(estimate.pointmaps.values())
+    images = {keyframe.name: keyframe.image for keyframe in estimate.graph.keyframes}
+    masks = {keyframe.name: keyframe.mask for keyframe in estimate.graph.keyframes}
+    found = light.differing(pointmaps, images, config.light)
+    if found is None:
+        return initial_scene(pointmaps, images, config.initialisation, masks)
+    alike, told = found.applied(images, masks)
+    return initial_scene(pointmaps, alike, config.initialisation, told, found.gains)
 
 
 def refined(
@@ -127,6 +132,7 @@ def snapshot(
         evidence=conclusion.evidence_record,
         landmarks=conclusion.landmarks if scene and final else None,
         masked=conclusion.masked,
+        gains={view.name: view.gains for view in scene.views if view.gains is not None} if scene else {},
     )
 
 

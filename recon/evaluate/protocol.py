@@ -39,6 +39,8 @@ class Settings:
     alignment_levels: int = 1
     continued_steps: int = 60  # from the pose that was found in another moment of the same run, at full size
     start: Literal["true", "interpolated"] = "true"  # of the search: start_pose.py
+    # A render gets, a channel, the gain that fits the photograph best: how that was exposed is nobody's to know
+    best_gain: bool = False
 
 
 INTERPOLATED_START = Settings(alignment_steps=300, alignment_levels=3, start="interpolated")
@@ -223,14 +225,27 @@ def _score_test_views(
             if settings.start == "interpolated":
                 start = between_neighbours(name, list(scene.paths), {c.name: c.T_world_camera for c in estimated})
             steps, levels, rate = settings.alignment_steps, settings.alignment_levels, _FIRST_RATE
-        aligned = find_test_pose(appearance, truth, start, K, steps=steps, levels=levels, learning_rate=rate)
+        used = torch.from_numpy(modelled_mask(mask, *photograph.shape[:2]))
+        target = truth
+        if settings.best_gain:
+            begun = appearance.render(start, K, truth.shape[1], truth.shape[0])
+            target = (truth / best_gains(truth, begun, used[rows, columns])).clamp(0.0, 1.0)
+        aligned = find_test_pose(appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate)
         T_world_camera = aligned.T_world_camera
         found.setdefault(name, T_world_camera)
         with_rim = appearance.render(T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
+        if settings.best_gain:
+            gains = best_gains(truth, with_rim[rows, columns], used[rows, columns])
+            with_rim = (with_rim * gains).clamp(0.0, 1.0)
         show(name, truth, with_rim[rows, columns])
-        used = torch.from_numpy(modelled_mask(mask, *photograph.shape[:2]))
         scores.append(_view_score(with_rim, whole, used, (rows, columns), networks, counts.get(name)))
     return scores
+
+
+def best_gains(truth: Tensor, image: Tensor, used: Tensor) -> Tensor:
+    """(3,) by which `image` fits `truth` best, both (H, W, 3), in each channel, where `used` (H, W) says so."""
+    seen, known = image[used], truth[used]
+    return ((seen * known).sum(0) / (seen * seen).sum(0).clamp_min(1e-12)).clamp_min(1e-3)
 
 
 def _view_score(

@@ -20,6 +20,7 @@ from splatnode.recon.result.export.staged import write_files
 logger = logging.getLogger(__name__)
 
 _STARTS = {"true": "the true pose", "interpolated": "between the neighbouring cameras"}
+_GAINS = {False: "", True: ", in the exposure and white balance of each held-out photograph"}
 _STYLE = (
     "body{font:15px/1.45 sans-serif;margin:2em auto;max-width:1500px;padding:0 1em;color:#222}"
     "table{border-collapse:collapse;margin:1em 0;display:block;overflow-x:auto}td,th{border-bottom:1px solid #ddd;"
@@ -60,7 +61,8 @@ def _introduction(bench: Bench) -> str:
         f"pose was found in the finished scene ({settings.alignment_steps} steps from {_STARTS[settings.start]}, "
         "equation 18), at "
         f"{settings.longer_side} px, without the black rim that undistortion left (`with rim`: PSNR of the whole "
-        "photograph). Seconds are wall time of the reconstruction alone, with the cameras and points that methods of "
+        f"photograph){_GAINS[settings.best_gain]}. "
+        "Seconds are wall time of the reconstruction alone, with the cameras and points that methods of "
         "one prior share. Means are over the runs that every method was put to and, of these, the method's that "
         "published a scene; `±`: standard deviation "
         "between seeds; `–`: not measured."

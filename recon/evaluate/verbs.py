@@ -29,6 +29,11 @@ def _bench_arguments(parser: argparse.ArgumentParser) -> None:
         help="seek a held-out view's pose from between its neighbours, not from the true one: 300 steps, three sizes",
     )
     parser.add_argument(
+        "--best-gain",
+        action="store_true",
+        help="bring each render to the exposure and white balance of the held-out photograph before it is scored",
+    )
+    parser.add_argument(
         "--by-region", action="store_true", help="score also what two training photographs show, one, or none"
     )
     parser.add_argument("--seeds", type=positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")

@@ -75,3 +75,4 @@ class Snapshot:
     scale: Scale = RELATIVE  # the unit of all lengths
     landmarks: Landmarks | None = None  # by which further photographs are placed; None: they were not gathered
     masked: Mapping[str, float] = field(default_factory=dict)  # share that a mask hides, by photograph that has one
+    gains: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # taken out of photographs: red, green, blue

@@ -30,6 +30,7 @@ class TrainingView:
     K: Tensor  # (3, 3) at modelled size
     pointmap: Pointmap | None = None  # with the camera as registered; None: there is none
     mask: npt.NDArray[np.bool_] | None = None  # (h, w), True: the scene is fitted to it; None: to all pixels
+    gains: tuple[float, ...] | None = None  # red, green, blue: of the photograph over `image`; None: it is the same
 
     @property
     def width(self) -> int:

@@ -1,0 +1,133 @@
+"""The light of photographs that were exposed differently: what brings each to that of the others.
+
+A camera that opens its iris, or takes another white for white, between two photographs makes one surface two colours.
+Depth that two photographs agree on tells which pixels show one surface; the median ratio of their colours is the ratio
+of their gains, per channel, and all ratios together give each photograph's gains in closed form (least squares of
+their logarithms). What they say is used only where it is more than light that differs by where it is seen from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import cv2
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from msgspec import Meta
+
+from splatnode.recon.priors import reprojection
+from splatnode.recon.priors.confirmed import AGREEING, LEAST_CONFIDENCE, MOST_PARTNERS
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.workers import each
+
+Array = npt.NDArray[np.float64]
+Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+
+STEP = 3  # pixels between those that are compared
+DARKEST, BRIGHTEST = 12.0, 243.0  # grey levels between which a camera answers to light in proportion
+SATURATED = 250  # grey level from which a pixel does not tell how bright it was
+MIN_SAMPLES = 200  # pixels that two photographs must share
+INDEPENDENT = 50.0  # samples that count as one: neighbours show one surface
+LEAST_SIGMA = 0.01  # of the logarithm of a ratio: surfaces shine differently in different directions
+PRIOR_SIGMA = 1.0  # of a logarithm of a gain: a photograph that shares nothing keeps its light
+_ROUNDS, _HUBER = 10, 2.0  # of robust least squares; in standard deviations
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    enabled: bool = True  # bring photographs of different exposure or white balance to one light
+    # Gains that differ by less, as a share, from the median of all, in each channel, are left as they are
+    least: Annotated[float, Meta(ge=0)] = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """How photographs were exposed."""
+
+    gains: Mapping[str, tuple[float, ...]]  # for red, green and blue, by the photograph's name; 1 is the median of all
+
+    def applied(
+        self, images: Mapping[str, Image], masks: Mapping[str, Mask | None]
+    ) -> tuple[dict[str, Image], dict[str, Mask | None]]:
+        """The images (h, w, 3) as gains of 1 would have them, and what their `masks` (h, w) leave of them.
+
+        Left out are pixels that are saturated where others would not be: they do not tell how bright they were.
+        """
+        alike, told = dict(images), dict(masks)
+        for name, gains in self.gains.items():
+            image, mask = images[name], masks.get(name)
+            alike[name] = np.clip(np.rint(image / np.array(gains)), 0, 255).astype(np.uint8)
+            lost = ((image >= SATURATED) & (np.array(gains) > 1.0)).any(axis=-1)
+            if lost.any():
+                told[name] = ~lost if mask is None else mask & ~lost
+        return alike, told
+
+
+def differing(pointmaps: Sequence[Pointmap], images: Mapping[str, Image], config: Config) -> Light | None:
+    """The gains of `images` (h, w, 3), by name; None where they do not differ by more than `config` says."""
+    if not config.enabled or len(pointmaps) < 2:
+        return None
+    logs = log_gains(pointmaps, [images[pointmap.name] for pointmap in pointmaps])
+    if np.abs(logs).max() < np.log1p(config.least):
+        return None
+    gains = np.exp(logs).tolist()
+    return Light({pointmap.name: tuple(own) for pointmap, own in zip(pointmaps, gains, strict=True)})
+
+
+def log_gains(pointmaps: Sequence[Pointmap], pictures: Sequence[Image]) -> Array:
+    """(V, 3) logarithms of the photographs' gains; the median of each channel is 0."""
+    known = [pointmap.masked(pointmap.confidence >= LEAST_CONFIDENCE) for pointmap in pointmaps]
+    partners = reprojection.overlapping(known, MOST_PARTNERS)
+    smooth = [cv2.blur(picture.astype(np.float32), (3, 3)) for picture in pictures]
+    pairs = sorted({(min(i, j), max(i, j)) for i, others in enumerate(partners) for j in others})
+    found = each(lambda pair: log_ratio(*(part for k in pair for part in (known[k], smooth[k]))), pairs)
+    compared = [(pair, *ratio) for pair, ratio in zip(pairs, found, strict=True) if ratio is not None]
+    logs = _solved(len(pictures), compared)
+    return logs - np.median(logs, axis=0)
+
+
+def log_ratio(
+    source: Pointmap, source_picture: npt.NDArray[np.float32], target: Pointmap, target_picture: npt.NDArray[np.float32]
+) -> tuple[Array, Array] | None:
+    """(3,) logarithms of the source's gains over the target's, and their sigmas; None where they share too little."""
+    own = np.zeros(source.depth.shape, bool)
+    own[::STEP, ::STEP] = source.depth[::STEP, ::STEP] > 0
+    points = source.points[own]
+    T_target_world = np.linalg.inv(target.T_world_camera)
+    x, y, z = target.K @ (T_target_world[:3, :3] @ points.T + T_target_world[:3, 3:])
+    height, width = target.depth.shape
+    column, row = (np.floor(np.divide(each, z, out=np.full_like(z, -1.0), where=z > 0)).astype(int) for each in (x, y))
+    inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    column, row, z = column[inside], row[inside], z[inside]
+    agree = np.abs(target.depth[row, column] - z) < AGREEING * z
+    one, other = source_picture[own][inside][agree], target_picture[row[agree], column[agree]]
+    usable = ((np.minimum(one, other) > DARKEST) & (np.maximum(one, other) < BRIGHTEST)).all(axis=1)
+    if usable.sum() < MIN_SAMPLES:
+        return None
+    logs = np.log(one[usable] / other[usable]).astype(np.float64)
+    median = np.median(logs, axis=0)
+    spread = 1.4826 * np.median(np.abs(logs - median), axis=0)
+    return median, np.hypot(spread / np.sqrt(len(logs) / INDEPENDENT), LEAST_SIGMA)
+
+
+def _solved(count: int, compared: Sequence[tuple[tuple[int, int], Array, Array]]) -> Array:
+    """(count, 3) logarithms whose differences are the compared ones, by robust least squares under the prior."""
+    result = np.zeros((count, 3))
+    for channel in range(3):
+        weights = np.ones(len(compared))
+        for _ in range(_ROUNDS):
+            information, gradient = np.eye(count) / PRIOR_SIGMA**2, np.zeros(count)
+            for weight, ((i, j), ratio, sigma) in zip(weights, compared, strict=True):
+                share = weight / sigma[channel] ** 2
+                information[[i, j], [i, j]] += share
+                information[[i, j], [j, i]] -= share
+                gradient[i] += share * ratio[channel]
+                gradient[j] -= share * ratio[channel]
+            logs = np.linalg.solve(information, gradient)
+            misfit = np.array([abs(logs[i] - logs[j] - ratio[channel]) / s[channel] for (i, j), ratio, s in compared])
+            weights = np.minimum(1.0, _HUBER / np.maximum(misfit, 1e-9))
+        result[:, channel] = logs
+    return result

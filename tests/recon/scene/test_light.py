@@ -1,0 +1,90 @@
+"""Photographs that were exposed differently, or took another white for white, are brought to one light."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+
+from splatnode.capture.cameras import synthetic
+from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.scene.light import Config, Light, differing, log_gains
+
+PLACE = synthetic.Config(views=5, width=240, height=180)
+GAINS = np.array([[0.5, 0.45, 0.5], [1.0, 1.0, 1.1], [2.0, 2.0, 1.8], [1.0, 1.0, 1.0], [0.8, 0.9, 0.8]])
+
+
+@lru_cache(maxsize=1)
+def place() -> tuple[list[Pointmap], list[np.ndarray]]:
+    """Photographs with the depth that they show, where the camera answers to light in proportion."""
+    maps, images = [], []
+    for index, (T, K) in enumerate(synthetic.scene_cameras(PLACE)):
+        depth = synthetic.depth_map(PLACE, (T, K))
+        known = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
+        normal = np.zeros((*depth.shape, 3), np.float32)
+        maps.append(Pointmap(f"{index}", index, known, (known > 0).astype(np.float32), normal, T, K))
+        images.append((0.45 * synthetic.photograph(PLACE, (T, K), index)).astype(np.uint8))
+    return maps, images
+
+
+def exposed(images: list[np.ndarray], gains: np.ndarray = GAINS) -> list[np.ndarray]:
+    return [np.clip(np.rint(image * own), 0, 255).astype(np.uint8) for image, own in zip(images, gains, strict=True)]
+
+
+def by_name(images: list[np.ndarray]) -> dict[str, np.ndarray]:
+    return {f"{index}": image for index, image in enumerate(images)}
+
+
+def test_gains_are_found_within_three_per_cent():
+    maps, images = place()
+    found = np.exp(log_gains(maps, exposed(images)))
+    expected = GAINS / np.median(GAINS, axis=0)
+    assert np.abs(found / expected - 1.0).max() < 0.03
+
+
+def test_photographs_of_one_light_are_left_as_they_are():
+    maps, images = place()
+    assert np.abs(log_gains(maps, images)).max() < 0.03
+    assert differing(maps, by_name(images), Config()) is None
+
+
+def test_a_small_difference_is_left_and_a_large_one_is_not_unless_it_is_switched_off():
+    maps, images = place()
+    slightly = exposed(images, np.array([1.0, 1.05, 1.0, 1.0, 0.95])[:, None])
+    assert differing(maps, by_name(slightly), Config()) is None
+    widely = by_name(exposed(images))
+    assert differing(maps, widely, Config()) is not None
+    assert differing(maps, widely, Config(enabled=False)) is None
+    assert differing(maps[:1], widely, Config()) is None
+
+
+def test_one_light_gives_back_the_photographs():
+    maps, images = place()
+    changed = by_name(exposed(images))
+    found = differing(maps, changed, Config())
+    assert found is not None
+    alike, _ = found.applied(changed, {})
+    for name, image in by_name(images).items():
+        off = np.abs(alike[name].astype(float) - image * np.median(GAINS, axis=0))
+        assert np.median(off) <= 2.0  # a gain that is halved doubles what rounding took
+
+
+def test_pixels_that_do_not_tell_their_brightness_are_left_out():
+    image = np.full((4, 6, 3), 100, np.uint8)
+    image[0], image[1, :, 2] = 255, 252
+    given = np.ones((4, 6), bool)
+    given[3] = False
+    brighter = Light({"a": (1.5, 1.5, 1.5)})
+    assert np.array_equal(brighter.applied({"a": image}, {})[1]["a"], np.repeat([[False, False, True, True]], 6, 0).T)
+    assert np.array_equal(brighter.applied({"a": image}, {"a": given})[1]["a"][:, 0], [False, False, True, False])
+    darker = Light({"a": (0.8, 0.8, 0.8)})
+    assert darker.applied({"a": image}, {"a": None})[1]["a"] is None
+
+
+def test_photographs_that_share_nothing_keep_their_light():
+    maps, images = place()
+    away = np.eye(4)
+    away[:3, 3] = 100.0
+    apart = [maps[0], replace(maps[1], T_world_camera=away)]
+    assert np.array_equal(log_gains(apart, exposed(images)[:2]), np.zeros((2, 3)))

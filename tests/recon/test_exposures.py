@@ -1,0 +1,72 @@
+"""Photographs of different exposure make the scene that those of one exposure make, in the light of their median."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from splatnode.capture.cameras import synthetic
+from splatnode.capture.frame import Frame
+from splatnode.recon.config import overlaid, preset
+from splatnode.recon.geometry import align_cameras
+from splatnode.recon.offline import run
+from splatnode.recon.result.preview import render_rgb
+from splatnode.recon.result.report import build_report
+from splatnode.recon.result.snapshot import Snapshot
+from tests.support.synthetic import SMALL, photographs
+
+CONFIG = overlaid(preset("preview"), {"size": 320})
+GAINS = (0.55, 1.0, 0.8, 1.0, 0.6, 1.0)
+
+
+def exposed(frame: Frame) -> Frame:
+    dimmed = np.rint(frame.image * GAINS[frame.frame_id]).astype(np.uint8)
+    return replace(frame, image=dimmed, encoded=None)
+
+
+@lru_cache(maxsize=3)
+def snapshot_of(differing: bool, enabled: bool = True) -> Snapshot:
+    config = overlaid(CONFIG, {"light": {"enabled": enabled}})
+    return run([exposed(each) if differing else each for each in photographs()], config)
+
+
+def held_out_psnr(snapshot: Snapshot) -> float:
+    """dB, with the gain that fits each held-out photograph best."""
+    true = synthetic.scene_cameras(SMALL)
+    known = np.stack([true[camera.frame_id][0] for camera in snapshot.cameras])
+    similarity = align_cameras(known, np.stack([camera.T_world_camera for camera in snapshot.cameras]))
+    K, errors = snapshot.cameras[0].K, []
+    for T, _ in synthetic.held_out_cameras(SMALL):
+        photograph = synthetic.photograph(SMALL, (T, K), 99) / 255.0
+        shown = np.asarray(render_rgb(snapshot.gaussians, similarity.camera(T), K, SMALL.width, SMALL.height))
+        gain = (shown * photograph).sum((0, 1)) / (shown * shown).sum((0, 1))
+        errors.append(((gain * shown - photograph) ** 2).mean())
+    return float(-10 * np.log10(np.mean(errors)))
+
+
+def test_gains_are_found_told_and_taken_out():
+    snapshot = snapshot_of(True)
+    assert snapshot.verdict.publishable and len(snapshot.cameras) == SMALL.views
+    expected = np.array(GAINS) / np.median(GAINS)
+    found = np.array([snapshot.gains[camera.name] for camera in snapshot.cameras])
+    assert found == pytest.approx(np.repeat(expected[:, None], 3, 1), rel=0.05)
+    told = build_report(snapshot, seed=0, preset="preview", peak_rss_mb=None)["gains"]
+    assert isinstance(told, dict) and len(told) == SMALL.views
+    means = np.array([snapshot.images[camera.name].mean() for camera in snapshot.cameras])
+    assert means.max() / means.min() < 1.25  # of what the scene is fitted to; as photographed it is 1.8
+
+
+def test_held_out_views_are_as_good_as_of_one_exposure():
+    alike = held_out_psnr(snapshot_of(False))
+    assert held_out_psnr(snapshot_of(True)) > alike - 0.5
+    assert held_out_psnr(snapshot_of(True, enabled=False)) < alike - 1.5  # it is not for nothing
+
+
+def test_photographs_of_one_exposure_are_untouched():
+    snapshot = snapshot_of(False)
+    assert snapshot.gains == {} and all(
+        np.array_equal(snapshot.images[frame.name], frame.image) for frame in photographs()
+    )
