@@ -8,15 +8,17 @@ import logging
 import math
 import pkgutil
 from collections.abc import Iterator
+from dataclasses import asdict
 from importlib import import_module
 
 from splatnode.capture import cameras, daemon
 from splatnode.capture.config import CaptureConfig, is_live, open_stream
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.last_run import last_run
+from splatnode.capture.lens_file import read_lens
 from splatnode.capture.messaging import keys as key_files
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.process.config import load_config, read_yaml, typed
+from splatnode.capture.process.config import load_config, merged, parse_changes, read_yaml, typed
 from splatnode.capture.process.logs import use_structured_lines
 from splatnode.capture.process.progress import counted, telling, waiting
 from splatnode.capture.process.terminal import say
@@ -54,7 +56,10 @@ def record(args: argparse.Namespace) -> int:
 
 
 def _config(args: argparse.Namespace) -> CaptureConfig:
-    return load_config(args.config, CaptureConfig, args.set)
+    if args.intrinsics is None:
+        return load_config(args.config, CaptureConfig, args.set)
+    lens = {"camera": {"intrinsics": asdict(read_lens(args.intrinsics))}}
+    return typed(merged(merged(read_yaml(args.config), lens), parse_changes(args.set)), CaptureConfig)
 
 
 def _until(reader: Reader, seconds: float | None) -> Iterator[Frame | DroppedFrame]:

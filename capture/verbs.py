@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from splatnode.capture.calibration.verb import CALIBRATE
 from splatnode.capture.process.arguments import add_json, seconds
 from splatnode.capture.process.verb import Verb, lazily
 
@@ -15,6 +16,12 @@ def _camera_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="a change to it, such as camera.loops=2"
+    )
+    parser.add_argument(
+        "--intrinsics",
+        type=Path,
+        metavar="FILE",
+        help="the camera's lens, as calibrate writes it; COLMAP's cameras.txt or Kalibr's camchain, too",
     )
 
 
@@ -54,6 +61,7 @@ VERBS = (
         _config_arguments,
         lazily("splatnode.capture.examples", "config"),
     ),
+    CALIBRATE,
     Verb("find", "list the cameras that are connected", add_json, lazily("splatnode.capture.cli", "find")),
     Verb(
         "keys",

@@ -1,6 +1,6 @@
 """The command line. Each room lists its verbs in its `verbs.py`; the rest of a room is imported when one of them runs.
 
-Exit codes: 0 good; 2 usage or configuration; 65 the photographs cannot be reconstructed (the verdict says why);
+Exit codes: 0 good; 2 usage or configuration; 65 the photographs give no scene, or no lens (the text says why);
 69 camera or package unavailable; 70 internal; 73, 74 cannot write; 75 try again; 77 not allowed; 130 interrupted;
 141 nobody reads what is printed any more, as after `| head`.
 A daemon that has been ready ends with none of 2 and 77: what fails then is no fault of its configuration.

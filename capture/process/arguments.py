@@ -53,6 +53,11 @@ def megabytes(text: str) -> float:
     return _above_zero(text, "megabytes")
 
 
+def millimetres(text: str) -> float:
+    """A length in millimetres, above 0."""
+    return _above_zero(text, "millimetres")
+
+
 def percent(text: str) -> float:
     """A share in percent, above 0."""
     return _above_zero(text, "percent")

@@ -39,6 +39,7 @@ BENCHMARKS = {
         "race",
         "movers",
         "fisheyes",
+        "calibrate",
     ),
     "speed": ("rasterize", "stereo", "growth"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),

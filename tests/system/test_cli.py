@@ -50,6 +50,7 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
     )
     loaded, heavy = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, text=True).splitlines()
     assert loaded.split() == [
+        "splatnode.capture.calibration.verb",
         "splatnode.capture.process.arguments",
         "splatnode.capture.process.config_text",
         "splatnode.capture.process.foreign",

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 
 from splatnode import command_line
-from splatnode.capture import cameras
 from splatnode.capture.config import CaptureConfig, is_live, open_stream
 from splatnode.capture.process.config import ConfigError, load_config
+from tests.support.fake_camera import fake_camera
 
 CAMERA = '''
 """Grey frames."""
@@ -39,14 +37,8 @@ def find():
 @pytest.fixture
 def config(tmp_path, monkeypatch):
     """A configuration of the new camera, whose file lies where the package's other cameras lie."""
-    (tmp_path / "cameras").mkdir()
-    (tmp_path / "cameras" / "grey.py").write_text(CAMERA)
-    monkeypatch.setattr(cameras, "__path__", [*cameras.__path__, str(tmp_path / "cameras")])
-    (tmp_path / "grey.yaml").write_text("camera: {kind: grey}")
-    yield tmp_path / "grey.yaml"
-    sys.modules.pop("splatnode.capture.cameras.grey", None)
-    if hasattr(cameras, "grey"):
-        delattr(cameras, "grey")
+    with fake_camera("grey", CAMERA, tmp_path, monkeypatch) as path:
+        yield path
 
 
 def test_its_frames_are_streamed_as_it_is_configured(config):

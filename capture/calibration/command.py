@@ -1,0 +1,151 @@
+"""`splatnode calibrate`: prints the board, or finds the lens of a camera that is shown it."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from splatnode.capture.calibration.board import Board, board_page
+from splatnode.capture.calibration.coverage import Coverage
+from splatnode.capture.calibration.gathering import MOST_VIEWS, Gathering
+from splatnode.capture.calibration.hold_out import Choice, choose
+from splatnode.capture.calibration.lacking import ENOUGH, GOOD, LEAST_VIEWS, TooLittle, too_few, uncovered, unknown
+from splatnode.capture.calibration.models import MODELS, Model
+from splatnode.capture.calibration.other_board import what_is_shown
+from splatnode.capture.calibration.pdf import PAPERS, pdf_of
+from splatnode.capture.calibration.report import lens_file, told
+from splatnode.capture.config import CaptureConfig, is_live, open_stream
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.image_file import SUFFIXES
+from splatnode.capture.process.config import load_config, merged, parse_changes, typed
+from splatnode.capture.process.durable import write_whole
+from splatnode.capture.process.progress import Step, Tell, telling
+from splatnode.capture.process.terminal import say
+from splatnode.capture.reader import Reader, State
+
+_TRY_EVERY = 4  # views: a lens is looked for so often while more come
+_POLL_S = 0.1
+
+
+def calibrate(args: argparse.Namespace) -> int:
+    """Writes the board or the lens. Raises TooLittle, with what is missing; ValueError, OSError, CameraUnavailable."""
+    board = Board(args.columns, args.rows, args.square_mm, args.marker_mm or 19 / 26 * args.square_mm, args.dictionary)
+    if args.board is not None:
+        return _print_board(args, board)
+    if args.source is None or args.out is None:
+        raise ValueError(
+            "give a camera's configuration, a folder of photographs or a video, and --out lens.yaml; or --board "
+            "board.pdf, to print the board first"
+        )
+    _check_free(args.out)
+    config = _config(args.source, args.set)
+    models = list(MODELS.values()) if args.model == "auto" else [MODELS[args.model]]
+    with telling() as tell:
+        choice, coverage = _shown(config, board, models, args.seconds, tell)
+    write_whole(args.out, [lens_file(choice, coverage, board).encode()])
+    for line in told(choice, coverage):
+        say(line)
+    say(f"written to {args.out}; use it by: splatnode replay photographs --intrinsics {args.out} --out out")
+    return 0
+
+
+def _print_board(args: argparse.Namespace, board: Board) -> int:
+    if args.source is not None:
+        raise ValueError("give --board to print the board, or a source to calibrate by it, not both")
+    _check_free(args.board)
+    write_whole(args.board, [pdf_of([board_page(board, PAPERS[args.paper])], f"ChArUco board, {board}")])
+    say(
+        f"written to {args.board}: print it at 100 % on {args.paper}, glue it to something flat, and measure a square; "
+        f"where it is not {board.square_mm:g} mm wide, calibrate with --square-mm"
+    )
+    return 0
+
+
+def _check_free(path: Path) -> None:
+    if path.exists():
+        raise ValueError(f"{path} is there already; give another name, or remove it")
+    if not path.parent.is_dir():
+        raise ValueError(f"there is no folder {path.parent}; make it first")
+
+
+def _config(source: Path, changes: list[str]) -> CaptureConfig:
+    """What is read: a folder and a video need no configuration."""
+    if source.suffix.lower() in (".yaml", ".yml"):
+        return load_config(source, CaptureConfig, changes)
+    if source.suffix.lower() in SUFFIXES:
+        raise ValueError(f"{source} is one photograph; give the folder of all that show the board")
+    key, kind = ("folder", "folder") if source.is_dir() or not source.exists() else ("file", "video")
+    return typed(merged({"camera": {"kind": kind, key: str(source)}}, parse_changes(changes)), CaptureConfig)
+
+
+def _shown(
+    config: CaptureConfig, board: Board, models: list[Model], seconds: float | None, tell: Tell
+) -> tuple[Choice, Coverage]:
+    """The lens, once it is known well, or from all there is."""
+    camera = config.camera
+    gathering = Gathering(board, moving=is_live(camera) or camera.kind == "video")
+    tried, drawn = 0, []
+    with Reader(lambda: open_stream(camera, config.body_mask), is_live(camera), config.reader) as reader:
+        for frame in _frames(reader, seconds, tell):
+            taken = gathering.take(frame)
+            tell(Step("looking for the board", len(gathering.views), 0, "view"))
+            views, coverage = gathering.views, gathering.coverage
+            if taken is None or coverage is None:
+                continue
+            if gathering.moving and coverage.drawn != drawn:
+                drawn = coverage.drawn
+                _draw(coverage, tell)
+            ready = len(views) >= max(LEAST_VIEWS, tried + _TRY_EVERY) and uncovered(coverage) is None
+            if is_live(camera) and ready:
+                tried = len(views)
+                tell(Step("looking for the lens", 0, 0, ""))
+                choice = choose(views, board, coverage.width, coverage.height, models)
+                if choice is not None and not unknown(choice.taken.estimate, coverage, GOOD):
+                    return choice, coverage
+            if len(views) >= MOST_VIEWS:
+                break
+    return _judged(gathering, models, tell)
+
+
+def _frames(reader: Reader, seconds: float | None, tell: Tell) -> Iterator[Frame]:
+    """Until the camera ends, or for so long; what cannot be read is said."""
+    ends_s = None if seconds is None else time.monotonic() + seconds
+    while reader.state is not State.FINISHED and (ends_s is None or time.monotonic() < ends_s):
+        item = reader.next(_POLL_S)
+        if isinstance(item, DroppedFrame):
+            tell(f"{item.name} is left out: {item.reason}")
+        elif item is not None:
+            yield item
+
+
+def _judged(gathering: Gathering, models: list[Model], tell: Tell) -> tuple[Choice, Coverage]:
+    """The lens of what there is. Raises TooLittle, with all that is missing."""
+    views, coverage = gathering.views, gathering.coverage
+    if coverage is None:
+        raise TooLittle("no picture came; is the camera there, and the folder the right one?")
+    if not views and gathering.unseen:
+        raise TooLittle(
+            f"none of {gathering.pictures} pictures shows the board ({gathering.board}): "
+            f"{what_is_shown(gathering.unseen, gathering.board)}"
+        )
+    missing = [sentence for sentence in (too_few(len(views), gathering.pictures), uncovered(coverage)) if sentence]
+    choice = None
+    if len(views) >= LEAST_VIEWS:
+        tell(Step("looking for the lens", 0, 0, ""))
+        choice = choose(views, gathering.board, coverage.width, coverage.height, models)
+        if choice is None:
+            missing.append("no lens explains the views: another board than was given, or one that is not flat")
+        else:
+            missing += unknown(choice.taken.estimate, coverage, ENOUGH)
+    _draw(coverage, tell)
+    if missing or choice is None:
+        raise TooLittle("no lens yet:\n" + "\n".join(f"- {sentence}" for sentence in missing))
+    return choice, coverage
+
+
+def _draw(coverage: Coverage, tell: Tell) -> None:
+    tell("the picture: # where the board was seen, . where not yet")
+    for line in coverage.drawn:
+        tell(f"  |{line}|")

@@ -1,0 +1,26 @@
+"""How well it is known where the lens shows a ray."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.calibration.estimate import Estimate
+from splatnode.capture.calibration.projection import projected
+from splatnode.capture.lenses import lens as lenses
+
+Array = npt.NDArray[np.float64]
+
+
+def pixel_sigmas(estimate: Estimate, pixels: Array) -> Array:
+    """(K,) standard deviations, in pixels, of where the rays of `pixels` (K, 2) are seen: both directions together.
+
+    The lens's covariance, carried to the picture. Not a number where the lens shows no ray.
+    """
+    sigmas = np.full(len(pixels), np.nan)
+    rays = lenses.unproject(pixels, estimate.lens)
+    seen = np.isfinite(rays).all(axis=1)
+    by_lens = projected(rays[seen], estimate.solution.numbers, estimate.model.kind).by_lens
+    variances = np.einsum("kip,pq,kiq->k", by_lens, estimate.covariance, by_lens)
+    sigmas[seen] = np.sqrt(np.maximum(variances, 0.0))
+    return sigmas
