@@ -45,7 +45,7 @@ def sightings(frames: Iterable[Frame | DroppedFrame], dictionary: str) -> list[S
 
 
 def _in_frame(frame: Frame, detector: cv2.aruco.ArucoDetector, definition: cv2.aruco.Dictionary) -> list[Sighting]:
-    grey = cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY)
+    grey = np.asarray(cv2.cvtColor(frame.image, cv2.COLOR_RGB2GRAY), np.uint8)
     found = [
         Sighting(frame.name, frame.width, frame.height, marker, corners)
         for marker, start in _detected(grey, detector)

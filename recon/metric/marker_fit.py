@@ -19,11 +19,12 @@ Grey = npt.NDArray[np.float32]  # (H, W)
 _AS_FITTED_PX = 64.0  # longest side of a marker: larger ones are shrunk, and known well enough
 _MARGIN = 0.5  # of a bit: the white around the marker that is compared
 _FINE = 4  # samples a pixel, across and down
-_STEPS, _SETTLED_PX = 12, 2e-3
+_STEPS, _HALVINGS, _SETTLED_PX = 12, 4, 2e-3
 _BLURS_PX = (0.25, 2.5)  # least and most standard deviation
 _LOG_SIGMA = 0.7  # of the prior of blur and mixing
 _FIRST_BLUR_PX = 0.6
-_NUDGES = np.array([*[0.05] * 8, 0.05, 0.05])  # of the parameters, for derivatives
+_NUDGES = np.full(10, 0.05)  # of the parameters, for derivatives: pixels, and logarithms
+_NUM_PARAMETERS = 14  # with the light's four
 _FLOOR_PX = 0.03  # standard deviation of a corner that is added: paper is not quite flat, a lens not quite known
 
 
@@ -37,7 +38,7 @@ class Corners:
 
 
 def fitted(picture: Grey, bits: npt.NDArray[np.bool_], corners: Array) -> Corners | None:
-    """The corners near `corners` (4, 2); None where the marker lies partly outside the picture, or nothing fits.
+    """The corners near `corners` (4, 2); None where the marker or the white around it is partly outside the picture.
 
     `bits` (B, B) are True where the marker is white, its black border included.
     """
@@ -48,12 +49,9 @@ def fitted(picture: Grey, bits: npt.NDArray[np.bool_], corners: Array) -> Corner
         return None
     left, top, width, height = window
     patch = picture[top : top + height * shrink, left : left + width * shrink]
-    patch = cv2.resize(patch, (width, height), interpolation=cv2.INTER_AREA)
+    patch = np.asarray(cv2.resize(patch, (width, height), interpolation=cv2.INTER_AREA), np.float32)
     within = (corners - (left, top)) / shrink
-    found = _adjusted(patch, bits, within)
-    if found is None:
-        return None
-    moved, covariance, correlation = found
+    moved, covariance, correlation = _adjusted(patch, bits, within)
     return Corners(shrink * moved + (left, top), shrink**2 * covariance, correlation)
 
 
@@ -66,57 +64,50 @@ def _window(corners: Array, around: float, shrink: int, shape: tuple[int, ...]) 
     return int(least[0]), int(least[1]), int(size[0]), int(size[1])
 
 
-def _adjusted(patch: Grey, bits: npt.NDArray[np.bool_], start: Array) -> tuple[Array, Array, float] | None:
+def _adjusted(patch: Grey, bits: npt.NDArray[np.bool_], start: Array) -> tuple[Array, Array, float]:
     """Corners (4, 2), their covariance (8, 8), and the correlation: Gauss-Newton with halved steps."""
     texture, per_bit = _texture(bits, start)
     used = _used(start, len(bits), patch.shape)
-    values = np.array([*start.ravel(), np.log(_FIRST_BLUR_PX), 0.0])
-    held = np.array([*[0.0] * 8, 1.0, 1.0]) / _LOG_SIGMA
-    before = np.array([*[0.0] * 8, np.log(_FIRST_BLUR_PX), 0.0])
+    before: Array = np.array([*start.ravel(), np.log(_FIRST_BLUR_PX), 0.0])
+    held = np.array([*[0.0] * 8, 1.0, 1.0]) / _LOG_SIGMA  # blur and mixing, by their prior
 
-    def differences(values: Array) -> Array | None:
+    def differences(values: Array) -> Array:
         return _differences(patch, used, texture, per_bit, values)
 
-    now = differences(values)
-    noise = 0.0
+    def derivatives(values: Array, now: Array) -> Array:
+        nudged = [differences(values + nudge) - now for nudge in np.diag(_NUDGES)]
+        return np.stack(nudged, 1) / _NUDGES
+
+    def cost(values: Array, now: Array, noise: float) -> float:
+        return float((now**2).sum() / noise**2 + ((held * (values - before)) ** 2).sum())
+
+    values, now = before, differences(before)
     for _ in range(_STEPS):
-        if now is None:
-            return None
-        noise = float(np.sqrt((now**2).sum() / max(len(now) - 14, 1))) + 1e-3
-        columns = [differences(values + nudge) for nudge in np.diag(_NUDGES)]
-        if any(column is None for column in columns):
-            return None
-        jacobian = np.stack([(column - now) / nudge for column, nudge in zip(columns, _NUDGES, strict=True)], 1)  # type: ignore[operator]
-        rows = np.vstack([jacobian / noise, np.diag(held)])
+        noise = _noise(now)
+        rows = np.vstack([derivatives(values, now) / noise, np.diag(held)])
         residuals = np.concatenate([now / noise, held * (values - before)])
-        step = -np.linalg.lstsq(rows, residuals, rcond=None)[0]
+        step = -np.asarray(np.linalg.lstsq(rows, residuals, rcond=None)[0], np.float64)
         step[:8] = np.clip(step[:8], -1.0, 1.0)
-        for _ in range(4):
+        for _ in range(_HALVINGS):
             later = values + step
             later[8] = np.clip(later[8], *np.log(_BLURS_PX))
             then = differences(later)
-            if then is not None and _cost(then, later, before, held, noise) <= _cost(now, values, before, held, noise):
+            if cost(later, then, noise) <= cost(values, now, noise):
                 values, now = later, then
                 break
-            step = step / 2.0
+            step = 0.5 * step
         if np.abs(step[:8]).max() < _SETTLED_PX:
             break
-    jacobian = np.stack(
-        [(_known(differences(values + nudge), now) - now) / nudge.sum() for nudge in np.diag(_NUDGES)], 1
-    )
-    information = jacobian.T @ jacobian / noise**2 + np.diag(held**2)
+    jacobian = derivatives(values, now)
+    information = jacobian.T @ jacobian / _noise(now) ** 2 + np.diag(held**2)
     covariance = np.linalg.pinv(information)[:8, :8] + _FLOOR_PX**2 * np.eye(8)
-    spread = float(np.std(patch[used]))
-    correlation = float(np.sqrt(max(0.0, 1.0 - (now**2).mean() / max(spread**2, 1e-9))))
-    return values[:8].reshape(4, 2), covariance, correlation
+    explained = 1.0 - float((now**2).mean()) / max(float(np.var(patch[used])), 1e-9)
+    return values[:8].reshape(4, 2), np.asarray(covariance, np.float64), max(0.0, explained) ** 0.5
 
 
-def _known(found: Array | None, otherwise: Array) -> Array:
-    return otherwise if found is None else found
-
-
-def _cost(residuals: Array, values: Array, before: Array, held: Array, noise: float) -> float:
-    return float((residuals**2).sum() / noise**2 + ((held * (values - before)) ** 2).sum())
+def _noise(differences: Array) -> float:
+    """Standard deviation of a pixel, grey levels; never 0."""
+    return float(np.sqrt((differences**2).sum() / max(len(differences) - _NUM_PARAMETERS, 1))) + 1e-3
 
 
 def _texture(bits: npt.NDArray[np.bool_], corners: Array) -> tuple[Grey, int]:
@@ -134,8 +125,8 @@ def _used(corners: Array, bits: int, shape: tuple[int, ...]) -> npt.NDArray[np.b
     return inside > 0
 
 
-def _differences(patch: Grey, used: npt.NDArray[np.bool_], texture: Grey, per_bit: int, values: Array) -> Array | None:
-    """(M,) picture less model at the pixels that are used, black, white and the light's slope solved for."""
+def _differences(patch: Grey, used: npt.NDArray[np.bool_], texture: Grey, per_bit: int, values: Array) -> Array:
+    """(M,) model less picture at the pixels that are used, black, white and the light's slope solved for."""
     corners, blur, mixing = values[:8].reshape(4, 2), float(np.exp(values[8])), float(np.exp(values[9]))
     size = texture.shape[0]
     square = np.array([[1, 1], [size // per_bit - 1, 1], [size // per_bit - 1] * 2, [1, size // per_bit - 1]]) * per_bit
@@ -151,4 +142,4 @@ def _differences(patch: Grey, used: npt.NDArray[np.bool_], texture: Grey, per_bi
     light = np.stack([np.ones_like(white), white, white * slopes[0], white * slopes[1]], 1)
     seen = patch[used].astype(np.float64)
     found, *_ = np.linalg.lstsq(light, seen, rcond=None)
-    return None if found[1] <= 0.0 else light @ found - seen
+    return np.asarray(light @ found - seen if found[1] > 0.0 else seen.mean() - seen, np.float64)  # never a negative
