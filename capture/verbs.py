@@ -6,7 +6,8 @@ import argparse
 from pathlib import Path
 
 from splatnode.capture.calibration.verb import CALIBRATE
-from splatnode.capture.process.arguments import add_json, seconds
+from splatnode.capture.process.arguments import add_json, natural, positive, seconds
+from splatnode.capture.process.lengths import metres_argument
 from splatnode.capture.process.verb import Verb, lazily
 
 
@@ -44,6 +45,21 @@ def _keys_arguments(parser: argparse.ArgumentParser) -> None:
     change.add_argument("--server", metavar="KEY", help="connect to the machine with this public key")
 
 
+def _marker_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("file", type=Path, metavar="FILE", help="the PDF that is written, such as markers.pdf")
+    add("--side", type=metres_argument, default=0.1, metavar="LENGTH", help="of the black square (default: 100mm)")
+    add("--count", type=positive, metavar="N", help="how many different ones (default: as many as a page holds)")
+    add("--first", type=natural, default=0, metavar="NUMBER", help="of the first one (default: 0)")
+    add("--paper", choices=("a4", "letter"), default="a4", help="default: a4")
+    add(
+        "--dictionary",
+        default="4X4_50",
+        metavar="NAME",
+        help="of OpenCV's ArUco dictionaries (default: 4X4_50), or APRILTAG_36h11",
+    )
+
+
 def _status_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="FILE", help="where it says how to reach the processes: network")
     parser.add_argument("--seen", action="store_true", help="the problems that are told need not be told again")
@@ -68,6 +84,12 @@ VERBS = (
         "make this machine's keys; say who may connect",
         _keys_arguments,
         lazily("splatnode.capture.cli", "keys"),
+    ),
+    Verb(
+        "marker",
+        "write markers of known size as a PDF to print: in a scene, they give it metres",
+        _marker_arguments,
+        lazily("splatnode.capture.calibration.marker_page", "command"),
     ),
     Verb("status", "tell how the running processes are", _status_arguments, lazily("splatnode.capture.cli", "status")),
 )

@@ -33,6 +33,7 @@ from splatnode.recon.evaluate.report import redraw
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.mapping.command import replay_map
+from splatnode.recon.metric.arguments import metric_changes
 from splatnode.recon.offline import check_baseline, reconstructed, run, shown_to_nobody, with_looks
 from splatnode.recon.rasterize import device
 from splatnode.recon.rasterize.device import Device
@@ -182,13 +183,6 @@ def bench(args: argparse.Namespace) -> int:
     return EXIT_GOOD
 
 
-def _metres(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError as error:
-        raise ValueError(f"--baseline must end with a distance in metres, got {text!r}") from error
-
-
 def _lens(args: argparse.Namespace) -> Intrinsics | None:
     """The lens that is given for all photographs."""
     return None if args.intrinsics is None else read_lens(args.intrinsics)
@@ -201,9 +195,7 @@ def _config(args: argparse.Namespace) -> Config:
         config = overlaid(config, read_yaml(args.config))
     if args.prior is not None and args.prior != config.prior.kind:
         config = overlaid(config, {"prior": {"kind": args.prior}})
-    if args.baseline is not None:
-        first, *further = ([*names, _metres(metres)] for *names, metres in args.baseline)
-        config = overlaid(config, {"metric": {"baseline": first, "further_baselines": further}})
+    config = overlaid(config, {"metric": metric_changes(args)})
     flags = {
         "size": args.size,
         "device": args.device,

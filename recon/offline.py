@@ -15,6 +15,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.progress import Tell, told_to_nobody
 from splatnode.recon import threads
 from splatnode.recon.config import Config
+from splatnode.recon.metric.evidence import gathered
 from splatnode.recon.metric.metres import in_metres
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.replay_source import Source
@@ -64,7 +65,8 @@ def reconstructed(
     Raises ValueError where the intrinsics of a photograph or a number of threads cannot be used.
     """
     with threads.at_most(most_threads):
-        snapshot = in_metres(run(source.frames, config, show, tell), config.metric)
+        evidence = gathered(source.frames, config.metric, tell)
+        snapshot = in_metres(run(source.frames, config, show, tell), config.metric, evidence)
     if without_guesses:
         snapshot = only_seen(snapshot)
     kept = source if source.photographs is None else replace(source, frames=())

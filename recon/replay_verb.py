@@ -10,6 +10,7 @@ from pathlib import Path
 
 from splatnode.capture.process.arguments import add_json, megabytes, names, natural, percent, positive, seconds
 from splatnode.capture.process.verb import Verb, lazily
+from splatnode.recon.metric.arguments import add_baseline, add_marker
 from splatnode.recon.shared_arguments import add_device, add_only_seen
 
 
@@ -25,13 +26,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
     add_way(parser)
-    parser.add_argument(
-        "--baseline",
-        nargs=3,
-        action="append",
-        metavar=("A", "B", "METRES"),
-        help="how far apart photographs A and B were taken; given again, the distances check one another",
-    )
+    add_baseline(parser)
     _add_masks(parser)
     parser.add_argument(
         "--intrinsics",
@@ -80,6 +75,7 @@ def add_way(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
             help="refuse what is rougher: positions must be known to so much of the distance to the scene (95 %% "
             "bound)",
         ),
+        add_marker(parser),
         add("--max-gaussians", type=positive, metavar="N", help="and with at most so many Gaussians"),
         add("--max-mb", type=megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes"),
         add("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)"),

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from splatnode.api.node import Node, NodeUpdate, connect
     from splatnode.api.reconstruction import reconstruct
     from splatnode.api.result import Result
+    from splatnode.api.scale import Marker
     from splatnode.api.session import Session, Update
     from splatnode.api.view import View
     from splatnode.capture.frame import Intrinsics
@@ -22,6 +23,7 @@ __all__ = [
     "Camera",
     "Intrinsics",
     "Located",
+    "Marker",
     "Node",
     "NodeUpdate",
     "NotLocated",
@@ -39,6 +41,7 @@ _MODULES = {
     "Camera": "splatnode.api.camera",
     "Intrinsics": "splatnode.capture.frame",
     "Located": "splatnode.recon.locating.outcome",
+    "Marker": "splatnode.api.scale",
     "Node": "splatnode.api.node",
     "NodeUpdate": "splatnode.api.node",
     "NotLocated": "splatnode.recon.locating.outcome",

@@ -13,7 +13,7 @@ from splatnode.capture.calibration.pdf import Page, Paper, Rectangle, Text
 DICTIONARIES = {
     name.removeprefix("DICT_"): getattr(cv2.aruco, name)
     for name in sorted(dir(cv2.aruco))
-    if name.startswith(("DICT_4X4", "DICT_5X5", "DICT_6X6", "DICT_7X7"))
+    if name.startswith(("DICT_4X4", "DICT_5X5", "DICT_6X6", "DICT_7X7", "DICT_APRILTAG_36h11"))
 }  # by the name that people write, such as 5X5_100
 _TEXT_MM = 3.5
 

@@ -14,6 +14,7 @@ from splatnode.recon.daemon.config import Config
 from splatnode.recon.daemon.places import Place, Places, State, described
 from splatnode.recon.estimation import Estimate
 from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.metric.evidence import NOTHING, gathered
 from splatnode.recon.metric.metres import in_metres
 from splatnode.recon.modelling import with_landmarks
 from splatnode.recon.result import bounds_in_words
@@ -67,7 +68,9 @@ class Output:
         judged = snapshot.final or not snapshot.verdict.provisional
         before = self.places.cameras(place.scene_id) if judged else {}
         try:
-            measured = in_metres(with_landmarks(snapshot, estimate), recipe.metric)
+            keyframes = () if estimate is None else estimate.graph.keyframes
+            evidence = gathered((each.frame for each in keyframes), recipe.metric) if keyframes else NOTHING
+            measured = in_metres(with_landmarks(snapshot, estimate), recipe.metric, evidence)
             finish(measured, folder, seed=recipe.seed, preset_name="live")
             if snapshot.final:
                 remove_result(provisional)

@@ -6,7 +6,10 @@ from typing import Annotated, NamedTuple
 
 import msgspec
 
+from splatnode.capture.calibration.board import DICTIONARIES
+
 _MAX_METRES = 1_000_000  # of a baseline
+_LARGEST_MARKER = 100.0  # metres
 
 
 class Baseline(NamedTuple):
@@ -22,6 +25,11 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     further_baselines: tuple[Baseline, ...] = ()  # more of them: they make the scale surer, and check one another
     # Standard deviation of each measured distance, as a share of it
     baseline_sigma: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = 0.01
+    # Side of the black square of printed markers in the scene, metres; nothing: none are looked for
+    marker_m: Annotated[float, msgspec.Meta(gt=0, le=_LARGEST_MARKER)] | None = None
+    # Standard deviation of that side as it was measured, metres: what a ruler can tell
+    marker_sigma_m: Annotated[float, msgspec.Meta(ge=0, le=_LARGEST_MARKER)] = 0.0005
+    marker_dictionary: str = "4X4_50"  # of OpenCV's ArUco dictionaries, as `splatnode marker` prints, or APRILTAG_36h11
     network: bool = False  # ask Depth Anything V2 Metric Indoor Small, where its weights are
     # Standard deviation of the network's error in a place, all views alike, as a share
     network_sigma: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = 0.15
@@ -31,6 +39,15 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return (*(() if self.baseline is None else (self.baseline,)), *self.further_baselines)
 
     def __post_init__(self) -> None:
+        if self.marker_dictionary not in DICTIONARIES:
+            raise ValueError(
+                f"a marker's dictionary must be one of {', '.join(DICTIONARIES)}; got {self.marker_dictionary[:40]!a}"
+            )
+        if self.marker_m is not None and self.marker_sigma_m >= 0.5 * self.marker_m:
+            raise ValueError(
+                f"a marker's side must be known to less than half of itself, got {self.marker_m:g} m with a standard "
+                f"deviation of {self.marker_sigma_m:g} m"
+            )
         for baseline in self.baselines:
             if not 1 / _MAX_METRES <= baseline.metres <= _MAX_METRES or baseline.first == baseline.second:
                 raise ValueError(

@@ -8,25 +8,26 @@ import numpy as np
 
 from splatnode.recon.metric.config import Config
 from splatnode.recon.metric.distances import by_distance
+from splatnode.recon.metric.evidence import NOTHING, Evidence
+from splatnode.recon.metric.markers import by_markers
 from splatnode.recon.metric.measurement import Measurement, together
 from splatnode.recon.metric.network import MetricDepth, by_network
+from splatnode.recon.metric.views import views_of
 from splatnode.recon.networks.depth_anything import load_metric
 from splatnode.recon.result.bounds_in_words import rounded_up
 from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
 
-def in_metres(snapshot: Snapshot, config: Config) -> Snapshot:
+def in_metres(snapshot: Snapshot, config: Config, evidence: Evidence = NOTHING) -> Snapshot:
     """The snapshot with lengths in metres where `config` gives them a unit; as it is where nothing was asked for.
 
-    A source that can say nothing is left out where another can. Where sources contradict each other the scene stays
-    relative.
+    `evidence` is what its photographs tell of what `config` asks for. A source that can say nothing is left out where
+    another can. Where sources contradict each other the scene stays relative.
     """
-    if not len(snapshot.cameras) or not (config.baselines or config.network):
+    said = _said(snapshot, config, evidence) if len(snapshot.cameras) else []
+    if not said:
         return snapshot
-    said = [by_distance(snapshot.cameras, baseline, config.baseline_sigma) for baseline in config.baselines]
-    if config.network:
-        said.append(_by_the_network(snapshot, config.network_sigma))
     measurements = [each for each in said if isinstance(each, Measurement)]
     silent = [each for each in said if isinstance(each, str)]
     agreed = together(measurements) if measurements else "; ".join(silent)
@@ -35,6 +36,18 @@ def in_metres(snapshot: Snapshot, config: Config) -> Snapshot:
     low, high = agreed.interval_95
     source = "; ".join([f"{agreed.source}, known to {rounded_up(100 * (high - 1.0))} %", *silent])
     return replace(_scaled(snapshot, agreed.metres_per_unit), scale=Scale(True, source, (low, high)))
+
+
+def _said(snapshot: Snapshot, config: Config, evidence: Evidence) -> list[Measurement | str]:
+    """What each source says, or why it says nothing."""
+    said: list[Measurement | str] = [
+        by_distance(snapshot.cameras, baseline, config.baseline_sigma) for baseline in config.baselines
+    ]
+    if config.marker_m is not None:
+        said += by_markers(views_of(snapshot), evidence.sightings, config.marker_m, config.marker_sigma_m)
+    if config.network:
+        said.append(_by_the_network(snapshot, config.network_sigma))
+    return said
 
 
 def _by_the_network(snapshot: Snapshot, sigma: float) -> Measurement | str:

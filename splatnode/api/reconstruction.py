@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from os import PathLike, fspath
+from collections.abc import Mapping
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
 from splatnode.api.masks import Masks, finder
 from splatnode.api.photographs import Images, Lens, lenses, photographs, with_lens
 from splatnode.api.result import Result, result_of
-from splatnode.capture.cameras.folder import frame_name
+from splatnode.api.scale import Scale, metric_changes
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.progress import Tell, told_to_nobody
 from splatnode.recon.config import Config, overlaid
@@ -18,7 +18,6 @@ from splatnode.recon.config import preset as named
 from splatnode.recon.offline import check_baseline, reconstructed
 from splatnode.recon.replay_source import with_masks
 
-Baseline = tuple[str | int, str | int, float]
 Changes = Mapping[str, Any] | str | PathLike[str]
 
 
@@ -27,7 +26,7 @@ def reconstruct(
     *,
     intrinsics: Lens | None = None,
     masks: Masks | None = None,
-    scale: Baseline | None = None,
+    scale: Scale | None = None,
     budget_s: float | None = None,
     preset: str = "balanced",
     config: Changes | None = None,
@@ -51,7 +50,8 @@ def reconstruct(
       with the photographs' names, one file for all, or a list, for each photograph an array (H, W), a path, or None
       for one that is used whole. None: all is used.
     - `scale`: two photographs and the metres between their cameras: `("a.jpg", "b.jpg", 0.5)`, of pictures their
-      places in the list: `(0, 3, 0.5)`. None: lengths have no unit.
+      places in the list: `(0, 3, 0.5)`; or a printed marker, `splatnode.Marker(0.1)`; or a list of these, which check
+      one another. None: lengths have no unit.
     - `budget_s`: the best scene within so many seconds. None: as long as it takes.
     - `preset`: `preview`, `fast`, `balanced` or `quality`.
     - `config`: what differs from the preset, as `docs/configuration.md` lists it: a mapping, or a YAML file.
@@ -79,7 +79,7 @@ def reconstruct(
 
 
 def configured(
-    preset: str, changes: Changes | None, flags: Mapping[str, Any], scale: Baseline | None, of_pictures: bool
+    preset: str, changes: Changes | None, flags: Mapping[str, Any], scale: Scale | None, of_pictures: bool
 ) -> Config:
     """The preset, then what differs from it, then the arguments: what comes later wins."""
     config = named(preset)
@@ -90,7 +90,7 @@ def configured(
     elif changes is not None:
         raise TypeError(f"config must be a mapping or a YAML file, got {type(changes).__name__}")
     if scale is not None:
-        config = overlaid(config, {"metric": {"baseline": _baseline(scale, of_pictures)}})
+        config = overlaid(config, {"metric": metric_changes(scale, of_pictures)})
     return overlaid(config, {name: value for name, value in flags.items() if value is not None})
 
 
@@ -98,21 +98,3 @@ def check_count(name: str, value: int | None) -> None:
     """Raises ValueError for an argument that is neither a number of things nor None."""
     if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
         raise ValueError(f"{name} must be a whole number of 1 or more, or None, got {value!r}")
-
-
-def _baseline(scale: Baseline, of_pictures: bool) -> Sequence[Any]:
-    """As the configuration has it. Raises TypeError."""
-    if not isinstance(scale, (tuple, list)) or len(scale) != 3 or not isinstance(scale[2], (int, float)):
-        raise TypeError(
-            f"scale must be two photographs and the metres between them, ('a.jpg', 'b.jpg', 0.5), got {scale!r}"
-        )
-    first, second, metres = scale
-    return [_name(first, of_pictures), _name(second, of_pictures), float(metres)]
-
-
-def _name(photograph: object, of_pictures: bool) -> str:
-    if isinstance(photograph, int) and of_pictures:
-        return f"{photograph:04d}.png"
-    if isinstance(photograph, (str, PathLike)):
-        return frame_name(Path(fspath(photograph)))
-    raise TypeError(f"scale must name photographs by their files, or pictures by their places, got {photograph!r}")

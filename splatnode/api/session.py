@@ -7,8 +7,9 @@ import time
 from dataclasses import dataclass
 
 from splatnode.api.photographs import Lens, Picture, frame, intrinsics_of, lenses, seen_through
-from splatnode.api.reconstruction import Baseline, Changes, check_count, configured
+from splatnode.api.reconstruction import Changes, check_count, configured
 from splatnode.api.result import Result, result_of
+from splatnode.api.scale import Scale
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.progress import Tell, told_to_nobody
 from splatnode.capture.quality import Limits
@@ -17,6 +18,7 @@ from splatnode.capture.selection import Selector
 from splatnode.capture.stamp import Stamp
 from splatnode.recon import threads as limits
 from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.metric.evidence import NOTHING, gathered
 from splatnode.recon.metric.metres import in_metres
 from splatnode.recon.offline import Reconstructed
 from splatnode.recon.pipeline import made_anew
@@ -47,7 +49,7 @@ class Session:
         self,
         *,
         intrinsics: Lens | None = None,
-        scale: Baseline | None = None,
+        scale: Scale | None = None,
         preset: str = "balanced",
         config: Changes | None = None,
         every_frame: bool = False,
@@ -66,6 +68,7 @@ class Session:
         self._work: IncrementalReconstruction | None = IncrementalReconstruction(self._config)
         self._frames: dict[str, Frame] = {}  # that were taken
         self._given: set[str] = set()
+        self._evidence = NOTHING  # of metres, in these frames
         self._snapshot: Snapshot | None = None
         self._lock = threading.RLock()
 
@@ -86,6 +89,7 @@ class Session:
             decision = self._selector.decide(frame)
             if decision.take:
                 self._frames[frame.name] = frame
+                self._evidence = self._evidence.and_also(gathered((frame,), self._config.metric))
                 work.take(frame)
                 work.update()
                 self._snapshot = work.snapshot()
@@ -108,7 +112,7 @@ class Session:
         """What is known of all photographs so far."""
         with self._lock:
             snapshot = self._snapshot or self._nothing_yet()
-            snapshot = in_metres(snapshot, self._config.metric)
+            snapshot = in_metres(snapshot, self._config.metric, self._evidence)
             frames = tuple(self._frames.values())
             made = Reconstructed(snapshot, Source(frames, None, None), self._config.seed, self._preset)
             return result_of(snapshot, made, lenses(frames))

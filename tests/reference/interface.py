@@ -42,6 +42,7 @@ _CLASSES = (
     "Located",
     "NotLocated",
     "Intrinsics",
+    "Marker",
 )
 _WIDE = 110  # characters
 _FURTHER = (Verdict, Bounds, Claim, DroppedFrame, Stamp, Step)  # what these lead to

@@ -1,0 +1,50 @@
+"""The options of the command line that give a scene metres, and what they are in a configuration."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from splatnode.capture.process.lengths import measured, measured_argument
+
+
+def add_marker(parser: argparse.ArgumentParser) -> argparse.Action:
+    """Of all recordings alike: for many, too."""
+    return parser.add_argument(
+        "--marker",
+        type=measured_argument,
+        metavar="LENGTH[@SIGMA]",
+        help="look for printed markers (splatnode marker) whose black square has this side, as 100mm, and take the "
+        "metres from them; @0.2mm: you measured it to that (standard deviation; default: 0.5mm)",
+    )
+
+
+def add_baseline(parser: argparse.ArgumentParser) -> argparse.Action:
+    return parser.add_argument(
+        "--baseline",
+        nargs=3,
+        action="append",
+        metavar=("A", "B", "METRES"),
+        help="how far apart photographs A and B were taken; given again, the distances check one another",
+    )
+
+
+def metric_changes(args: argparse.Namespace) -> dict[str, Any]:
+    """What of the configuration's `metric` these arguments set. Raises ValueError."""
+    changes: dict[str, Any] = {}
+    if args.baseline is not None:
+        first, *further = ([*names, _metres(metres)] for *names, metres in args.baseline)
+        changes |= {"baseline": first, "further_baselines": further}
+    if args.marker is not None:
+        side_m, sigma_m = measured(args.marker)
+        changes["marker_m"] = side_m
+        if sigma_m is not None:
+            changes["marker_sigma_m"] = sigma_m
+    return changes
+
+
+def _metres(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        raise ValueError(f"--baseline must end with a distance in metres, got {text!r}") from error

@@ -1,0 +1,160 @@
+"""The unit by printed markers of known size: a square that several cameras see is so large in the scene."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from splatnode.capture.process.lengths import in_words
+from splatnode.recon.metric.marker_detection import Sighting
+from splatnode.recon.metric.measurement import TWO_SIDED_95, Measurement, together
+from splatnode.recon.metric.views import View
+
+Array = npt.NDArray[np.float64]
+
+_SQUARE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])  # as corners are named
+_LEAST_PARALLAX_DEG = 1.0  # between the cameras, seen from the marker
+_CAMERA_PX = 0.3  # standard deviation, at REFERENCE_SIDE, of where a registered camera sees a known point
+_REFERENCE_SIDE = 1024.0  # pixels
+_MOST_PX = 4.0  # of the corners' error at REFERENCE_SIDE: beyond, the marker was moved, or is another one
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A marker in the photograph of a camera."""
+
+    view: View
+    rays: Array  # (4, 2) at depth 1
+    whitening: Array  # (8, 8): times the rays' error, independent errors of standard deviation 1
+    px: float  # of the reference size, in rays
+
+
+def by_markers(
+    views: Mapping[str, View], sightings: Sequence[Sighting], side_m: float, sigma_m: float
+) -> list[Measurement | str]:
+    """The unit by all markers together, and a sentence for each that says nothing.
+
+    `side_m` is the side of the black square and `sigma_m` its standard deviation, metres: all markers have both alike.
+    Where two markers contradict each other, each is a measurement of its own. Raises ValueError for a side of 0.
+    """
+    if side_m <= 0:
+        raise ValueError(f"the side of a marker must be above 0, got {side_m}")
+    if not sightings:
+        return [f"no marker of {in_words(side_m)} was found in the photographs"]
+    numbers = sorted({each.marker for each in sightings})
+    told = [
+        _by_marker(number, views, [each for each in sightings if each.marker == number], side_m) for number in numbers
+    ]
+    single = [each for each in told if isinstance(each, Measurement)]
+    silent = [each for each in told if isinstance(each, str)]
+    agreed = together(single) if single else ""
+    of_side = sigma_m / side_m
+    known = [agreed] if isinstance(agreed, Measurement) else single
+    return [*(replace(each, sigma=math.hypot(each.sigma, of_side)) for each in known), *silent]
+
+
+def _by_marker(
+    number: int, views: Mapping[str, View], sightings: Sequence[Sighting], side_m: float
+) -> Measurement | str:
+    seen = [_through(views[each.photograph], each) for each in sightings if each.photograph in views]
+    name = f"marker {number} of {in_words(side_m)}"
+    if not seen:
+        return f"{name} is in no photograph that has a camera in the scene"
+    if len(seen) == 1:
+        where = next(each.photograph for each in sightings if each.photograph in views)
+        return f"{name} is in one photograph of the scene alone, {where}; two are needed"
+    found = _square(seen)
+    if found is None:
+        return f"{name} is in {len(seen)} photographs, from one and the same side; step to the side between them"
+    side, sigma, error_px = found
+    if error_px > _MOST_PX:
+        return f"{name} does not lie still, or there are two of it: its corners are off by {error_px:.1f} pixels"
+    source = f"{name} in {len(seen)} photographs"
+    return Measurement(side_m / side, math.hypot(sigma, _of_cameras([each.view for each in seen])), source)
+
+
+def _through(view: View, sighting: Sighting) -> _Seen:
+    """What a camera sees of the marker; its corners are wrong each by itself, and all alike by the camera's error."""
+    pixels, size = sighting.corners.pixels, (sighting.width, sighting.height)
+    px = max(size) / _REFERENCE_SIDE
+    alike = np.kron(np.ones((4, 4)), np.eye(2))
+    per_ray = 1.0 / (view.focal * max(size))  # rays a pixel; what the lens bends of it is no matter
+    covariance = (sighting.corners.covariance + (_CAMERA_PX * px) ** 2 * alike) * per_ray**2
+    whitening = np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), np.float64)
+    return _Seen(view, view.rays(pixels, *size), whitening, px * per_ray)
+
+
+def _square(seen: Sequence[_Seen]) -> tuple[float, float, float] | None:
+    """Side in the scene's unit, standard deviation of its logarithm, and the corners' rms error in reference pixels.
+
+    The pose and the side of a square whose corners are seen where they are. None without parallax.
+    """
+    corners = np.stack([_triangulated([(each.view, each.rays[corner]) for each in seen]) for corner in range(4)])
+    middle = corners.mean(0)
+    if (
+        not np.isfinite(corners).all()
+        or _parallax_deg(middle, [each.view.centre for each in seen]) < _LEAST_PARALLAX_DEG
+    ):
+        return None
+    side = float(np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1).mean())
+    u, _, vt = np.linalg.svd((corners - middle).T @ _SQUARE)
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    unit = float(np.median([np.linalg.norm(middle - each.view.centre) for each in seen]))
+
+    def errors(values: Array) -> Array:
+        square = _placed(values, turn, middle, side, unit)
+        return np.concatenate([each.whitening @ _off(each, square) for each in seen])
+
+    found = least_squares(errors, np.zeros(7), method="lm", x_scale=np.full(7, 0.01))
+    square = _placed(found.x, turn, middle, side, unit)
+    per_px = np.concatenate([_off(each, square) / each.px for each in seen])
+    covariance = np.linalg.pinv(found.jac.T @ found.jac)
+    freedom = 8 * len(seen) - 7
+    wider = max(1.0, math.sqrt(2.0 * found.cost / freedom))  # where the errors are larger than they should be
+    return side * math.exp(found.x[6]), wider * math.sqrt(covariance[6, 6]), float(np.sqrt((per_px**2).mean() * 2.0))
+
+
+def _placed(values: Array, turn: Array, middle: Array, side: float, unit: float) -> Array:
+    """(4, 3) corners of the square after a small turn (3), a move (3) in `unit`, and a change of its log side."""
+    rotation = Rotation.from_rotvec(values[:3]).as_matrix() @ turn
+    return side * math.exp(values[6]) * _SQUARE @ rotation.T + middle + unit * values[3:6]
+
+
+def _off(seen: _Seen, corners: Array) -> Array:
+    """(8,) rays at which the corners (4, 3) are seen, less those at which they should be."""
+    in_camera = (corners - seen.view.centre) @ seen.view.T_world_camera[:3, :3]
+    depth = np.where(np.abs(in_camera[:, 2:]) < 1e-9, 1e-9, in_camera[:, 2:])
+    return (in_camera[:, :2] / depth - seen.rays).ravel()
+
+
+def _triangulated(rays: Sequence[tuple[View, Array]]) -> Array:
+    """(3,) the point nearest to all rays (Hartley and Sturm's linear method on rays at depth 1)."""
+    rows = []
+    for view, (x, y) in rays:
+        world_to_camera = np.linalg.inv(view.T_world_camera)[:3]
+        rows += [x * world_to_camera[2] - world_to_camera[0], y * world_to_camera[2] - world_to_camera[1]]
+    point = np.linalg.svd(np.array(rows))[2][-1]
+    return point[:3] / point[3] if abs(point[3]) > 1e-12 else np.full(3, np.nan)
+
+
+def _parallax_deg(point: Array, centres: Sequence[Array]) -> float:
+    """The largest angle between two cameras, seen from the point."""
+    directions = [(centre - point) / max(float(np.linalg.norm(centre - point)), 1e-12) for centre in centres]
+    return max(
+        math.degrees(math.acos(float(np.clip(first @ second, -1.0, 1.0))))
+        for first, second in combinations(directions, 2)
+    )
+
+
+def _of_cameras(views: Sequence[View]) -> float:
+    """Standard deviation of log length that the cameras' bounds allow, by the two that are farthest apart."""
+    first, second = max(combinations(views, 2), key=lambda pair: float(np.linalg.norm(pair[0].centre - pair[1].centre)))
+    apart = float(np.linalg.norm(first.centre - second.centre))
+    return math.hypot(first.bound, second.bound) / TWO_SIDED_95 / max(apart, 1e-12)

@@ -1,0 +1,66 @@
+"""The cameras of a scene as single measurements see through them: the registered ones with their lens, where known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.result.snapshot import Snapshot
+
+Array = npt.NDArray[np.float64]
+
+_UNDISTORT_ITERATIONS = 8
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A camera. Lengths in its picture count over the picture's longer side."""
+
+    T_world_camera: Array  # (4, 4)
+    focal: float
+    radial: float  # first radial coefficient, as recon/registration/bundle.py has it
+    shift: Array  # (2,) of the principal point from the middle of the picture
+    bound: float  # 95 % bound of the centre's error, in the scene's unit; 0 where none is known
+
+    @property
+    def centre(self) -> Array:
+        return self.T_world_camera[:3, 3]
+
+    def rays(self, pixels: Array, width: int, height: int) -> Array:
+        """(M, 2) at depth 1 of pixels (M, 2) in a picture of this size."""
+        side = max(width, height)
+        distorted = ((pixels - np.array([width, height]) / 2.0) / side - self.shift) / self.focal
+        rays = distorted
+        for _ in range(_UNDISTORT_ITERATIONS if self.radial else 0):
+            rays = distorted / (1.0 + self.radial * (rays**2).sum(1))[:, None]
+        return rays
+
+    def pixels(self, points: Array, width: int, height: int) -> Array:
+        """(M, 2) in a picture of this size of world points (M, 3); not a number behind the camera."""
+        in_camera = (points - self.centre) @ self.T_world_camera[:3, :3]
+        depth = np.where(in_camera[:, 2] > 0, in_camera[:, 2], np.nan)
+        rays = in_camera[:, :2] / depth[:, None]
+        distorted = self.focal * (1.0 + self.radial * (rays**2).sum(1))[:, None] * rays + self.shift
+        return max(width, height) * distorted + np.array([width, height]) / 2.0
+
+
+def views_of(snapshot: Snapshot) -> Mapping[str, View]:
+    """By the photograph's name: as they were registered, where that is known; else as they are published."""
+    bounds = {camera.name: camera.bounds.centre if camera.bounds else 0.0 for camera in snapshot.cameras}
+    found = {}
+    for camera in snapshot.cameras:
+        side, size = max(camera.width, camera.height), np.array([camera.width, camera.height])
+        shift = (camera.K[:2, 2] - size / 2.0) / side
+        found[camera.name] = View(camera.T_world_camera, float(camera.K[0, 0]) / side, 0.0, shift, bounds[camera.name])
+    landmarks = snapshot.landmarks
+    if landmarks is None:
+        return found
+    lenses = landmarks.lenses
+    for index, name in enumerate(landmarks.names):
+        if name in found:
+            lens = float(lenses.focals[index]), float(lenses.radials[index]), lenses.shifts[index]
+            found[name] = View(landmarks.Ts_world_camera[index], *lens, bounds[name])
+    return found

@@ -1,0 +1,25 @@
+from __future__ import annotations
+
+import pytest
+
+import splatnode
+from splatnode.api.scale import metric_changes
+from splatnode.recon.config import Config, overlaid
+
+
+def test_what_is_known_of_the_size_becomes_the_configuration():
+    known = [("a.jpg", "b.jpg", 0.5), splatnode.Marker(0.08, sigma_m=0.0002), (0, 2, 1)]
+    metric = overlaid(Config(), {"metric": metric_changes(known, of_pictures=True)}).metric
+    assert metric.baselines == (("a.jpg", "b.jpg", 0.5), ("0000.png", "0002.png", 1.0))
+    assert (metric.marker_m, metric.marker_sigma_m, metric.marker_dictionary) == (0.08, 0.0002, "4X4_50")
+    assert metric_changes(splatnode.Marker(0.1), False)["marker_m"] == 0.1
+    assert metric_changes(("a.jpg", "b.jpg", 2), False) == {
+        "baseline": ["a.jpg", "b.jpg", 2.0],
+        "further_baselines": [],
+    }
+
+
+@pytest.mark.parametrize("wrong", [0.1, "100mm", ("a.jpg", "b.jpg"), [("a.jpg", 0.5)], ("a.jpg", 3, 0.5)])
+def test_what_is_no_scale_is_refused(wrong):
+    with pytest.raises(TypeError, match="scale must"):
+        metric_changes(wrong, of_pictures=False)
