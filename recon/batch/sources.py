@@ -9,7 +9,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatnode.capture import recording
+from splatnode.capture import film, recording
+from splatnode.capture.cameras import mcap
 from splatnode.capture.cameras.folder import image_paths, natural_order
 from splatnode.capture.process.printable import printable_name
 
@@ -26,20 +27,23 @@ class Recording:
     """One run of `splatnode replay`."""
 
     name: str  # of its result folder; no other recording of the batch has it
-    source: str  # the absolute path of a folder of photographs, or of a video
+    source: str  # the absolute path of a folder of photographs, or of a film as `capture/film.py` names it
 
 
 def recordings(sources: Sequence[Path], out: Path, own_names: frozenset[str] = frozenset()) -> list[Recording]:
     """All recordings, once each, in the order of the sources; results that lie in `out` are none.
 
-    A source is a folder of photographs, a folder that holds such folders and videos at any depth, a video, or a text
-    file that names sources, one a line. What a list names need not be there: its recording fails, and the others go on.
+    A source is a folder of photographs, a video, an MCAP file (each of its image topics is a recording) or one of its
+    topics, a folder that holds such at any depth, or a text file that names sources, one a line. What a list names need
+    not be there, and what a file holds need not be readable: its recording fails, and the others go on.
     Raises FileNotFoundError and ValueError for what the command line itself names. Names of `own_names` are not given.
     """
     found: dict[Path, str] = {}
     for source in sources:
-        if not source.exists():
-            raise FileNotFoundError(f"{str(source)!r} is not there; give a folder, a video, or a list of them (.txt)")
+        if not source.exists() and not film.is_film(source):
+            raise FileNotFoundError(
+                f"{str(source)!r} is not there; give a folder, a video, an MCAP file, or a list of them (.txt)"
+            )
         before = len(found)
         for path, label in _found(source, out.resolve()):
             found.setdefault(path.resolve(), label)
@@ -56,12 +60,29 @@ def _found(source: Path, out: Path) -> Iterator[tuple[Path, str]]:
     """Paths of recordings, each with what it is called."""
     if source.is_dir():
         for path in _walked(source, out, set()):
-            yield path, _label(path, source)
-    elif source.suffix.lower() == LIST:
+            yield from _parts(path, _label(path, source))
+    elif source.suffix.lower() == LIST and source.is_file():
         for path in _listed(source):
-            yield from _found(path, out) if path.is_dir() or path.suffix.lower() == LIST else [(path, _label(path))]
+            yield from _found(path, out)
     else:
-        yield source, _label(source)
+        yield from _parts(source, _label(source))
+
+
+def _parts(path: Path, label: str) -> Iterator[tuple[Path, str]]:
+    """The image topics of an MCAP file; anything else itself, and so a file that its recording is to complain of."""
+    topics = _topics(path) if path.suffix.lower() == film.MCAP and path.is_file() else []
+    for topic in topics:
+        yield film.part_of(path.resolve(), topic), _name([label, *topic.split("/")])
+    if not topics:
+        yield path, label
+
+
+def _topics(file: Path) -> list[str]:
+    """None where the file cannot be read: `replay` says why."""
+    try:
+        return [topic.name for topic in mcap.image_topics(file)]
+    except (ValueError, OSError, ModuleNotFoundError):
+        return []
 
 
 def _listed(path: Path) -> Iterator[Path]:
@@ -85,21 +106,26 @@ def _walked(folder: Path, out: Path, seen: set[Path]) -> Iterator[Path]:
             continue
         if path.is_dir():
             yield from _walked(path, out, seen)
-        elif path.suffix.lower() in VIDEOS and path.is_file():
+        elif path.suffix.lower() in {*VIDEOS, film.MCAP} and path.is_file():
             yield path
 
 
 def _label(path: Path, source: Path | None = None) -> str:
     """What a recording is called: its place below the source that was named, or its own name; `images` says nothing."""
-    own = path.resolve()
+    file, part = film.file_and_part(path)
+    own = file.resolve()
     below = [] if source is None else list(path.relative_to(source).parts)
     if not below or below == [_PHOTOGRAPHS]:
         below = [own.parent.name] if own.name == _PHOTOGRAPHS else [own.name]
     elif below[-1] == _PHOTOGRAPHS:
         below.pop()
-    if own.suffix.lower() in VIDEOS:
+    if own.suffix.lower() in {*VIDEOS, film.MCAP}:
         below[-1] = Path(below[-1]).stem
-    return printable_name("_".join(below), _LONGEST).lstrip(".") or "recording"
+    return _name([*below, *part.split("/")])
+
+
+def _name(parts: Sequence[str]) -> str:
+    return printable_name("_".join(filter(None, parts)), _LONGEST).lstrip(".") or "recording"
 
 
 def _marked(label: str, path: Path) -> str:

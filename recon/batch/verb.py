@@ -32,8 +32,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="SOURCE",
-        help="a folder of photographs, or a folder that holds such folders and videos, or a video, or a text file "
-        "that names them, one a line",
+        help="a folder of photographs, a video, or an MCAP file, or a folder that holds such, or a text file that "
+        "names them, one a line",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for all results")
     parser.add_argument(
