@@ -1,4 +1,7 @@
-"""A recording in a file, by its name: a video, film.mp4, or an image topic of an MCAP file, drive.mcap#/front/image."""
+"""A recording in a file, by its name: a video, an image topic of an MCAP file, or an episode of a LeRobot data set.
+
+film.mp4, drive.mcap#/front/image, pusht#episode_000003/observation.images.top
+"""
 
 from __future__ import annotations
 
@@ -7,20 +10,25 @@ from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote, unquote
 
-from splatnode.capture.cameras import mcap, video
+from splatnode.capture.cameras import lerobot, mcap, video
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.lerobot.data_set import is_data_set
 
 MCAP = ".mcap"
 _MARK = "#"  # between a file and the part of it that is meant
 
 
 def file_and_part(path: Path) -> tuple[Path, str]:
-    """The file, and what of it is meant; all of it where that is empty. A file whose own name has a # is itself."""
+    """The file or the data set, and what of it is meant; all where that is empty.
+
+    A file whose own name has a # is itself.
+    """
     if path.exists():
         return path, ""
     text = str(path)
     for place in (place for place, letter in enumerate(text) if letter == _MARK):
-        if (file := Path(text[:place])).is_file():
+        file = Path(text[:place])
+        if file.is_file() or is_data_set(file):
             return file, unquote(text[place + 1 :])
     return path, ""
 
@@ -32,8 +40,9 @@ def part_of(file: Path, part: str) -> Path:
 
 
 def is_film(path: Path) -> bool:
-    """Whether this is a file, or a part of one, and not a folder."""
-    return file_and_part(path)[0].is_file()
+    """Whether this is a file, or a part of one or of a data set, and not a folder."""
+    file, part = file_and_part(path)
+    return bool(part) or file.is_file()
 
 
 def stream(path: Path) -> Iterator[Frame | DroppedFrame]:
@@ -41,6 +50,8 @@ def stream(path: Path) -> Iterator[Frame | DroppedFrame]:
     file, part = file_and_part(path)
     if file.suffix.lower() == MCAP:
         return mcap.stream(mcap.Config(file=file, topic=part))
+    if file.is_dir():
+        return lerobot.stream(lerobot.Config(folder=file, part=part))
     if part:
         raise ValueError(f"{str(path)!r}: of an MCAP file a topic can be named behind the #, of a video nothing")
     return video.stream(video.Config(file=file))

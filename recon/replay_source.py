@@ -1,6 +1,6 @@
 """What is reconstructed offline: a folder of photographs, some of its photographs, a recording, a film, or frames.
 
-A film is a video, or an image topic of an MCAP file, by the name that `film` knows.
+A film is a video, an image topic of an MCAP file, or an episode of a LeRobot data set, by the name that `film` knows.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from splatnode.capture.choosing import Choice, choose
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.given_lens import check_fits, seen_through
 from splatnode.capture.image_file import encode_png
+from splatnode.capture.lerobot import data_set
 from splatnode.capture.masks import Find, all_masked, in_files
 from splatnode.capture.process.printable import printable_name
 from splatnode.capture.process.progress import Tell, counted, told_to_nobody
@@ -192,6 +193,12 @@ def _check_there(path: Path) -> None:
     if not path.exists() and not film.is_film(path):
         raise FileNotFoundError(
             f"{str(path)!r} is not there; give a folder that holds photographs, a video, or an MCAP file"
+        )
+    if path.is_dir() and data_set.is_data_set(path):
+        first = data_set.parts(path)[0]
+        raise ValueError(
+            f"{str(path)!r} is a LeRobot data set; name an episode and a camera of it, such as "
+            f"{str(film.part_of(path, first))!r}, or give it to `splatnode batch`, which takes them all"
         )
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from splatnode.capture import film, recording
 from splatnode.capture.cameras import mcap
 from splatnode.capture.cameras.folder import image_paths, natural_order
+from splatnode.capture.lerobot import data_set
 from splatnode.capture.process.printable import printable_name
 
 VIDEOS = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".webm"}
@@ -33,16 +34,17 @@ class Recording:
 def recordings(sources: Sequence[Path], out: Path, own_names: frozenset[str] = frozenset()) -> list[Recording]:
     """All recordings, once each, in the order of the sources; results that lie in `out` are none.
 
-    A source is a folder of photographs, a video, an MCAP file (each of its image topics is a recording) or one of its
-    topics, a folder that holds such at any depth, or a text file that names sources, one a line. What a list names need
-    not be there, and what a file holds need not be readable: its recording fails, and the others go on.
+    A source is a folder of photographs, a video, an MCAP file (each of its image topics is a recording), a LeRobot data
+    set (each camera of each episode), one such part, a folder that holds such at any depth, or a text file that names
+    sources, one a line. What a list names need not be there, and what a file holds need not be readable: its recording
+    fails, and the others go on.
     Raises FileNotFoundError and ValueError for what the command line itself names. Names of `own_names` are not given.
     """
     found: dict[Path, str] = {}
     for source in sources:
         if not source.exists() and not film.is_film(source):
             raise FileNotFoundError(
-                f"{str(source)!r} is not there; give a folder, a video, an MCAP file, or a list of them (.txt)"
+                f"{str(source)!r} is not there; give a folder, a video, an MCAP file, a data set, or a list (.txt)"
             )
         before = len(found)
         for path, label in _found(source, out.resolve()):
@@ -69,20 +71,24 @@ def _found(source: Path, out: Path) -> Iterator[tuple[Path, str]]:
 
 
 def _parts(path: Path, label: str) -> Iterator[tuple[Path, str]]:
-    """The image topics of an MCAP file; anything else itself, and so a file that its recording is to complain of."""
-    topics = _topics(path) if path.suffix.lower() == film.MCAP and path.is_file() else []
-    for topic in topics:
-        yield film.part_of(path.resolve(), topic), _name([label, *topic.split("/")])
-    if not topics:
+    """The image topics of an MCAP file, the episodes and cameras of a data set; anything else itself.
+
+    So is a file or a data set that cannot be read: its recording says why.
+    """
+    try:
+        names = _names(path)
+    except (ValueError, OSError, ModuleNotFoundError):
+        names = []
+    for name in names:
+        yield film.part_of(path.resolve(), name), _name([label, *name.split("/")])
+    if not names:
         yield path, label
 
 
-def _topics(file: Path) -> list[str]:
-    """None where the file cannot be read: `replay` says why."""
-    try:
-        return [topic.name for topic in mcap.image_topics(file)]
-    except (ValueError, OSError, ModuleNotFoundError):
-        return []
+def _names(path: Path) -> list[str]:
+    if path.suffix.lower() == film.MCAP and path.is_file():
+        return [topic.name for topic in mcap.image_topics(path)]
+    return data_set.parts(path) if data_set.is_data_set(path) else []
 
 
 def _listed(path: Path) -> Iterator[Path]:
@@ -98,7 +104,7 @@ def _walked(folder: Path, out: Path, seen: set[Path]) -> Iterator[Path]:
     if real in seen or real == out or (folder / REPORT).is_file():
         return
     seen.add(real)  # links may lead in a circle
-    if recording.is_recording(folder) or image_paths(folder):
+    if recording.is_recording(folder) or data_set.is_data_set(folder) or image_paths(folder):
         yield folder
         return
     for path in sorted(folder.iterdir(), key=natural_order):

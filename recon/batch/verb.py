@@ -32,8 +32,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="SOURCE",
-        help="a folder of photographs, a video, or an MCAP file, or a folder that holds such, or a text file that "
-        "names them, one a line",
+        help="a folder of photographs, a video, an MCAP file, or a LeRobot data set, or a folder that holds such, or a "
+        "text file that names them, one a line",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for all results")
     parser.add_argument(
@@ -53,7 +53,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
 
 BATCH = Verb(
     "batch",
-    "reconstruct many folders of photographs and videos",
+    "reconstruct many folders of photographs, videos, logs and data sets",
     _arguments,
     lazily("splatnode.recon.batch.command", "batch"),
 )
