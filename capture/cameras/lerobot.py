@@ -1,4 +1,4 @@
-"""What a camera saw in an episode of a LeRobot data set (v3.0), as a camera. Needs the extra lerobot."""
+"""What a camera saw in an episode of a LeRobot data set (v3.0), as a camera. Needs pyarrow; AV1, PyAV."""
 
 from __future__ import annotations
 

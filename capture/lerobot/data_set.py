@@ -93,25 +93,31 @@ def film(folder: Path, part: str) -> Film:
     Raises UnusableDataSet where there is none, or where it has no images; OSError, ModuleNotFoundError.
     """
     info = read_info(folder)
+    number, key = episode_and_camera(folder, info, part)
+    shown = f"{printable(str(folder))!r}"
+    wanted = tuple(f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp"))
+    episodes = _tables(folder, wanted)
+    row = episodes.get(number)
+    if row is None:
+        raise UnusableDataSet(f"{shown} has no episode {number}; it has {len(episodes)} episodes")
+    chunk, file, from_s, to_s = (row.get(name) for name in wanted)
+    if chunk is None or file is None or from_s is None or to_s is None or to_s <= from_s:
+        raise UnusableDataSet(f"{shown}: episode {number} has no images of {printable(key)}")
+    return Film(number, key, folder / _video(info, key, int(chunk), int(file)), float(from_s), float(to_s))
+
+
+def episode_and_camera(folder: Path, info: Info, part: str) -> tuple[int, str]:
+    """The number and the key that a part names. Raises UnusableDataSet where it names none."""
     said, _, key = part.partition("/")
     number = said.removeprefix(_NAMED)
     key = key or (info.cameras[0] if len(info.cameras) == 1 else "")
-    shown = f"{printable(str(folder))!r}"
     if not number.isascii() or not number.isdecimal() or key not in info.cameras:
         cameras = printable(", ".join(info.cameras))
         raise UnusableDataSet(
-            f"{shown}: behind the # must be an episode and a camera, as {_NAMED}000000/{info.cameras[0]}; got "
-            f"{printable(part, 100)!r}. The cameras are {cameras}"
+            f"{printable(str(folder))!r}: behind the # must be an episode and a camera, as "
+            f"{_NAMED}000000/{info.cameras[0]}; got {printable(part, 100)!r}. The cameras are {cameras}"
         )
-    wanted = tuple(f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp"))
-    episodes = _tables(folder, wanted)
-    row = episodes.get(int(number))
-    if row is None:
-        raise UnusableDataSet(f"{shown} has no episode {int(number)}; it has {len(episodes)} episodes")
-    chunk, file, from_s, to_s = (row.get(name) for name in wanted)
-    if chunk is None or file is None or from_s is None or to_s is None or to_s <= from_s:
-        raise UnusableDataSet(f"{shown}: episode {int(number)} has no images of {printable(key)}")
-    return Film(int(number), key, folder / _video(info, key, int(chunk), int(file)), float(from_s), float(to_s))
+    return int(number), key
 
 
 def _tables(folder: Path, wanted: tuple[str, ...]) -> dict[int, Mapping[str, Any]]:

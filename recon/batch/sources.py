@@ -18,6 +18,7 @@ from splatnode.capture.process.printable import printable_name
 VIDEOS = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".webm"}
 LIST = ".txt"
 REPORT = "report.json"  # a folder that has one is a result, whose pictures are no photographs
+OWN_SUFFIX = ".splatnode.mcap"  # of what a batch writes beside an MCAP file: no recording
 _PHOTOGRAPHS = "images"  # the name of a folder that says nothing of what the photographs show
 _LONGEST = 150  # characters of a result folder's name
 _MARKED = 8  # hexadecimal digits that tell recordings of one name apart
@@ -108,7 +109,7 @@ def _walked(folder: Path, out: Path, seen: set[Path]) -> Iterator[Path]:
         yield folder
         return
     for path in sorted(folder.iterdir(), key=natural_order):
-        if path.name.startswith("."):
+        if path.name.startswith(".") or path.name.endswith(OWN_SUFFIX):
             continue
         if path.is_dir():
             yield from _walked(path, out, seen)

@@ -47,6 +47,14 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--max-memory", type=megabytes, metavar="MB", help="end a recording that takes more, in 10^6 bytes"
     )
     parser.add_argument("--timeout-s", type=seconds, metavar="S", help="end a recording that takes longer")
+    parser.add_argument(
+        "--write-back",
+        action="store_true",
+        help="at the end, write the cameras beside the LeRobot data sets and MCAP files that they are of",
+    )
+    parser.add_argument(
+        "--in-place", action="store_true", help="of a LeRobot data set, as columns of its own tables in meta/episodes"
+    )
     add_json(parser)
     _options_of_replay(parser)
 
