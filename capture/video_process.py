@@ -7,12 +7,14 @@ what it does with a crafted stream is its own affair: here it can end without th
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import struct
 import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import IO
 
@@ -21,11 +23,14 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process import apart
+from splatnode.capture.process.packages import remedy
 
 MAX_VIDEO_PIXELS = 36_000_000  # of a frame: 8192 x 4320
 BYTES_A_PIXEL = 80  # of memory at most for the decoder: its frames in flight, in colour, and what it refers to
 BASE_BYTES = 500_000_000  # further ones, whatever the size of a frame
 _MAX_THREADS = 8  # each has a frame of its own
+_AV1 = int.from_bytes(b"AV01", "little")  # OpenCV's number of the codec, which its wheels know and cannot decode
+_NEEDS_AV = 3  # exit code
 _START, _FRAME = struct.Struct("<d"), struct.Struct("<QII")  # frames a second; index, width, height
 
 
@@ -40,12 +45,25 @@ class VideoFrame:
     image: npt.NDArray[np.uint8]  # (H, W, 3) BGR, as it is decoded
 
 
-def decoded(file: Path, every: int, max_pixels: int) -> Iterator[VideoFrame]:
-    """Every `every`-th frame of `file`, all of one size. Those that cannot be decoded are left out.
+@dataclass(frozen=True)
+class Span:
+    """A part of a video, in seconds from its beginning."""
+
+    from_s: float = 0.0
+    to_s: float = math.inf  # which is in it no more
+
+    @property
+    def is_all(self) -> bool:
+        return self == Span()
+
+
+def decoded(file: Path, every: int, max_pixels: int, span: Span = Span()) -> Iterator[VideoFrame]:
+    """Every `every`-th frame of `span`, all of one size. Those that cannot be decoded are left out.
 
     Raises VideoError, after the frames before it where it is about a later one.
     """
-    command = apart.command(__name__, os.fsdecode(file.absolute()), str(every), str(max_pixels))
+    numbers = every, max_pixels, span.from_s, span.to_s
+    command = apart.command(__name__, os.fsdecode(file.absolute()), *map(str, numbers))
     child = subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
@@ -57,7 +75,9 @@ def decoded(file: Path, every: int, max_pixels: int) -> Iterator[VideoFrame]:
         cleanup.callback(child.kill)
         assert child.stdout is not None
         yield from _received(child.stdout, max_pixels)
-        if child.wait() != 0:
+        if child.wait() == _NEEDS_AV:
+            raise VideoError(f"its codec is AV1, which needs PyAV. {remedy('av')}")
+        if child.returncode != 0:
             raise VideoError(
                 f"its decoder ended ({child.returncode}); is it whole, with frames of {max_pixels} pixels?"
             )
@@ -81,24 +101,55 @@ def _received(stream: IO[bytes], max_pixels: int) -> Iterator[VideoFrame]:
 
 
 def main() -> None:
-    """The decoder's process: FILE EVERY MAX_PIXELS; writes what `_received` reads."""
+    """The decoder's process: FILE EVERY MAX_PIXELS FROM_S TO_S; writes what `_received` reads."""
     file, every, max_pixels = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    span = Span(float(sys.argv[4]), float(sys.argv[5]))
     apart.limit_memory(BASE_BYTES + BYTES_A_PIXEL * max_pixels)
     threads = min(_MAX_THREADS, os.cpu_count() or 1)
     video = cv2.VideoCapture(file, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, threads])
     if not video.isOpened():
         return
+    is_av1 = round(video.get(cv2.CAP_PROP_FOURCC)) == _AV1
+    has_av = find_spec("av") is not None
+    if is_av1 and not has_av:
+        sys.exit(_NEEDS_AV)
     out = sys.stdout.buffer
-    out.write(_START.pack(video.get(cv2.CAP_PROP_FPS)))
+    if has_av and (is_av1 or not span.is_all):
+        video.release()
+        _write_by_av(out, Path(file), every, max_pixels, span, threads)
+    else:
+        _write_by_opencv(out, video, every, max_pixels, span)
+
+
+def _write_by_opencv(out: IO[bytes], video: cv2.VideoCapture, every: int, max_pixels: int, span: Span) -> None:
+    """All frames before the span are decoded, too: OpenCV's way to a frame is not exact."""
+    rate = video.get(cv2.CAP_PROP_FPS)
+    out.write(_START.pack(rate))
     width, height = (round(video.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     if width * height > max_pixels:  # known before a frame is decoded
         out.write(_FRAME.pack(0, width, height))
         return
+    first, end = round(span.from_s * rate), math.inf if math.isinf(span.to_s) else round(span.to_s * rate)
     index = 0
-    while video.grab():
-        if index % every == 0:
+    while index < end and video.grab():
+        if index >= first and (index - first) % every == 0:
             found, image = video.retrieve()
             if found:
                 height, width = image.shape[:2]
                 out.write(_FRAME.pack(index, width, height) + image.tobytes())
         index += 1
+
+
+def _write_by_av(out: IO[bytes], file: Path, every: int, max_pixels: int, span: Span, threads: int) -> None:
+    from splatnode.capture.av import TooLarge, Video
+
+    video = Video(file, threads)
+    out.write(_START.pack(video.rate))
+    try:
+        for index, image in video.frames(span.from_s, span.to_s, every, max_pixels):
+            height, width = image.shape[:2]
+            out.write(_FRAME.pack(index, width, height) + image.tobytes())
+    except TooLarge as error:
+        out.write(_FRAME.pack(0, error.width, error.height))
+    finally:
+        video.close()

@@ -1,4 +1,7 @@
-"""What is reconstructed offline: a folder of photographs, some of its photographs, a recording, a video, or frames."""
+"""What is reconstructed offline: a folder of photographs, some of its photographs, a recording, a film, or frames.
+
+A film is a video, an image topic of an MCAP file, or an episode of a LeRobot data set, by the name that `film` knows.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +14,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from splatnode.capture.cameras import folder, video
+from splatnode.capture import film
+from splatnode.capture.cameras import folder
 from splatnode.capture.choosing import Choice, choose
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.given_lens import check_fits, seen_through
 from splatnode.capture.image_file import encode_png
+from splatnode.capture.lerobot import data_set
 from splatnode.capture.masks import Find, all_masked, in_files
 from splatnode.capture.process.printable import printable_name
 from splatnode.capture.process.progress import Tell, counted, told_to_nobody
@@ -35,7 +40,7 @@ _OF_PHOTOGRAPHS = Config(per_second=1e9)  # which were not taken at any rate
 class Request:
     """What is to be reconstructed."""
 
-    source: Path  # a folder, or a video
+    source: Path  # a folder, or a film
     listed: tuple[str, ...] = ()  # the photographs of the folder that were named; none: all
     views: int | None = None  # so many of them, evenly spread
     frames: tuple[str, ...] = ()  # those of the folder with these names
@@ -49,7 +54,7 @@ class Source:
     """The frames to reconstruct, in their order, and where they come from."""
 
     frames: tuple[Frame | DroppedFrame, ...]
-    photographs: Path | None  # the folder that they lie in; None: they lie in none, as a video's
+    photographs: Path | None  # the folder that they lie in; None: they lie in none, as a film's
     choice: Choice | None  # None: all that were asked for are used
 
     @property
@@ -63,7 +68,7 @@ class Source:
         return 0 if self.photographs else sum(3 * width * height for width, height in self.sizes)
 
     def keep(self, out: Path) -> Path:
-        """The folder that the frames lie in; those of a video are written into the result folder `out`.
+        """The folder that the frames lie in; those of a film are written into the result folder `out`.
 
         Raises ResultWriteError.
         """
@@ -85,15 +90,15 @@ class Recording:
     lens: Intrinsics | None = None
 
     @property
-    def is_video(self) -> bool:
-        return self.path.is_file()
+    def is_film(self) -> bool:
+        return film.is_film(self.path)
 
     def identity(self, config: Reconstruction) -> str:
         """32 hexadecimal digits that tell it, reconstructed in this way, from others.
 
         Of a folder the names count: it may hold the results, too, which change when it was last written.
         """
-        written_ns = self.path.stat().st_mtime_ns if self.is_video else 0
+        written_ns = film.file_and_part(self.path)[0].stat().st_mtime_ns if self.is_film else 0
         known = [str(self.path.resolve()), written_ns, self.choice.names, config]
         if self.masks is not None:
             known.append(str(self.masks.resolve()))
@@ -172,7 +177,7 @@ def with_masks(given: Source, find: Find, tell: Tell = told_to_nobody) -> Source
 
 
 def _unmasked(request: Request, tell: Tell) -> Source:
-    if request.source.is_file():
+    if film.is_film(request.source):
         if request.frames:
             raise ValueError("--frames names photographs of a folder; of a video, give --views N or nothing")
         return _chosen(request, None, tell)
@@ -185,8 +190,16 @@ def _unmasked(request: Request, tell: Tell) -> Source:
 
 
 def _check_there(path: Path) -> None:
-    if not path.exists():
-        raise FileNotFoundError(f"{str(path)!r} is not there; give a folder that holds photographs, or a video")
+    if not path.exists() and not film.is_film(path):
+        raise FileNotFoundError(
+            f"{str(path)!r} is not there; give a folder that holds photographs, a video, or an MCAP file"
+        )
+    if path.is_dir() and data_set.is_data_set(path):
+        first = data_set.parts(path)[0]
+        raise ValueError(
+            f"{str(path)!r} is a LeRobot data set; name an episode and a camera of it, such as "
+            f"{str(film.part_of(path, first))!r}, or give it to `splatnode batch`, which takes them all"
+        )
 
 
 def _there(request: Request) -> Sequence[str]:
@@ -195,14 +208,14 @@ def _there(request: Request) -> Sequence[str]:
 
 
 def _stream(path: Path, listed: tuple[str, ...]) -> Iterator[Frame | DroppedFrame]:
-    if path.is_file():
-        return video.stream(video.Config(file=path))
+    if film.is_film(path):
+        return film.stream(path)
     return folder.stream(folder.Config(folder=path, names=listed))
 
 
 def _looked_through(request: Request, tell: Tell) -> Iterator[Frame | DroppedFrame]:
     """All that there is to choose from; how many frames a video has is known at its end."""
-    of = 0 if request.source.is_file() else len(_there(request))
+    of = 0 if film.is_film(request.source) else len(_there(request))
     doing = f"choosing keyframes of {printable_name(request.source.name)}"
     return counted(_stream(request.source, request.listed), tell, doing, of, _what(request))
 
@@ -217,11 +230,11 @@ def _noted(frames: Iterator[Frame | DroppedFrame], sizes: set[tuple[int, int]]) 
 
 def _what(request: Request) -> str:
     """One of those that keyframes are chosen of."""
-    return "frame" if request.source.is_file() else "photograph"
+    return "frame" if film.is_film(request.source) else "photograph"
 
 
 def _selection(request: Request) -> Config:
-    config = Config() if request.source.is_file() else _OF_PHOTOGRAPHS
+    config = Config() if film.is_film(request.source) else _OF_PHOTOGRAPHS
     return msgspec.structs.replace(config, every_frame=request.every_frame)
 
 

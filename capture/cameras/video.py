@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +16,7 @@ from splatnode.capture.image_file import MaxPixels
 from splatnode.capture.pace import Pace, paced
 from splatnode.capture.process.printable import LONGEST_NAME, printable_name
 from splatnode.capture.stamp import Clock, Stamp
-from splatnode.capture.video_process import MAX_VIDEO_PIXELS, VideoError, VideoFrame, decoded
+from splatnode.capture.video_process import MAX_VIDEO_PIXELS, Span, VideoError, VideoFrame, decoded
 
 _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes behind it
 
@@ -23,6 +24,8 @@ _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes b
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     file: Path  # the video
     every: Annotated[int, msgspec.Meta(ge=1)] = 1  # 3: every third frame is taken; the others are not decoded
+    from_s: Annotated[float, msgspec.Meta(ge=0)] = 0.0  # where it begins, in seconds from the video's beginning
+    to_s: Annotated[float, msgspec.Meta(gt=0)] | None = None  # where it ends, likewise; None: with the video
     max_pixels: MaxPixels = MAX_VIDEO_PIXELS  # of a frame, at most; the decoder's memory is bounded accordingly
     pace: Pace = "fastest"  # recorded: at the pace of the video; fastest: as fast as frames are taken
     intrinsics: Intrinsics | None = None  # the lens, of a calibration at the same aspect ratio
@@ -41,8 +44,9 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
 
 def _frames(config: Config) -> Iterator[Frame | DroppedFrame]:
     frame_id = 0
+    span = Span(config.from_s, math.inf if config.to_s is None else config.to_s)
     try:
-        for found in decoded(config.file, config.every, config.max_pixels):
+        for found in decoded(config.file, config.every, config.max_pixels, span):
             yield _frame(found, frame_id, config)
             frame_id += 1
     except VideoError as error:
@@ -50,8 +54,9 @@ def _frames(config: Config) -> Iterator[Frame | DroppedFrame]:
             raise VideoError(f"{str(config.file)!r} is no video that can be used: {error}") from error
         yield DroppedFrame(f"{_stem(config)}_rest", str(error))
     if frame_id == 0:
+        where = "" if span.is_all else f" between {span.from_s:g} and {span.to_s:g} s"
         raise ValueError(
-            f"{str(config.file)!r} is no video that can be decoded, or has no frame; convert it to MP4 (H.264)"
+            f"{str(config.file)!r} is no video that can be decoded, or has no frame{where}; convert it to MP4 (H.264)"
         )
 
 

@@ -15,6 +15,7 @@ REQUIRED = {
 # Import name -> the extra that brings the package of that name.
 EXTRAS = {
     "PIL": "heic",
+    "av": "lerobot",
     "depthai": "oak",
     "gsplat": "cuda",
     "matplotlib": "bench",

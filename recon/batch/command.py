@@ -16,7 +16,7 @@ from splatnode.capture.process.packages import remedy
 from splatnode.capture.process.printable import printable
 from splatnode.capture.process.progress import Step, Tell, telling, times, waiting
 from splatnode.capture.process.terminal import in_place, say, taken_away
-from splatnode.recon.batch.answer import FAILED
+from splatnode.recon.batch.answer import FAILED, Outcome
 from splatnode.recon.batch.child import Limits
 from splatnode.recon.batch.engine import Plan, Work, run_all
 from splatnode.recon.batch.ledger import LEDGER, Ledger
@@ -24,6 +24,7 @@ from splatnode.recon.batch.page import PAGE, write_page
 from splatnode.recon.batch.sources import Recording, recordings
 from splatnode.recon.batch.tables import CSV, PARQUET, write_csv, write_parquet
 from splatnode.recon.batch.verb import replay_options
+from splatnode.recon.batch.write_back import write_back
 from splatnode.recon.result.folder import result_folder
 
 EXIT_GOOD, EXIT_SOME_FAILED = 0, 65
@@ -39,13 +40,16 @@ def batch(args: argparse.Namespace) -> int:
     def replay(recording: Recording, folder: Path) -> Sequence[str]:
         return [sys.executable, "-m", "splatnode", "replay", recording.source, "--out", str(folder), *options]
 
+    if args.in_place and not args.write_back:
+        raise ValueError("--in-place says how --write-back writes; give both")
     return run_batch(args, found, replay, ["splatnode", "replay", *options])
 
 
 def run_batch(args: argparse.Namespace, found: list[Recording], work: Work, told_command: list[str]) -> int:
     """Runs `work` for the recordings that have not come to an end, then writes the tables of all.
 
-    `args` has out, resume, retry, cores, max_memory, timeout_s and json; `told_command` is what the ledger says of it.
+    `args` has out, resume, retry, cores, max_memory, timeout_s, write_back, in_place and json; `told_command` is what
+    the ledger says of it.
     Raises ValueError, OtherBatch, OSError.
     """
     cores = _cores(args.cores)
@@ -63,12 +67,13 @@ def run_batch(args: argparse.Namespace, found: list[Recording], work: Work, told
                     say(told)
             tell(Step("writing the tables"))
             counts = _write_tables(args.out, found, ledger, tell)
+            all_written = not args.write_back or _write_back(args, ledger.rows(found), tell)
     if args.json:
         print(json.dumps({"recordings": len(found), "verdicts": counts}))
     else:
         say("; ".join(f"{code}: {count}" for code, count in counts.items()))
         say(f"results: {args.out}/ ({PAGE}, {CSV}, {LEDGER}, a folder for each recording)")
-    return EXIT_SOME_FAILED if counts.get(FAILED) else EXIT_GOOD
+    return EXIT_SOME_FAILED if counts.get(FAILED) or not all_written else EXIT_GOOD
 
 
 def _run(todo: Sequence[Recording], work: Work, plan: Plan, ledger: Ledger, tell: Tell) -> Iterator[str]:
@@ -82,6 +87,17 @@ def _run(todo: Sequence[Recording], work: Work, plan: Plan, ledger: Ledger, tell
         left = "" if in_place() else f"{done} of {len(todo)} ({times(step, time.monotonic() - began_s)}): "
         yield f"{left}{found.name}: {found.verdict}, {found.seconds:.1f} s{f': {found.message}' * found.failed}"
         tell(step)
+
+
+def _write_back(args: argparse.Namespace, rows: Iterator[Outcome], tell: Tell) -> bool:
+    """Whether the cameras lie in or beside all data sets and logs that they are of."""
+    tell(Step("writing the cameras back"))
+    written = list(write_back(rows, args.out, args.in_place))
+    for each in written:
+        tell(each.sentence)
+    if not written:
+        tell("nothing to write back to: no recording is of a data set or an MCAP file")
+    return not any(each.failed for each in written)
 
 
 def _write_tables(out: Path, found: Sequence[Recording], ledger: Ledger, tell: Tell) -> dict[str, int]:

@@ -32,8 +32,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="SOURCE",
-        help="a folder of photographs, or a folder that holds such folders and videos, or a video, or a text file "
-        "that names them, one a line",
+        help="a folder of photographs, a video, an MCAP file, or a LeRobot data set, or a folder that holds such, or a "
+        "text file that names them, one a line",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for all results")
     parser.add_argument(
@@ -47,13 +47,21 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--max-memory", type=megabytes, metavar="MB", help="end a recording that takes more, in 10^6 bytes"
     )
     parser.add_argument("--timeout-s", type=seconds, metavar="S", help="end a recording that takes longer")
+    parser.add_argument(
+        "--write-back",
+        action="store_true",
+        help="at the end, write the cameras beside the LeRobot data sets and MCAP files that they are of",
+    )
+    parser.add_argument(
+        "--in-place", action="store_true", help="of a LeRobot data set, as columns of its own tables in meta/episodes"
+    )
     add_json(parser)
     _options_of_replay(parser)
 
 
 BATCH = Verb(
     "batch",
-    "reconstruct many folders of photographs and videos",
+    "reconstruct many folders of photographs, videos, logs and data sets",
     _arguments,
     lazily("splatnode.recon.batch.command", "batch"),
 )

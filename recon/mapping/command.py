@@ -49,7 +49,7 @@ def replay_map(args: argparse.Namespace, request: Request, config: Config) -> in
         tell(str(source.choice))
     began_s = time.monotonic()
     with result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):
-        frames = _kept(source, args.out) if source.is_video else source.frames()
+        frames = _kept(source, args.out) if source.is_film else source.frames()
         told = _ToldOfMap(args.json, len(source.choice.names))
         with _only_warnings():
             make_scenes(frames, source.identity(config), node_config(config, args.out), told)
@@ -96,7 +96,7 @@ class _ToldOfMap:
 
 
 def _kept(source: Recording, out: Path) -> Iterator[Frame | DroppedFrame]:
-    """The frames of a video, each of which is written into out/images, too."""
+    """The frames of a film, each of which is written into out/images, too."""
     for frame in source.frames():
         path = out / IMAGES / frame.name
         if isinstance(frame, Frame) and not path.exists():
@@ -112,7 +112,7 @@ def _report(source: Recording, out: Path, reports: Reports, seconds: float) -> d
     placed = {camera.name for name in reports for camera in read_cameras(out / name / "cameras.json")}
     left_out = [name for name in source.choice.names if name not in placed]
     return {
-        "photographs": str(out / IMAGES if source.is_video else source.path),
+        "photographs": str(out / IMAGES if source.is_film else source.path),
         "selection": source.choice.record(),
         "keyframes_in_a_map": len(placed),
         "left_out": [{"name": name, "reason": why.get(name, "it is in no scene")} for name in left_out],

@@ -123,7 +123,7 @@ def test_a_file_that_is_no_video_is_told(tmp_path):
     (tmp_path / "notes.txt").write_text("not a video")
     with pytest.raises(ValueError, match="notes.txt' is no video that can be"):
         source(Request(tmp_path / "notes.txt"))
-    with pytest.raises(FileNotFoundError, match="nothing.mp4' is not there; give a folder .* or a video"):
+    with pytest.raises(FileNotFoundError, match="nothing.mp4' is not there; give a folder .* a video, or an MCAP file"):
         source(Request(tmp_path / "nothing.mp4"))
 
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from splatnode.recon.batch.sources import recordings
+from tests.support import lerobot_sets
+from tests.support.mcap_files import as_json, compressed, write
 
 
 def put(path: Path) -> None:
@@ -71,7 +74,7 @@ def test_the_same_recording_is_found_once(tmp_path):
 
 
 def test_what_is_named_must_be_there_and_hold_something(tmp_path):
-    with pytest.raises(FileNotFoundError, match="is not there; give a folder, a video, or a list"):
+    with pytest.raises(FileNotFoundError, match="is not there; give a folder, a video, .* or a list"):
         names(tmp_path / "lost")
     with pytest.raises(ValueError, match="no photographs and no videos in"):
         names(tmp_path)
@@ -82,3 +85,31 @@ def test_any_file_name_makes_a_folder_name_of_one_line(tmp_path):
     put(strange / "1.jpg")
     (found,) = recordings([strange], Path("out"))
     assert found.name.isprintable() and os.fsdecode(b"a\nb\xff") in found.source
+
+
+def test_each_image_topic_of_an_mcap_file_is_a_recording(tmp_path):
+    picture = np.zeros((48, 64, 3), np.uint8)
+    (tmp_path / "day").mkdir()
+    write(tmp_path / "day" / "drive.mcap", [compressed("/front/image", picture), compressed("/rear/image", picture)])
+    write(tmp_path / "day" / "talk.mcap", [as_json("/log", "Log", {})])
+    (tmp_path / "day" / "broken.mcap").write_bytes(b"no log")
+    assert names(tmp_path) == ["day_broken", "day_drive_front_image", "day_drive_rear_image", "day_talk"]
+    (tmp_path / "list.txt").write_text("day/drive.mcap#/rear/image\nday/drive.mcap\n")
+    found = recordings([tmp_path / "list.txt"], Path("out"))
+    assert [recording.name for recording in found] == ["drive_rear_image", "drive_front_image"]
+    assert found[0].source == str(tmp_path / "day" / "drive.mcap#" / "rear" / "image")
+    assert names(Path(found[0].source)) == ["drive_rear_image"]
+
+
+def test_each_camera_of_each_episode_of_a_data_set_is_a_recording(tmp_path):
+    pytest.importorskip("pyarrow", reason="needs pyarrow")
+    picture = [np.zeros((48, 64, 3), np.uint8)]
+    data_set = lerobot_sets.write(
+        tmp_path / "sets" / "pusht", [{"top": picture, "side": picture}, {"top": picture, "side": picture}]
+    )
+    lerobot_sets.write(tmp_path / "sets" / "old", [{"top": picture}], codebase_version="v2.1")
+    found = recordings([tmp_path / "sets"], Path("out"))
+    episodes = [f"pusht_episode_00000{number}_{key}" for number in range(2) for key in ("top", "side")]
+    assert [recording.name for recording in found] == ["old", *episodes]
+    assert found[2].source == str(data_set) + "#episode_000000/side"
+    assert names(data_set) == episodes and names(Path(found[2].source)) == [episodes[1]]

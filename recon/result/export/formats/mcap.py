@@ -1,21 +1,18 @@
 """An MCAP file for Foxglove: for each photograph its camera, calibration and picture, and the scene as points.
 
-The schemas are Foxglove's well-known ones, as JSON. The times are those of capture where all photographs have one
-of the same clock; else the frames are a second apart. The world is the first camera's frame: y is down.
+The times are those of capture where all photographs have one of the same clock; else the frames are a second apart. The
+world is the first camera's frame: y is down.
 """
 
 from __future__ import annotations
 
-import base64
-import io
-import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.result.export.foxglove import Message, calibration, in_base64, pose, time, written
 from splatnode.recon.result.export.prepare import base_rgb
-from splatnode.recon.result.export.quaternions import quats_from_matrices
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.result.stored_snapshot import photograph_of, recorded_snapshot
@@ -26,87 +23,22 @@ _NS = 1_000_000_000
 _WORLD, _CAMERA = "world", "camera"
 _UINT8, _FLOAT32 = 1, 7  # Foxglove's numbers of types
 _INFO, _WARNING = 2, 3  # and of levels
-_HALF_PIXEL = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])  # ROS and Foxglove: the top-left pixel is at (0, 0)
-
-_NUMBER, _TEXT = {"type": "number"}, {"type": "string"}
-_INTEGER, _BYTES = {"type": "integer"}, {"type": "string", "contentEncoding": "base64"}
-_NUMBERS = {"type": "array", "items": _NUMBER}
-
-
-def _object(**properties: object) -> dict[str, object]:
-    return {"type": "object", "properties": properties}
-
-
-def _array(items: object) -> dict[str, object]:
-    return {"type": "array", "items": items}
-
-
-_TIME = _object(sec=_INTEGER, nsec=_INTEGER)
-_VECTOR = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_QUATERNION = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
-_POSE = _object(position=_VECTOR, orientation=_QUATERNION)
-_TRANSFORM = _object(
-    timestamp=_TIME, parent_frame_id=_TEXT, child_frame_id=_TEXT, translation=_VECTOR, rotation=_QUATERNION
-)
-_FIELD = _object(name=_TEXT, offset=_INTEGER, type=_INTEGER)
-
 _SCHEMAS = {  # by topic
-    "/tf": ("FrameTransforms", _object(transforms=_array(_TRANSFORM))),
-    "/camera/pose": ("PoseInFrame", _object(timestamp=_TIME, frame_id=_TEXT, pose=_POSE)),
-    "/camera/calibration": (
-        "CameraCalibration",
-        _object(
-            timestamp=_TIME,
-            frame_id=_TEXT,
-            width=_INTEGER,
-            height=_INTEGER,
-            distortion_model=_TEXT,
-            D=_NUMBERS,
-            K=_NUMBERS,
-            R=_NUMBERS,
-            P=_NUMBERS,
-        ),
-    ),
-    "/camera/image": ("CompressedImage", _object(timestamp=_TIME, frame_id=_TEXT, data=_BYTES, format=_TEXT)),
-    **dict.fromkeys(
-        ("/gaussians", "/landmarks"),
-        (
-            "PointCloud",
-            _object(
-                timestamp=_TIME, frame_id=_TEXT, pose=_POSE, point_stride=_INTEGER, fields=_array(_FIELD), data=_BYTES
-            ),
-        ),
-    ),
-    "/verdict": (
-        "Log",
-        _object(timestamp=_TIME, level=_INTEGER, message=_TEXT, name=_TEXT, file=_TEXT, line=_INTEGER),
-    ),
+    "/tf": "FrameTransforms",
+    "/camera/pose": "PoseInFrame",
+    "/camera/calibration": "CameraCalibration",
+    "/camera/image": "CompressedImage",
+    "/gaussians": "PointCloud",
+    "/landmarks": "PointCloud",
+    "/verdict": "Log",
 }
-
-Message = tuple[str, int, dict[str, object]]  # topic, nanoseconds, content
 
 
 def export(result: StoredResult) -> bytes:
     """Raises ModuleNotFoundError without the package mcap."""
     from mcap.writer import Writer  # an extra
 
-    return _written(Writer, _messages(recorded_snapshot(result)))
-
-
-def _written(make_writer: Callable, messages: Sequence[Message]) -> bytes:
-    file = io.BytesIO()
-    writer = make_writer(file)
-    writer.start(library="splatnode")
-    channels = {}
-    for topic in dict.fromkeys(topic for topic, _, _ in messages):
-        name, schema = _SCHEMAS[topic]
-        titled = json.dumps({"title": f"foxglove.{name}", **schema}).encode()
-        known = writer.register_schema(f"foxglove.{name}", "jsonschema", titled)
-        channels[topic] = writer.register_channel(topic, "json", known)
-    for topic, ns, content in messages:
-        writer.add_message(channels[topic], log_time=ns, publish_time=ns, data=json.dumps(content).encode())
-    writer.finish()
-    return file.getvalue()
+    return written(Writer, _messages(recorded_snapshot(result)), _SCHEMAS)
 
 
 def _messages(snapshot: Snapshot) -> list[Message]:
@@ -131,7 +63,7 @@ def _scene(snapshot: Snapshot, ns: int) -> list[Message]:
     said = " ".join(part for part in (f"{verdict.code.value}:", verdict.message, verdict.advice) if part)
     said += f" Lengths are {snapshot.scale.sentence}."
     level = _INFO if verdict.publishable else _WARNING
-    log = {"timestamp": _time(ns), "level": level, "message": said, "name": "splatnode", "file": "", "line": 0}
+    log = {"timestamp": time(ns), "level": level, "message": said, "name": "splatnode", "file": "", "line": 0}
     found: list[Message] = [("/verdict", ns, log)]
     if len(gaussians):
         alpha = np.rint(255 * gaussians.opacities).astype(np.uint8)
@@ -142,33 +74,21 @@ def _scene(snapshot: Snapshot, ns: int) -> list[Message]:
 
 
 def _photograph(camera: CameraEstimate, jpeg: bytes | None, ns: int) -> list[Message]:
-    stamp, pose = _time(ns), _pose(camera.T_world_camera)
+    stamp, placed = time(ns), pose(camera.T_world_camera)
     transform = {
         "timestamp": stamp,
         "parent_frame_id": _WORLD,
         "child_frame_id": _CAMERA,
-        "translation": pose["position"],
-        "rotation": pose["orientation"],
-    }
-    K = camera.K - _HALF_PIXEL
-    calibration = {
-        "timestamp": stamp,
-        "frame_id": _CAMERA,
-        "width": camera.width,
-        "height": camera.height,
-        "distortion_model": "plumb_bob",
-        "D": [0.0] * 5,
-        "K": K.ravel().tolist(),
-        "R": np.eye(3).ravel().tolist(),
-        "P": np.column_stack([K, np.zeros(3)]).ravel().tolist(),
+        "translation": placed["position"],
+        "rotation": placed["orientation"],
     }
     found: list[Message] = [
         ("/tf", ns, {"transforms": [transform]}),
-        ("/camera/pose", ns, {"timestamp": stamp, "frame_id": _WORLD, "pose": pose}),
-        ("/camera/calibration", ns, calibration),
+        ("/camera/pose", ns, {"timestamp": stamp, "frame_id": _WORLD, "pose": placed}),
+        ("/camera/calibration", ns, calibration(camera, ns, _CAMERA)),
     ]
     if jpeg is not None:
-        image = {"timestamp": stamp, "frame_id": _CAMERA, "data": _base64(jpeg), "format": "jpeg"}
+        image = {"timestamp": stamp, "frame_id": _CAMERA, "data": in_base64(jpeg), "format": "jpeg"}
         found.append(("/camera/image", ns, image))
     return found
 
@@ -187,24 +107,10 @@ def _cloud(points: npt.NDArray, rgba: npt.NDArray[np.uint8] | None, ns: int) -> 
         for name, kind in names + colours
     ]
     return {
-        "timestamp": _time(ns),
+        "timestamp": time(ns),
         "frame_id": _WORLD,
-        "pose": _pose(np.eye(4)),
+        "pose": pose(np.eye(4)),
         "point_stride": packed.dtype.itemsize,
         "fields": fields,
-        "data": _base64(packed.tobytes()),
+        "data": in_base64(packed.tobytes()),
     }
-
-
-def _pose(T_world_camera: npt.NDArray[np.float64]) -> dict[str, dict[str, float]]:
-    w, x, y, z = (float(value) for value in quats_from_matrices(T_world_camera[:3, :3]))
-    position = dict(zip("xyz", T_world_camera[:3, 3].tolist(), strict=True))
-    return {"position": position, "orientation": {"x": x, "y": y, "z": z, "w": w}}
-
-
-def _time(ns: int) -> dict[str, int]:
-    return {"sec": ns // _NS, "nsec": ns % _NS}
-
-
-def _base64(data: bytes) -> str:
-    return base64.b64encode(data).decode()

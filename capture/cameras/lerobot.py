@@ -1,0 +1,58 @@
+"""What a camera saw in an episode of a LeRobot data set (v3.0), as a camera. Needs pyarrow; AV1, PyAV."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+
+from splatnode.capture.cameras import video
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, renamed
+from splatnode.capture.image_file import MaxPixels
+from splatnode.capture.lerobot.data_set import Film, film
+from splatnode.capture.pace import Pace, paced
+from splatnode.capture.process.printable import LONGEST_NAME, printable_name
+from splatnode.capture.stamp import Clock, Stamp
+from splatnode.capture.video_process import MAX_VIDEO_PIXELS
+
+_LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes behind it
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    folder: Path  # of the data set
+    part: str  # the episode and the camera's key: 3/observation.images.top; of a data set with one camera, 3
+    max_pixels: MaxPixels = MAX_VIDEO_PIXELS  # of a frame, at most; the decoder's memory is bounded accordingly
+    pace: Pace = "fastest"  # recorded: at the pace of the video; fastest: as fast as frames are taken
+    intrinsics: Intrinsics | None = None  # the lens, of a calibration at the same aspect ratio
+
+
+def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
+    """The episode's frames, numbered and timed from its own beginning.
+
+    Raises UnusableDataSet, FileNotFoundError and ValueError where they cannot be had.
+    """
+    found = film(config.folder, config.part)
+    part = video.Config(
+        file=found.video,
+        max_pixels=config.max_pixels,
+        intrinsics=config.intrinsics,
+        from_s=found.from_s,
+        to_s=found.to_s,
+    )
+    return paced(_frames(video.stream(part), found), config.pace)
+
+
+def _frames(frames: Iterator[Frame | DroppedFrame], found: Film) -> Iterator[Frame | DroppedFrame]:
+    stem = printable_name(f"episode_{found.episode:06d}_{found.key}", _LONGEST_STEM)
+    begins_ns = math.inf
+    for each in frames:
+        if isinstance(each, DroppedFrame):
+            yield replace(each, name=f"{stem}_rest")
+            continue
+        begins_ns = min(begins_ns, each.stamp_ns)
+        stamp_ns = each.stamp_ns - round(begins_ns)
+        item = renamed(each, each.frame_id, f"{stem}_{each.frame_id:06d}.png", stamp_ns)
+        yield replace(item, captured_at=Stamp(stamp_ns, Clock.RECORDING)) if isinstance(item, Frame) else item

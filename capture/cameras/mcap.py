@@ -1,0 +1,164 @@
+"""An image topic of an MCAP file as a camera: what a robot logged, by Foxglove's schemas or by ROS 2. Needs mcap."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
+from splatnode.capture.given_lens import same_aspect
+from splatnode.capture.image_file import MAX_PIXELS, MaxPixels
+from splatnode.capture.logged.calibration import calibration_topic, lens
+from splatnode.capture.logged.mcap import Message, Topic, UnusableLog, messages, topics
+from splatnode.capture.logged.message import Calibration, Picture, UnusableMessage
+from splatnode.capture.logged.pixels import is_photograph, rgb
+from splatnode.capture.logged.schemas import CALIBRATIONS, PICTURES, READ
+from splatnode.capture.pace import Pace, paced
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.logs import event
+from splatnode.capture.process.printable import LONGEST_NAME, printable, printable_name
+from splatnode.capture.stamp import LARGEST_NS, Clock, Stamp
+
+log = logging.getLogger(__name__)
+
+_EARLIEST_UTC_NS = 946_684_800 * 10**9  # the year 2000: a smaller stamp is of a clock that began with the recording
+_LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the message comes behind it
+_NOT_PHOTOGRAPHS = "/compressedDepth"  # the end of a topic's name: depth that ROS packs into a PNG
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    file: Path  # the MCAP file
+    topic: str = ""  # with the images; "": the only one that has any
+    max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
+    pace: Pace = "fastest"  # recorded: at the pace of the log; fastest: as fast as frames are taken
+    intrinsics: Intrinsics | None = None  # the lens, of images of its aspect ratio, instead of what the file tells
+
+
+def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
+    """The images at the times at which they were logged, each with the lens that the file tells for its camera.
+
+    Raises FileNotFoundError, or ValueError where the file or the topic cannot be used. What goes wrong after a frame
+    is named as a dropped frame.
+    """
+    if not config.file.is_file():
+        raise FileNotFoundError(f"no file {str(config.file)!r}; give an MCAP file")
+    topic = _chosen(config)
+    return paced(_frames(config, topic), config.pace)
+
+
+def image_topics(file: Path) -> list[Topic]:
+    """Those whose messages are photographs, by name. Raises UnusableLog, OSError, ModuleNotFoundError without mcap."""
+    pictures = [topic for topic in topics(file) if topic.kind in PICTURES and not topic.name.endswith(_NOT_PHOTOGRAPHS)]
+    return [topic for topic in pictures if topic.schema.endswith("CompressedImage") or _shows_photographs(file, topic)]
+
+
+def _shows_photographs(file: Path, topic: Topic) -> bool:
+    """Whether the first image of a topic is a photograph, and not depth; one that cannot be read may be."""
+    first = next(messages(file, {topic.name}), None)
+    if first is None:
+        return False
+    try:
+        return is_photograph(_picture(first))
+    except UnusableMessage:
+        return True
+
+
+def _chosen(config: Config) -> Topic:
+    """The topic that is configured, or the only one."""
+    there = image_topics(config.file)
+    names = ", ".join(printable(topic.name, LONGEST_NAME) for topic in there)
+    shown = repr(printable(str(config.file)))
+    if not there:
+        others = sorted({topic.schema for topic in topics(config.file) if topic.schema})
+        held = f"it holds {printable(', '.join(others))}" if others else "it holds no messages of any schema"
+        raise ValueError(f"{shown} must have a topic of images ({READ}); {held}")
+    if not config.topic and len(there) > 1:
+        raise ValueError(f"{shown} has {len(there)} topics of images: {names}; name one, as in FILE.mcap#TOPIC")
+    for topic in there:
+        if config.topic in ("", topic.name):
+            return topic
+    raise ValueError(f"{shown} has no images of a topic {printable(config.topic, LONGEST_NAME)!r}; there are: {names}")
+
+
+def _frames(config: Config, topic: Topic) -> Iterator[Frame | DroppedFrame]:
+    known = config.intrinsics or _lens(config.file, topic)
+    index, told = 0, False
+    try:
+        for message in messages(config.file, {topic.name}):
+            item = _frame(message, index, config, known)
+            if isinstance(item, Frame) and known is not None and item.intrinsics is None and not told:
+                sizes = {"calibrated": f"{known.width}x{known.height}", "image": f"{item.width}x{item.height}"}
+                event(log, logging.WARNING, "lens_of_another_size", topic=printable(topic.name), **sizes)
+                told = True
+            yield item
+            index += 1
+    except UnusableLog as error:
+        if index == 0:
+            raise
+        yield DroppedFrame(f"{_stem(topic)}_rest", str(error))
+    if index == 0:
+        raise ValueError(f"{str(config.file)!r} has no message of {printable(topic.name, LONGEST_NAME)}")
+
+
+def _frame(message: Message, index: int, config: Config, known: Intrinsics | None) -> Frame | DroppedFrame:
+    name = f"{_stem(message.topic)}_{index:06d}.png"
+    try:
+        picture = _picture(message)
+        with foreign(UnusableMessage):
+            image = rgb(picture, config.max_pixels)
+    except UnusableMessage as error:
+        return DroppedFrame(name, str(error))
+    height, width = image.shape[:2]
+    fits = known is not None and same_aspect(known, width, height)
+    own = known.resized(width, height) if known is not None and fits else None
+    return framed(index, name, message.log_ns, image, own, captured_at=_captured_at(picture, message))
+
+
+def _captured_at(picture: Picture, message: Message) -> Stamp | None:
+    """By the clock of who took it, or wrote it down, whichever knows the time of day; else since an unknown time."""
+    for ns in (picture.captured_ns, message.log_ns):
+        if _EARLIEST_UTC_NS <= ns <= LARGEST_NS:
+            return Stamp(ns, Clock.UTC)
+    return Stamp(picture.captured_ns, Clock.RECORDING) if picture.captured_ns <= LARGEST_NS else None
+
+
+def _picture(message: Message) -> Picture:
+    with foreign(UnusableMessage):
+        return PICTURES[message.topic.kind](message.data)
+
+
+def _lens(file: Path, topic: Topic) -> Intrinsics | None:
+    """What the file tells of the topic's camera; where that cannot be used, it is said and None."""
+    told = [each.name for each in topics(file) if each.kind in CALIBRATIONS]
+    known: dict[str, Calibration] = {}
+    sensor = _sensor(file, topic)
+    for name in told:
+        first = next(messages(file, {name}), None)
+        try:
+            with foreign(UnusableMessage):
+                if first is not None:
+                    known[name] = CALIBRATIONS[first.topic.kind](first.data)
+        except UnusableMessage as error:
+            event(log, logging.WARNING, "calibration_unreadable", topic=printable(name), error=printable(error))
+    chosen = calibration_topic(topic.name, sensor, known)
+    try:
+        return None if chosen is None else lens(topic.name, known[chosen])
+    except UnusableMessage as error:
+        event(log, logging.WARNING, "calibration_unusable", topic=printable(chosen), error=printable(error))
+        return None
+
+
+def _sensor(file: Path, topic: Topic) -> str:
+    first = next(messages(file, {topic.name}), None)
+    try:
+        return "" if first is None else _picture(first).sensor
+    except UnusableMessage:
+        return ""
+
+
+def _stem(topic: Topic) -> str:
+    """The topic in the name of a frame, which may name a file."""
+    return printable_name(topic.name.strip("/").replace("/", "_"), _LONGEST_STEM) or "image"

@@ -1,0 +1,57 @@
+"""A recording in a file, by its name: a video, an image topic of an MCAP file, or an episode of a LeRobot data set.
+
+film.mp4, drive.mcap#/front/image, pusht#episode_000003/observation.images.top
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import quote, unquote
+
+from splatnode.capture.cameras import lerobot, mcap, video
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.lerobot.data_set import is_data_set
+
+MCAP = ".mcap"
+_MARK = "#"  # between a file and the part of it that is meant
+
+
+def file_and_part(path: Path) -> tuple[Path, str]:
+    """The file or the data set, and what of it is meant; all where that is empty.
+
+    A file whose own name has a # is itself.
+    """
+    if path.exists():
+        return path, ""
+    text = str(path)
+    for place in (place for place, letter in enumerate(text) if letter == _MARK):
+        file = Path(text[:place])
+        if file.is_file() or is_data_set(file):
+            return file, unquote(text[place + 1 :])
+    return path, ""
+
+
+def part_of(file: Path, part: str) -> Path:
+    """The path by which `file_and_part` finds this part, whatever characters it has."""
+    plain = f"{file}{_MARK}{quote(part, safe='/')}"
+    return Path(plain if os.path.normpath(plain) == plain else f"{file}{_MARK}{quote(part, safe='')}")
+
+
+def is_film(path: Path) -> bool:
+    """Whether this is a file, or a part of one or of a data set, and not a folder."""
+    file, part = file_and_part(path)
+    return bool(part) or file.is_file()
+
+
+def stream(path: Path) -> Iterator[Frame | DroppedFrame]:
+    """Its frames. Raises FileNotFoundError, or ValueError where they cannot be had."""
+    file, part = file_and_part(path)
+    if file.suffix.lower() == MCAP:
+        return mcap.stream(mcap.Config(file=file, topic=part))
+    if file.is_dir():
+        return lerobot.stream(lerobot.Config(folder=file, part=part))
+    if part:
+        raise ValueError(f"{str(path)!r}: of an MCAP file a topic can be named behind the #, of a video nothing")
+    return video.stream(video.Config(file=file))

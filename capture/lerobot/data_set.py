@@ -1,0 +1,144 @@
+"""The episodes of a data set, and where in which file the video of each camera is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import msgspec
+
+from splatnode.capture.process.bounded_file import read_bounded
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import printable
+
+VERSION = "v3.0"
+INFO, EPISODES = Path("meta", "info.json"), Path("meta", "episodes")
+_MOST_BYTES = 10_000_000  # of info.json
+_NAMED = "episode_"  # before an episode's number, in the name of a part
+
+
+class UnusableDataSet(ValueError):
+    """A folder that is no data set that can be read here, or has no such episode; the text says why."""
+
+
+class Feature(msgspec.Struct, frozen=True):
+    dtype: str
+    info: dict[str, Any] | None = None
+    video_info: dict[str, Any] | None = None
+
+    @property
+    def is_film(self) -> bool:
+        told = {**(self.video_info or {}), **(self.info or {})}
+        return self.dtype == "video" and not (told.get("is_depth_map") or told.get("video.is_depth_map"))
+
+
+class Info(msgspec.Struct, frozen=True):
+    """What of meta/info.json is read."""
+
+    codebase_version: str
+    fps: float = 0.0
+    features: dict[str, Feature] = {}
+    video_path: str | None = None
+
+    @property
+    def cameras(self) -> list[str]:
+        """The keys of the features that are videos of photographs."""
+        return [key for key, feature in self.features.items() if feature.is_film]
+
+
+@dataclass(frozen=True)
+class Film:
+    """What one camera saw in one episode."""
+
+    episode: int
+    key: str  # of the camera's feature
+    video: Path
+    from_s: float  # in the video
+    to_s: float
+
+
+def is_data_set(folder: Path) -> bool:
+    return (folder / INFO).is_file()
+
+
+def read_info(folder: Path) -> Info:
+    """Raises UnusableDataSet where it is of another version, or has no videos; OSError."""
+    shown = f"{printable(str(folder))!r}"
+    with foreign(UnusableDataSet, f"{shown}: {INFO}"):
+        info = msgspec.json.decode(read_bounded(folder / INFO, _MOST_BYTES, UnusableDataSet, shown), type=Info)
+    if info.codebase_version != VERSION:
+        version = printable(info.codebase_version, 40)
+        raise UnusableDataSet(
+            f"{shown} must be a LeRobot data set of version {VERSION}, it is of {version}; convert it with LeRobot's "
+            "convert_dataset_v21_to_v30, or install a splatnode that reads it"
+        )
+    if not info.cameras or not info.video_path:
+        raise UnusableDataSet(
+            f"{shown} has no videos: a feature must be a video; pictures in the tables of data/ are not read"
+        )
+    return info
+
+
+def parts(folder: Path) -> list[str]:
+    """The names of all episodes' cameras, in order, for `film`. Raises as `read_info`, and without pyarrow."""
+    cameras = read_info(folder).cameras
+    return [f"{_NAMED}{number:06d}/{key}" for number in sorted(_tables(folder, ())) for key in cameras]
+
+
+def film(folder: Path, part: str) -> Film:
+    """The episode and camera that `parts` names so; "3/KEY" is the episode 3, too, and one camera need not be named.
+
+    Raises UnusableDataSet where there is none, or where it has no images; OSError, ModuleNotFoundError.
+    """
+    info = read_info(folder)
+    number, key = episode_and_camera(folder, info, part)
+    shown = f"{printable(str(folder))!r}"
+    wanted = tuple(f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp"))
+    episodes = _tables(folder, wanted)
+    row = episodes.get(number)
+    if row is None:
+        raise UnusableDataSet(f"{shown} has no episode {number}; it has {len(episodes)} episodes")
+    chunk, file, from_s, to_s = (row.get(name) for name in wanted)
+    if chunk is None or file is None or from_s is None or to_s is None or to_s <= from_s:
+        raise UnusableDataSet(f"{shown}: episode {number} has no images of {printable(key)}")
+    return Film(number, key, folder / _video(info, key, int(chunk), int(file)), float(from_s), float(to_s))
+
+
+def episode_and_camera(folder: Path, info: Info, part: str) -> tuple[int, str]:
+    """The number and the key that a part names. Raises UnusableDataSet where it names none."""
+    said, _, key = part.partition("/")
+    number = said.removeprefix(_NAMED)
+    key = key or (info.cameras[0] if len(info.cameras) == 1 else "")
+    if not number.isascii() or not number.isdecimal() or key not in info.cameras:
+        cameras = printable(", ".join(info.cameras))
+        raise UnusableDataSet(
+            f"{printable(str(folder))!r}: behind the # must be an episode and a camera, as "
+            f"{_NAMED}000000/{info.cameras[0]}; got {printable(part, 100)!r}. The cameras are {cameras}"
+        )
+    return int(number), key
+
+
+def _tables(folder: Path, wanted: tuple[str, ...]) -> dict[int, Mapping[str, Any]]:
+    """The rows of meta/episodes by the episodes' numbers."""
+    from splatnode.capture.lerobot import pyarrow  # takes half a second, and is an extra
+
+    shown = f"{printable(str(folder))!r}"
+    found: dict[int, Mapping[str, Any]] = {}
+    with foreign(UnusableDataSet, f"{shown}: {EPISODES}"):
+        for file in sorted((folder / EPISODES).glob("*/*.parquet")):
+            for row in pyarrow.rows(file, ("episode_index", *wanted)):
+                found[int(row["episode_index"])] = row
+    if not found:
+        raise UnusableDataSet(f"{shown} has no episodes: there are no rows in {EPISODES}/*/*.parquet")
+    return found
+
+
+def _video(info: Info, key: str, chunk: int, file: int) -> PurePosixPath:
+    """The path in the data set, which leads nowhere else."""
+    with foreign(UnusableDataSet, "video_path"):
+        path = PurePosixPath(str(info.video_path).format(video_key=key, chunk_index=chunk, file_index=file))
+    if path.is_absolute() or ".." in path.parts:
+        raise UnusableDataSet(f"video_path must lead to a file of the data set, it leads to {printable(path, 200)!r}")
+    return path

@@ -1,0 +1,96 @@
+"""Foxglove's CompressedImage, RawImage and CameraCalibration, in JSON and in protobuf.
+
+Source: Foxglove's schemas (foxglove-sdk), whose field numbers are those below.
+"""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import msgspec
+
+from splatnode.capture.logged.message import Calibration, Layout, Picture, UnusableMessage
+from splatnode.capture.logged.protobuf import Fields
+
+_NS = 10**9
+_Message = TypeVar("_Message", bound=msgspec.Struct)
+
+
+class _Time(msgspec.Struct, frozen=True):
+    sec: int = 0
+    nsec: int = 0
+
+    @property
+    def ns(self) -> int:
+        return max(0, self.sec * _NS + self.nsec)
+
+
+class _Compressed(msgspec.Struct, frozen=True):
+    data: bytes  # base64 in JSON
+    timestamp: _Time = _Time()
+    frame_id: str = ""
+
+
+class _Raw(msgspec.Struct, frozen=True):
+    width: int
+    height: int
+    encoding: str
+    step: int
+    data: bytes
+    timestamp: _Time = _Time()
+    frame_id: str = ""
+
+
+class _Calibration(msgspec.Struct, frozen=True):
+    width: int
+    height: int
+    K: tuple[float, ...]
+    distortion_model: str = ""
+    D: tuple[float, ...] = ()
+    P: tuple[float, ...] = ()
+    frame_id: str = ""
+
+
+def compressed_of_json(data: bytes) -> Picture:
+    found = _decoded(data, _Compressed)
+    return Picture(found.frame_id, found.timestamp.ns, found.data, None)
+
+
+def raw_of_json(data: bytes) -> Picture:
+    found = _decoded(data, _Raw)
+    layout = Layout(found.width, found.height, found.encoding, found.step)
+    return Picture(found.frame_id, found.timestamp.ns, found.data, layout)
+
+
+def calibration_of_json(data: bytes) -> Calibration:
+    found = _decoded(data, _Calibration)
+    return Calibration(found.frame_id, found.width, found.height, found.distortion_model, found.D, found.K, found.P)
+
+
+def compressed_of_protobuf(data: bytes) -> Picture:
+    fields = Fields(data)
+    return Picture(fields.text(4), _time_ns(fields.message(1)), fields.bytes(2), None)
+
+
+def raw_of_protobuf(data: bytes) -> Picture:
+    fields = Fields(data)
+    layout = Layout(fields.integer(2), fields.integer(3), fields.text(4), fields.integer(5))
+    return Picture(fields.text(7), _time_ns(fields.message(1)), fields.bytes(6), layout)
+
+
+def calibration_of_protobuf(data: bytes) -> Calibration:
+    fields = Fields(data)
+    size = fields.integer(2), fields.integer(3)
+    return Calibration(fields.text(9), *size, fields.text(4), fields.doubles(5), fields.doubles(6), fields.doubles(8))
+
+
+def _time_ns(stamp: Fields) -> int:
+    """google.protobuf.Timestamp."""
+    return stamp.integer(1) * _NS + stamp.integer(2)
+
+
+def _decoded(data: bytes, kind: type[_Message]) -> _Message:
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except msgspec.DecodeError as error:
+        raise UnusableMessage(f"the message must be JSON of Foxglove's schema: {error}") from error

@@ -1,0 +1,152 @@
+"""The topics of an MCAP file, and the messages of some of them, in the order of the file. Needs the extra mcap.
+
+Where the file has an index, only the chunks that hold these topics are read; one without, such as that of a robot that
+lost its power, is read from its beginning as far as it goes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import printable
+
+_MOST_BYTES = 1 << 29  # of a record, and of what it is decompressed to
+
+
+class UnusableLog(ValueError):
+    """A file that is no MCAP file, or that ends within a record; the text says which."""
+
+
+@dataclass(frozen=True)
+class Topic:
+    """What messages a topic has."""
+
+    name: str
+    schema: str  # its name
+    encoding: str  # of the messages: json, protobuf, cdr, ...
+
+    @property
+    def kind(self) -> tuple[str, str]:
+        return self.schema, self.encoding
+
+
+@dataclass(frozen=True, eq=False)
+class Message:
+    topic: Topic
+    log_ns: int  # when it was written down, mostly since 1970
+    data: bytes
+
+
+def topics(file: Path) -> list[Topic]:
+    """All topics, by name. Raises UnusableLog, OSError; ModuleNotFoundError without mcap."""
+    from mcap.exceptions import EndOfFile
+    from mcap.records import Channel, Schema
+
+    known = _Known()
+    with _opened(file) as stream:
+        summary = _summary(stream)
+        records = _records(stream) if summary is None else [*summary.schemas.values(), *summary.channels.values()]
+        with contextlib.suppress(EndOfFile):  # what there is before the end counts
+            for record in records:
+                if isinstance(record, (Schema, Channel)):
+                    known.add(record)
+    return sorted({topic for topic in known.topics.values()}, key=lambda topic: topic.name)
+
+
+def messages(file: Path, wanted: Collection[str]) -> Iterator[Message]:
+    """The messages of the topics of these names.
+
+    Raises UnusableLog, after the messages before it where it is about a later one; OSError; ModuleNotFoundError
+    without mcap.
+    """
+    from mcap.records import Channel, Schema
+    from mcap.records import Message as Record
+
+    known = _Known()
+    with _opened(file) as stream:
+        for record in _of_topics(stream, wanted, known):
+            if isinstance(record, (Schema, Channel)):
+                known.add(record)
+            elif isinstance(record, Record) and known.topics[record.channel_id].name in wanted:
+                yield Message(known.topics[record.channel_id], record.log_time, record.data)
+
+
+class _Known:
+    """The topics that a file has told of so far."""
+
+    def __init__(self) -> None:
+        self.topics: dict[int, Topic] = {}  # by the channel's number
+        self._schemas: dict[int, str] = {}
+
+    def add(self, record: Any) -> None:
+        """A Schema or a Channel of mcap."""
+        if hasattr(record, "topic"):
+            schema = self._schemas.get(record.schema_id, "")
+            self.topics[record.id] = Topic(record.topic, schema, record.message_encoding)
+        else:
+            self._schemas[record.id] = record.name
+
+
+@contextlib.contextmanager
+def _opened(file: Path) -> Iterator[IO[bytes]]:
+    with file.open("rb") as stream, foreign(UnusableLog, f"{printable(str(file))!r} is no MCAP file that is whole"):
+        yield stream
+
+
+def _of_topics(stream: IO[bytes], wanted: Collection[str], known: _Known) -> Iterator[Any]:
+    """The records of the chunks that may hold these topics, or all; what the index knows is added to `known`."""
+    summary = _summary(stream)
+    if summary is None or not summary.chunk_indexes:
+        yield from _records(stream)
+        return
+    for record in (*summary.schemas.values(), *summary.channels.values()):
+        known.add(record)
+    channels = {number for number, topic in known.topics.items() if topic.name in wanted}
+    for chunk in sorted(summary.chunk_indexes, key=lambda each: each.chunk_start_offset):
+        if channels.isdisjoint(chunk.message_index_offsets) and chunk.message_index_offsets:
+            continue
+        stream.seek(chunk.chunk_start_offset)
+        yield from _unpacked(next(_reader(stream, skip_magic=True).records))
+
+
+def _summary(stream: IO[bytes]) -> Any:
+    """The index at the end of the file; None where it has none."""
+    from mcap.reader import SeekingReader
+
+    stream.seek(0)
+    reader = SeekingReader(stream, record_size_limit=_MOST_BYTES)
+    try:
+        return reader.get_summary()
+    except Exception:  # its end is not there; what the parser meets instead may be anything
+        return None
+
+
+def _records(stream: IO[bytes]) -> Iterator[Any]:
+    stream.seek(0)
+    for record in _reader(stream).records:
+        yield from _unpacked(record)
+
+
+def _unpacked(record: Any) -> Iterator[Any]:
+    """What a chunk holds; any other record itself. Raises UnusableLog where it would take too much memory."""
+    from mcap.records import Chunk
+    from mcap.stream_reader import breakup_chunk
+
+    if not isinstance(record, Chunk):
+        yield record
+        return
+    if record.uncompressed_size > _MOST_BYTES:
+        raise UnusableLog(f"a chunk must have at most {_MOST_BYTES} bytes, it has {record.uncompressed_size}")
+    yield from breakup_chunk(record, validate_crc=True)
+
+
+def _reader(stream: IO[bytes], skip_magic: bool = False) -> Any:
+    from mcap.stream_reader import StreamReader
+
+    make: Callable = StreamReader
+    return make(stream, skip_magic=skip_magic, emit_chunks=True, record_size_limit=_MOST_BYTES)

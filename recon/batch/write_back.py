@@ -1,0 +1,137 @@
+"""The cameras of a batch beside the data sets and logs that they are of, in the formats of these.
+
+Of a LeRobot data set it is one table, meta/splatnode_cameras.parquet, with a row for each camera of each episode, or
+columns of the same names in its own tables. Of an MCAP file it is another one beside it, NAME.splatnode.mcap.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from splatnode.capture import film
+from splatnode.capture.lerobot import data_set
+from splatnode.capture.logged.mcap import messages
+from splatnode.recon.batch.answer import Outcome
+from splatnode.recon.batch.sources import OWN_SUFFIX
+from splatnode.recon.batch.tables import replacing
+from splatnode.recon.result.export import read_cameras
+from splatnode.recon.result.export.foxglove import Message, calibration, pose, time
+from splatnode.recon.result.snapshot import CameraEstimate
+
+CAMERAS = "cameras.json"
+TABLE = Path("meta", "splatnode_cameras.parquet")
+_WORLD, _CAMERA = "world", "camera"  # coordinate frames, behind the topic
+_INFO, _WARNING = 2, 3  # Foxglove's numbers of levels
+
+
+@dataclass(frozen=True)
+class WrittenBack:
+    """What became of one data set or log."""
+
+    sentence: str
+    failed: bool = False
+
+
+def write_back(rows: Iterable[Outcome], out: Path, in_place: bool) -> Iterator[WrittenBack]:
+    """Writes the cameras of `rows`, whose results lie in `out`; one after the other, what becomes of each file.
+
+    `in_place` adds columns to the tables of a data set; an MCAP file is never changed. Recordings of neither are left.
+    """
+    found: defaultdict[Path, list[tuple[str, Outcome]]] = defaultdict(list)
+    for row in rows:
+        file, part = film.file_and_part(Path(row.source))
+        if part and not row.failed:
+            found[file].append((part, row))
+    for file, parts in found.items():
+        try:
+            if file.suffix.lower() == film.MCAP:
+                yield WrittenBack(_beside_log(file, parts, out))
+            else:
+                yield WrittenBack(_into_data_set(file, parts, out, in_place))
+        except (OSError, ValueError, ModuleNotFoundError) as error:
+            yield WrittenBack(f"the cameras of {file} were not written back: {error}", failed=True)
+
+
+def _into_data_set(folder: Path, parts: Sequence[tuple[str, Outcome]], out: Path, in_place: bool) -> str:
+    """Raises OSError, UnusableDataSet, ModuleNotFoundError without pyarrow."""
+    from splatnode.recon.batch import pyarrow  # takes half a second, and is an extra
+
+    info = data_set.read_info(folder)
+    numbered = [(*data_set.episode_and_camera(folder, info, part), row) for part, row in parts]
+    numbered.sort(key=lambda each: each[:2])
+    seen = ((episode, key, _seen(row, out, info.fps)) for episode, key, row in numbered)
+    if in_place:
+        by_key: defaultdict[str, dict[int, Mapping[str, Any]]] = defaultdict(dict)
+        for episode, key, values in seen:
+            by_key[key][episode] = values
+        files = sorted((folder / data_set.EPISODES).glob("*/*.parquet"))
+        for file in files:
+            with replacing(file) as temporary:
+                pyarrow.write_with_columns(file, temporary, by_key)
+        return f"{len(parts)} recordings are columns splatnode/CAMERA/... in {len(files)} tables of {folder}"
+    with replacing(folder / TABLE) as temporary:
+        pyarrow.write_seen(temporary, ({"episode_index": n, "camera": key, **values} for n, key, values in seen))
+    return f"{len(parts)} recordings are rows of {folder / TABLE}"
+
+
+def _seen(row: Outcome, out: Path, rate: float) -> dict[str, Any]:
+    """What is known of a recording: a verdict, and its keyframes, with the frames' numbers in the episode."""
+    cameras = _cameras(row, out)
+    indices = [_index(camera) for camera in cameras]
+    return {
+        "verdict": row.verdict,
+        "message": row.message,
+        "rotation_deg": row.rotation_deg,
+        "centre_percent": row.centre_percent,
+        "focal_percent": row.focal_percent,
+        "frame_index": indices,
+        "timestamp": [index / rate for index in indices] if rate > 0 else [],
+        "T_world_camera": [camera.T_world_camera.ravel().tolist() for camera in cameras],
+        "K": [camera.K.ravel().tolist() for camera in cameras],
+        "width": [camera.width for camera in cameras],
+        "height": [camera.height for camera in cameras],
+    }
+
+
+def _beside_log(file: Path, parts: Sequence[tuple[str, Outcome]], out: Path) -> str:
+    """Raises OSError, UnusableLog, ModuleNotFoundError without mcap."""
+    from splatnode.recon.batch import mcap
+
+    told: list[Message] = []
+    schemas: dict[str, str] = {}
+    for topic, row in parts:
+        names = {kind: f"{topic}/splatnode/{kind}" for kind in ("pose", "calibration", "verdict")}
+        schemas |= {names["pose"]: "PoseInFrame", names["calibration"]: "CameraCalibration", names["verdict"]: "Log"}
+        told += _of_topic(file, topic, row, out, names)
+    target = file.with_name(file.stem + OWN_SUFFIX)
+    with replacing(target) as temporary:
+        temporary.write_bytes(mcap.encoded(sorted(told, key=lambda each: each[1]), schemas))
+    return f"{len(parts)} topics of {file} have cameras in {target}"
+
+
+def _of_topic(file: Path, topic: str, row: Outcome, out: Path, names: Mapping[str, str]) -> Iterator[Message]:
+    """The verdict with the first picture, and of each keyframe its pose and lens, at the time of its picture."""
+    by_index = {_index(camera): camera for camera in _cameras(row, out)}
+    for index, message in enumerate(messages(file, {topic})):
+        ns = message.log_ns
+        if index == 0:
+            level = _INFO if row.published else _WARNING
+            said = {"message": f"{row.verdict}: {row.message}", "name": "splatnode", "file": "", "line": 0}
+            yield names["verdict"], ns, {"timestamp": time(ns), "level": level, **said}
+        if (camera := by_index.get(index)) is not None:
+            placed = {"timestamp": time(ns), "frame_id": f"{topic}/{_WORLD}", "pose": pose(camera.T_world_camera)}
+            yield names["pose"], ns, placed
+            yield names["calibration"], ns, calibration(camera, ns, f"{topic}/{_CAMERA}")
+
+
+def _cameras(row: Outcome, out: Path) -> Sequence[CameraEstimate]:
+    return read_cameras(out / row.name / CAMERAS) if row.published else ()
+
+
+def _index(camera: CameraEstimate) -> int:
+    """Of the frame in its topic or episode, which its name ends with."""
+    return int(Path(camera.name).stem.rpartition("_")[2])

@@ -1,0 +1,173 @@
+"""Episodes of LeRobot data sets."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from splatnode.capture import film, video_process
+from splatnode.capture.cameras import lerobot
+from splatnode.capture.lerobot.data_set import UnusableDataSet, parts
+from splatnode.recon.replay_source import Request, source
+from tests.support.lerobot_sets import write
+
+pq = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
+
+TOP, WRIST = "observation.images.top", "observation.images.wrist"
+
+
+def levels(*values: int) -> list[np.ndarray]:
+    return [np.full((48, 64, 3), (value, 100, 50), np.uint8) for value in values]
+
+
+def episodes() -> list[dict[str, list[np.ndarray]]]:
+    """Three of 4, 3 and 5 frames. The red of a frame says its place in the file: 20 a frame, the wrist's from 10 on."""
+    ranges = ((0, 4), (4, 7), (7, 12))
+    return [
+        {TOP: levels(*(20 * place for place in range(*each))), WRIST: levels(*(10 + 20 * n for n in range(*each)))}
+        for each in ranges
+    ]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return write(tmp_path_factory.mktemp("lerobot") / "pusht", episodes())
+
+
+@pytest.fixture
+def copy(made, tmp_path):
+    return Path(shutil.copytree(made, tmp_path / "copy"))
+
+
+def frames(folder: Path, part: str) -> list[Any]:
+    return list(film.stream(film.part_of(folder, part)))
+
+
+def reds(found: list[Any]) -> list[float]:
+    return [float(frame.image[24, 32, 0]) for frame in found]
+
+
+def change(folder: Path, **columns: Any) -> None:
+    """Other values of columns of the second episode."""
+    file = folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    rows = pq.read_table(file).to_pylist()
+    rows[1] |= {name.replace("__", "/"): value for name, value in columns.items()}
+    pq.write_table(pq.read_table(file).from_pylist(rows), file)
+
+
+def check(found: list[Any]) -> None:
+    """The second episode, seen by the wrist's camera."""
+    assert [frame.name for frame in found] == [f"episode_000001_{WRIST}_{index:06d}.png" for index in range(3)]
+    assert [frame.stamp_ns for frame in found] == [0, 100_000_000, 200_000_000]
+    assert np.allclose(reds(found), (90, 110, 130), atol=6)
+
+
+def test_each_camera_of_each_episode_is_a_film(made):
+    assert parts(made) == [f"episode_{number:06d}/{key}" for number in range(3) for key in (TOP, WRIST)]
+    check(frames(made, f"episode_000001/{WRIST}"))
+    check(frames(made, f"1/{WRIST}"))
+    assert np.allclose(reds(frames(made, f"2/{TOP}")), (140, 160, 180, 200, 220), atol=6)
+
+
+def test_without_pyav_the_same_frames_come(made, monkeypatch, tmp_path):
+    monkeypatch.setattr(video_process.apart, "command", _without_av(video_process.apart.command))
+    check(frames(made, f"1/{WRIST}"))
+
+
+def _without_av(command: Any) -> Any:
+    def changed(*arguments: str) -> list[str]:
+        *start, code, file, every, most, from_s, to_s = command(*arguments)
+        return [*start, f"import sys; sys.modules['av'] = None; {code}", file, every, most, from_s, to_s]
+
+    return changed
+
+
+@pytest.mark.parametrize("codec", ["libsvtav1", "h264"])
+def test_what_lerobot_encodes_is_decoded(tmp_path, codec, monkeypatch):
+    pytest.importorskip("av", reason="needs PyAV")
+    folder = write(tmp_path / "set", episodes(), codec)
+    check(frames(folder, f"1/{WRIST}"))
+    monkeypatch.setattr(video_process.apart, "command", _without_av(video_process.apart.command))
+    if codec == "h264":
+        check(frames(folder, f"1/{WRIST}"))
+    else:
+        with pytest.raises(ValueError, match=r"AV1, which needs PyAV. Run: pip install 'splatnode\[lerobot\]'"):
+            frames(folder, f"1/{WRIST}")
+
+
+def test_another_version_is_refused_by_its_name(copy):
+    info = json.loads((copy / "meta" / "info.json").read_text())
+    (copy / "meta" / "info.json").write_text(json.dumps({**info, "codebase_version": "v2.1"}))
+    for given in (copy, film.part_of(copy, f"0/{TOP}")):
+        with pytest.raises(UnusableDataSet, match=r"data set of version v3.0, it is of v2.1; convert it with LeRobot"):
+            source(Request(given))
+
+
+def test_a_data_set_without_videos_says_so(copy):
+    info = json.loads((copy / "meta" / "info.json").read_text())
+    for feature in info["features"].values():
+        feature["dtype"] = "image"
+    (copy / "meta" / "info.json").write_text(json.dumps(info))
+    with pytest.raises(UnusableDataSet, match="has no videos: .* pictures in the tables of data/ are not read"):
+        source(Request(copy))
+
+
+def test_depth_is_no_camera(copy):
+    info = json.loads((copy / "meta" / "info.json").read_text())
+    info["features"][WRIST]["info"] = {"video.is_depth_map": True}
+    (copy / "meta" / "info.json").write_text(json.dumps(info))
+    assert parts(copy) == [f"episode_{number:06d}/{TOP}" for number in range(3)]
+    assert len(frames(copy, "1")) == 3, "the only camera need not be named"
+
+
+def test_an_episode_without_images_says_so(copy):
+    change(copy, **{f"videos__{TOP}__to_timestamp": 0.4})
+    with pytest.raises(UnusableDataSet, match=f"episode 1 has no images of {TOP}"):
+        frames(copy, f"1/{TOP}")
+    change(copy, **{f"videos__{TOP}__file_index": None})
+    with pytest.raises(UnusableDataSet, match="episode 1 has no images"):
+        frames(copy, f"1/{TOP}")
+    check(frames(copy, f"1/{WRIST}"))
+
+
+def test_a_video_that_is_not_there_or_cannot_be_read_says_so(copy):
+    video = copy / "videos" / TOP / "chunk-000" / "file-000.mp4"
+    video.write_bytes(b"no video")
+    with pytest.raises(ValueError, match=r"file-000.mp4' is no video that can be decoded, .* between 0.4 and 0.7 s"):
+        frames(copy, f"1/{TOP}")
+    video.unlink()
+    with pytest.raises(FileNotFoundError, match="no file .*file-000.mp4"):
+        frames(copy, f"1/{TOP}")
+
+
+def test_what_is_not_there_is_told_with_what_is(made):
+    with pytest.raises(UnusableDataSet, match="has no episode 9; it has 3 episodes"):
+        frames(made, f"9/{TOP}")
+    with pytest.raises(UnusableDataSet, match=f"got '1/other'. The cameras are {TOP}, {WRIST}"):
+        frames(made, "1/other")
+    with pytest.raises(ValueError, match="is a LeRobot data set; name an episode and a camera of it, such as"):
+        source(Request(made))
+
+
+@pytest.mark.parametrize("path", ["/etc/{video_key}", "../{chunk_index}", "{nothing}", "{file_index:x9}"])
+def test_a_video_path_leads_nowhere_else(copy, path):
+    info = json.loads((copy / "meta" / "info.json").read_text())
+    (copy / "meta" / "info.json").write_text(json.dumps({**info, "video_path": path}))
+    with pytest.raises(UnusableDataSet, match="video_path"):
+        frames(copy, f"1/{TOP}")
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b"[1]", b'{"codebase_version": 3}'])
+def test_an_info_that_is_none_is_told(copy, content):
+    (copy / "meta" / "info.json").write_bytes(content)
+    with pytest.raises(UnusableDataSet, match="info.json: cannot be read"):
+        parts(copy)
+
+
+def test_the_camera_takes_a_configuration(made):
+    assert len(list(lerobot.stream(lerobot.Config(made, f"2/{TOP}")))) == 5

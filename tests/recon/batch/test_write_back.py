@@ -1,0 +1,157 @@
+"""Cameras written back, and read again by the formats' own libraries."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from splatnode import command_line
+from splatnode.capture.lerobot.data_set import parts
+from splatnode.capture.stamp import Clock, Stamp
+from splatnode.recon.batch.command import EXIT_GOOD, EXIT_SOME_FAILED, run_batch
+from splatnode.recon.batch.sources import Recording, recordings
+from splatnode.recon.result.export.cameras import encode_cameras
+from splatnode.recon.result.snapshot import CameraEstimate
+from tests.support import lerobot_sets, mcap_files
+from tests.support.recordings import REFUSAL, REPORT, options
+from tests.support.synthetic import photographs
+
+pq = pytest.importorskip("pyarrow.parquet", reason="needs pyarrow")
+
+PICTURE = np.zeros((48, 64, 3), np.uint8)
+K = np.array([[100.0, 0.0, 32.0], [0.0, 110.0, 24.0], [0.0, 0.0, 1.0]])
+
+
+def camera(stem: str, index: int) -> CameraEstimate:
+    T_world_camera = np.array(
+        [[0.0, -1.0, 0.0, index], [1.0, 0.0, 0.0, 0.5], [0.0, 0.0, 1.0, 2.0], [0.0, 0.0, 0.0, 1.0]]
+    )
+    captured_at = Stamp(100_000_000 * index, Clock.RECORDING)
+    return CameraEstimate(f"{stem}_{index:06d}.png", index, T_world_camera, K, 64, 48, None, captured_at)
+
+
+def placed(tmp_path: Path, *refused: str):
+    """The work of a batch: the cameras of frames 0 and 2, or a refusal for recordings of these names."""
+
+    def work(recording: Recording, folder: Path) -> list[str]:
+        made = tmp_path / "made" / recording.name
+        made.mkdir(parents=True, exist_ok=True)
+        (made / "report.json").write_text(json.dumps(REFUSAL if recording.name in refused else REPORT))
+        (made / "cameras.json").write_bytes(encode_cameras([camera("a", 0), camera("a", 2)]))
+        return ["cp", "-r", str(made), str(folder)]
+
+    return work
+
+
+def ran(tmp_path: Path, source: Path, *refused: str, **changed: Any) -> int:
+    out = tmp_path / "out"
+    found = recordings([source], out)
+    return run_batch(options(out, write_back=True, **changed), found, placed(tmp_path, *refused), ["act"])
+
+
+@pytest.fixture
+def data_set(tmp_path):
+    episodes = [{"top": [PICTURE] * 4, "side": [PICTURE] * 4}, {"top": [PICTURE] * 3, "side": [PICTURE] * 3}]
+    return lerobot_sets.write(tmp_path / "pusht", episodes)
+
+
+@pytest.fixture
+def drive(tmp_path):
+    told = [mcap_files.compressed(topic, PICTURE) for topic in ("/a", "/b", "/a", "/a", "/b")]
+    return mcap_files.write(tmp_path / "drive.mcap", told)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_data_set_gets_a_table_beside_its_own_which_stay(tmp_path, data_set, capsys):
+    before = content(data_set)
+    assert ran(tmp_path, data_set, "pusht_episode_000001_side") == EXIT_GOOD
+    after = content(data_set)
+    assert set(after) - set(before) == {"meta/splatnode_cameras.parquet"}
+    assert {name: after[name] for name in before} == before
+    assert "4 recordings are rows of" in capsys.readouterr().out
+    rows = pq.read_table(data_set / "meta" / "splatnode_cameras.parquet").to_pylist()
+    assert [(row["episode_index"], row["camera"]) for row in rows] == [(0, "side"), (0, "top"), (1, "side"), (1, "top")]
+    first, refused = rows[0], rows[2]
+    assert (first["verdict"], first["frame_index"], first["timestamp"]) == ("OK", [0, 2], [0.0, 0.2])
+    assert np.array_equal(np.reshape(first["T_world_camera"][1], (4, 4)), camera("a", 2).T_world_camera)
+    assert np.array_equal(np.reshape(first["K"][0], (3, 3)), K) and first["width"] == [64, 64]
+    assert (refused["verdict"], refused["frame_index"]) == ("NO_OVERLAP", [])
+
+
+def test_in_place_the_tables_get_columns_and_keep_theirs(tmp_path, data_set):
+    file = data_set / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    before = pq.read_table(file)
+    for _ in range(2):  # the second time they take the place of the first
+        assert ran(tmp_path, data_set, in_place=True, resume=True) == EXIT_GOOD
+    after = pq.read_table(file)
+    assert after.select(before.column_names) == before and len(after.column_names) == len(before.column_names) + 22
+    row = after.to_pylist()[1]
+    assert row["splatnode/top/frame_index"] == [0, 2] and row["splatnode/side/verdict"] == "OK"
+    assert len(parts(data_set)) == 4, "it is a data set as before"
+
+
+def test_a_log_gets_another_one_beside_it(tmp_path, drive):
+    before = drive.read_bytes()
+    assert ran(tmp_path, drive, "drive_b") == EXIT_GOOD
+    assert drive.read_bytes() == before
+    with (tmp_path / "drive.splatnode.mcap").open("rb") as stream:
+        told = [(channel.topic, schema.name, message.log_time, json.loads(message.data)) for schema, channel, message
+                in make_reader(stream).iter_messages()]  # fmt: skip
+    start, step = mcap_files.START_NS, mcap_files.STEP_NS
+    assert [(topic, name, at_ns - start) for topic, name, at_ns, _ in told] == [
+        ("/a/splatnode/verdict", "foxglove.Log", 0),
+        ("/a/splatnode/pose", "foxglove.PoseInFrame", 0),
+        ("/a/splatnode/calibration", "foxglove.CameraCalibration", 0),
+        ("/b/splatnode/verdict", "foxglove.Log", step),
+        ("/a/splatnode/pose", "foxglove.PoseInFrame", 3 * step),
+        ("/a/splatnode/calibration", "foxglove.CameraCalibration", 3 * step),
+    ]
+    pose, lens = told[4][3]["pose"], told[5][3]
+    assert pose["position"] == {"x": 2.0, "y": 0.5, "z": 2.0}
+    assert pose["orientation"]["z"] == pytest.approx(0.5**0.5) and pose["orientation"]["w"] == pytest.approx(0.5**0.5)
+    assert (lens["K"][0], lens["K"][2], lens["width"]) == (100.0, 31.5, 64), "the top-left pixel is at (0, 0)"
+    assert told[3][3]["level"] == 3 and told[3][3]["message"].startswith("NO_OVERLAP")
+    assert [recording.name for recording in recordings([tmp_path], tmp_path / "out")] == ["drive_a", "drive_b"]
+
+
+def test_what_cannot_be_written_is_said_and_the_rest_goes_on(tmp_path, data_set, drive, capsys):
+    (tmp_path / "drive.splatnode.mcap").mkdir()
+    out = tmp_path / "out"
+    found = recordings([data_set, drive], out)
+    assert run_batch(options(out, write_back=True), found, placed(tmp_path), ["act"]) == EXIT_SOME_FAILED
+    said = capsys.readouterr().out
+    assert "4 recordings are rows of" in said and f"the cameras of {drive} were not written back: " in said
+
+
+def test_photographs_have_nothing_to_be_written_back_to(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run_batch(options(out, write_back=True), [Recording("a", "/x")], placed(tmp_path), ["act"]) == EXIT_GOOD
+    assert "nothing to write back to" in capsys.readouterr().out
+
+
+def test_in_place_goes_with_write_back(tmp_path, drive, capsys):
+    argv = ["batch", str(drive), "--out", str(tmp_path / "out"), "--in-place"]
+    assert command_line.main(argv) != EXIT_GOOD
+    assert "--in-place says how --write-back writes; give both" in capsys.readouterr().err
+
+
+def test_an_episode_and_a_topic_are_reconstructed_and_written_back(tmp_path):
+    images = [frame.image for frame in photographs()[:3]]
+    data_set = lerobot_sets.write(tmp_path / "in" / "set", [{"top": images}])
+    mcap_files.write(tmp_path / "in" / "log.mcap", [mcap_files.compressed("/image", image) for image in images])
+    how = ["--preset", "preview", "--every-frame"]
+    argv = ["batch", str(tmp_path / "in"), "--out", str(tmp_path / "out"), "--cores", "1", "--write-back", *how]
+    assert command_line.main(argv) == EXIT_GOOD
+    (row,) = pq.read_table(data_set / "meta" / "splatnode_cameras.parquet").to_pylist()
+    assert row["verdict"] == "OK" and row["frame_index"] == [0, 1, 2]
+    with (tmp_path / "in" / "log.splatnode.mcap").open("rb") as stream:
+        poses = [each for _, channel, each in make_reader(stream).iter_messages() if channel.topic.endswith("pose")]
+    assert len(poses) == 3
