@@ -53,6 +53,11 @@ def megabytes(text: str) -> float:
     return _above_zero(text, "megabytes")
 
 
+def length(text: str) -> float:
+    """A length in the unit of a result, above 0."""
+    return _above_zero(text, "units of length")
+
+
 def percent(text: str) -> float:
     """A share in percent, above 0."""
     return _above_zero(text, "percent")
