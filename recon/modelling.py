@@ -131,6 +131,7 @@ def snapshot(
         served_by=scene.served_by if scene else {},
         evidence=conclusion.evidence_record,
         landmarks=conclusion.landmarks if scene and final else None,
+        depths=conclusion.depths if scene and final else {},
         masked=conclusion.masked,
         gains={view.name: view.gains for view in scene.views if view.gains is not None} if scene else {},
     )
@@ -139,7 +140,8 @@ def snapshot(
 def with_landmarks(made: Snapshot, estimate: Estimate | None) -> Snapshot:
     """The snapshot of a scene that grew, to be saved: with the landmarks of `estimate` in the world of its cameras.
 
-    Without landmarks where the estimate is not known any more, or has fewer than two of the cameras.
+    Without them, and without confirmed depths, where the estimate is not known any more, or has fewer than two of the
+    cameras.
     """
     landmarks = None if estimate is None else estimate.landmarks
     if landmarks is None:
@@ -149,7 +151,12 @@ def with_landmarks(made: Snapshot, estimate: Estimate | None) -> Snapshot:
     if len(common) < 2:
         return made
     by = align_cameras(landmarks.Ts_world_camera[common], np.stack([Ts_shown[landmarks.names[i]] for i in common]))
-    return replace(made, landmarks=landmarks.moved(by.scale, by.rotation, by.translation))
+    depths = {
+        name: (depth * np.float32(by.scale)).astype(np.float16)
+        for name, depth in (estimate.depths if estimate is not None else {}).items()
+        if name in Ts_shown
+    }
+    return replace(made, landmarks=landmarks.moved(by.scale, by.rotation, by.translation), depths=depths)
 
 
 def in_words(made: Snapshot) -> str:

@@ -14,6 +14,7 @@ from splatnode.capture.process.arguments import (
     add_json,
     angle,
     box,
+    length,
     megabytes,
     natural,
     positive,
@@ -91,6 +92,18 @@ def _add_lens(parser: argparse.ArgumentParser) -> None:
     lens.add_argument("--fov", type=angle, metavar="DEGREES", help="their angle of view, across the longer side")
 
 
+def _map_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("result", type=Path, metavar="RESULT", help="the folder that replay wrote, with depth.npz")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="default: RESULT/occupancy")
+    parser.add_argument("--voxel", type=length, metavar="SIZE", help="default: a 64th of the median depth")
+    parser.add_argument(
+        "--band", type=float, nargs=2, metavar=("LOW", "HIGH"), help="heights of which nav2's map.pgm is made"
+    )
+    parser.add_argument(
+        "--up", type=float, nargs=3, metavar=("X", "Y", "Z"), help="where up is in the result's world, if it is known"
+    )
+
+
 def _merge_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, metavar="OUT_FOLDER", help="that a node writes its scenes into")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where the merged scenes go (default: OUT_FOLDER)")
@@ -129,6 +142,12 @@ VERBS = (
         "tell which camera of a station moved, when and by how much",
         _audit_arguments,
         lazily("splatnode.recon.auditing.command", "audit"),
+    ),
+    Verb(
+        "map",
+        "tell which space of a scene is free, occupied, or not seen",
+        _map_arguments,
+        lazily("splatnode.recon.occupancy.command", "map_result"),
     ),
     Verb(
         "merge",

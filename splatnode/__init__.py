@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from splatnode.api.view import View
     from splatnode.capture.frame import Intrinsics
     from splatnode.recon.locating.outcome import Located, NotLocated
+    from splatnode.recon.occupancy.occupancy_map import OccupancyMap
     from splatnode.recon.result.verdict import Verdict
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "Node",
     "NodeUpdate",
     "NotLocated",
+    "OccupancyMap",
     "Result",
     "Session",
     "Update",
@@ -45,6 +47,7 @@ _MODULES = {
     "Node": "splatnode.api.node",
     "NodeUpdate": "splatnode.api.node",
     "NotLocated": "splatnode.recon.locating.outcome",
+    "OccupancyMap": "splatnode.recon.occupancy.occupancy_map",
     "Result": "splatnode.api.result",
     "Session": "splatnode.api.session",
     "Update": "splatnode.api.session",

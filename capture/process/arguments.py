@@ -58,6 +58,11 @@ def millimetres(text: str) -> float:
     return _above_zero(text, "millimetres")
 
 
+def length(text: str) -> float:
+    """A length in the unit of a result, above 0."""
+    return _above_zero(text, "units of length")
+
+
 def percent(text: str) -> float:
     """A share in percent, above 0."""
     return _above_zero(text, "percent")

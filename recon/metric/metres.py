@@ -71,4 +71,6 @@ def _scaled(snapshot: Snapshot, factor: float) -> Snapshot:
         scales=(gaussians.scales * factor).astype(np.float32),
     )
     landmarks = snapshot.landmarks and snapshot.landmarks.moved(factor, np.eye(3), np.zeros(3), metric=True)
-    return replace(snapshot, cameras=tuple(map(moved, snapshot.cameras)), gaussians=larger, landmarks=landmarks)
+    depths = {name: (depth * np.float32(factor)).astype(np.float16) for name, depth in snapshot.depths.items()}
+    cameras = tuple(map(moved, snapshot.cameras))
+    return replace(snapshot, cameras=cameras, gaussians=larger, landmarks=landmarks, depths=depths)

@@ -1,4 +1,4 @@
-"""Depths that two photographs confirm."""
+"""Depths that two photographs confirm, and what of them a result keeps."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ Mask = npt.NDArray[np.bool_]
 
 LEAST_CONFIDENCE = 0.12  # of stereo for a depth that counts, as in recon.scene.completion
 AGREEING = 0.02  # relative difference of two photographs' depths of one point
+REDUCTION = 2  # pixels along each axis of which a result keeps one depth
 MOST_PARTNERS = 8  # other photographs that each is compared with: those that share most with it
 
 
@@ -32,3 +33,24 @@ def confirmed(pointmaps: Sequence[Pointmap]) -> list[Mask]:
         return mask & (mine.depth > 0)
 
     return each(agrees, range(len(known)))
+
+
+def confirmed_depths(pointmaps: Sequence[Pointmap]) -> dict[str, npt.NDArray[np.float16]]:
+    """By photograph the depths that another one confirms, one for REDUCTION squared pixels; 0 where there is none.
+
+    It is the mean of those of the square that are confirmed, at least half of its pixels, where these show one surface:
+    at outlines nothing is kept.
+    """
+    return {
+        pointmap.name: _reduced(np.where(mask, pointmap.depth, np.float32(0)))
+        for pointmap, mask in zip(pointmaps, confirmed(pointmaps), strict=True)
+    }
+
+
+def _reduced(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float16]:
+    height, width = (side // REDUCTION for side in depth.shape)
+    squares = depth[: height * REDUCTION, : width * REDUCTION].reshape(height, REDUCTION, width, REDUCTION)
+    count = (squares > 0).sum((1, 3))
+    near, far = np.where(squares > 0, squares, np.inf).min((1, 3)), squares.max((1, 3))
+    sure = (2 * count >= REDUCTION**2) & (far - near < AGREEING * near)
+    return np.where(sure, squares.sum((1, 3)) / np.maximum(count, 1), 0.0).astype(np.float16)

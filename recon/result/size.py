@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 BYTES_A_GAUSSIAN = 124  # 68 in scene.ply, 46 to 50 in colmap/points3D.txt, 4 in sources.bin
 OTHER_BYTES = 2_000_000  # preview.png (1.2 MB measured at most), report and cameras
+DEPTH_BYTES = 130_000  # a photograph of 512 x 384 pixels, of depth.npz, before it is packed
 LANDMARK_BYTES = 310_000  # a photograph, of landmarks.npz: 2000 descriptors and their points, before they are packed
 # Photographs of real scenes led to a Gaussian for 28 to 60 pixels; four times as many are allowed for.
 PIXELS_A_GAUSSIAN = 8
@@ -24,5 +25,5 @@ def largest_result_bytes(sizes: Iterable[tuple[int, int]], longer_side: int, mos
 
 
 def result_bytes(num_gaussians: int, num_photographs: int = 0) -> int:
-    """Bytes of a result folder with so many Gaussians, and with the landmarks of so many photographs, rounded up."""
-    return BYTES_A_GAUSSIAN * num_gaussians + LANDMARK_BYTES * num_photographs + OTHER_BYTES
+    """Bytes of a result folder with so many Gaussians, and with what is kept of so many photographs, rounded up."""
+    return BYTES_A_GAUSSIAN * num_gaussians + (LANDMARK_BYTES + DEPTH_BYTES) * num_photographs + OTHER_BYTES

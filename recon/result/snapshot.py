@@ -74,5 +74,7 @@ class Snapshot:
     evidence: Mapping[str, object] | None = None  # recon.verification.likelihood.record; None: nothing to verify
     scale: Scale = RELATIVE  # the unit of all lengths
     landmarks: Landmarks | None = None  # by which further photographs are placed; None: they were not gathered
+    # By camera (h, w), one value for 2 x 2 pixels: z where a second photograph confirms it, else 0. Empty: not gathered
+    depths: Mapping[str, npt.NDArray[np.float16]] = field(default_factory=dict)
     masked: Mapping[str, float] = field(default_factory=dict)  # share that a mask hides, by photograph that has one
     gains: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # taken out of photographs: red, green, blue

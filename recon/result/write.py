@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from splatnode.recon.result.depth_file import DEPTHS, encode_depths
 from splatnode.recon.result.export import viewer_safe, write_result
 from splatnode.recon.result.export.sources import SOURCES, encode_sources
 from splatnode.recon.result.landmarks_file import LANDMARKS, encode_landmarks
@@ -20,5 +21,7 @@ def finish(snapshot: Snapshot, out: Path, *, seed: int, preset_name: str, **extr
     further = {SOURCES: encode_sources(source_frame)} if snapshot.verdict.publishable else {}
     if snapshot.verdict.publishable and snapshot.landmarks is not None:
         further[LANDMARKS] = encode_landmarks(snapshot.landmarks)
+    if snapshot.verdict.publishable and snapshot.depths:
+        further[DEPTHS] = encode_depths(snapshot.depths)
     write_result(snapshot, out, report, preview=preview, further=further)
     return report

@@ -7,6 +7,7 @@ from os import PathLike
 from pathlib import Path
 
 from splatnode.api.result import Result, result_of
+from splatnode.recon.result.depth_file import read_depths
 from splatnode.recon.result.export.result import copy_result
 from splatnode.recon.result.landmarks_file import LANDMARKS, read_landmarks
 from splatnode.recon.result.stored_snapshot import read_result
@@ -38,4 +39,5 @@ def load(folder: str | PathLike[str]) -> Result:
     snapshot = read_result(place)[0]
     if (place / LANDMARKS).exists():
         snapshot = replace(snapshot, landmarks=read_landmarks(place))
+    snapshot = replace(snapshot, depths=read_depths(place))
     return result_of(snapshot, Stored(place.resolve()))

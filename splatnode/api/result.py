@@ -9,6 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Protocol
 
+import numpy as np
 import numpy.typing as npt
 
 from splatnode.api.camera import Camera, camera_of
@@ -24,6 +25,7 @@ from splatnode.recon.result.verdict import Verdict
 if TYPE_CHECKING:
     from splatnode.api.photographs import Lens, Picture
     from splatnode.recon.locating.outcome import Located, NotLocated
+    from splatnode.recon.occupancy.occupancy_map import OccupancyMap
 
 
 class Files(Protocol):
@@ -122,6 +124,17 @@ class Result:
                 why = f"there is none: {self.verdict.code.value}. Ask verdict.publishable first"
             raise ValueError(f"no scene to look for a photograph in: {why}")
         return localised(landmarks, image, intrinsics)
+
+    def map(self, *, voxel: float | None = None, up: npt.ArrayLike | None = None) -> OccupancyMap:
+        """Which space is free, occupied, or not seen, by depths that two photographs confirm and by nothing else.
+
+        `voxel` is the side of a voxel in the result's unit; None: a 64th of the median depth. `up` (3,) is the
+        direction of up in the world; None: the floor tells it, or the cameras, as `upright.source` says. Raises
+        ValueError where no map can be made of the result, with the reason, or these are no size and no direction.
+        """
+        from splatnode.recon.occupancy.build import occupancy_map  # brings what carves
+
+        return occupancy_map(self._snapshot, voxel, None if up is None else np.asarray(up, np.float64))
 
     def save(self, folder: str | PathLike[str]) -> Path:
         """Writes the files that `splatnode replay --out FOLDER` writes, and returns the folder.

@@ -40,6 +40,7 @@ BENCHMARKS = {
         "movers",
         "fisheyes",
         "calibrate",
+        "occupancy",
     ),
     "speed": ("rasterize", "stereo", "growth"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),

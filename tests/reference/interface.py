@@ -15,6 +15,7 @@ from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.process.progress import Step
 from splatnode.capture.stamp import Stamp
 from splatnode.recon.locating.outcome import Claim
+from splatnode.recon.occupancy.upright import Upright
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.verdict import Verdict
 from tests.reference.comments import field_comments
@@ -41,11 +42,12 @@ _CLASSES = (
     "NodeUpdate",
     "Located",
     "NotLocated",
+    "OccupancyMap",
     "Intrinsics",
     "Marker",
 )
 _WIDE = 110  # characters
-_FURTHER = (Verdict, Bounds, Claim, DroppedFrame, Stamp, Step)  # what these lead to
+_FURTHER = (Verdict, Bounds, Claim, Upright, DroppedFrame, Stamp, Step)  # what these lead to
 
 
 def page() -> str:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.recon.priors.confirmed import confirmed
+from splatnode.recon.priors.confirmed import confirmed, confirmed_depths
 from tests.support.synthetic import plane_pointmap
 
 WIDTH, HEIGHT = 64, 48
@@ -31,3 +31,22 @@ def test_doubtful_depths_confirm_nothing():
     left, right = wall(-0.2), wall(0.2)
     doubtful = replace(right, confidence=np.full_like(right.confidence, 0.1))
     assert not any(mask.any() for mask in confirmed([left, doubtful]))
+
+
+def test_a_value_for_four_pixels_is_kept_where_two_of_them_are_confirmed_on_one_surface():
+    left, right = wall(-0.2), wall(0.2)
+    kept = confirmed_depths([left, replace(right, name="right")])[left.name]
+    mask = confirmed([left, right])[0].reshape(HEIGHT // 2, 2, WIDTH // 2, 2).sum((1, 3))
+    assert kept.shape == (HEIGHT // 2, WIDTH // 2) and kept.dtype == np.float16
+    assert np.array_equal(kept > 0, mask >= 2) and np.allclose(kept[kept > 0], 2.0, rtol=1e-3)
+    step = replace(left, depth=left.depth.copy())
+    step.depth[:, 33:] *= 1.01  # within a square: two surfaces 1 % apart count as one, 5 % apart as none
+    assert confirmed_depths([step, replace(step, name="again")])[left.name][10, 16] > 0
+    step.depth[:, 33:] *= 1.05
+    assert confirmed_depths([step, replace(step, name="again")])[left.name][10, 16] == 0
+
+
+def test_of_an_odd_side_the_last_pixels_are_left_out():
+    odd = replace(wall(), depth=wall().depth[:47, :63], confidence=wall().confidence[:47, :63])
+    kept = confirmed_depths([odd, replace(odd, name="again")])[odd.name]
+    assert kept.shape == (23, 31) and (kept > 0).all()

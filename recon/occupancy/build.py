@@ -1,0 +1,75 @@
+"""occupancy_map: a snapshot's cameras and confirmed depths, as a map of three states."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.occupancy.carving import passed
+from splatnode.recon.occupancy.layout import laid_out
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap, State
+from splatnode.recon.occupancy.sight import Sight, sights
+from splatnode.recon.occupancy.surfaces import blurred, surfaces
+from splatnode.recon.occupancy.upright import upright
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.verdict import Code
+
+SURE = (Code.OK, Code.OK_PARTIAL)
+LEAST_KNOWN = 0.01  # of the pixels: with fewer confirmed depths there is no map
+
+
+class NoMap(ValueError):
+    """Of this result there is no map; the text says why, and what to do."""
+
+    exit_code = 65
+
+
+def occupancy_map(
+    snapshot: Snapshot, voxel: float | None = None, up: npt.NDArray[np.float64] | None = None
+) -> OccupancyMap:
+    """The map of what the photographs show at depths that two of them confirm; nothing else makes a voxel known.
+
+    A voxel is free where a camera looks through all of it, and occupied where a confirmed surface is in it, which
+    counts for more. `voxel` is its side in the result's unit; None: a 64th of the median depth. `up` (3,) is the
+    direction of up in the world, where it is known. Raises NoMap, and ValueError for arguments that cannot be used.
+    """
+    seen = _sights(snapshot)
+    points = np.concatenate([sight.points for sight in seen]).astype(np.float64)
+    unit = float(np.median(np.concatenate([sight.depth[sight.depth > 0] for sight in seen])))
+    frame = upright([camera.T_world_camera for camera in snapshot.cameras], points, up, unit)
+    T = frame.T_world_map
+    centres = np.stack([camera.T_world_camera[:3, 3] for camera in snapshot.cameras])
+    layout = laid_out(_in_map(points, T), _in_map(centres, T), unit, snapshot.scale.metric, voxel)
+    states = np.zeros(layout.shape, np.uint8)
+    for sight in seen:
+        states[passed(sight, layout, T)] = State.FREE
+    ends = np.concatenate([blurred(sight) for sight in seen])
+    states[surfaces(_in_map(ends, T), layout)] = State.OCCUPIED
+    return OccupancyMap(states, layout.voxel, layout.origin, frame, snapshot.scale)
+
+
+def _in_map(points: npt.NDArray[np.float64], T_world_map: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    return (points - T_world_map[:3, 3]) @ T_world_map[:3, :3]
+
+
+def _sights(snapshot: Snapshot) -> list[Sight]:
+    """Of a scene that a map may be made of. Raises NoMap."""
+    verdict = snapshot.verdict
+    if not verdict.publishable:
+        raise NoMap(f"there is no map of a scene that was refused: {verdict.code.value}. {verdict.message}")
+    if verdict.code not in SURE:
+        raise NoMap(
+            f"the verdict is {verdict.code.value}: the scene can be looked at, but a map of it could call free what is "
+            f"solid. {verdict.advice or 'Take more photographs'}"
+        )
+    if not snapshot.depths:
+        raise NoMap(
+            "it is not known which depths two photographs confirm: the result has no depth.npz. An earlier splatnode "
+            "made it, or it is a merged map, a scene file, or not final. Reconstruct the photographs again, or give "
+            "the folder of one scene"
+        )
+    seen = sights(snapshot.cameras, snapshot.depths)
+    known = sum(int((sight.depth > 0).sum()) for sight in seen)
+    if known < LEAST_KNOWN * sum(sight.depth.size for sight in seen) or not known:
+        raise NoMap("next to no depth is confirmed by two photographs: give photographs that share more of the scene")
+    return seen

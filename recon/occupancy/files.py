@@ -1,0 +1,29 @@
+"""The files of a map in a folder: all of them, or none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from splatnode.recon.occupancy.formats.glb import encode_glb
+from splatnode.recon.occupancy.formats.nav2 import encode_nav2
+from splatnode.recon.occupancy.formats.npz import encode_npz
+from splatnode.recon.occupancy.formats.octomap import encode_octomap
+from splatnode.recon.occupancy.formats.ply import encode_ply_mesh
+from splatnode.recon.occupancy.mesh import surface_mesh
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap
+from splatnode.recon.result.export.staged import write_files
+
+
+def save(occupancy: OccupancyMap, folder: Path, band: Sequence[float] | None) -> list[Path]:
+    """As `OccupancyMap.save`."""
+    mesh = surface_mesh(occupancy)
+    files = {
+        "occupancy.npz": encode_npz(occupancy),
+        "occupancy.bt": encode_octomap(occupancy),
+        "collision.ply": encode_ply_mesh(mesh, occupancy.scale),
+        "collision.glb": encode_glb(mesh),
+        **({} if band is None else encode_nav2(occupancy, band)),
+    }
+    write_files(folder, files)
+    return [folder / name for name in files]

@@ -1,0 +1,1 @@
+"""The files that a map of three states is written as, one a module."""

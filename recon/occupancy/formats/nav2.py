@@ -1,0 +1,57 @@
+"""map.pgm and map.yaml: a band of heights, seen from above, as nav2's map_server and ROS 1's read it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap, State
+
+# What map_saver writes. 205 is not seen only with a threshold of .196; of nav2's default, .25, it would be free.
+_GREY = {State.NOT_SEEN: 205, State.FREE: 254, State.OCCUPIED: 0}
+_FREE_BELOW, _OCCUPIED_ABOVE = 0.196, 0.65
+
+
+def encode_nav2(occupancy: OccupancyMap, band: Sequence[float]) -> dict[str, bytes]:
+    """map.pgm and map.yaml of the voxels that reach into the band of heights (low, high) in the map's frame.
+
+    A cell is occupied where any of these voxels is, free where all of them are. Raises ValueError for a band that is
+    none, or that the map does not reach.
+    """
+    cells = flattened(occupancy, band)
+    x, y = occupancy.origin[:2].tolist()
+    low, high = band
+    yaml = (
+        f"# seen from above: heights {low:g} to {high:g}, {occupancy.scale.sentence}\n"
+        f"# {occupancy.upright.height}\n"
+        "image: map.pgm\n"
+        "mode: trinary\n"
+        f"resolution: {occupancy.voxel!r}\n"
+        f"origin: [{x!r}, {y!r}, 0.0]\n"
+        "negate: 0\n"
+        f"occupied_thresh: {_OCCUPIED_ABOVE}\n"
+        f"free_thresh: {_FREE_BELOW}\n"
+    )
+    grey = np.vectorize(_GREY.__getitem__, otypes=[np.uint8])(cells)
+    rows = np.ascontiguousarray(grey.T[::-1])  # the first row is that of the largest y
+    header = f"P5\n{rows.shape[1]} {rows.shape[0]}\n255\n"
+    return {"map.pgm": header.encode() + rows.tobytes(), "map.yaml": yaml.encode()}
+
+
+def flattened(occupancy: OccupancyMap, band: Sequence[float]) -> npt.NDArray[np.uint8]:
+    """(X, Y) the states of a band of heights, as `encode_nav2` has them. Raises ValueError."""
+    if len(band) != 2 or not all(math.isfinite(height) for height in band) or not band[0] < band[1]:
+        raise ValueError(f"a band must be two heights, the lower one first, got {list(band)}")
+    bottom, voxel, layers = float(occupancy.origin[2]), occupancy.voxel, occupancy.states.shape[2]
+    first, last = (round((band[0] - bottom) / voxel, 6), round((band[1] - bottom) / voxel, 6))
+    if first < 0 or last > layers:
+        raise ValueError(
+            f"the map reaches from {bottom:.3g} to {bottom + layers * voxel:.3g}; the band {band[0]:g} to {band[1]:g} "
+            "is not within"
+        )
+    part = occupancy.states[:, :, math.floor(first) : math.ceil(last)]
+    free, occupied = (part == State.FREE).all(2), (part == State.OCCUPIED).any(2)
+    return np.select([occupied, free], [State.OCCUPIED, State.FREE], State.NOT_SEEN).astype(np.uint8)

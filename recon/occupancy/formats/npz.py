@@ -1,0 +1,29 @@
+"""occupancy.npz: the map as NumPy arrays, which `numpy.load(..., allow_pickle=False)` reads."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap, State
+
+AXES = "states[i, j, k] along x, y, z of the map: x forward of the first camera, y to its left, z up"
+
+
+def encode_npz(occupancy: OccupancyMap) -> bytes:
+    """`states` (X, Y, Z) uint8, `origin` (3,), `voxel` (), `T_world_map` (4, 4), and texts that say what they mean."""
+    file = io.BytesIO()
+    np.savez_compressed(
+        file,
+        states=occupancy.states,
+        origin=occupancy.origin,
+        voxel=np.float64(occupancy.voxel),
+        T_world_map=occupancy.T_world_map,
+        axes=np.array(AXES),
+        meaning=np.array(", ".join(f"{state.value}: {state.name.lower()}" for state in State)),
+        scale=np.array(occupancy.scale.sentence),
+        up=np.array(occupancy.upright.source),
+        height=np.array(occupancy.upright.height),
+    )
+    return file.getvalue()

@@ -1,0 +1,49 @@
+"""Sight: what one camera saw at depths that another photograph confirms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.result.snapshot import CameraEstimate
+
+Float32 = npt.NDArray[np.float32]
+DEPTH_ERROR = 0.02  # of a depth: as much confirmed depths may differ from each other (recon/priors/confirmed.py)
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """Confirmed depths of a camera, and how wrong they may be."""
+
+    T_world_camera: npt.NDArray[np.float64]  # (4, 4)
+    K: npt.NDArray[np.float64]  # (3, 3) of the depth's pixels
+    depth: Float32  # (h, w) z in the camera's frame, 0 where nobody confirms one
+    error: float = DEPTH_ERROR  # of a depth, relative: its own, and what the camera's bounds let it be off
+
+    @property
+    def points(self) -> Float32:
+        """(M, 3) world points of the pixels with a depth."""
+        rows, columns = np.nonzero(self.depth)
+        z = self.depth[rows, columns]
+        x = (columns + 0.5 - self.K[0, 2]) / self.K[0, 0] * z
+        y = (rows + 0.5 - self.K[1, 2]) / self.K[1, 1] * z
+        in_camera = np.stack([x, y, z], 1)
+        return (in_camera @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]).astype(np.float32)
+
+
+def sights(cameras: Sequence[CameraEstimate], depths: Mapping[str, npt.NDArray[np.float16]]) -> list[Sight]:
+    """Of the cameras that have depths."""
+    return [_sight(camera, depths[camera.name]) for camera in cameras if camera.name in depths]
+
+
+def _sight(camera: CameraEstimate, depth: npt.NDArray[np.float16]) -> Sight:
+    reduction = round(camera.width / depth.shape[1])  # the last row or column of an odd number is not in the depth
+    K = np.diag([1 / reduction, 1 / reduction, 1.0]) @ camera.K
+    error = DEPTH_ERROR
+    if camera.bounds is not None:
+        error += camera.bounds.centre_percent / 100.0 + math.radians(camera.bounds.rotation_deg)
+    return Sight(camera.T_world_camera, K, depth.astype(np.float32), error)

@@ -1,0 +1,127 @@
+"""A map of a known room: what is called free is free, what is called occupied is there, the rest is not seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatnode.recon.occupancy.build import NoMap, occupancy_map
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap, State
+from splatnode.recon.result.scale import Scale
+from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.verdict import Code
+from tests.support.exported import make_snapshot
+from tests.support.occupied import WALL, room_snapshot
+
+
+@pytest.fixture(scope="module")
+def room() -> Snapshot:
+    return room_snapshot()
+
+
+@pytest.fixture(scope="module")
+def made(room) -> OccupancyMap:
+    return occupancy_map(room)
+
+
+def corners(made: OccupancyMap, state: State) -> np.ndarray:
+    """(M, 8, 3) the corners of the voxels in a state, in the world."""
+    index = np.argwhere(made.states == state)
+    steps = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), -1).reshape(-1, 3)
+    T = made.T_world_map
+    return (made.origin + (index[:, None] + steps) * made.voxel) @ T[:3, :3].T + T[:3, 3]
+
+
+def test_what_is_free_lies_before_wall_and_above_floor_whole(made):
+    free = corners(made, State.FREE)
+    assert len(free) > 1000
+    assert free[..., 0].max() < WALL and free[..., 2].min() > 0
+
+
+def test_what_is_occupied_is_at_a_surface(made):
+    occupied = corners(made, State.OCCUPIED)
+    off = np.minimum(np.abs(occupied[..., 0] - WALL).min(1), np.abs(occupied[..., 2]).min(1))
+    assert len(occupied) > 300 and off.max() < 0.05
+
+
+def test_surfaces_that_are_seen_are_found(made, room):
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(0.9, 1.9, 200), rng.uniform(-0.3, 0.3, 200), np.zeros(200)])
+    wall = np.column_stack([np.full(200, WALL), rng.uniform(-0.3, 0.3, 200), rng.uniform(0.1, 0.6, 200)])
+    assert (made.at(np.concatenate([floor, wall])) == State.OCCUPIED).mean() > 0.98
+
+
+def test_behind_the_wall_and_outside_the_map_nothing_is_known(made):
+    assert (made.at([[WALL + 0.2, 0, 0.5], [50.0, 0, 0], [np.nan, 0, 0]]) == State.NOT_SEEN).all()
+    with pytest.raises(ValueError, match=r"points must be \(M, 3\)"):
+        made.at([0.0, 0, 0])
+
+
+def test_the_floor_is_zero_and_up_is_its_normal(made):
+    assert made.upright.on_floor and "floor" in made.upright.source
+    assert np.allclose(made.T_world_map[:3, 2], [0, 0, 1], atol=2e-3)
+    assert abs(made.T_world_map[2, 3]) < 5e-3 and np.allclose(made.T_world_map[:2, 3], [0, -0.6], atol=5e-3)
+
+
+def test_what_is_filled_in_frees_nothing(room, made):
+    """Pixels without a confirmed depth, as a plain wall's, tell nothing, whatever Gaussians a scene has there."""
+    holes = {name: depth.copy() for name, depth in room.depths.items()}
+    for depth in holes.values():
+        depth[:, :64] = 0
+    fewer = occupancy_map(replace(room, depths=holes))
+    assert (fewer.states == State.FREE).sum() < 0.75 * (made.states == State.FREE).sum()
+    points = np.random.default_rng(1).uniform((0, -1, 0), (WALL, 1, 1), (20000, 3))
+    for camera in room.cameras:
+        x, _, z = ((points - camera.T_world_camera[:3, 3]) @ camera.T_world_camera[:3, :3]).T
+        points = points[(z < 0) | (x * camera.K[0, 0] / z < 0)]  # in the left half of its picture, or not in it
+    assert len(points) > 1000
+    assert (made.at(points) == State.FREE).sum() > 500 and not (fewer.at(points) == State.FREE).any()
+
+
+def test_a_wider_claim_frees_less(room, made):
+    bounds = make_snapshot().cameras[0].bounds
+    wide = replace(room, cameras=tuple(replace(camera, bounds=bounds) for camera in room.cameras))
+    assert (occupancy_map(wide).states == State.FREE).sum() < (made.states == State.FREE).sum()
+
+
+def test_voxels_of_a_metric_scene_are_round(room):
+    metric = replace(room, scale=Scale(True, "a baseline", (0.99, 1.01)))
+    assert occupancy_map(metric).voxel in (0.01, 0.02, 0.05)
+    assert occupancy_map(metric, voxel=0.04).voxel == 0.04
+
+
+def test_up_may_be_given(room):
+    up = np.array([0.02, 0.0, 1.0])
+    given = occupancy_map(room, up=up)
+    assert given.upright.source == "given" and np.allclose(given.T_world_map[:3, 2], up / np.linalg.norm(up))
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"verdict": make_snapshot(Code.NO_PARALLAX, False).verdict}, "refused: NO_PARALLAX"),
+        ({"verdict": make_snapshot(Code.OK_ROUGH).verdict}, "OK_ROUGH"),
+        ({"depths": {}}, "no depth.npz"),
+        ({"depths": {"0.png": np.zeros((96, 128), np.float16)}}, "next to no depth"),
+    ],
+)
+def test_where_nothing_is_sure_there_is_no_map(room, changed, said):
+    with pytest.raises(NoMap, match=said) as raised:
+        occupancy_map(replace(room, **changed))
+    assert raised.value.exit_code == 65
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"voxel": 0.0}, "side above 0"),
+        ({"voxel": 1e-5}, "give a voxel of at least"),
+        ({"up": np.zeros(3)}, "direction"),
+        ({"up": np.ones(2)}, "direction"),
+    ],
+)
+def test_what_cannot_be_used_is_told(room, arguments, said):
+    with pytest.raises(ValueError, match=said):
+        occupancy_map(room, **arguments)

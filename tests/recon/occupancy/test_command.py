@@ -1,0 +1,66 @@
+"""The verb map: files and a line, or why there is no map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatnode import command_line
+from splatnode.recon.result.verdict import Code
+from splatnode.recon.result.write import finish
+from tests.support.exported import make_snapshot
+from tests.support.occupied import room_snapshot
+
+ALWAYS = {"occupancy.npz", "occupancy.bt", "collision.ply", "collision.glb"}
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("result")
+    finish(room_snapshot(), folder, seed=0, preset_name="fast")
+    return folder
+
+
+def test_a_map_is_written_beside_the_scene(result, capsys):
+    assert command_line.main(["map", str(result), "--band", "0.1", "0.5"]) == 0
+    told = capsys.readouterr().out
+    assert "not seen" in told and "up: the floor" in told and "relative (no metric unit)" in told
+    assert {path.name for path in (result / "occupancy").iterdir()} == ALWAYS | {"map.pgm", "map.yaml"}
+    with np.load(result / "occupancy" / "occupancy.npz", allow_pickle=False) as arrays:
+        assert arrays["states"].dtype == np.uint8 and arrays["T_world_map"].shape == (4, 4)
+        assert str(arrays["meaning"]) == "0: not_seen, 1: free, 2: occupied"
+        assert np.allclose(arrays["origin"] / arrays["voxel"], np.round(arrays["origin"] / arrays["voxel"]))
+
+
+def test_without_a_band_there_is_nothing_for_nav2(result, tmp_path, capsys):
+    assert (
+        command_line.main(["map", str(result), "--out", str(tmp_path), "--voxel", "0.05", "--up", "0", "0", "1"]) == 0
+    )
+    assert {path.name for path in tmp_path.iterdir()} == ALWAYS
+    assert "--band LOW HIGH" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("snapshot", "code", "said"),
+    [
+        (make_snapshot(Code.NO_OVERLAP, False), 65, "refused: NO_OVERLAP"),
+        (replace(room_snapshot(), depths={}), 65, "no depth.npz"),
+    ],
+)
+def test_of_a_result_that_is_not_sure_there_is_none(tmp_path, capsys, snapshot, code, said):
+    finish(snapshot, tmp_path, seed=0, preset_name="fast")
+    assert command_line.main(["map", str(tmp_path)]) == code
+    assert said in capsys.readouterr().err and not (tmp_path / "occupancy").exists()
+
+
+@pytest.mark.parametrize("arguments", [["--band", "0.5", "0.1"], ["--band", "-9", "0.1"], ["--voxel", "1e-6"]])
+def test_what_cannot_be_used_writes_nothing(result, tmp_path, capsys, arguments):
+    assert command_line.main(["map", str(result), "--out", str(tmp_path / "new"), *arguments]) == 2
+    assert not (tmp_path / "new").exists() and capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path, capsys):
+    assert command_line.main(["map", str(tmp_path / "nothing")]) == 2
+    assert "is no folder" in capsys.readouterr().err

@@ -1,0 +1,68 @@
+"""The floor and the direction of up, of points and cameras that are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from splatnode.capture.diorama.look_at import look_at
+from splatnode.recon.occupancy.floor import find_floor
+from splatnode.recon.occupancy.upright import level, upright
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def room(rng: np.random.Generator, floor: int, table: int, wall: int) -> np.ndarray:
+    """(M, 3) points of a floor z = 0, a table at .7 and a wall x = 3, with 3 mm of noise."""
+    parts = [
+        np.column_stack([rng.uniform(0, 3, floor), rng.uniform(-2, 2, floor), np.zeros(floor)]),
+        np.column_stack([rng.uniform(1, 2, table), rng.uniform(-0.5, 0.5, table), np.full(table, 0.7)]),
+        np.column_stack([np.full(wall, 3.0), rng.uniform(-2, 2, wall), rng.uniform(0, 2.5, wall)]),
+    ]
+    return np.concatenate(parts) + rng.normal(0, 0.003, (floor + table + wall, 3))
+
+
+def cameras(*heights: float) -> list[np.ndarray]:
+    return [look_at(np.array([-1.0, y, h]), np.array([2.0, 0, 0.5])) for y, h in zip((-1, 0, 1), heights, strict=True)]
+
+
+def test_the_floor_is_found_below_a_table_that_more_pixels_show():
+    points = room(np.random.default_rng(0), 3000, 6000, 9000)
+    tilted = np.array([0.4, 0.1, 1.0]) / np.linalg.norm([0.4, 0.1, 1.0])  # as from cameras that look down
+    floor = find_floor(points, np.stack(cameras(1.5, 1.6, 1.4))[:, :3, 3], tilted, 3.0)
+    assert floor is not None and floor.normal @ UP > np.cos(np.radians(0.2))
+    assert abs(floor.height(np.array([1.0, 0, 0.5]), UP) - 0.5) < 0.005 and floor.share == pytest.approx(
+        1 / 6, abs=0.03
+    )
+
+
+@pytest.mark.parametrize(("floor", "table"), [(0, 0), (0, 6000), (200, 200)])
+def test_without_a_floor_none_is_found(floor, table):
+    """A table that hides what is below it is no floor: the wall goes on below it."""
+    points = room(np.random.default_rng(0), floor, table, 9000)
+    assert find_floor(points, np.stack(cameras(1.5, 1.6, 1.4))[:, :3, 3], UP, 3.0) is None
+
+
+def test_cameras_that_look_down_still_tell_where_up_is():
+    Ts = np.stack(cameras(1.5, 1.6, 1.4))
+    assert level(Ts)[0] @ UP > np.cos(np.radians(0.1)) and "not rolled" in level(Ts)[1]
+    alike = np.stack([Ts[1]] * 3)
+    assert "mean up" in level(alike)[1] and level(alike)[0] @ UP > 0.9
+
+
+def test_without_a_floor_heights_count_from_the_first_camera():
+    points = room(np.random.default_rng(0), 0, 0, 9000)
+    frame = upright(cameras(1.5, 1.6, 1.4), points, None, 3.0)
+    assert not frame.on_floor and "height of the first camera" in frame.height
+    assert np.allclose(frame.T_world_map[:3, 3], [-1, -1, 1.5])
+    assert np.allclose(frame.T_world_map[:3, :3] @ frame.T_world_map[:3, :3].T, np.eye(3))
+    assert np.linalg.det(frame.T_world_map[:3, :3]) == pytest.approx(1)
+
+
+def test_a_camera_that_looks_straight_down_has_a_frame():
+    T = np.eye(4)
+    T[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    T[2, 3] = 1.5
+    frame = upright([T], room(np.random.default_rng(0), 3000, 0, 0), UP, 1.5)
+    assert frame.on_floor and np.allclose(frame.T_world_map[:3, 2], UP) and abs(frame.T_world_map[2, 3]) < 0.01
+    assert np.allclose(frame.T_world_map[:3, 0], [0, 1, 0])  # its upper side

@@ -1,0 +1,51 @@
+"""depth.npz is read as it was written, or refused."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+
+from splatnode.recon.result.depth_file import DEPTHS, decode_depths, encode_depths, read_depths
+from splatnode.recon.result.export.error import SceneFileError
+
+KNOWN = {"a.png": np.arange(12, dtype=np.float16).reshape(3, 4), "ü b.jpg": np.ones((2, 2), np.float16)}
+
+
+def test_it_is_read_as_it_was(tmp_path):
+    (tmp_path / DEPTHS).write_bytes(encode_depths(KNOWN))
+    found = read_depths(tmp_path)
+    assert list(found) == list(KNOWN) and all(np.array_equal(found[name], KNOWN[name]) for name in KNOWN)
+
+
+def test_where_there_is_no_file_there_are_none(tmp_path):
+    assert read_depths(tmp_path) == {}
+
+
+def packed(**arrays) -> bytes:
+    file = io.BytesIO()
+    np.savez(file, **arrays)
+    return file.getvalue()
+
+
+NAMES = np.array([b"a"])
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"nothing",
+        encode_depths(KNOWN)[:-30],
+        packed(names=NAMES),
+        packed(names=np.array(["a"]), depth_0=KNOWN["a.png"]),
+        packed(names=NAMES, depth_0=np.ones((2, 2))),
+        packed(names=NAMES, depth_0=np.ones((2, 2, 1), np.float16)),
+        packed(names=NAMES, depth_0=-np.ones((2, 2), np.float16)),
+        packed(names=NAMES, depth_0=np.full((2, 2), np.nan, np.float16)),
+        packed(names=NAMES, depth_0=np.array([{}], object)),
+    ],
+)
+def test_something_else_is_refused(data):
+    with pytest.raises(SceneFileError, match="depth.npz"):
+        decode_depths(data)
