@@ -34,11 +34,13 @@ from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.mapping.command import replay_map
 from splatnode.recon.metric.arguments import metric_changes
+from splatnode.recon.metric.evidence import NOTHING, Evidence
+from splatnode.recon.metric.poses_file import poses_of, read_poses
 from splatnode.recon.offline import check_baseline, reconstructed, run, shown_to_nobody, with_looks
 from splatnode.recon.rasterize import device
 from splatnode.recon.rasterize.device import Device
 from splatnode.recon.rasterize.dispatch import rasterizer
-from splatnode.recon.replay_source import Request, asked_for, source
+from splatnode.recon.replay_source import Request, Source, asked_for, source
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.size import largest_result_bytes
@@ -75,6 +77,7 @@ def _replay(args: argparse.Namespace, request: Request, config: Config, tell: Te
     if not args.json and (taken := cost.in_words(given.sizes)) is not None:
         say(taken, error=True)
     check_baseline(config, [frame.name for frame in given.frames])
+    known = _known_of_metres(args, given)
     needed_bytes = largest_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
     with (
         result_folder(args.out, needed_bytes),
@@ -82,7 +85,9 @@ def _replay(args: argparse.Namespace, request: Request, config: Config, tell: Te
     ):
         config = with_looks(config, LOOK_EVERY) if args.view else config
         preset_name = args.preset or "balanced"
-        made = reconstructed(given, config, preset_name, without_guesses=args.only_seen, show=show, tell=tell)
+        made = reconstructed(
+            given, config, preset_name, without_guesses=args.only_seen, given=known, show=show, tell=tell
+        )
         del given  # and with it photographs that lie in a folder
         tell(Step("writing the results"))
         snapshot, report = made.snapshot, made.write(args.out)
@@ -181,6 +186,13 @@ def bench(args: argparse.Namespace) -> int:
     redraw(found, args.out)
     say(f"results: {args.out}/ (report.html, report.md, bench.json, bench.csv)")
     return EXIT_GOOD
+
+
+def _known_of_metres(args: argparse.Namespace, given: Source) -> Evidence:
+    """What is known of metres beside the photographs. Raises ValueError where no photograph has a pose."""
+    if args.poses is None:
+        return NOTHING
+    return Evidence(poses=poses_of(read_poses(args.poses), given.frames, str(args.poses)))
 
 
 def _lens(args: argparse.Namespace) -> Intrinsics | None:

@@ -15,7 +15,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.progress import Tell, told_to_nobody
 from splatnode.recon import threads
 from splatnode.recon.config import Config
-from splatnode.recon.metric.evidence import gathered
+from splatnode.recon.metric.evidence import NOTHING, Evidence, gathered
 from splatnode.recon.metric.metres import in_metres
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.replay_source import Source
@@ -52,20 +52,22 @@ def reconstructed(
     source: Source,
     config: Config,
     preset_name: str,
-    *,
     without_guesses: bool = False,
     most_threads: int | None = None,
+    given: Evidence = NOTHING,
+    *,
     show: Callable[[Snapshot], None] = shown_to_nobody,
     tell: Tell = told_to_nobody,
 ) -> Reconstructed:
     """The final snapshot of what `source` gives, in metres where `config` knows how.
 
-    `without_guesses` leaves out what no two photographs confirm. `show` gets every snapshot, and `tell` hears what is
-    being done. The work takes `most_threads` threads at most; None: as many as the process may use.
+    `given` is what is known of metres beside the photographs. `without_guesses` leaves out what no two photographs
+    confirm. `show` gets every snapshot, and `tell` hears what is being done. The work takes `most_threads` threads at
+    most; None: as many as the process may use.
     Raises ValueError where the intrinsics of a photograph or a number of threads cannot be used.
     """
     with threads.at_most(most_threads):
-        evidence = gathered(source.frames, config.metric, tell)
+        evidence = given.and_also(gathered(source.frames, config.metric, tell))
         snapshot = in_metres(run(source.frames, config, show, tell), config.metric, evidence)
     if without_guesses:
         snapshot = only_seen(snapshot)

@@ -14,11 +14,10 @@ from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import printable
 from splatnode.recon.evaluate.json_file import MAX_BYTES, EvaluationFileError
+from splatnode.recon.result.colmap_images import binary_images, content_lines, text_images
 
 _PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # parameters of each
 _NUMBERS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE"}
-_POINT2D_BYTES = 24
-_LONGEST_NAME = 4096  # bytes
 
 
 @dataclass(frozen=True)
@@ -49,8 +48,11 @@ def read_model(folder: Path) -> list[ColmapImage]:
     with foreign(EvaluationFileError, str(folder)):
         try:
             cameras = dict(_binary_cameras(cameras_file) if suffix == "bin" else _text_cameras(cameras_file.decode()))
-            images = _binary_images(images_file) if suffix == "bin" else _text_images(images_file.decode())
-            return [ColmapImage(name, motion[:4], motion[4:], cameras[camera_id]) for name, motion, camera_id in images]
+            images = binary_images(images_file) if suffix == "bin" else text_images(images_file.decode())
+            return [
+                ColmapImage(name, (w, x, y, z), (tx, ty, tz), cameras[camera_id])
+                for name, (w, x, y, z, tx, ty, tz), camera_id in images
+            ]
         except KeyError as error:
             raise EvaluationFileError(f"{folder}: a photograph has the camera {error}, which is not there") from error
         except (ValueError, struct.error) as error:
@@ -68,25 +70,11 @@ def _camera(model: str, width: int, height: int, lens: tuple[float, ...]) -> Col
     return ColmapCamera(width, height, fx, fy, cx, cy)
 
 
-def _lines(text: str) -> Iterator[str]:
-    return (line for line in text.splitlines() if not line.startswith("#"))
-
-
 def _text_cameras(text: str) -> Iterator[tuple[int, ColmapCamera]]:
-    for line in _lines(text):
+    for line in content_lines(text):
         if line.strip():
             number, model, width, height, *lens = line.split()
             yield int(number), _camera(model, int(width), int(height), tuple(map(float, lens)))
-
-
-def _text_images(text: str) -> Iterator[tuple[str, tuple, int]]:
-    """Two lines each, of which the second, its points, may be empty."""
-    lines = _lines(text)
-    for line in lines:
-        if line.strip():
-            _, *motion, camera_id, name = line.split(maxsplit=9)
-            yield name.strip(), tuple(map(float, motion)), int(camera_id)
-            next(lines, "")
 
 
 def _binary_cameras(data: bytes) -> Iterator[tuple[int, ColmapCamera]]:
@@ -97,15 +85,3 @@ def _binary_cameras(data: bytes) -> Iterator[tuple[int, ColmapCamera]]:
         lens = struct.unpack_from(f"<{size}d", data, position + 24)
         yield number, _camera(_NUMBERS.get(model, f"of model {model}"), width, height, lens)
         position += 24 + 8 * size
-
-
-def _binary_images(data: bytes) -> Iterator[tuple[str, tuple, int]]:
-    (count,), position = struct.unpack_from("<Q", data), 8
-    for _ in range(count):
-        _, *motion, camera_id = struct.unpack_from("<I7dI", data, position)
-        end = data.index(b"\0", position + 64, position + 64 + _LONGEST_NAME)
-        (points,) = struct.unpack_from("<Q", data, end + 1)
-        name, position = data[position + 64 : end].decode(), end + 9 + _POINT2D_BYTES * points
-        if position > len(data):
-            raise ValueError(f"{printable(name, 100)} has {points} points, which are not there")
-        yield name, tuple(motion), camera_id

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 from typing import Any
 
 from splatnode.capture.process.lengths import measured, measured_argument
+from splatnode.capture.process.printable import printable
 
 
 def add_marker(parser: argparse.ArgumentParser) -> argparse.Action:
@@ -29,6 +31,35 @@ def add_baseline(parser: argparse.ArgumentParser) -> argparse.Action:
     )
 
 
+def add_poses(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--poses",
+        type=Path,
+        metavar="FILE",
+        help="poses of the photographs in metres, from odometry or a tracker: a TUM trajectory, nerfstudio's "
+        "transforms.json, or the folder of a COLMAP model; they give metres and the world's axes, and each that does "
+        "not fit the photographs is named",
+    )
+    parser.add_argument(
+        "--poses-sigma",
+        type=_two_sigmas,
+        metavar="METRES,DEGREES",
+        help="how unsure each pose is: the standard deviation of its position and of its orientation (default: 0.01,2)",
+    )
+
+
+def _two_sigmas(text: str) -> tuple[float, float]:
+    try:
+        metres, degrees = map(float, text.split(","))
+    except ValueError:
+        metres = degrees = 0.0
+    if not (0.0 < metres <= 1e6 and 0.0 < degrees <= 180.0):
+        raise argparse.ArgumentTypeError(
+            f"must be metres and degrees above 0 with a comma between them, as 0.01,2; got {printable(text, 100)!r}"
+        )
+    return metres, degrees
+
+
 def metric_changes(args: argparse.Namespace) -> dict[str, Any]:
     """What of the configuration's `metric` these arguments set. Raises ValueError."""
     changes: dict[str, Any] = {}
@@ -40,6 +71,8 @@ def metric_changes(args: argparse.Namespace) -> dict[str, Any]:
         changes["marker_m"] = side_m
         if sigma_m is not None:
             changes["marker_sigma_m"] = sigma_m
+    if args.poses_sigma is not None:
+        changes["poses_sigma_m"], changes["poses_sigma_deg"] = args.poses_sigma
     return changes
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.progress import Step, Tell, told_to_nobody
@@ -16,10 +19,13 @@ class Evidence:
     """What was found in photographs, whatever becomes of them."""
 
     sightings: tuple[Sighting, ...] = ()  # of printed markers
+    # T_world_camera (4, 4) in metres that others estimated, by photograph; None: no poses were given
+    poses: Mapping[str, npt.NDArray[np.float64]] | None = None
 
     def and_also(self, further: Evidence) -> Evidence:
         """With what further photographs tell."""
-        return Evidence((*self.sightings, *further.sightings))
+        poses = self.poses if further.poses is None else {**(self.poses or {}), **further.poses}
+        return Evidence((*self.sightings, *further.sightings), poses)
 
 
 NOTHING = Evidence()

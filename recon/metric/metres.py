@@ -6,15 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from splatnode.recon.geometry import Similarity
 from splatnode.recon.metric.config import Config
 from splatnode.recon.metric.distances import by_distance
 from splatnode.recon.metric.evidence import NOTHING, Evidence
 from splatnode.recon.metric.markers import by_markers
 from splatnode.recon.metric.measurement import Measurement, together
 from splatnode.recon.metric.network import MetricDepth, by_network
+from splatnode.recon.metric.poses import Aligned, Sigmas, by_poses
 from splatnode.recon.metric.views import views_of
 from splatnode.recon.networks.depth_anything import load_metric
 from splatnode.recon.result.bounds_in_words import rounded_up
+from splatnode.recon.result.placement import Placement
 from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
@@ -23,9 +26,10 @@ def in_metres(snapshot: Snapshot, config: Config, evidence: Evidence = NOTHING) 
     """The snapshot with lengths in metres where `config` gives them a unit; as it is where nothing was asked for.
 
     `evidence` is what its photographs tell of what `config` asks for. A source that can say nothing is left out where
-    another can. Where sources contradict each other the scene stays relative.
+    another can. Where sources contradict each other the scene stays relative. Where poses are among what counts, the
+    world is theirs.
     """
-    said = _said(snapshot, config, evidence) if len(snapshot.cameras) else []
+    said, aligned = _said(snapshot, config, evidence) if len(snapshot.cameras) else ([], None)
     if not said:
         return snapshot
     measurements = [each for each in said if isinstance(each, Measurement)]
@@ -35,19 +39,27 @@ def in_metres(snapshot: Snapshot, config: Config, evidence: Evidence = NOTHING) 
         return replace(snapshot, scale=Scale(False, agreed))
     low, high = agreed.interval_95
     source = "; ".join([f"{agreed.source}, known to {rounded_up(100 * (high - 1.0))} %", *silent])
-    return replace(_scaled(snapshot, agreed.metres_per_unit), scale=Scale(True, source, (low, high)))
+    unit = agreed.metres_per_unit
+    metric = _scaled(snapshot, unit) if aligned is None else _placed(snapshot, aligned.placed(unit))
+    return replace(metric, scale=Scale(True, source, (low, high)))
 
 
-def _said(snapshot: Snapshot, config: Config, evidence: Evidence) -> list[Measurement | str]:
-    """What each source says, or why it says nothing."""
+def _said(snapshot: Snapshot, config: Config, evidence: Evidence) -> tuple[list[Measurement | str], Aligned | None]:
+    """What each source says, or why it says nothing; and where given poses place the scene."""
     said: list[Measurement | str] = [
         by_distance(snapshot.cameras, baseline, config.baseline_sigma) for baseline in config.baselines
     ]
     if config.marker_m is not None:
         said += by_markers(views_of(snapshot), evidence.sightings, config.marker_m, config.marker_sigma_m)
+    aligned = None
+    if evidence.poses is not None:
+        sigmas = Sigmas(config.poses_sigma_m, config.poses_sigma_deg, config.poses_drift)
+        found = by_poses(views_of(snapshot), evidence.poses, sigmas)
+        aligned = None if isinstance(found, str) else found
+        said += [found] if isinstance(found, str) else [found.unit, *found.told]
     if config.network:
         said.append(_by_the_network(snapshot, config.network_sigma))
-    return said
+    return said, aligned
 
 
 def _by_the_network(snapshot: Snapshot, sigma: float) -> Measurement | str:
@@ -55,6 +67,18 @@ def _by_the_network(snapshot: Snapshot, sigma: float) -> Measurement | str:
     if loaded is None:
         return "no weights of the metric network: splatnode weights list tells where they are had"
     return by_network(snapshot, MetricDepth(loaded.name, loaded), sigma)
+
+
+def _placed(snapshot: Snapshot, by: Similarity) -> Snapshot:
+    """The snapshot in the world that `by` leads to, in metres."""
+    placement = Placement(by.scale, by.rotation, by.translation)
+    landmarks = snapshot.landmarks and snapshot.landmarks.moved(by.scale, by.rotation, by.translation, metric=True)
+    return replace(
+        snapshot,
+        cameras=tuple(map(placement.camera, snapshot.cameras)),
+        gaussians=placement.gaussians(snapshot.gaussians),
+        landmarks=landmarks,
+    )
 
 
 def _scaled(snapshot: Snapshot, factor: float) -> Snapshot:

@@ -48,10 +48,10 @@ class View:
 
 
 def views_of(snapshot: Snapshot) -> Mapping[str, View]:
-    """By the photograph's name: as they were registered, where that is known; else as they are published."""
+    """By the photograph's name, in their order: as they were registered, where that is known; else as published."""
     bounds = {camera.name: camera.bounds.centre if camera.bounds else 0.0 for camera in snapshot.cameras}
     found = {}
-    for camera in snapshot.cameras:
+    for camera in sorted(snapshot.cameras, key=lambda camera: camera.frame_id):
         side, size = max(camera.width, camera.height), np.array([camera.width, camera.height])
         shift = (camera.K[:2, 2] - size / 2.0) / side
         found[camera.name] = View(camera.T_world_camera, float(camera.K[0, 0]) / side, 0.0, shift, bounds[camera.name])

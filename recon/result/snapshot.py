@@ -58,7 +58,7 @@ class GaussianArrays:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """The scene after a step of the reconstruction. The world is the first camera's frame."""
+    """The scene after a step of the reconstruction. The world is the first camera's frame, or that of given poses."""
 
     sequence: int
     verdict: Verdict

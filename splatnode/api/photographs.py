@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from os import PathLike
+from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.cameras.folder import SUFFIXES, frame_name
 from splatnode.capture.exif import exif_intrinsics, read_tags
 from splatnode.capture.exif_time import exif_time
 from splatnode.capture.frame import Frame, Intrinsics
@@ -45,6 +46,17 @@ def photographs(images: Images, views: int | None, every_frame: bool, tell: Tell
 def picture_name(index: int) -> str:
     """The name of the picture in this place of a list."""
     return f"{index:04d}.png"
+
+
+def names_of(images: Images) -> list[str]:
+    """The names of listed photographs or pictures, in their order. Raises TypeError, ValueError: of a folder, too."""
+    given = as_list(images)
+    if len(given) == 1 and isinstance(given[0], (str, PathLike)) and Path(given[0]).suffix.lower() not in SUFFIXES:
+        raise TypeError("a list goes with a list of photographs, one for each; of a folder or a video, give names")
+    return [
+        frame_name(Path(fspath(each))) if isinstance(each, (str, PathLike)) else picture_name(index)
+        for index, each in enumerate(given)
+    ]
 
 
 def frame(picture: Picture, frame_id: int, name: str, stamp_ns: int, captured_at: Stamp | None = None) -> Frame:

@@ -9,6 +9,7 @@ from typing import Any
 
 from splatnode.api.masks import Masks, finder
 from splatnode.api.photographs import Images, Lens, lenses, photographs, with_lens
+from splatnode.api.poses import Poses, evidence_of, sigmas_of
 from splatnode.api.result import Result, result_of
 from splatnode.api.scale import Scale, metric_changes
 from splatnode.capture.process.config import read_yaml
@@ -25,6 +26,8 @@ def reconstruct(
     images: Images,
     *,
     intrinsics: Lens | None = None,
+    poses: Poses | None = None,
+    poses_sigma: tuple[float, float] | None = None,
     masks: Masks | None = None,
     scale: Scale | None = None,
     budget_s: float | None = None,
@@ -46,6 +49,9 @@ def reconstruct(
       and of more than 30 photographs, keyframes are chosen.
     - `intrinsics`: the lens of all photographs of its aspect ratio: `Intrinsics`, or K (3, 3) in pixels of the
       photographs without distortion. None: what EXIF tells, else it is estimated.
+    - `poses`: T_world_camera (4, 4) in metres that others estimated: by the photographs' names, in the order of a list
+      (None: not known), or a file as `--poses` reads it. They give metres and the world's axes; one that does not fit
+      is left out and named. `poses_sigma`: standard deviations of a position, metres, and an orientation, degrees.
     - `masks`: what of the photographs is used: white (any value above 0) is used, black is ignored. A folder of masks
       with the photographs' names, one file for all, or a list, for each photograph an array (H, W), a path, or None
       for one that is used whole. None: all is used.
@@ -70,11 +76,11 @@ def reconstruct(
     source = photographs(images, views, every_frame, telling)
     source = source if masks is None else with_masks(source, finder(masks, images), telling)
     source = with_lens(source, intrinsics)
-    flags = {"budget_s": budget_s, "seed": seed}
+    flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma)}
     chosen = configured(preset, config, flags, scale, of_pictures=source.photographs is None)
     check_baseline(chosen, [frame.name for frame in source.frames])
-    known = lenses(source.frames)
-    made = reconstructed(source, chosen, preset, without_guesses=only_seen, most_threads=threads, tell=telling)
+    known, given = lenses(source.frames), evidence_of(poses, images, source.frames)
+    made = reconstructed(source, chosen, preset, only_seen, threads, given, tell=telling)
     return result_of(made.snapshot, made, known)
 
 

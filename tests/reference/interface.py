@@ -26,8 +26,8 @@ What `import splatnode` gives. Each name is loaded when it is first used, so tha
 [Python](python.md) shows them at work.
 
 Arrays are NumPy's. Axes are OpenCV's: x right, y down, z forward; quaternions are wxyz; the centre of the top-left
-pixel is at (0.5, 0.5). The world is the frame of the first camera that was placed. Records are frozen; they and results
-can be pickled, and used by several threads.
+pixel is at (0.5, 0.5). The world is the frame of the first camera that was placed, or that of the poses that were
+given. Records are frozen; they and results can be pickled, and used by several threads.
 
 This page is made from the code by `python -m tests.reference`; change it there.
 """

@@ -1,0 +1,197 @@
+"""Poses that others estimated, in metres: a TUM trajectory, nerfstudio's transforms.json, or a COLMAP model."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+from typing import Annotated
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation, Slerp
+
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.process.bounded_file import read_bounded
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import printable
+from splatnode.recon.result.camera_check import camera_problem
+from splatnode.recon.result.colmap_images import ImageRow, binary_images, text_images
+from splatnode.recon.result.export.quaternions import matrices_from_quats
+
+Array = npt.NDArray[np.float64]
+
+_MAX_BYTES = 200_000_000
+_LONGEST_GAP_S = 1.0  # between two poses, over which a time between them is interpolated
+_NEAREST_S = 0.02  # of a time to the one pose that counts where there is none on its other side
+_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's cameras: x right, y up, z back
+_Row = tuple[float, float, float, float]
+_Name = Annotated[str, msgspec.Meta(max_length=4096)]
+
+
+class PosesFileError(ValueError):
+    """A file of poses that is not what it should be; the message names it."""
+
+
+class _Frame(msgspec.Struct, frozen=True):
+    file_path: _Name
+    transform_matrix: tuple[_Row, _Row, _Row, _Row]
+
+
+class _Transforms(msgspec.Struct, frozen=True):
+    frames: tuple[_Frame, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """T_world_camera (4, 4) in metres, OpenCV's axes, by the name of the photograph or by the time."""
+
+    by_name: Mapping[str, Array] = field(default_factory=dict)
+    seconds: Array = field(default_factory=lambda: np.zeros(0))  # (M,) rising
+    Ts: Array = field(default_factory=lambda: np.zeros((0, 4, 4)))  # (M, 4, 4)
+
+    def of(self, frames: Iterable[Frame | DroppedFrame]) -> dict[str, Array]:
+        """The poses of the frames that have one, by their names."""
+        found = {each.name: self._of(each) for each in frames if isinstance(each, Frame)}
+        return {name: T for name, T in found.items() if T is not None}
+
+    def _of(self, frame: Frame) -> Array | None:
+        if self.by_name:
+            known = self.by_name.get(frame.name)
+            return known if known is not None else self.by_name.get(frame.name.rpartition(".")[0])
+        if frame.captured_at is not None and (found := self._at(frame.captured_at.ns / 1e9)) is not None:
+            return found
+        return self._at(float(frame.frame_id)) if _are_numbers(self.seconds) else None
+
+    def _at(self, seconds: float) -> Array | None:
+        """The pose at this time, between its two neighbours; None where they are too far away."""
+        after = int(np.searchsorted(self.seconds, seconds))
+        near = [index for index in (after - 1, after) if 0 <= index < len(self.seconds)]
+        nearest = min(near, key=lambda index: abs(self.seconds[index] - seconds))
+        if abs(self.seconds[nearest] - seconds) < 1e-6:
+            return self.Ts[nearest]
+        if (
+            len(near) < 2
+            or self.seconds[after] - self.seconds[after - 1] > _LONGEST_GAP_S
+            or _are_numbers(self.seconds)
+        ):
+            return self.Ts[nearest] if abs(self.seconds[nearest] - seconds) <= _NEAREST_S else None
+        between, T = self.seconds[after - 1 : after + 1], np.eye(4)
+        share = (seconds - between[0]) / (between[1] - between[0])
+        T[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(self.Ts[after - 1 : after + 1, :3, :3]))(share).as_matrix()
+        T[:3, 3] = (1.0 - share) * self.Ts[after - 1, :3, 3] + share * self.Ts[after, :3, 3]
+        return T
+
+
+def _are_numbers(seconds: Array) -> bool:
+    """Whether the times are the numbers of frames, as where nobody knows when they were taken."""
+    return bool((seconds == np.floor(seconds)).all() and (seconds < 1e6).all())
+
+
+def poses_of(trajectory: Trajectory, frames: Sequence[Frame | DroppedFrame], where: str) -> dict[str, Array]:
+    """The poses of the frames that have one, by their names. Raises PosesFileError, `where` in it, where none has."""
+    found = trajectory.of(frames)
+    if not found and any(isinstance(each, Frame) for each in frames):
+        first = printable(next(each.name for each in frames if isinstance(each, Frame)), 100)
+        has = (
+            f"photographs such as {printable(min(trajectory.by_name), 100)}"
+            if trajectory.by_name
+            else (f"the times {trajectory.seconds[0]:.3f} to {trajectory.seconds[-1]:.3f} s")
+        )
+        raise PosesFileError(
+            f"{where} has no pose of any photograph: it has {has}, and the first photograph is {first}. "
+            "Name the photographs by their time in seconds, or give poses by the photographs' names"
+        )
+    return found
+
+
+def read_poses(path: Path) -> Trajectory:
+    """The poses in `path`: transforms.json, a folder with images.txt or images.bin, one of these, or a TUM trajectory.
+
+    Raises PosesFileError, which names the file, and OSError.
+    """
+    if path.is_dir():
+        there = [path / name for name in ("images.bin", "images.txt") if (path / name).exists()]
+        if not there:
+            raise PosesFileError(f"{path} must hold images.txt or images.bin of a COLMAP model; give that folder")
+        path = there[0]
+    where = str(path)
+    with foreign(PosesFileError, where):
+        data = read_bounded(path, _MAX_BYTES, PosesFileError, where)
+        try:
+            return _read(path, data)
+        except PosesFileError:
+            raise
+        except (ValueError, struct.error) as error:  # msgspec's errors are ValueErrors, too
+            raise PosesFileError(
+                f"{where} must be a TUM trajectory (time x y z qx qy qz qw), nerfstudio's transforms.json, or COLMAP's "
+                f"images.txt or images.bin: {printable(str(error), 200)}"
+            ) from error
+
+
+def _read(path: Path, data: bytes) -> Trajectory:
+    if path.suffix == ".json":
+        content = msgspec.json.decode(data, type=_Transforms)
+        return named((each.file_path, np.array(each.transform_matrix) @ _OPENGL) for each in content.frames)
+    if path.suffix == ".bin":
+        return named(_of_colmap(binary_images(data)))
+    text = data.decode()
+    if path.name.startswith("images"):
+        return named(_of_colmap(text_images(text)))
+    return _tum(text)
+
+
+def named(poses: Iterable[tuple[str, Array]]) -> Trajectory:
+    """Poses by the names of their photographs. Raises ValueError where one is no rigid motion or comes twice."""
+    by_name: dict[str, Array] = {}
+    for name, T in poses:
+        name = PurePosixPath(name).name
+        if name in by_name:
+            raise ValueError(f"there are two poses of {printable(name, 100)}")
+        by_name[name] = _checked(name, T)
+    if not by_name:
+        raise ValueError("it holds no poses")
+    return Trajectory(by_name)
+
+
+def _of_colmap(rows: Iterable[ImageRow]) -> Iterator[tuple[str, Array]]:
+    for name, motion, _ in rows:
+        T_camera_world = _motion(motion[4:], motion[:4])
+        yield name, np.asarray(np.linalg.inv(_checked(name, T_camera_world)), np.float64)
+
+
+def _tum(text: str) -> Trajectory:
+    rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    if not rows or any(len(row) != 8 for row in rows):
+        raise ValueError("each line must have eight values")
+    motions = [(row[0], _checked(row[0], _of_tum(row[1:]))) for row in rows]
+    try:
+        seconds = np.array([float(name) for name, _ in motions])
+    except ValueError:  # names of photographs in place of times
+        return named(motions)
+    if not np.isfinite(seconds).all():
+        raise ValueError("times must be finite")
+    order = np.argsort(seconds, kind="stable")
+    return Trajectory(seconds=seconds[order], Ts=np.stack([motions[index][1] for index in order]))
+
+
+def _of_tum(row: Sequence[str]) -> Array:
+    x, y, z, qx, qy, qz, qw = map(float, row)
+    return _motion((x, y, z), (qw, qx, qy, qz))
+
+
+def _motion(translation: Sequence[float], quat: Sequence[float]) -> Array:
+    T = np.eye(4)
+    with np.errstate(invalid="ignore"):  # a quaternion of zeros is no rotation, which is found when it is checked
+        T[:3, :3], T[:3, 3] = matrices_from_quats(quat), translation
+    return T
+
+
+def _checked(name: str, T: Array) -> Array:
+    """Raises ValueError where it is no rigid motion of finite numbers."""
+    problem = camera_problem(np.asarray(T, np.float64), np.eye(3), 1, 1)
+    if problem:
+        raise ValueError(f"the pose of {printable(name, 100)}: {problem}")
+    return np.asarray(T, np.float64)

@@ -1,0 +1,56 @@
+"""Poses as a program has them: a file, or matrices, by the photographs' names or in their order."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from os import PathLike, fspath
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.api.photographs import Images, names_of
+from splatnode.capture.cameras.folder import frame_name
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.recon.metric.evidence import NOTHING, Evidence
+from splatnode.recon.metric.poses_file import named, poses_of, read_poses
+
+Matrix: TypeAlias = "npt.NDArray[np.floating]"
+Poses: TypeAlias = "str | PathLike[str] | Mapping[str, Matrix] | Sequence[Matrix | None]"
+
+
+def sigmas_of(poses_sigma: tuple[float, float] | None) -> dict[str, float] | None:
+    """What of the configuration's `metric` the standard deviations set. Raises TypeError."""
+    if poses_sigma is None:
+        return None
+    if not isinstance(poses_sigma, (tuple, list)) or len(poses_sigma) != 2:
+        raise TypeError(f"poses_sigma must be metres and degrees, (0.01, 2.0), got {poses_sigma!r}")
+    return dict(zip(("poses_sigma_m", "poses_sigma_deg"), map(float, poses_sigma), strict=True))
+
+
+def evidence_of(poses: Poses | None, images: Images, frames: Sequence[Frame | DroppedFrame]) -> Evidence:
+    """What poses of `images` tell of the frames that are used. Raises TypeError, ValueError, FileNotFoundError."""
+    if poses is None:
+        return NOTHING
+    if isinstance(poses, (str, PathLike)):
+        return Evidence(poses=poses_of(read_poses(Path(poses)), frames, fspath(poses)))
+    return Evidence(poses=poses_of(named(_rows(poses, images)), frames, "poses"))
+
+
+def _rows(
+    poses: Mapping[str, Matrix] | Sequence[Matrix | None], images: Images
+) -> list[tuple[str, npt.NDArray[np.float64]]]:
+    if isinstance(poses, Mapping):
+        return [(frame_name(Path(name)), _matrix(T)) for name, T in poses.items()]
+    names = names_of(images)
+    if len(poses) != len(names):
+        raise ValueError(f"poses must be one for each of the {len(names)} photographs, got {len(poses)}")
+    return [(name, _matrix(T)) for name, T in zip(names, poses, strict=True) if T is not None]
+
+
+def _matrix(T: Any) -> npt.NDArray[np.float64]:
+    matrix = np.asarray(T, np.float64)
+    if matrix.shape != (4, 4):
+        raise TypeError(f"a pose must be T_world_camera (4, 4) or None, got shape {matrix.shape}")
+    return matrix

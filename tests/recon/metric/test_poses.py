@@ -1,0 +1,116 @@
+"""Poses from odometry give metres and axes; one that is wrong is named and left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from splatnode.capture.cameras import synthetic
+from splatnode.recon.metric.config import Baseline, Config
+from splatnode.recon.metric.evidence import Evidence
+from splatnode.recon.metric.metres import in_metres
+from splatnode.recon.metric.poses import Aligned, Sigmas, by_poses
+from splatnode.recon.metric.views import View, views_of
+from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
+from tests.recon.result.test_preview import snapshot as ball_snapshot
+from tests.support.odometry import drifting
+
+PLACE = synthetic.Config(views=8)
+UNIT = 1.7  # metres a unit of the scene
+TRUE = [T for T, _ in synthetic.scene_cameras(PLACE)]
+NAMES = [synthetic.frame_name(index) for index in range(PLACE.views)]
+SIGMAS = Sigmas(0.01, 2.0, 0.02)
+
+
+def scene() -> Snapshot:
+    """The true cameras in a world whose unit is UNIT metres, and whose axes are others."""
+    turn = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
+    cameras = []
+    for index, (T, K) in enumerate(synthetic.scene_cameras(PLACE)):
+        moved = np.eye(4)
+        moved[:3, :3], moved[:3, 3] = turn @ T[:3, :3], turn @ (T[:3, 3] - TRUE[0][:3, 3]) / UNIT
+        cameras.append(CameraEstimate(NAMES[index], index, moved, K, PLACE.width, PLACE.height))
+    return replace(ball_snapshot(1), cameras=tuple(cameras))
+
+
+def views() -> dict[str, View]:
+    return dict(views_of(scene()))
+
+
+def given(seed: int) -> dict[str, np.ndarray]:
+    """Odometry with 2 % drift and 2 degrees of noise."""
+    return dict(zip(NAMES, drifting(TRUE, np.random.default_rng(seed)), strict=True))
+
+
+def test_true_poses_give_the_unit_and_the_axes():
+    found = by_poses(views(), dict(zip(NAMES, TRUE, strict=True)), SIGMAS)
+    assert isinstance(found, Aligned) and found.told == () and found.unit.source == "poses of 8 photographs"
+    assert found.unit.metres_per_unit == pytest.approx(UNIT) and 0.005 < found.unit.sigma < 0.03
+    metric = in_metres(scene(), Config(), Evidence(poses=dict(zip(NAMES, TRUE, strict=True))))
+    for camera, T in zip(metric.cameras, TRUE, strict=True):
+        np.testing.assert_allclose(camera.T_world_camera, T, atol=1e-6)
+    assert metric.scale.metric and (metric.scale.source or "").startswith("poses of 8 photographs, known to")
+
+
+def test_odometry_that_drifts_by_2_percent_gives_metres_within_2_percent():
+    held = 0
+    for seed in range(40):
+        found = by_poses(views(), given(seed), SIGMAS)
+        assert isinstance(found, Aligned)
+        low, high = found.unit.interval_95
+        held += low <= UNIT / found.unit.metres_per_unit <= high
+        assert found.unit.metres_per_unit == pytest.approx(UNIT, rel=0.02), seed
+    assert held >= 38
+
+
+@pytest.mark.parametrize("wrong", range(0, 8, 3))
+def test_a_pose_that_is_wrong_by_a_metre_is_named_and_the_rest_stands(wrong):
+    poses = given(wrong)
+    poses[NAMES[wrong]] = poses[NAMES[wrong]].copy()
+    poses[NAMES[wrong]][:3, 3] += [0.6, -0.6, 0.53]
+    found = by_poses(views(), poses, SIGMAS)
+    assert isinstance(found, Aligned) and found.unit.metres_per_unit == pytest.approx(UNIT, rel=0.03)
+    (told,) = found.told
+    assert told.startswith(f"the pose of {NAMES[wrong]} was left out: it is 1") or "0.9" in told
+    metric = in_metres(scene(), Config(), Evidence(poses=poses))
+    assert metric.scale.metric and NAMES[wrong] in (metric.scale.source or "") and len(metric.cameras) == 8
+
+
+def test_a_pose_that_looks_elsewhere_is_named():
+    poses = given(1)
+    poses[NAMES[4]] = poses[NAMES[4]].copy()
+    poses[NAMES[4]][:3, :3] = poses[NAMES[4]][:3, :3] @ Rotation.from_rotvec([0.0, 0.7, 0.0]).as_matrix()
+    found = by_poses(views(), poses, SIGMAS)
+    assert isinstance(found, Aligned) and len(found.told) == 1
+    assert NAMES[4] in found.told[0] and found.told[0].endswith("degrees off")
+
+
+def test_what_poses_cannot_tell_is_said():
+    one = by_poses(views(), {NAMES[0]: TRUE[0]}, SIGMAS)
+    assert isinstance(one, str) and "two are needed" in one
+    still = by_poses(views(), dict.fromkeys(NAMES, TRUE[0]), SIGMAS)
+    assert isinstance(still, str) and "not farther apart than they are unsure" in still
+    rng = np.random.default_rng(0)
+    nonsense = {name: _anywhere(rng) for name in NAMES}
+    refused = by_poses(views(), nonsense, SIGMAS)
+    assert isinstance(refused, str) and "x right, y down and z forward" in refused
+
+
+def _anywhere(rng: np.random.Generator) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3)
+    return T
+
+
+def test_poses_and_a_baseline_are_weighed_together_or_contradict_each_other():
+    apart = float(np.linalg.norm(TRUE[7][:3, 3] - TRUE[0][:3, 3]))
+    evidence = Evidence(poses=given(2))
+    both = in_metres(scene(), Config(baseline=Baseline(NAMES[0], NAMES[7], apart)), evidence)
+    centres = [camera.T_world_camera[:3, 3] for camera in both.cameras]
+    assert np.linalg.norm(centres[7] - centres[0]) == pytest.approx(apart, rel=0.015)
+    np.testing.assert_allclose(np.mean(centres, 0), np.mean([T[:3, 3] for T in TRUE], 0), atol=0.1)
+    torn = in_metres(scene(), Config(baseline=Baseline(NAMES[0], NAMES[7], 1.2 * apart)), evidence)
+    assert not torn.scale.metric and "contradicts poses of 8 photographs" in (torn.scale.source or "")

@@ -1,0 +1,113 @@
+"""The formats in which poses come, and how photographs find theirs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatnode.capture.frame import Frame
+from splatnode.capture.stamp import Clock, Stamp
+from splatnode.recon.metric.poses_file import PosesFileError, Trajectory, poses_of, read_poses
+from splatnode.recon.result.export import export_scene
+from splatnode.recon.result.write import finish
+from tests.recon.metric.test_poses import NAMES, TRUE, scene
+
+SEEN = np.zeros((8, 8, 3), np.uint8)
+
+
+def frame(name: str, frame_id: int = 0, seconds: float | None = None) -> Frame:
+    stamp = None if seconds is None else Stamp(round(1e9 * seconds), Clock.UTC)
+    return Frame(frame_id, name, frame_id, SEEN, None, captured_at=stamp)
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory) -> Path:
+    """A result whose cameras are known, in every format that it writes."""
+    out = tmp_path_factory.mktemp("saved")
+    finish(scene(), out, seed=0, preset_name="fast")
+    export_scene(out, "colmap", out / "again")
+    return out
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "colmap", "colmap/images.txt", "again", "trajectory.tum"])
+def test_what_a_result_writes_is_read(saved, name):
+    frames = [frame(NAMES[index], index) for index in range(8)]
+    found = poses_of(read_poses(saved / name), frames, name)
+    assert list(found) == NAMES
+    for camera in scene().cameras:
+        np.testing.assert_allclose(found[camera.name], camera.T_world_camera, atol=1e-6)
+
+
+def test_a_binary_model_is_read(saved, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap")
+    pycolmap.Reconstruction(str(saved / "again")).write_binary(str(tmp_path))
+    found = read_poses(tmp_path).by_name
+    np.testing.assert_allclose(found[NAMES[3]], scene().cameras[3].T_world_camera, atol=1e-6)
+
+
+def test_times_between_two_poses_are_interpolated(tmp_path):
+    file = tmp_path / "odometry.txt"
+    file.write_text("# time x y z qx qy qz qw\n100.0 0 0 0 0 0 0 1\n100.5 1 0 0 0 0 0.7071067811865476 0.70710678\n")
+    found = read_poses(file).of(
+        [frame("a.png", 0, 100.25), frame("b.png", 1, 100.51), frame("c.png", 2, 101.0), frame("d.png", 3)]
+    )
+    assert list(found) == ["a.png", "b.png"]
+    np.testing.assert_allclose(found["a.png"][:3, 3], [0.5, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(found["a.png"][:2, 0], [np.cos(np.pi / 4), np.sin(np.pi / 4)], atol=1e-6)
+
+
+def test_a_trajectory_may_name_photographs(tmp_path):
+    file = tmp_path / "poses.tum"
+    file.write_text("a.jpg 1 2 3 0 0 0 1\nb.jpg 4 5 6 0 0 0 1\n")
+    found = read_poses(file).of([frame("b.jpg"), frame("c.jpg")])
+    assert list(found) == ["b.jpg"] and found["b.jpg"][:3, 3].tolist() == [4.0, 5.0, 6.0]
+
+
+def test_no_photograph_with_a_pose_is_told(tmp_path):
+    with pytest.raises(PosesFileError, match=r"it has photographs such as a\.png, and the first photograph is z\.png"):
+        poses_of(Trajectory({"a.png": TRUE[0]}), [frame("z.png")], "poses.json")
+    timed = Trajectory(seconds=np.array([5.5, 6.0]), Ts=np.stack(TRUE[:2]))
+    with pytest.raises(PosesFileError, match=r"the times 5\.500 to 6\.000 s"):
+        poses_of(timed, [frame("z.png", 0, 100.0)], "poses.tum")
+
+
+def transforms(T: np.ndarray, times: int) -> str:
+    return json.dumps({"frames": [{"file_path": "a", "transform_matrix": T.tolist()}] * times})
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "told"),
+    [
+        ("a.tum", "1 2 3\n", "eight values"),
+        ("a.tum", "", "eight values"),
+        ("a.tum", "1 0 0 0 0 0 0 0\n", "rigid motion|finite"),
+        ("a.tum", "nan 0 0 0 0 0 0 1\n", "times must be finite"),
+        ("a.json", "{}", "frames"),
+        (
+            "a.json",
+            json.dumps({"frames": [{"file_path": "a", "transform_matrix": np.zeros((4, 4)).tolist()}]}),
+            "rigid",
+        ),
+        (
+            "a.json",
+            json.dumps({"frames": [{"file_path": "a", "transform_matrix": np.eye(4).tolist()}] * 2}),
+            "two poses",
+        ),
+        ("images.txt", "1 1 0 0 0 0 0\n", "images.txt"),
+        ("images.bin", "xx", "images.bin"),
+    ],
+)
+def test_what_is_no_file_of_poses_is_refused(tmp_path, name, content, told):
+    file = tmp_path / name
+    file.write_text(content)
+    with pytest.raises(PosesFileError, match=told) as refused:
+        read_poses(file)
+    assert str(file) in str(refused.value)
+
+
+def test_a_folder_must_hold_a_model(tmp_path):
+    with pytest.raises(PosesFileError, match=r"must hold images\.txt or images\.bin"):
+        read_poses(tmp_path)
