@@ -63,11 +63,9 @@ def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
     pointmaps = tuple(estimate.pointmaps.values())
     images = {keyframe.name: keyframe.image for keyframe in estimate.graph.keyframes}
     masks = {keyframe.name: keyframe.mask for keyframe in estimate.graph.keyframes}
-    found = light.differing(pointmaps, images, config.light)
-    if found is None:
-        return initial_scene(pointmaps, images, config.initialisation, masks)
-    alike, told = found.applied(images, masks)
-    return initial_scene(pointmaps, alike, config.initialisation, told, found.gains)
+    exposures = light.differing(pointmaps, images, config.light)
+    alike = {name: light.alike(images[name], exposure) for name, exposure in exposures.items()}
+    return initial_scene(pointmaps, images | alike, config.initialisation, masks, exposures)
 
 
 def refined(
@@ -133,7 +131,7 @@ def snapshot(
         landmarks=conclusion.landmarks if scene and final else None,
         depths=conclusion.depths if scene and final else {},
         masked=conclusion.masked,
-        gains={view.name: view.gains for view in scene.views if view.gains is not None} if scene else {},
+        gains={view.name: view.exposure.gains for view in scene.views if view.exposure is not None} if scene else {},
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -22,7 +23,19 @@ class TrainingImage:
     K: Tensor  # (3, 3) intrinsics at this size, pixels
     width: int  # pixels
     height: int
-    loss: PhotometricLoss  # of a render (height, width, 3), against the photograph where it shows the scene
+    loss: Callable[[Tensor], Tensor]  # of a render (height, width, 3), against the photograph where it shows the scene
+
+
+@dataclass(frozen=True, eq=False)
+class _AtLeastSoBright:
+    """The loss of a photograph that is saturated in places: a render that is brighter there is right."""
+
+    loss: PhotometricLoss
+    target: Tensor  # (height, width, 3) the photograph
+    saturated: Tensor  # (height, width, 3) bool
+
+    def __call__(self, rgb: Tensor) -> Tensor:
+        return self.loss(torch.where(self.saturated, torch.minimum(rgb, self.target), rgb))
 
 
 def training_image(
@@ -49,7 +62,12 @@ def training_image(
         share = cv2.resize(shown.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         weights = torch.from_numpy(np.floor(share + np.float32(_WHOLLY_SHOWN))).to(device)
     target = torch.tensor(image, device=device).float() / 255.0  # a copy: what is read from a file is read-only
-    return TrainingImage(K, width, height, PhotometricLoss(target, dssim, weights, keep_moments))
+    loss = PhotometricLoss(target, dssim, weights, keep_moments)
+    if view.exposure is None or view.exposure.saturated is None:
+        return TrainingImage(K, width, height, loss)
+    share = cv2.resize(view.exposure.saturated.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    saturated = torch.from_numpy(share > 0).to(device)
+    return TrainingImage(K, width, height, _AtLeastSoBright(loss, target, saturated))
 
 
 def scaled(K: Tensor, width: int, height: int, scale: float) -> tuple[Tensor, int, int]:

@@ -14,7 +14,7 @@ from splatnode.recon.frames import border
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.scene import background, completion, pixelwise, seeding
 from splatnode.recon.scene.gaussians import Gaussians, concatenate
-from splatnode.recon.scene.scene import Scene, TrainingView
+from splatnode.recon.scene.scene import Exposure, Scene, TrainingView
 
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
@@ -37,13 +37,13 @@ def initial_scene(
     images: Mapping[str, Image],
     config: Config,
     masks: Mapping[str, Mask | None] = MappingProxyType({}),
-    gains: Mapping[str, tuple[float, ...]] = MappingProxyType({}),
+    exposures: Mapping[str, Exposure] = MappingProxyType({}),
 ) -> Scene:
     """The scene with a training view for each point map, and Gaussians seeded from all of them.
 
     `images` (h, w, 3) are found by the point maps' names. Pixels of a dark rim, which do not show the
     scene, seed nothing. Nor do those that `masks` (h, w) hide, of which the point maps know nothing; where no view
-    sees behind them, the fill goes on there. `gains` are those that were taken out of the images.
+    sees behind them, the fill goes on there. `exposures` were taken out of the images.
     """
     pictures = [images[pointmap.name] for pointmap in pointmaps]
     valid = border.valid_masks(pictures)
@@ -59,12 +59,14 @@ def initial_scene(
     del usable
     if config.pixelwise is not None:
         surfaces = pixelwise.pixelwise_gaussians(dense, pictures, config.pixelwise, limit)
-        return Scene(_views(dense, images, masks, gains), concatenate([surfaces, *shells]))
+        return Scene(_views(dense, images, masks, exposures), concatenate([surfaces, *shells]))
     surfaces = seeding.initial_gaussians(dense, pictures, config.seeding)
     num_unlimited = len(surfaces) + sum(map(len, shells))
     if limit is not None and len(surfaces) > limit:
         surfaces = seeding.initial_gaussians(dense, pictures, config.seeding, limit)
-    return Scene(_views(pointmaps, images, masks, gains), concatenate([surfaces, *shells]), num_unlimited=num_unlimited)
+    return Scene(
+        _views(pointmaps, images, masks, exposures), concatenate([surfaces, *shells]), num_unlimited=num_unlimited
+    )
 
 
 def _shell(pointmaps: Sequence[Pointmap], pictures: Sequence[Image], config: Config) -> Gaussians:
@@ -76,7 +78,7 @@ def _views(
     pointmaps: Sequence[Pointmap],
     images: Mapping[str, Image],
     masks: Mapping[str, Mask | None],
-    gains: Mapping[str, tuple[float, ...]],
+    exposures: Mapping[str, Exposure],
 ) -> tuple[TrainingView, ...]:
     return tuple(
         TrainingView(
@@ -87,7 +89,7 @@ def _views(
             K=torch.tensor(pointmap.K, dtype=torch.float32),
             pointmap=pointmap,
             mask=masks.get(pointmap.name),
-            gains=gains.get(pointmap.name),
+            exposure=exposures.get(pointmap.name),
         )
         for pointmap in pointmaps
     )

@@ -9,7 +9,6 @@ their logarithms). What they say is used only where it is more than light that d
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Annotated
 
 import cv2
@@ -21,6 +20,7 @@ from msgspec import Meta
 from splatnode.recon.priors import reprojection
 from splatnode.recon.priors.confirmed import AGREEING, LEAST_CONFIDENCE, MOST_PARTNERS
 from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.scene.scene import Exposure
 from splatnode.recon.workers import each
 
 Array = npt.NDArray[np.float64]
@@ -43,38 +43,26 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     least: Annotated[float, Meta(ge=0)] = 0.3
 
 
-@dataclass(frozen=True, eq=False)
-class Light:
-    """How photographs were exposed."""
-
-    gains: Mapping[str, tuple[float, ...]]  # for red, green and blue, by the photograph's name; 1 is the median of all
-
-    def applied(
-        self, images: Mapping[str, Image], masks: Mapping[str, Mask | None]
-    ) -> tuple[dict[str, Image], dict[str, Mask | None]]:
-        """The images (h, w, 3) as gains of 1 would have them, and what their `masks` (h, w) leave of them.
-
-        Left out are pixels that are saturated where others would not be: they do not tell how bright they were.
-        """
-        alike, told = dict(images), dict(masks)
-        for name, gains in self.gains.items():
-            image, mask = images[name], masks.get(name)
-            alike[name] = np.clip(np.rint(image / np.array(gains)), 0, 255).astype(np.uint8)
-            lost = ((image >= SATURATED) & (np.array(gains) > 1.0)).any(axis=-1)
-            if lost.any():
-                told[name] = ~lost if mask is None else mask & ~lost
-        return alike, told
-
-
-def differing(pointmaps: Sequence[Pointmap], images: Mapping[str, Image], config: Config) -> Light | None:
-    """The gains of `images` (h, w, 3), by name; None where they do not differ by more than `config` says."""
+def differing(pointmaps: Sequence[Pointmap], images: Mapping[str, Image], config: Config) -> dict[str, Exposure]:
+    """The exposures of `images` (h, w, 3), by name; none where they do not differ by more than `config` says."""
     if not config.enabled or len(pointmaps) < 2:
-        return None
+        return {}
     logs = log_gains(pointmaps, [images[pointmap.name] for pointmap in pointmaps])
     if np.abs(logs).max() < np.log1p(config.least):
-        return None
-    gains = np.exp(logs).tolist()
-    return Light({pointmap.name: tuple(own) for pointmap, own in zip(pointmaps, gains, strict=True)})
+        return {}
+    gains = {pointmap.name: own for pointmap, own in zip(pointmaps, np.exp(logs), strict=True)}
+    return {name: Exposure(tuple(own.tolist()), _saturated(images[name], own)) for name, own in gains.items()}
+
+
+def alike(image: Image, exposure: Exposure) -> Image:
+    """The photograph `image` (h, w, 3) as gains of 1 would have it."""
+    return np.clip(np.rint(image / np.array(exposure.gains)), 0, 255).astype(np.uint8)
+
+
+def _saturated(image: Image, gains: Array) -> Mask | None:
+    """(h, w, 3) where others would not be saturated, and it does not tell how bright it was; None: nowhere."""
+    found = (image >= SATURATED) & (gains > 1.0)
+    return found if found.any() else None
 
 
 def log_gains(pointmaps: Sequence[Pointmap], pictures: Sequence[Image]) -> Array:

@@ -20,6 +20,14 @@ from splatnode.recon.scene.gaussians import Gaussians
 
 
 @dataclass(frozen=True, eq=False)
+class Exposure:
+    """How a photograph differs from its image in a scene of one light."""
+
+    gains: tuple[float, ...]  # red, green, blue: of the photograph over the image
+    saturated: npt.NDArray[np.bool_] | None  # (h, w, 3), True: what it shows is at least so bright; None: nowhere
+
+
+@dataclass(frozen=True, eq=False)
 class TrainingView:
     """A keyframe that the Gaussians are fitted to, with its camera as refined so far."""
 
@@ -30,7 +38,7 @@ class TrainingView:
     K: Tensor  # (3, 3) at modelled size
     pointmap: Pointmap | None = None  # with the camera as registered; None: there is none
     mask: npt.NDArray[np.bool_] | None = None  # (h, w), True: the scene is fitted to it; None: to all pixels
-    gains: tuple[float, ...] | None = None  # red, green, blue: of the photograph over `image`; None: it is the same
+    exposure: Exposure | None = None  # that was taken out of the photograph; None: `image` is the photograph
 
     @property
     def width(self) -> int:

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from splatnode.recon.optimize.training_image import training_image
-from splatnode.recon.scene.scene import TrainingView
+from splatnode.recon.scene.scene import Exposure, TrainingView
 
 HEIGHT, WIDTH = 24, 40
 
@@ -35,3 +35,19 @@ def test_a_photograph_that_is_read_only_is_nothing_to_warn_of(recwarn):
     found = training_image(view, np.ones((8, 12), bool), 1.0, 0.0)
     assert float(found.loss(torch.full((8, 12, 3), 0.2))) == pytest.approx(0.0, abs=1e-6)
     assert not recwarn.list
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5])
+def test_a_render_may_be_brighter_where_the_photograph_is_saturated(scale):
+    image = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    saturated = np.zeros((HEIGHT, WIDTH, 3), bool)
+    saturated[:, :20] = True
+    K = torch.tensor([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
+    view = TrainingView("a", 0, image, torch.eye(4), K, exposure=Exposure((2.0, 2.0, 2.0), saturated))
+    compared = training_image(view, np.ones((HEIGHT, WIDTH), bool), scale, 0.0)
+    for level, expected in ((0.9, False), (0.2, True)):
+        render = torch.full((compared.height, compared.width, 3), level, requires_grad=True)
+        compared.loss(render).backward()
+        assert render.grad is not None
+        left, right = (render.grad[:, part] for part in (slice(0, int(20 * scale)), slice(int(20 * scale), None)))
+        assert bool((left != 0).all()) is expected and bool((right != 0).all())
