@@ -12,13 +12,11 @@ from splatnode.recon.deadline import pausing_until
 from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.locating.gathering import gathered
 from splatnode.recon.matching.view_graph import ViewGraph
-from splatnode.recon.priors.confirmed import confirmed_depths
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior, without_hidden
 from splatnode.recon.registration import continuation
 from splatnode.recon.registration.register import Registration, register
 from splatnode.recon.result.bounds import Bounds
-from splatnode.recon.result.depth_file import Depths
 from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.verification.claims import claims, shaped
@@ -44,7 +42,6 @@ class Conclusion:
     evidence_record: dict[str, object] | None  # for reports; None where nothing was verified
     captured_at: Mapping[str, Stamp] = field(default_factory=dict)  # by keyframe, where it is known
     landmarks: Landmarks | None = None  # of a scene that is to be saved
-    depths: Depths = field(default_factory=dict)  # likewise, that two photographs confirm, as Snapshot has them
     masked: Mapping[str, float] = field(default_factory=dict)  # share that a mask hides, by keyframe that has one
 
 
@@ -96,11 +93,8 @@ class Estimate:
 
     @property
     def conclusion_to_save(self) -> Conclusion:
-        """With the landmarks by which further photographs are placed, and the depths that two photographs confirm.
-
-        Gathering them takes up to a second.
-        """
-        return replace(self.conclusion, landmarks=self.landmarks, depths=self.depths)
+        """With the landmarks by which further photographs are placed; gathering them takes up to a second."""
+        return replace(self.conclusion, landmarks=self.landmarks)
 
     @property
     def landmarks(self) -> Landmarks | None:
@@ -108,11 +102,6 @@ class Estimate:
         if not self.publishable or self.registration is None:
             return None
         return gathered(self.graph, self.registration, self.bounds)
-
-    @property
-    def depths(self) -> Depths:
-        """By keyframe the depths that another one confirms; none where no scene is published."""
-        return confirmed_depths(list(self.pointmaps.values())) if self.publishable else {}
 
     @property
     def registered(self) -> set[str]:

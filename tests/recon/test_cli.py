@@ -130,7 +130,7 @@ def test_a_nearly_full_disk_is_told_before_the_work(replayed, monkeypatch, capsy
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(total=10**9, free=1_500_000))
     assert replayed(lambda: pytest.fail("was begun")) == 74
     said = capsys.readouterr().err
-    assert "1.5 MB are free in new/out, and the result may take 8.7 MB. Free some space" in said
+    assert "1.5 MB are free in new/out, and the result may take 9.0 MB. Free some space" in said
     assert command_line.main(["demo", "--out", "new/out"]) == 74
     assert "the result may take" in capsys.readouterr().err
     assert not Path("new").exists()

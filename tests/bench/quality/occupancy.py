@@ -43,6 +43,7 @@ from splatnode.recon.geometry import Similarity, align_cameras
 from splatnode.recon.occupancy.build import NoMap, occupancy_map
 from splatnode.recon.occupancy.occupancy_map import OccupancyMap, State
 from splatnode.recon.pipeline import estimate_frames
+from splatnode.recon.priors.confirmed import confirmed_depths
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.threads import at_most
 from tests.bench.quality.pane import Pane, photograph
@@ -175,9 +176,8 @@ def mapped(place: Place) -> tuple[Snapshot, list[int]]:
         )
         for each in estimate.pointmaps.values()
     )
-    snapshot = Snapshot(
-        0, estimate.verdict, cameras, GaussianArrays.empty(), {}, (), 0, final=True, depths=estimate.depths
-    )
+    depths = confirmed_depths(list(estimate.pointmaps.values()))
+    snapshot = Snapshot(0, estimate.verdict, cameras, GaussianArrays.empty(), {}, (), 0, final=True, depths=depths)
     return snapshot, [int(camera.name[:3]) for camera in cameras]
 
 

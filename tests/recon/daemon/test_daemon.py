@@ -36,6 +36,7 @@ from splatnode.recon.locating.locate import locate
 from splatnode.recon.locating.outcome import Located
 from splatnode.recon.optimize import refinement
 from splatnode.recon.result.bounds_in_words import of_cameras
+from splatnode.recon.result.depth_file import read_depths
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.folder import FolderInUse
 from splatnode.recon.result.landmarks_file import read_landmarks
@@ -162,6 +163,7 @@ def test_keyframes_become_a_scene_that_survives_the_process_and_forgets_what_it_
     assert [camera.name for camera in exported] == [frame.name for frame in frames]
     landmarks = read_landmarks(config.out / "scene-0001")
     assert isinstance(locate(landmarks, frames[1].image), Located)
+    assert set(read_depths(config.out / "scene-0001")) == {frame.name for frame in frames}
 
     with running(config):
         again = peer.wait(lambda scene: scene.session != first.session, "a new session")
@@ -243,7 +245,7 @@ def test_a_nearly_full_disk_is_a_problem_that_the_status_tells_until_there_is_ro
 
     with running(replace(config, max_views=10, max_gaussians=10_000)), caplog.at_level("INFO"):
         assert problem() == ""
-        for folder, what, needed in (("checkpoint", "the checkpoint", "60.6 MB"), ("out", "the result", "6.3 MB")):
+        for folder, what, needed in (("checkpoint", "the checkpoint", "60.6 MB"), ("out", "the result", "7.6 MB")):
             free[folder] = 2_000_000
             said = f"2.0 MB are free in {tmp / folder}, and {what} may take {needed}: make room on the disk"
             wait_for(lambda said=said: problem() == said, PATIENCE_S)
