@@ -25,6 +25,7 @@ from splatnode.capture.process.progress import Step, Tell, telling
 from splatnode.capture.process.terminal import say
 from splatnode.capture.reader import Reader, State
 
+_OF_AN_END = ("folder", "video")  # cameras of which all is looked at; others are left once the lens is known
 _TRY_EVERY = 4  # views: a lens is looked for so often while more come
 _POLL_S = 0.1
 
@@ -98,12 +99,15 @@ def _shown(
                 drawn = coverage.drawn
                 _draw(coverage, tell)
             ready = len(views) >= max(LEAST_VIEWS, tried + _TRY_EVERY) and uncovered(coverage) is None
-            if is_live(camera) and ready:
+            if ready and camera.kind not in _OF_AN_END:
                 tried = len(views)
                 tell(Step("looking for the lens", 0, 0, ""))
                 choice = choose(views, board, coverage.width, coverage.height, models)
-                if choice is not None and not unknown(choice.taken.estimate, coverage, GOOD):
+                wanted = [] if choice is None else unknown(choice.taken.estimate, coverage, GOOD)
+                if choice is not None and not wanted:
                     return choice, coverage
+                for sentence in wanted:
+                    tell(f"{len(views)} views: {sentence}")
             if len(views) >= MOST_VIEWS:
                 break
     return _judged(gathering, models, tell)

@@ -8,7 +8,7 @@ from pathlib import Path
 from splatnode.capture.process.arguments import millimetres, positive, seconds
 from splatnode.capture.process.verb import Verb, lazily
 
-_MODELS = ("auto", "pinhole", "opencv2", "opencv4", "opencv5", "opencv8", "fisheye")
+_MODELS = ("auto", "pinhole", "opencv2", "opencv4", "fisheye", "opencv5", "opencv8")
 
 
 def _arguments(parser: argparse.ArgumentParser) -> None:

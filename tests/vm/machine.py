@@ -47,6 +47,8 @@ MODULES = (
     "vivid",
 )
 VIVID_OPTIONS = "n_devs=1 node_types=0x1 num_inputs=1 input_types=0x0 no_error_inj=0"
+# With a second device: what is written to it is what the first one sees, once its control "Loop Video" is on (S-Video).
+VIVID_LOOP = "n_devs=1 node_types=0x101 num_inputs=1 input_types=0x2 num_outputs=1 output_types=0x0"
 
 INIT = """#!/bin/busybox sh
 export PATH=/bin
@@ -103,11 +105,13 @@ def find_kernel() -> Kernel | str:
     return Kernel(images[-1], modules)
 
 
-def run(kernel: Kernel, script: Path, files: Path, timeout_s: float = 240) -> Outcome:
+def run(
+    kernel: Kernel, script: Path, files: Path, timeout_s: float = 240, vivid_options: str = VIVID_OPTIONS
+) -> Outcome:
     """Boots, runs `script` with this Python, and shuts down. `files` is the guest's writable /mnt."""
     with tempfile.TemporaryDirectory() as folder:
         memory_disk = Path(folder, "initramfs.gz")
-        memory_disk.write_bytes(gzip.compress(initramfs(kernel, script), compresslevel=1))
+        memory_disk.write_bytes(gzip.compress(initramfs(kernel, script, vivid_options), compresslevel=1))
         shares = "multidevs=remap,security_model=none"
         command = [
             *("qemu-system-x86_64", "-accel", "tcg,thread=multi", "-cpu", "max", "-smp", "2"),
@@ -124,12 +128,12 @@ def run(kernel: Kernel, script: Path, files: Path, timeout_s: float = 240) -> Ou
     return Outcome(int((files / "code").read_text()), (files / "output").read_text(errors="replace"), files)
 
 
-def initramfs(kernel: Kernel, script: Path) -> bytes:
+def initramfs(kernel: Kernel, script: Path, vivid_options: str) -> bytes:
     """A cpio archive (newc, see the kernel's early-userspace/buffer-format.rst) with busybox, modules and INIT."""
     found = {path.stem: path for path in kernel.modules.rglob("*.ko")}
     modules = [name for name in MODULES if name in found]
     init = INIT.format(
-        modules=" ".join(modules), vivid=VIVID_OPTIONS, root=ROOT, python=sys.executable, script=script.resolve()
+        modules=" ".join(modules), vivid=vivid_options, root=ROOT, python=sys.executable, script=script.resolve()
     )
     busybox = shutil.which("busybox")
     if busybox is None:
