@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from splatnode.api.node import Node, NodeUpdate, connect
     from splatnode.api.reconstruction import reconstruct
     from splatnode.api.result import Result
-    from splatnode.api.scale import Marker
+    from splatnode.api.scale import Marker, Stereo
     from splatnode.api.session import Session, Update
     from splatnode.api.view import View
     from splatnode.capture.frame import Intrinsics
@@ -29,6 +29,7 @@ __all__ = [
     "NotLocated",
     "Result",
     "Session",
+    "Stereo",
     "Update",
     "Verdict",
     "View",
@@ -47,6 +48,7 @@ _MODULES = {
     "NotLocated": "splatnode.recon.locating.outcome",
     "Result": "splatnode.api.result",
     "Session": "splatnode.api.session",
+    "Stereo": "splatnode.api.scale",
     "Update": "splatnode.api.session",
     "Verdict": "splatnode.recon.result.verdict",
     "View": "splatnode.api.view",

@@ -43,6 +43,7 @@ _CLASSES = (
     "NotLocated",
     "Intrinsics",
     "Marker",
+    "Stereo",
 )
 _WIDE = 110  # characters
 _FURTHER = (Verdict, Bounds, Claim, DroppedFrame, Stamp, Step)  # what these lead to
