@@ -38,6 +38,7 @@ BENCHMARKS = {
         "race",
         "movers",
         "fisheyes",
+        "metres",
     ),
     "speed": ("rasterize", "stereo", "growth"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),
