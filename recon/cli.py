@@ -34,8 +34,9 @@ from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.mapping.command import replay_map
 from splatnode.recon.metric.arguments import metric_changes
-from splatnode.recon.metric.evidence import NOTHING, Evidence
+from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.poses_file import poses_of, read_poses
+from splatnode.recon.metric.stereo_pairs import pairs_of, rights_in
 from splatnode.recon.offline import check_baseline, reconstructed, run, shown_to_nobody, with_looks
 from splatnode.recon.rasterize import device
 from splatnode.recon.rasterize.device import Device
@@ -189,10 +190,10 @@ def bench(args: argparse.Namespace) -> int:
 
 
 def _known_of_metres(args: argparse.Namespace, given: Source) -> Evidence:
-    """What is known of metres beside the photographs. Raises ValueError where no photograph has a pose."""
-    if args.poses is None:
-        return NOTHING
-    return Evidence(poses=poses_of(read_poses(args.poses), given.frames, str(args.poses)))
+    """What is known of metres beside the photographs. Raises ValueError where it is of none of them."""
+    poses = None if args.poses is None else poses_of(read_poses(args.poses), given.frames, str(args.poses))
+    pairs = () if args.stereo is None else pairs_of(given.frames, rights_in(args.stereo, given.frames))
+    return Evidence(poses=poses, pairs=pairs)
 
 
 def _lens(args: argparse.Namespace) -> Intrinsics | None:

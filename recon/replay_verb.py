@@ -10,7 +10,7 @@ from pathlib import Path
 
 from splatnode.capture.process.arguments import add_json, megabytes, names, natural, percent, positive, seconds
 from splatnode.capture.process.verb import Verb, lazily
-from splatnode.recon.metric.arguments import add_baseline, add_marker, add_poses
+from splatnode.recon.metric.arguments import add_baseline, add_marker, add_poses, add_stereo
 from splatnode.recon.shared_arguments import add_device, add_only_seen
 
 
@@ -29,6 +29,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     add_way(parser)
     add_baseline(parser)
     add_poses(parser)
+    add_stereo(parser)
     _add_masks(parser)
     parser.add_argument(
         "--intrinsics",

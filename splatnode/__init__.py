@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from splatnode.api.node import Node, NodeUpdate, connect
     from splatnode.api.reconstruction import reconstruct
     from splatnode.api.result import Result
-    from splatnode.api.scale import Marker
+    from splatnode.api.scale import Marker, Stereo
     from splatnode.api.session import Session, Update
     from splatnode.api.view import View
     from splatnode.capture.frame import Intrinsics
@@ -31,6 +31,7 @@ __all__ = [
     "OccupancyMap",
     "Result",
     "Session",
+    "Stereo",
     "Update",
     "Verdict",
     "View",
@@ -50,6 +51,7 @@ _MODULES = {
     "OccupancyMap": "splatnode.recon.occupancy.occupancy_map",
     "Result": "splatnode.api.result",
     "Session": "splatnode.api.session",
+    "Stereo": "splatnode.api.scale",
     "Update": "splatnode.api.session",
     "Verdict": "splatnode.recon.result.verdict",
     "View": "splatnode.api.view",

@@ -35,7 +35,7 @@ from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.whole import FILE
 
-_OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses")
+_OF_ONE_SCENE = ("views", "frames", "view", "budget_s", "baseline", "marker", "poses", "stereo")
 
 
 def replay_map(args: argparse.Namespace, request: Request, config: Config) -> int:

@@ -48,6 +48,22 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_stereo(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--stereo",
+        type=Path,
+        metavar="FOLDER",
+        help="the photographs of a second camera, to the right of the first, named as their partners; rectified pairs",
+    )
+    parser.add_argument(
+        "--stereo-baseline",
+        type=measured_argument,
+        metavar="LENGTH[@SIGMA]",
+        help="how far apart the two cameras of the pairs are, as 75mm; @0.1mm: you know it to that (standard "
+        "deviation; default: 0.3mm)",
+    )
+
+
 def _two_sigmas(text: str) -> tuple[float, float]:
     try:
         metres, degrees = map(float, text.split(","))
@@ -67,13 +83,19 @@ def metric_changes(args: argparse.Namespace) -> dict[str, Any]:
         first, *further = ([*names, _metres(metres)] for *names, metres in args.baseline)
         changes |= {"baseline": first, "further_baselines": further}
     if args.marker is not None:
-        side_m, sigma_m = measured(args.marker)
-        changes["marker_m"] = side_m
-        if sigma_m is not None:
-            changes["marker_sigma_m"] = sigma_m
+        changes |= _measured("marker", args.marker)
+    if (args.stereo is None) != (args.stereo_baseline is None):
+        raise ValueError("--stereo and --stereo-baseline belong together: the right photographs, and how far apart")
+    if args.stereo_baseline is not None:
+        changes |= _measured("stereo", args.stereo_baseline)
     if args.poses_sigma is not None:
         changes["poses_sigma_m"], changes["poses_sigma_deg"] = args.poses_sigma
     return changes
+
+
+def _measured(what: str, text: str) -> dict[str, float]:
+    length_m, sigma_m = measured(text)
+    return {f"{what}_m": length_m} | ({} if sigma_m is None else {f"{what}_sigma_m": sigma_m})
 
 
 def _metres(text: str) -> float:

@@ -35,6 +35,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     poses_sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = 2.0  # and of each orientation about each axis
     # Standard deviation of how far given poses have drifted at the end of the way, as a share of the way; 0: not at all
     poses_drift: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.02
+    # Metres between the cameras of given stereo pairs; nothing: none are given
+    stereo_m: Annotated[float, msgspec.Meta(gt=0, le=_MAX_METRES)] | None = None
+    # Standard deviation of that distance, metres
+    stereo_sigma_m: Annotated[float, msgspec.Meta(ge=0, le=_MAX_METRES)] = 0.0003
     network: bool = False  # ask Depth Anything V2 Metric Indoor Small, where its weights are
     # Standard deviation of the network's error in a place, all views alike, as a share
     network_sigma: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = 0.15

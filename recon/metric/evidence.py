@@ -12,6 +12,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.process.progress import Step, Tell, told_to_nobody
 from splatnode.recon.metric.config import Config
 from splatnode.recon.metric.marker_detection import Sighting, sightings
+from splatnode.recon.metric.stereo_pairs import Pair
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,11 +22,12 @@ class Evidence:
     sightings: tuple[Sighting, ...] = ()  # of printed markers
     # T_world_camera (4, 4) in metres that others estimated, by photograph; None: no poses were given
     poses: Mapping[str, npt.NDArray[np.float64]] | None = None
+    pairs: tuple[Pair, ...] = ()  # of stereo cameras
 
     def and_also(self, further: Evidence) -> Evidence:
         """With what further photographs tell."""
         poses = self.poses if further.poses is None else {**(self.poses or {}), **further.poses}
-        return Evidence((*self.sightings, *further.sightings), poses)
+        return Evidence((*self.sightings, *further.sightings), poses, (*self.pairs, *further.pairs))
 
 
 NOTHING = Evidence()

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from splatnode.capture.process.lengths import in_words
 from splatnode.recon.metric.marker_detection import Sighting
-from splatnode.recon.metric.measurement import TWO_SIDED_95, Measurement, together
-from splatnode.recon.metric.views import View
+from splatnode.recon.metric.measurement import Measurement, together
+from splatnode.recon.metric.views import View, of_cameras
 
 Array = npt.NDArray[np.float64]
 
@@ -77,7 +77,7 @@ def _by_marker(
     if error_px > _MOST_PX:
         return f"{name} does not lie still, or there are two of it: its corners are off by {error_px:.1f} pixels"
     source = f"{name} in {len(seen)} photographs"
-    return Measurement(side_m / side, math.hypot(sigma, _of_cameras([each.view for each in seen])), source)
+    return Measurement(side_m / side, math.hypot(sigma, of_cameras([each.view for each in seen])), source)
 
 
 def _through(view: View, sighting: Sighting) -> _Seen:
@@ -151,10 +151,3 @@ def _parallax_deg(point: Array, centres: Sequence[Array]) -> float:
         math.degrees(math.acos(float(np.clip(first @ second, -1.0, 1.0))))
         for first, second in combinations(directions, 2)
     )
-
-
-def _of_cameras(views: Sequence[View]) -> float:
-    """Standard deviation of log length that the cameras' bounds allow, by the two that are farthest apart."""
-    first, second = max(combinations(views, 2), key=lambda pair: float(np.linalg.norm(pair[0].centre - pair[1].centre)))
-    apart = float(np.linalg.norm(first.centre - second.centre))
-    return math.hypot(first.bound, second.bound) / TWO_SIDED_95 / max(apart, 1e-12)

@@ -14,6 +14,7 @@ from splatnode.recon.metric.markers import by_markers
 from splatnode.recon.metric.measurement import Measurement, together
 from splatnode.recon.metric.network import MetricDepth, by_network
 from splatnode.recon.metric.poses import Aligned, Sigmas, by_poses
+from splatnode.recon.metric.stereo import by_stereo
 from splatnode.recon.metric.views import views_of
 from splatnode.recon.networks.depth_anything import load_metric
 from splatnode.recon.result.bounds_in_words import rounded_up
@@ -57,6 +58,9 @@ def _said(snapshot: Snapshot, config: Config, evidence: Evidence) -> tuple[list[
         found = by_poses(views_of(snapshot), evidence.poses, sigmas)
         aligned = None if isinstance(found, str) else found
         said += [found] if isinstance(found, str) else [found.unit, *found.told]
+    if config.stereo_m is not None:
+        stereo = config.stereo_m, config.stereo_sigma_m
+        said.append(by_stereo(views_of(snapshot), snapshot.landmarks, evidence.pairs, *stereo))
     if config.network:
         said.append(_by_the_network(snapshot, config.network_sigma))
     return said, aligned

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.metric.measurement import TWO_SIDED_95
 from splatnode.recon.result.snapshot import Snapshot
 
 Array = npt.NDArray[np.float64]
@@ -64,3 +67,12 @@ def views_of(snapshot: Snapshot) -> Mapping[str, View]:
             lens = float(lenses.focals[index]), float(lenses.radials[index]), lenses.shifts[index]
             found[name] = View(landmarks.Ts_world_camera[index], *lens, bounds[name])
     return found
+
+
+def of_cameras(views: Sequence[View]) -> float:
+    """Standard deviation of log length that the cameras' bounds allow, by the two that are farthest apart; 0 of one."""
+    if len(views) < 2:
+        return 0.0
+    first, second = max(combinations(views, 2), key=lambda pair: float(np.linalg.norm(pair[0].centre - pair[1].centre)))
+    apart = float(np.linalg.norm(first.centre - second.centre))
+    return math.hypot(first.bound, second.bound) / TWO_SIDED_95 / max(apart, 1e-12)

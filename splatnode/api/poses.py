@@ -13,7 +13,6 @@ import numpy.typing as npt
 from splatnode.api.photographs import Images, names_of
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.recon.metric.evidence import NOTHING, Evidence
 from splatnode.recon.metric.poses_file import named, poses_of, read_poses
 
 Matrix: TypeAlias = "npt.NDArray[np.floating]"
@@ -29,13 +28,15 @@ def sigmas_of(poses_sigma: tuple[float, float] | None) -> dict[str, float] | Non
     return dict(zip(("poses_sigma_m", "poses_sigma_deg"), map(float, poses_sigma), strict=True))
 
 
-def evidence_of(poses: Poses | None, images: Images, frames: Sequence[Frame | DroppedFrame]) -> Evidence:
-    """What poses of `images` tell of the frames that are used. Raises TypeError, ValueError, FileNotFoundError."""
+def poses_given(
+    poses: Poses | None, images: Images, frames: Sequence[Frame | DroppedFrame]
+) -> dict[str, npt.NDArray[np.float64]] | None:
+    """The poses of the frames that have one, by their names. Raises TypeError, ValueError, FileNotFoundError."""
     if poses is None:
-        return NOTHING
+        return None
     if isinstance(poses, (str, PathLike)):
-        return Evidence(poses=poses_of(read_poses(Path(poses)), frames, fspath(poses)))
-    return Evidence(poses=poses_of(named(_rows(poses, images)), frames, "poses"))
+        return poses_of(read_poses(Path(poses)), frames, fspath(poses))
+    return poses_of(named(_rows(poses, images)), frames, "poses")
 
 
 def _rows(

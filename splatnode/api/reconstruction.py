@@ -9,13 +9,14 @@ from typing import Any
 
 from splatnode.api.masks import Masks, finder
 from splatnode.api.photographs import Images, Lens, lenses, photographs, with_lens
-from splatnode.api.poses import Poses, evidence_of, sigmas_of
+from splatnode.api.poses import Poses, poses_given, sigmas_of
 from splatnode.api.result import Result, result_of
-from splatnode.api.scale import Scale, metric_changes
+from splatnode.api.scale import Scale, metric_changes, pairs_given
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.progress import Tell, told_to_nobody
 from splatnode.recon.config import Config, overlaid
 from splatnode.recon.config import preset as named
+from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.offline import check_baseline, reconstructed
 from splatnode.recon.replay_source import with_masks
 
@@ -56,8 +57,8 @@ def reconstruct(
       with the photographs' names, one file for all, or a list, for each photograph an array (H, W), a path, or None
       for one that is used whole. None: all is used.
     - `scale`: two photographs and the metres between their cameras: `("a.jpg", "b.jpg", 0.5)`, of pictures their
-      places in the list: `(0, 3, 0.5)`; or a printed marker, `splatnode.Marker(0.1)`; or a list of these, which check
-      one another. None: lengths have no unit.
+      places in the list: `(0, 3, 0.5)`; or a printed marker, `splatnode.Marker(0.1)`; or `splatnode.Stereo`; or a
+      list of these, which check one another. None: lengths have no unit.
     - `budget_s`: the best scene within so many seconds. None: as long as it takes.
     - `preset`: `preview`, `fast`, `balanced` or `quality`.
     - `config`: what differs from the preset, as `docs/configuration.md` lists it: a mapping, or a YAML file.
@@ -79,9 +80,9 @@ def reconstruct(
     flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma)}
     chosen = configured(preset, config, flags, scale, of_pictures=source.photographs is None)
     check_baseline(chosen, [frame.name for frame in source.frames])
-    known, given = lenses(source.frames), evidence_of(poses, images, source.frames)
+    given = Evidence((), poses_given(poses, images, source.frames), pairs_given(scale, images, source.frames))
     made = reconstructed(source, chosen, preset, only_seen, threads, given, tell=telling)
-    return result_of(made.snapshot, made, known)
+    return result_of(made.snapshot, made, lenses(source.frames))
 
 
 def configured(

@@ -1,14 +1,17 @@
-"""What a program knows of a scene's size: measured distances, printed markers."""
+"""What a program knows of a scene's size: measured distances, printed markers, stereo pairs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, TypeAlias
 
+from splatnode.api.photographs import Images, as_list, frame, names_of
 from splatnode.capture.cameras.folder import frame_name
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.recon.metric.stereo_pairs import Pair, pairs_of, rights_in
 
 Baseline: TypeAlias = tuple[str | int, str | int, float]  # two photographs and the metres between their cameras
 
@@ -22,7 +25,18 @@ class Marker:
     dictionary: str = "4X4_50"  # of OpenCV's ArUco dictionaries, or APRILTAG_36h11
 
 
-Known: TypeAlias = Baseline | Marker
+@dataclass(frozen=True, eq=False)
+class Stereo:
+    """A second camera to the right of the first: what both saw at once are rectified pairs."""
+
+    right: (
+        str | PathLike[str] | Sequence[Any]
+    )  # its photographs: a folder, where both of a pair have one name, or a list
+    baseline_m: float  # between the two cameras, metres
+    sigma_m: float = 0.0003  # standard deviation of that distance, metres
+
+
+Known: TypeAlias = Baseline | Marker | Stereo
 Scale: TypeAlias = Known | Sequence[Known]
 
 
@@ -36,6 +50,8 @@ def metric_changes(scale: Scale, of_pictures: bool) -> dict[str, Any]:
     for each in _known(scale):
         if isinstance(each, Marker):
             changes |= _of_marker(each)
+        elif isinstance(each, Stereo):
+            changes |= {"stereo_m": each.baseline_m, "stereo_sigma_m": each.sigma_m}
         else:
             baselines.append(_baseline(each, of_pictures))
     if baselines:
@@ -43,9 +59,29 @@ def metric_changes(scale: Scale, of_pictures: bool) -> dict[str, Any]:
     return changes
 
 
+def is_stereo(scale: Scale | None) -> bool:
+    """Whether stereo pairs are among what is known."""
+    return any(isinstance(each, Stereo) for each in _known(scale))
+
+
+def pairs_given(scale: Scale | None, images: Images, frames: Sequence[Frame | DroppedFrame]) -> tuple[Pair, ...]:
+    """The stereo pairs of the frames, in which `images` resulted. Raises TypeError, ValueError, FileNotFoundError."""
+    stereos = [each for each in _known(scale) if isinstance(each, Stereo)]
+    return tuple(pair for each in stereos for pair in pairs_of(frames, _rights(each.right, images, frames)))
+
+
+def _rights(right: object, images: Images, frames: Sequence[Frame | DroppedFrame]) -> Iterable[Frame | DroppedFrame]:
+    if isinstance(right, (str, PathLike)):
+        return rights_in(Path(right), frames)
+    names, pictures = names_of(images), as_list(right)
+    if len(names) != len(pictures):
+        raise ValueError(f"right must have one picture for each of the {len(names)} photographs, got {len(pictures)}")
+    return [frame(each, number, name, number) for number, (name, each) in enumerate(zip(names, pictures, strict=True))]
+
+
 def _known(scale: object) -> Sequence[object]:
-    """What is known, one by one: a sequence of distances and markers is several."""
-    if isinstance(scale, (list, tuple)) and all(isinstance(each, (list, tuple, Marker)) for each in scale):
+    """What is known, one by one: a sequence of distances, markers and pairs is several."""
+    if isinstance(scale, (list, tuple)) and all(isinstance(each, (list, tuple, Marker, Stereo)) for each in scale):
         return scale
     return (scale,)
 
@@ -63,7 +99,7 @@ def _baseline(scale: object, of_pictures: bool) -> list[Any]:
     if not isinstance(scale, (tuple, list)) or len(scale) != 3 or not isinstance(scale[2], (int, float)):
         raise TypeError(
             "scale must be two photographs and the metres between them, ('a.jpg', 'b.jpg', 0.5), or a Marker, or a "
-            f"list of these; got {scale!r}"
+            f"Stereo, or a list of these; got {scale!r}"
         )
     first, second, metres = scale
     return [_name(first, of_pictures), _name(second, of_pictures), float(metres)]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from splatnode.api.photographs import Lens, Picture, frame, intrinsics_of, lenses, seen_through
 from splatnode.api.reconstruction import Changes, check_count, configured
 from splatnode.api.result import Result, result_of
-from splatnode.api.scale import Scale
+from splatnode.api.scale import Scale, is_stereo
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.progress import Tell, told_to_nobody
 from splatnode.capture.quality import Limits
@@ -62,6 +62,8 @@ class Session:
         Photographs without a name are called 0000.png, 0001.png, ... in the order in which they are given.
         """
         check_count("threads", threads)
+        if is_stereo(scale):
+            raise TypeError("stereo pairs go with reconstruct(); of a session, give a distance or a Marker")
         self._config = configured(preset, config, {"seed": seed}, scale, of_pictures=True)
         self._preset, self._lens, self._threads, self._tell = preset, intrinsics, threads, tell or told_to_nobody
         self._selector = Selector(Selection(every_frame=every_frame, per_second=_EACH), Limits())

@@ -5,7 +5,7 @@ import pytest
 
 import splatnode
 from splatnode.api.photographs import frame as frame_of
-from splatnode.api.poses import evidence_of, sigmas_of
+from splatnode.api.poses import poses_given, sigmas_of
 from splatnode.capture.cameras import synthetic
 from tests.api.conftest import QUICK, SMALL
 from tests.support.synthetic import photographs
@@ -32,13 +32,13 @@ def test_poses_may_be_in_the_order_of_a_list(arrays):
     with pytest.raises(TypeError, match="metres and degrees"):
         sigmas_of((0.1,))  # type: ignore[arg-type]
     renamed = [frame_of(frame.image, i, f"{i:04d}.png", i) for i, frame in enumerate(frames)]
-    found = evidence_of([None, *TRUE[1:]], arrays, renamed).poses
+    found = poses_given([None, *TRUE[1:]], arrays, renamed)
     assert found is not None and list(found) == [f"{index:04d}.png" for index in range(1, len(TRUE))]
     for wrong, told in ((TRUE[:2], "one for each of the"), ([np.eye(3)] * len(TRUE), r"\(4, 4\) or None")):
         with pytest.raises((TypeError, ValueError), match=told):
-            evidence_of(wrong, arrays, renamed)
+            poses_given(wrong, arrays, renamed)
 
 
 def test_a_list_of_poses_does_not_go_with_a_folder(folder):
     with pytest.raises(TypeError, match="one for each; of a folder or a video, give names"):
-        evidence_of(TRUE, folder, photographs(SMALL))
+        poses_given(TRUE, folder, photographs(SMALL))

@@ -3,7 +3,8 @@ from __future__ import annotations
 import pytest
 
 import splatnode
-from splatnode.api.scale import metric_changes
+from splatnode.api.photographs import photographs
+from splatnode.api.scale import is_stereo, metric_changes, pairs_given
 from splatnode.recon.config import Config, overlaid
 
 
@@ -23,3 +24,18 @@ def test_what_is_known_of_the_size_becomes_the_configuration():
 def test_what_is_no_scale_is_refused(wrong):
     with pytest.raises(TypeError, match="scale must"):
         metric_changes(wrong, of_pictures=False)
+
+
+def test_pairs_are_a_folder_or_one_picture_for_each(folder, arrays):
+    stereo = splatnode.Stereo(folder, 0.075)
+    assert metric_changes([stereo, ("a", "b", 1)], False)["stereo_m"] == 0.075 and is_stereo(stereo)
+    taken = photographs(folder, None, False, lambda _: None).frames
+    assert len(pairs_given(stereo, folder, taken)) == len(taken)  # each is its own partner
+    listed = photographs(arrays, None, False, lambda _: None).frames
+    pairs = pairs_given([splatnode.Stereo(arrays, 0.1)], arrays, listed)
+    assert [pair.photograph for pair in pairs] == [frame.name for frame in listed]
+    assert pairs_given(splatnode.Marker(0.1), arrays, listed) == ()
+    with pytest.raises(ValueError, match="right must have one picture for each"):
+        pairs_given(splatnode.Stereo(arrays[:2], 0.1), arrays, listed)
+    with pytest.raises(TypeError, match="stereo pairs go with reconstruct"):
+        splatnode.Session(scale=stereo)

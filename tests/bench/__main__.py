@@ -41,6 +41,7 @@ BENCHMARKS = {
         "fisheyes",
         "calibrate",
         "occupancy",
+        "metres",
     ),
     "speed": ("rasterize", "stereo", "growth"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),

@@ -45,6 +45,7 @@ _CLASSES = (
     "OccupancyMap",
     "Intrinsics",
     "Marker",
+    "Stereo",
 )
 _WIDE = 110  # characters
 _FURTHER = (Verdict, Bounds, Claim, Upright, DroppedFrame, Stamp, Step)  # what these lead to

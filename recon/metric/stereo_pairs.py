@@ -1,0 +1,70 @@
+"""Stereo pairs: photographs of a second camera, to the right of the first, of which both pictures are rectified."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.cameras import folder
+from splatnode.capture.frame import DroppedFrame, Frame, reduced
+from splatnode.capture.process.printable import printable
+from splatnode.recon.frames.undistort import undistorted
+
+Grey = npt.NDArray[np.uint8]  # (H, W)
+
+_LONGEST_SIDE = 1280  # pixels that are compared at least, where a photograph has them
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """What both cameras saw at once, without the distortion that was given, of one size."""
+
+    photograph: str
+    left: Grey
+    right: Grey
+
+
+def pairs_of(frames: Sequence[Frame | DroppedFrame], rights: Iterable[Frame | DroppedFrame]) -> tuple[Pair, ...]:
+    """The pairs of frames and right photographs of the same name, whatever their suffixes.
+
+    Raises ValueError where none has a partner, or a partner is of another size.
+    """
+    lefts = {_stem(each.name): each for each in frames if isinstance(each, Frame)}
+    found = [_pair(lefts[_stem(right.name)], right) for right in rights if _is_of(right, lefts)]
+    if not found:
+        first = printable(next(iter(lefts), "none"), 100)
+        raise ValueError(f"no right photograph has the name of a left one, such as {first}; name both of a pair alike")
+    return tuple(found)
+
+
+def rights_in(path: Path, frames: Sequence[Frame | DroppedFrame]) -> Iterator[Frame | DroppedFrame]:
+    """The photographs in the folder that are partners of the frames. Raises FileNotFoundError, ValueError."""
+    wanted = {_stem(each.name) for each in frames}
+    names = tuple(name for name in folder.names_in(path) if _stem(name) in wanted)
+    return folder.stream(folder.Config(folder=path, names=names)) if names else iter(())
+
+
+def _stem(name: str) -> str:
+    return name.rpartition(".")[0] or name
+
+
+def _is_of(right: Frame | DroppedFrame, lefts: dict[str, Frame]) -> bool:
+    return isinstance(right, Frame) and _stem(right.name) in lefts
+
+
+def _pair(left: Frame, right: Frame | DroppedFrame) -> Pair:
+    """A right camera has the lens of the left one: that is what rectifying means."""
+    if not isinstance(right, Frame) or (right.width, right.height) != (left.width, left.height):
+        size = f"{right.width} x {right.height}" if isinstance(right, Frame) else "no size"
+        raise ValueError(
+            f"both photographs of a pair must have one size: {left.name} has {left.width} x {left.height} pixels, "
+            f"its partner {size}"
+        )
+    both = undistorted(left), undistorted(replace(right, intrinsics=left.intrinsics))
+    seen = [cv2.cvtColor(reduced(each.image, _LONGEST_SIDE), cv2.COLOR_RGB2GRAY) for each in both]
+    return Pair(left.name, np.asarray(seen[0], np.uint8), np.asarray(seen[1], np.uint8))

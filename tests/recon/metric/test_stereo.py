@@ -1,0 +1,125 @@
+"""Stereo pairs of known baseline give metres, once their rows agree."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from splatnode.capture.cameras import synthetic
+from splatnode.capture.frame import Frame
+from splatnode.capture.image_file import encode_png
+from splatnode.recon.metric.config import Config
+from splatnode.recon.metric.evidence import Evidence
+from splatnode.recon.metric.measurement import Measurement
+from splatnode.recon.metric.metres import in_metres
+from splatnode.recon.metric.stereo import by_stereo
+from splatnode.recon.metric.stereo_pairs import Pair, pairs_of, rights_in
+from splatnode.recon.metric.views import View
+from splatnode.recon.result.landmarks import KnownLenses, Landmarks
+from splatnode.recon.result.snapshot import CameraEstimate
+from tests.recon.result.test_preview import snapshot as ball_snapshot
+from tests.support import synthetic as support
+from tests.support.stereo import right_photographs
+
+PLACE = synthetic.Config(views=2, width=320, height=240)
+UNIT, BASELINE_M = 1.7, 0.15
+
+
+@lru_cache(maxsize=1)
+def rights() -> tuple[Frame, ...]:
+    return tuple(right_photographs(PLACE, BASELINE_M))
+
+
+@lru_cache(maxsize=1)
+def pairs() -> tuple[Pair, ...]:
+    return pairs_of(support.photographs(PLACE), rights())
+
+
+@lru_cache(maxsize=1)
+def landmarks() -> Landmarks:
+    """True points of the place on a grid of pixels of each photograph, in a world whose unit is UNIT metres."""
+    points, of = [], []
+    for index, (T, K) in enumerate(synthetic.scene_cameras(PLACE)):
+        depth = synthetic.depth(PLACE, index)
+        rows, columns = (each.ravel() for each in np.mgrid[20:220:7, 20:300:7])
+        rays = np.linalg.solve(K, np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))])).T
+        z = depth[rows, columns]
+        points.append(((z[:, None] * rays)[np.isfinite(z)] @ T[:3, :3].T + T[:3, 3]) / UNIT)
+        of.append(np.full(len(points[-1]), index))
+    count = sum(map(len, points))
+    views = known().values()
+    focals, shapes = np.array([view.focal for view in views]), np.full(2, PLACE.height / PLACE.width)
+    return Landmarks(
+        points=np.concatenate(points),
+        covariances=np.zeros((count, 3, 3)),
+        descriptors=np.zeros((count, 128), np.uint8),
+        point_of=np.arange(count),
+        photograph_of=np.concatenate(of),
+        names=tuple(known()),
+        Ts_world_camera=np.stack([view.T_world_camera for view in views]),
+        lenses=KnownLenses(focals, np.zeros(2), np.zeros((2, 2)), shapes),
+        rotation_bounds=np.zeros(2),
+        centre_bounds=np.zeros(2),
+        noise_px=0.3,
+    )
+
+
+def known() -> dict[str, View]:
+    found = {}
+    for index, (T, K) in enumerate(synthetic.scene_cameras(PLACE)):
+        smaller = T.copy()
+        smaller[:3, 3] /= UNIT
+        found[synthetic.frame_name(index)] = View(smaller, K[0, 0] / PLACE.width, 0.0, np.zeros(2), 0.0)
+    return found
+
+
+@pytest.mark.parametrize("stated", [1.0, 1.02, 1.05, 0.95])
+def test_the_scale_is_what_the_baseline_says_within_half_a_percent(stated):
+    told = by_stereo(known(), landmarks(), pairs(), stated * BASELINE_M, 0.0)
+    assert isinstance(told, Measurement) and told.source == "2 stereo pairs with " + told.source.split(" with ")[1]
+    assert told.metres_per_unit == pytest.approx(stated * UNIT, rel=0.005)
+    assert abs(np.log(told.metres_per_unit / (stated * UNIT))) < 1.96 * told.sigma < 0.02
+
+
+def test_a_scene_gets_metres_from_its_pairs():
+    cameras = tuple(
+        CameraEstimate(name, index, view.T_world_camera, np.diag([1.0, 1.0, 1.0]), 320, 240)
+        for index, (name, view) in enumerate(known().items())
+    )
+    snapshot = replace(ball_snapshot(1), cameras=cameras, landmarks=landmarks())
+    metric = in_metres(snapshot, Config(stereo_m=BASELINE_M), Evidence(pairs=pairs()))
+    assert metric.scale.metric and "2 stereo pairs with 150 mm between the cameras" in (metric.scale.source or "")
+
+
+def shifted(down: int = 0, across: int = 0, swap: bool = False) -> list[Pair]:
+    found = [replace(each, right=np.roll(each.right, (down, across), (0, 1))) for each in pairs()]
+    return [replace(each, left=each.right, right=each.left) for each in found] if swap else found
+
+
+def test_pairs_that_are_not_rectified_give_nothing():
+    def asked(given: list[Pair]) -> str:
+        told = by_stereo(known(), landmarks(), given, BASELINE_M, 0.0)
+        assert isinstance(told, str)
+        return told
+
+    assert "not rectified: what both see is" in asked(shifted(down=2))
+    assert "the principal points of both must be the same" in asked(shifted(across=-4))
+    assert "left and right exchanged" in asked(shifted(swap=True))
+    assert "share 0 points" in asked([replace(each, right=np.zeros_like(each.right)) for each in pairs()])
+    assert "no points to compare" in str(by_stereo(known(), None, pairs(), BASELINE_M, 0.0))
+
+
+def test_partners_have_one_name(tmp_path: Path):
+    frames = support.photographs(PLACE)
+    (tmp_path / "view_001.png").write_bytes(encode_png(rights()[1].image))
+    (tmp_path / "other.png").write_bytes(encode_png(rights()[0].image))
+    (found,) = pairs_of(frames, rights_in(tmp_path, frames))
+    assert found.photograph == "view_001.png"
+    with pytest.raises(ValueError, match=r"no right photograph has the name of a left one, such as view_000"):
+        pairs_of(frames, [replace(rights()[0], name="x.png")])
+    with pytest.raises(ValueError, match="must have one size"):
+        pairs_of(frames, [replace(rights()[0], image=rights()[0].image[:100])])
