@@ -100,9 +100,11 @@ def _on_ray(args: argparse.Namespace, work: Work) -> Iterator[Run]:
 
     results = args.results or str(args.out.resolve())
     job = Job(work, results, Limits(args.max_memory, args.timeout_s), own_version())
-    with ray.joined(args.ray, None if args.ray else len(_cores(args.cores))):
-        remove_leftovers(args.out)
-        yield lambda todo: ray.run_all(todo, job, args.cores)
+    try:
+        with ray.joined(args.ray, None if args.ray else len(_cores(args.cores))):
+            remove_leftovers(args.out)
+            yield lambda todo: ray.run_all(todo, job, args.cores)
+    finally:
         remove_leftovers(args.out)
 
 
