@@ -25,6 +25,7 @@ EXTRAS = {
     "pi_heif": "heic",
     "pyarrow": "batch",
     "pycolmap": "bench",
+    "ray": "ray",
     "rerun": "rerun",
     "safetensors": "learned",
 }

@@ -68,14 +68,14 @@ class _Report(msgspec.Struct, frozen=True):
 def outcome(recording: Recording, folder: Path, end: End) -> Outcome:
     """The row of a recording whose process has ended and has left its result in `folder`, or none."""
     if end.exit_code not in _WITH_ANSWER:
-        return _without_answer(recording, end, end.reason or f"ended with exit code {end.exit_code} and said nothing")
+        return without_answer(recording, end, end.reason or f"ended with exit code {end.exit_code} and said nothing")
     try:
         report = msgspec.json.decode(read_json_file(folder / REPORT), type=_Report)
     except (OSError, ValueError) as error:  # a decoder's errors are ValueErrors
-        return _without_answer(recording, end, f"ended with exit code {end.exit_code}, but {REPORT}: {error}")
+        return without_answer(recording, end, f"ended with exit code {end.exit_code}, but {REPORT}: {error}")
     claim = report.bounds
     return Outcome(
-        **msgspec.structs.asdict(_without_answer(recording, end, ""))
+        **msgspec.structs.asdict(without_answer(recording, end, ""))
         | {
             "verdict": printable(report.verdict.code, 100),
             "message": printable(report.verdict.message),
@@ -92,7 +92,8 @@ def outcome(recording: Recording, folder: Path, end: End) -> Outcome:
     )
 
 
-def _without_answer(recording: Recording, end: End, reason: str) -> Outcome:
+def without_answer(recording: Recording, end: End, reason: str) -> Outcome:
+    """The row of a recording that failed, or the beginning of another."""
     return Outcome(
         name=recording.name,
         source=recording.source,

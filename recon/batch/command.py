@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from splatnode.capture.process.folders import LOCK
@@ -19,13 +21,18 @@ from splatnode.capture.process.terminal import in_place, say, taken_away
 from splatnode.recon.batch.answer import FAILED, Outcome
 from splatnode.recon.batch.child import Limits
 from splatnode.recon.batch.engine import Plan, Work, run_all
+from splatnode.recon.batch.keeping import remove_leftovers
 from splatnode.recon.batch.ledger import LEDGER, Ledger
 from splatnode.recon.batch.page import PAGE, write_page
+from splatnode.recon.batch.remote import Job
 from splatnode.recon.batch.sources import Recording, recordings
 from splatnode.recon.batch.tables import CSV, PARQUET, write_csv, write_parquet
 from splatnode.recon.batch.verb import replay_options
+from splatnode.recon.batch.version import own_version
 from splatnode.recon.batch.write_back import write_back
 from splatnode.recon.result.folder import result_folder
+
+Run = Callable[[Sequence[Recording]], Iterator[Outcome]]  # the outcomes as they come
 
 EXIT_GOOD, EXIT_SOME_FAILED = 0, 65
 _OWN_NAMES = frozenset((LEDGER, CSV, PARQUET, PAGE))
@@ -36,32 +43,36 @@ def batch(args: argparse.Namespace) -> int:
     with waiting("looking for recordings"):
         found = recordings(args.sources, args.out, _OWN_NAMES)
     options = replay_options(args)
-
-    def replay(recording: Recording, folder: Path) -> Sequence[str]:
-        return [sys.executable, "-m", "splatnode", "replay", recording.source, "--out", str(folder), *options]
-
     if args.in_place and not args.write_back:
         raise ValueError("--in-place says how --write-back writes; give both")
-    return run_batch(args, found, replay, ["splatnode", "replay", *options])
+    if args.results and args.ray is None:
+        raise ValueError("--results says where the workers of a cluster write; give --ray, too")
+    if args.results and args.write_back:
+        raise ValueError("--write-back reads the results in --out; leave --results out")
+    return run_batch(args, found, partial(replay, tuple(options)), ["splatnode", "replay", *options])
+
+
+def replay(options: Sequence[str], recording: Recording, folder: Path) -> Sequence[str]:
+    """The command that reconstructs a recording, on whatever machine this is called."""
+    return [sys.executable, "-m", "splatnode", "replay", recording.source, "--out", str(folder), *options]
 
 
 def run_batch(args: argparse.Namespace, found: list[Recording], work: Work, told_command: list[str]) -> int:
     """Runs `work` for the recordings that have not come to an end, then writes the tables of all.
 
-    `args` has out, resume, retry, cores, max_memory, timeout_s, write_back, in_place and json; `told_command` is what
-    the ledger says of it.
+    `args` has out, resume, retry, cores, max_memory, timeout_s, write_back, in_place, ray, results and json;
+    `told_command` is what the ledger says of it.
     Raises ValueError, OtherBatch, OSError.
     """
-    cores = _cores(args.cores)
+    running = _here(args, work) if args.ray is None else _on_ray(args, work)
     with result_folder(args.out):
         _check_new(args.out, args.resume or args.retry)
-        with Ledger(args.out, told_command) as ledger, telling(quiet=args.json) as tell:
+        with Ledger(args.out, told_command) as ledger, running as run, telling(quiet=args.json) as tell:
             run_again = {None, FAILED} if args.retry else {None}
             todo = [recording for recording in found if ledger.verdict(recording) in run_again]
             if len(todo) < len(found):
                 tell(f"{len(found) - len(todo)} of {len(found)} recordings came to an end before")
-            plan = Plan(args.out, cores, Limits(args.max_memory, args.timeout_s))
-            for told in _run(todo, work, plan, ledger, tell):
+            for told in _run(todo, run, ledger, tell):
                 if not args.json:
                     taken_away()
                     say(told)
@@ -76,12 +87,33 @@ def run_batch(args: argparse.Namespace, found: list[Recording], work: Work, told
     return EXIT_SOME_FAILED if counts.get(FAILED) or not all_written else EXIT_GOOD
 
 
-def _run(todo: Sequence[Recording], work: Work, plan: Plan, ledger: Ledger, tell: Tell) -> Iterator[str]:
+@contextlib.contextmanager
+def _here(args: argparse.Namespace, work: Work) -> Iterator[Run]:
+    plan = Plan(args.out, _cores(args.cores), Limits(args.max_memory, args.timeout_s))
+    yield lambda todo: run_all(todo, work, plan)
+
+
+@contextlib.contextmanager
+def _on_ray(args: argparse.Namespace, work: Work) -> Iterator[Run]:
+    """Raises NoCluster; ModuleNotFoundError without ray."""
+    from splatnode.recon.batch import ray  # takes a second, and is an extra
+
+    results = args.results or str(args.out.resolve())
+    job = Job(work, results, Limits(args.max_memory, args.timeout_s), own_version())
+    try:
+        with ray.joined(args.ray, None if args.ray else len(_cores(args.cores))):
+            remove_leftovers(args.out)
+            yield lambda todo: ray.run_all(todo, job, args.cores)
+    finally:
+        remove_leftovers(args.out)
+
+
+def _run(todo: Sequence[Recording], run: Run, ledger: Ledger, tell: Tell) -> Iterator[str]:
     """A line for each recording that has come to its end and has been written down."""
     doing, began_s = "reconstructing", time.monotonic()
     if todo:
         tell(Step(doing, 0, len(todo), "recording"))
-    for done, found in enumerate(run_all(todo, work, plan), start=1):
+    for done, found in enumerate(run(todo), start=1):
         ledger.append(found)
         step = Step(doing, done, len(todo), "recording")
         left = "" if in_place() else f"{done} of {len(todo)} ({times(step, time.monotonic() - began_s)}): "

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import msgspec
 
+from splatnode.capture.process.durable import sync_folder
 from splatnode.capture.process.printable import escaped
 from splatnode.recon.batch.answer import Outcome
 
@@ -41,10 +42,13 @@ def shown(row: Outcome) -> Outcome:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file that takes the place of `path` at the end; what is left of one that was not finished is removed."""
+    """A file that takes the place of `path` at the end, and is on the disk then; else it is removed."""
     temporary = path.with_name(f".{path.name}.partial")
     try:
         yield temporary
+        with temporary.open("rb") as file:
+            os.fsync(file.fileno())
         os.replace(temporary, path)
+        sync_folder(path.parent)
     finally:
         temporary.unlink(missing_ok=True)

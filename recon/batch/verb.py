@@ -48,6 +48,19 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--timeout-s", type=seconds, metavar="S", help="end a recording that takes longer")
     parser.add_argument(
+        "--ray",
+        nargs="?",
+        const="",
+        metavar="ADDRESS",
+        help="on the Ray cluster at this address, such as 10.0.0.1:6379 or auto; without one, on a Ray of this machine",
+    )
+    parser.add_argument(
+        "--results",
+        metavar="WHERE",
+        help="where the workers of a cluster write: a folder that they share, or an object store (s3://bucket/run); "
+        "the tables stay in --out (default: --out)",
+    )
+    parser.add_argument(
         "--write-back",
         action="store_true",
         help="at the end, write the cameras beside the LeRobot data sets and MCAP files that they are of",

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import chdtr
 
 from splatnode.recon import poselib
 from splatnode.recon.frames.keyframe import PLAIN, Keyframe
@@ -135,7 +135,7 @@ def motion(before: Position, now: Position, config: Config) -> Motion:
     (u, v, depth), (u_now, v_now, _) = (_project(each.T_world_camera, now.K, now.points).T for each in (before, now))
     longer_side = 2 * max(now.K[0, 2], now.K[1, 2])
     shift = float(np.median(np.hypot(u - u_now, v - v_now))) * config.longer_side / longer_side
-    certainty = float(chi2.cdf(mahalanobis2, df=6))
+    certainty = float(chdtr(6, mahalanobis2))  # as scipy.stats has it, which takes half a second to load
     return Motion(
         moved=certainty >= config.certainty and shift >= config.shift_px,
         rotation_deg=float(np.degrees(np.linalg.norm(rotation))),

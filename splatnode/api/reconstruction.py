@@ -45,9 +45,10 @@ def reconstruct(
 
     A refusal is a result, too: ask `verdict.publishable`. Several threads may call this at once.
 
-    - `images`: a folder, a video, a list of photographs of one folder (paths), or a list of pictures: NumPy arrays
-      (H, W, 3) uint8 RGB, or PIL images. Grey is taken as RGB, 16 bits as the upper 8, alpha is dropped. Of a video,
-      and of more than 30 photographs, keyframes are chosen.
+    - `images`: a folder, a film (a video, an image topic `"drive.mcap#/front/image"`, an episode of a LeRobot data set
+      `"pusht#3/CAMERA"`), a list of photographs of one folder (paths), or a list of pictures: NumPy arrays (H, W, 3)
+      uint8 RGB, or PIL images. Grey is taken as RGB, 16 bits as the upper 8, alpha is dropped. Of a film, and of more
+      than 30 photographs, keyframes are chosen.
     - `intrinsics`: the lens of all photographs of its aspect ratio: `Intrinsics`, or K (3, 3) in pixels of the
       photographs without distortion. None: what EXIF tells, else it is estimated.
     - `poses`: T_world_camera (4, 4) in metres that others estimated: by the photographs' names, in the order of a list

@@ -9,6 +9,7 @@ import sys
 BENCHMARKS = {
     "node": (
         "batch_simulation",
+        "batch_ray",
         "queue",
         "live",
         "stream",

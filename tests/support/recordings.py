@@ -38,5 +38,5 @@ REFUSED = 'mkdir "$OUT" && printf %s "$REFUSAL" > "$OUT/report.json"; exit 65'
 def options(out: Path, **changed: object) -> argparse.Namespace:
     """What `run_batch` takes of the command line."""
     plain = {"resume": False, "retry": False, "cores": 1, "max_memory": None, "timeout_s": None, "json": False}
-    plain |= {"write_back": False, "in_place": False}
+    plain |= {"write_back": False, "in_place": False, "ray": None, "results": None}
     return argparse.Namespace(**{"out": out, **plain, **changed})

@@ -728,6 +728,29 @@ def test_fisheyes():
         says(f"| {across:.0f} degrees | {views} | {row['verdict']} | {errors} | {psnr} |")
 
 
+def test_a_cluster_that_loses_a_worker_and_a_node():
+    row = raw("batch_ray")
+    simulated, real = row["simulated"], row["real"]
+    for each in (simulated, real):
+        assert each["ledger_lines"] == each["recordings"] and each["hidden_files_left"] == each["other_folders"] == 0
+    assert simulated["rows"] == simulated["as_expected"] == simulated["recordings"]
+    lost = simulated["worker_killed_at_row"], simulated["node_removed_at_row"]
+    whole, count = simulated["results_whole"], simulated["recordings"]
+    says(
+        f"a batch of {count} simulated recordings on two node processes of Ray on one machine; a worker killed with -9 "
+        f"at row {lost[0]}, a node removed at row {lost[1]}",
+        f"{count} of {count} have their one answer, {simulated['repeated']} were repeated, {whole} of {whole} results "
+        "whole",
+        f"a worker killed at row {real['worker_killed_at_row']}, a node removed at row {real['node_removed_at_row']}",
+        f"{real['the_same_to_the_bit_as_replay_alone']} of {real['recordings']} results the same to the bit",
+    )
+    says(
+        f"{count} simulated recordings, of which a worker was killed with -9 and a node removed",
+        f"{simulated['repeated']} were run twice",
+        on="docs/cluster.md",
+    )
+
+
 def test_a_simulated_batch():
     row = raw("batch_simulation")
     last, count = row["last_life"], f"{row['recordings']:,}".replace(",", " ")

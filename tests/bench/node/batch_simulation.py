@@ -58,7 +58,7 @@ def simulate(folder: Path, count: int, kills: int) -> dict[str, Any]:
     last = _live(folder, count, until=None)
     began = Counter(tally.read_text().split())
     expected = {each.name: end_of(each)[0] for each in recordings(folder, count)}
-    verdicts = _verdicts(out)
+    found = verdicts(out)
     return {
         "processors": len(os.sched_getaffinity(0)),
         "recordings": count,
@@ -66,9 +66,9 @@ def simulate(folder: Path, count: int, kills: int) -> dict[str, Any]:
         "began": sum(began.values()),
         "repeated": sum(began.values()) - len(began),
         "repeated_percent": round(100 * (sum(began.values()) - len(began)) / count, 3),
-        "rows": len(verdicts),
-        "as_expected": sum(verdicts.get(name) == _verdict(end) for name, end in expected.items()),
-        "verdicts": dict(Counter(verdicts.values())),
+        "rows": len(found),
+        "as_expected": sum(found.get(name) == verdict(end) for name, end in expected.items()),
+        "verdicts": dict(Counter(found.values())),
         "results_whole": sum((out / name / "report.json").is_file() for name in expected),
         "hidden_files_left": sum(
             path.name.startswith(".") and path.name.endswith(".partial") for path in out.iterdir()
@@ -81,7 +81,7 @@ def simulate(folder: Path, count: int, kills: int) -> dict[str, Any]:
 def _live(folder: Path, count: int, until: int | None) -> dict[str, Any]:
     """One life of the driver: to `until` rows, and then it is killed; None: to its end."""
     ledger, started_s = folder / OUT / LEDGER, time.monotonic()
-    before = _lines(ledger)
+    before = lines(ledger)
     command = [sys.executable, "-m", "tests.bench.node.simulated_batch", str(folder), str(count)]
     with (folder / "driver.log").open("ab") as log:
         driver = subprocess.Popen(command, cwd=ROOT, stdout=log, stderr=log)
@@ -90,7 +90,7 @@ def _live(folder: Path, count: int, until: int | None) -> dict[str, Any]:
     try:
         while driver.poll() is None:
             expect(time.monotonic() < started_s + _PATIENCE_S, "the driver does not come to its end")
-            rows = _lines(ledger)
+            rows = lines(ledger)
             if until is not None and rows >= until:
                 break
             try:
@@ -125,18 +125,18 @@ def _live(folder: Path, count: int, until: int | None) -> dict[str, Any]:
     }
 
 
-def _verdict(end: str) -> str:
+def verdict(end: str) -> str:
     return FAILED if end in ("failed", "killed") else end
 
 
-def _verdicts(out: Path) -> dict[str, str]:
-    lines = (out / CSV).read_text(encoding="utf-8").splitlines()
-    expect(len({line.split(",")[0] for line in lines}) == len(lines), "a recording has two rows")
-    place = lines[0].split(",").index("verdict")
-    return {line.split(",")[0]: line.split(",")[place] for line in lines[1:]}
+def verdicts(out: Path) -> dict[str, str]:
+    rows = (out / CSV).read_text(encoding="utf-8").splitlines()
+    expect(len({line.split(",")[0] for line in rows}) == len(rows), "a recording has two rows")
+    place = rows[0].split(",").index("verdict")
+    return {line.split(",")[0]: line.split(",")[place] for line in rows[1:]}
 
 
-def _lines(ledger: Path) -> int:
+def lines(ledger: Path) -> int:
     """Of recordings: the first line says what the batch is."""
     return max(0, ledger.read_bytes().count(b"\n") - 1) if ledger.exists() else 0
 

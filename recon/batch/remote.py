@@ -1,0 +1,105 @@
+"""One recording on a worker of a cluster: a function of values, whose result is whole in a shared folder or a store.
+
+It may run more than once for one recording, after a worker or a machine is lost, and even twice at a time: each run
+makes its result under a name of its own, and the last one counts, which is the same to the bit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import platform
+import shutil
+import tempfile
+import time
+import uuid
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatnode.recon.batch.answer import Outcome, without_answer
+from splatnode.recon.batch.child import Child, End, Limits
+from splatnode.recon.batch.engine import Work
+from splatnode.recon.batch.keeping import hidden, hidden_log, kept
+from splatnode.recon.batch.sources import REPORT, Recording
+from splatnode.recon.batch.version import own_version
+
+_POLL_S = 0.05
+_OF_STORE = "://"  # in the address of an object store
+
+
+@dataclass(frozen=True)
+class Job:
+    """What all recordings of a batch have in common."""
+
+    work: Work  # that can be pickled: a function of a module, or a partial of one
+    results: str  # a folder that all workers share, or an address that fsspec knows, such as s3://bucket/run
+    limits: Limits
+    version: str  # of the splatnode that began the batch
+
+
+def run_recording(recording: Recording, job: Job) -> Outcome:
+    """Runs it on a core of this machine that no other recording is on; the result is in `job.results` then.
+
+    What fails is an outcome. Raises OSError where the results cannot be written.
+    """
+    if (version := own_version()) != job.version:
+        there = f"the worker on {platform.node()} has splatnode {version}, the batch was begun with {job.version}"
+        return without_answer(recording, End(None, "", 0.0, 0.0), f"{there}; install the same on all machines")
+    if _OF_STORE not in job.results:
+        return _run(recording, job, Path(job.results))
+    with tempfile.TemporaryDirectory(prefix="splatnode-") as folder:
+        found = _run(recording, job, Path(folder))
+        _upload(Path(folder), recording, job.results)
+        return found
+
+
+def _run(recording: Recording, job: Job, out: Path) -> Outcome:
+    out.mkdir(parents=True, exist_ok=True)
+    made_as = f"{recording.name}.{uuid.uuid4().hex[:12]}"
+    try:
+        with _core() as core:
+            child = Child(job.work(recording, hidden(out, made_as)), hidden_log(out, made_as), core)
+            try:
+                while (end := child.ended(job.limits)) is None:
+                    time.sleep(_POLL_S)
+            finally:
+                child.stop()
+        return kept(recording, out, made_as, end)
+    finally:
+        shutil.rmtree(hidden(out, made_as), ignore_errors=True)
+        hidden_log(out, made_as).unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def _core() -> Iterator[int]:
+    """A core that is free of recordings, of whatever worker of this user; where none is, the one with this turn."""
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
+    folder = Path(tempfile.gettempdir(), f"splatnode-cores-{os.getuid()}")
+    folder.mkdir(mode=0o700, exist_ok=True)
+    for core in cores:
+        with (folder / str(core)).open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            yield core
+            return
+    yield cores[os.getpid() % len(cores)]
+
+
+def _upload(folder: Path, recording: Recording, results: str) -> None:
+    """The report is the last file, so that a result that has one is whole."""
+    import fsspec  # brought by torch; its own packages know the stores
+
+    system, root = fsspec.core.url_to_fs(results)
+    result = folder / recording.name
+    files = sorted((path for path in result.rglob("*") if path.is_file()), key=lambda path: path == result / REPORT)
+    if not files:
+        system.makedirs(root, exist_ok=True)
+        system.put_file(str(folder / f"{recording.name}.log"), f"{root}/{recording.name}.log")
+    for path in files:
+        target = f"{root}/{path.relative_to(folder).as_posix()}"
+        system.makedirs(target.rpartition("/")[0], exist_ok=True)
+        system.put_file(str(path), target)
