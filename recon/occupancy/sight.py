@@ -36,12 +36,17 @@ class Sight:
 
 
 def sights(cameras: Sequence[CameraEstimate], depths: Mapping[str, npt.NDArray[np.float16]]) -> list[Sight]:
-    """Of the cameras that have depths."""
+    """Of the cameras that have depths. Raises ValueError where a depth is not of its camera's photograph."""
     return [_sight(camera, depths[camera.name]) for camera in cameras if camera.name in depths]
 
 
 def _sight(camera: CameraEstimate, depth: npt.NDArray[np.float16]) -> Sight:
-    reduction = round(camera.width / depth.shape[1])  # the last row or column of an odd number is not in the depth
+    reduction = max(1, round(camera.width / depth.shape[1]))
+    if depth.shape != (camera.height // reduction, camera.width // reduction):
+        raise ValueError(
+            f"the depth of {camera.name} has {depth.shape[1]} x {depth.shape[0]} values, which fits no photograph of "
+            f"{camera.width} x {camera.height} pixels: depth.npz is not of these cameras"
+        )
     K = np.diag([1 / reduction, 1 / reduction, 1.0]) @ camera.K
     error = DEPTH_ERROR
     if camera.bounds is not None:

@@ -18,7 +18,7 @@ from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.limits import MAX_CAMERAS
 
 DEPTHS = "depth.npz"  # in the result folder
-MOST_BYTES = 1 << 30  # of the arrays in a file that is read
+MOST_BYTES = 1 << 29  # of the arrays in a file that is read
 _LONGEST_SIDE = 8192  # pixels
 
 Depths = Mapping[str, npt.NDArray[np.float16]]

@@ -621,6 +621,44 @@ def test_photographs_of_other_scenes():
     says(f"degrees away | {median(following):.2f} in the median, {max(following):.2f} at most |")
 
 
+MAPPED = {
+    "built-in capture": "built-in capture, 3 places",
+    "building": "built-in building, 2 rooms",
+    "glass": "built-in capture with a pane of glass",
+    "mirror": "built-in building, at a mirror",
+}
+
+
+@pytest.mark.parametrize("start", MAPPED)
+@pytest.mark.parametrize("views", [3, 6, 12])
+def test_free_space(start, views):
+    rows = [row for row in raw("occupancy")["rows"] if row["place"].startswith(start) and row["views"] == views]
+    assert len(rows) == {"built-in capture": 3, "building": 2}.get(start, 1)
+
+    def percents(key: str, digits: int) -> str:
+        ends = [f"{100 * end(row[key] for row in rows):.{digits}f}" for end in (min, max)]
+        return f"{' to '.join(dict.fromkeys(ends))} %"
+
+    shares = [percents("free_solid", 3), *(percents(key, 0) for key in ("found", "found_near", "unknown"))]
+    says(f"| {MAPPED[start]} | {views} | {' | '.join(shares)} |")
+
+
+def test_free_space_in_all():
+    rows = raw("occupancy")["rows"]
+    plain = [row for row in rows if row["place"] not in ("glass", "mirror")]
+    most, enough = max(row["free_solid"] for row in plain), sum(row["found"] >= 0.9 for row in plain)
+    assert most < 0.001
+    says(f"at most {100 * most:.3f} % of what is called free is solid")
+    says(f"At least 90 % of the surface is found in {enough} of these {len(plain)} rows")
+    on_floor = [row for row in rows if row["floor_error_metres"] is not None]
+    up, floor = (max(row[key] for row in on_floor) for key in ("up_error_deg", "floor_error_metres"))
+    says(f"in {len(on_floor)} of {len(rows)} rows, up is right within {up:.2f} degrees")
+    says(f"degrees and the floor within {100 * floor:.1f} cm")
+    alone = max(row["up_error_deg"] for row in rows if row["floor_error_metres"] is None)
+    says(f"by the cameras alone up was {alone:.1f} degrees off at worst")
+    says(f"A map takes up to {max(row['seconds'] for row in rows):.1f} s of one core")
+
+
 def test_speed_of_parts():
     clock = raw("rasterize")["cases"]["50k_512x384_all"]["clock_ms"]
     says(f"| {clock['median']:.1f} ms in the median, {clock['min']:.1f} ms at best | `rasterize.json` |")

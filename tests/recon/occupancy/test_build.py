@@ -113,6 +113,13 @@ def test_where_nothing_is_sure_there_is_no_map(room, changed, said):
     assert raised.value.exit_code == 65
 
 
+@pytest.mark.parametrize("shape", [(96, 127), (384, 512), (1, 300)])
+def test_depths_of_other_photographs_are_told(room, shape):
+    depths = {"1.png": np.ones(shape, np.float16)}
+    with pytest.raises(ValueError, match=r"the depth of 1.png has .* not of these cameras"):
+        occupancy_map(replace(room, depths=depths))
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

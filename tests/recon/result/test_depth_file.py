@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import zipfile
 
 import numpy as np
 import pytest
@@ -29,6 +30,16 @@ def packed(**arrays) -> bytes:
     return file.getvalue()
 
 
+def claiming(shape: tuple[int, ...]) -> bytes:
+    """A depth whose header says that there is more than there is."""
+    whole, header = packed(names=NAMES), io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f2", "fortran_order": False, "shape": shape})
+    file = io.BytesIO(whole)
+    with zipfile.ZipFile(file, "a") as archive:
+        archive.writestr("depth_0.npy", header.getvalue() + b"1234")
+    return file.getvalue()
+
+
 NAMES = np.array([b"a"])
 
 
@@ -38,6 +49,9 @@ NAMES = np.array([b"a"])
         b"nothing",
         encode_depths(KNOWN)[:-30],
         packed(names=NAMES),
+        packed(names=np.array([b"\xff"]), depth_0=KNOWN["a.png"]),
+        claiming((2, 2)),
+        claiming((1 << 40, 2)),
         packed(names=np.array(["a"]), depth_0=KNOWN["a.png"]),
         packed(names=NAMES, depth_0=np.ones((2, 2))),
         packed(names=NAMES, depth_0=np.ones((2, 2, 1), np.float16)),
