@@ -36,6 +36,12 @@ def photographs(tmp_path):
     [
         (["--out", "new", "--baseline", "a.png", "c.png", "0.5"], 2, "'c.png' is not there; there are: a.png, b.png"),
         (["--out", "new", "--baseline", "a.png", "b.png", "far"], 2, "a distance in metres, got 'far'"),
+        (["--out", "new", "--stereo", "photographs"], 2, "--stereo and --stereo-baseline belong together"),
+        (["--out", "new", "--stereo", "gone", "--stereo-baseline", "75mm"], 2, "'gone' is not there"),
+        (["--out", "new", "--poses", "gone.tum"], 2, "gone.tum"),
+        (["--out", "new", "--poses", "photographs"], 2, "must hold images.txt or images.bin"),
+        (["--out", "new", "--poses", "photographs/a.png"], 2, "must be a TUM trajectory"),
+        (["--out", "new", "--map", "--marker", "100mm"], 2, "does not go with what is about one: --marker"),
         (["--out", "new/../photographs"], 2, "must not be the folder of the photographs"),
         (["--out", "photographs/a.png"], 73, "choose another folder"),
         (["--out", "photographs/a.png/below"], 73, "choose another folder"),

@@ -1,0 +1,40 @@
+"""The options of the command line become the configuration of the metres, and reach the scene."""
+
+from __future__ import annotations
+
+import pytest
+
+from splatnode.command_line import build_parser
+from splatnode.recon.batch.verb import replay_options
+from splatnode.recon.config import Config, overlaid
+from splatnode.recon.metric.arguments import metric_changes
+
+
+def configured(*options: str):
+    args = build_parser().parse_args(["replay", "photographs", "--out", "out", *options])
+    return overlaid(Config(), {"metric": metric_changes(args)}).metric
+
+
+def test_options_become_the_configuration():
+    plain = configured()
+    assert plain.marker_m is None and plain.stereo_m is None and plain.baselines == ()
+    metric = configured(
+        "--marker", "99.4mm@0.2mm", "--stereo", "r", "--stereo-baseline", "7.5cm", "--poses-sigma", "1,5"
+    )
+    assert (metric.marker_m, metric.marker_sigma_m) == pytest.approx((0.0994, 0.0002))
+    assert (metric.stereo_m, metric.stereo_sigma_m) == pytest.approx((0.075, 0.0003))
+    assert (metric.poses_sigma_m, metric.poses_sigma_deg) == (1.0, 5.0)
+
+
+def test_a_batch_passes_its_marker_on():
+    args = build_parser().parse_args(["batch", "all", "--out", "out", "--marker", "100mm@0.1mm"])
+    assert replay_options(args) == ["--marker", "100mm@0.1mm"]
+
+
+@pytest.mark.parametrize(
+    ("option", "value"), [("--poses-sigma", "1"), ("--poses-sigma", "0,2"), ("--marker", "100"), ("--marker", "1m@2")]
+)
+def test_what_is_no_value_is_refused(option, value, capsys):
+    with pytest.raises(SystemExit):
+        configured(option, value)
+    assert f"argument {option}: " in capsys.readouterr().err
