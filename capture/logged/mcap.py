@@ -7,6 +7,7 @@ lost its power, is read from its beginning as far as it goes.
 from __future__ import annotations
 
 import contextlib
+import io
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -106,10 +107,13 @@ def _of_topics(stream: IO[bytes], wanted: Collection[str], known: _Known) -> Ite
         return
     for record in (*summary.schemas.values(), *summary.channels.values()):
         known.add(record)
+    num_bytes = stream.seek(0, io.SEEK_END)
     channels = {number for number, topic in known.topics.items() if topic.name in wanted}
     for chunk in sorted(summary.chunk_indexes, key=lambda each: each.chunk_start_offset):
         if channels.isdisjoint(chunk.message_index_offsets) and chunk.message_index_offsets:
             continue
+        if chunk.chunk_start_offset >= num_bytes:  # a place that cannot be sought would be an error of the disk's
+            raise UnusableLog(f"its index leads to byte {chunk.chunk_start_offset}, it has {num_bytes}")
         stream.seek(chunk.chunk_start_offset)
         yield from _unpacked(next(_reader(stream, skip_magic=True).records))
 

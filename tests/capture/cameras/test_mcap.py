@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from mcap.writer import CompressionType
 
 from splatnode.capture import film
@@ -84,6 +86,19 @@ def test_a_file_that_ends_early_is_read_as_far_as_it_goes(tmp_path, compression)
     *read, last = frames(file)
     assert whole == 8 and 0 < len(read) < 8 and all(isinstance(each, Frame) for each in read)
     assert isinstance(last, DroppedFrame) and last.name == "image_rest" and "cannot be read" in last.reason
+
+
+def test_an_index_that_leads_nowhere_is_told(tmp_path):
+    file = write(tmp_path / "a.mcap", [compressed("/image", flat(1))])
+    with file.open("rb") as opened:
+        summary = make_reader(opened).get_summary()
+    (chunk,) = summary.chunk_indexes
+    times = chunk.message_start_time, chunk.message_end_time
+    entry, wrong = (struct.pack("<QQQ", *times, at) for at in (chunk.chunk_start_offset, 2**63 + 5))
+    assert file.read_bytes().count(entry) == 1
+    file.write_bytes(file.read_bytes().replace(entry, wrong))
+    with pytest.raises(ValueError, match=f"its index leads to byte {2**63 + 5}, it has {file.stat().st_size}"):
+        frames(file)
 
 
 def test_an_image_that_cannot_be_decoded_costs_only_itself(tmp_path):
