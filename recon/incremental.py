@@ -11,8 +11,6 @@ import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-import msgspec
-
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.budget import hits
 from splatnode.recon.clock import Clock
@@ -30,12 +28,11 @@ from splatnode.recon.preparation import check_device, load_prior, prepare
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import without_hidden
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.scene import growth, light, warping
+from splatnode.recon.scene import growth, warping
 from splatnode.recon.scene.scene import Scene
 
 log = logging.getLogger(__name__)
 
-_AS_THEY_ARE = light.Config(enabled=False)  # photographs that come later join a scene with the light that they have
 MAX_CAMERA_SHIFT = 0.1  # in median depths: where a new estimate moves a camera further, a scene begins anew
 
 Pause = Callable[[], None]
@@ -264,7 +261,7 @@ class IncrementalReconstruction:
     def rebuild(self, pause: Pause = without_pause) -> None:
         """Begins a scene from all keyframes, which is not shown yet; none where the verdict forbids it."""
         estimate = self.estimate_with_depth(pause)
-        begun = begin_scene(estimate, msgspec.structs.replace(self.config, light=_AS_THEY_ARE))
+        begun = begin_scene(estimate, self.config, one_light=False)
         self._known = replace(self._known, pointmaps=estimate.pointmaps or self._known.pointmaps, begun=begun)
         self.clock.lap("points")
 

@@ -55,17 +55,17 @@ def looked_at_first(estimate: Estimate, config: Config) -> Shown | None:
 
 
 @single_torch_thread()
-def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
+def begin_scene(estimate: Estimate, config: Config, one_light: bool = True) -> Scene | None:
     """The scene of all cameras that were placed, not optimised yet; None where the verdict forbids one.
 
-    Photographs that were exposed differently are brought to one light first.
+    Photographs that were exposed differently are brought to one light first, unless others will join them as they are.
     """
     if estimate.registration is None or not estimate.verdict.publishable:
         return None
     pointmaps = tuple(estimate.pointmaps.values())
     images = {keyframe.name: keyframe.image for keyframe in estimate.graph.keyframes}
     masks = {keyframe.name: keyframe.mask for keyframe in estimate.graph.keyframes}
-    exposures = light.differing(pointmaps, images, config.light)
+    exposures = light.differing(pointmaps, images, config.light) if one_light else {}
     alike = {name: light.alike(images[name], exposure) for name, exposure in exposures.items()}
     return initial_scene(pointmaps, images | alike, config.initialisation, masks, exposures)
 

@@ -32,3 +32,9 @@ def ssim(image: Tensor, truth: Tensor) -> float:
 def _check_same_shape(image: Tensor, truth: Tensor) -> None:
     if image.shape != truth.shape or image.ndim != 3 or image.shape[2] != 3:
         raise ValueError(f"images must both be (H, W, 3), got {tuple(image.shape)} and {tuple(truth.shape)}")
+
+
+def best_gains(truth: Tensor, image: Tensor, used: Tensor) -> Tensor:
+    """(3,) by which `image` fits `truth` best, both (H, W, 3), in each channel, where `used` (H, W) says so."""
+    seen, known = image[used], truth[used]
+    return ((seen * known).sum(0) / (seen * seen).sum(0).clamp_min(1e-12)).clamp_min(1e-3)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from splatnode.recon.evaluate.appearance import Appearance, Rasterize, appearance_of
 from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
-from splatnode.recon.evaluate.metrics import psnr, ssim
+from splatnode.recon.evaluate.metrics import best_gains, psnr, ssim
 from splatnode.recon.evaluate.regions import UNKNOWN, Counts, ErrorMaps, RegionScore, error_maps, region_scores
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.start_pose import between_neighbours
@@ -240,12 +240,6 @@ def _score_test_views(
         show(name, truth, with_rim[rows, columns])
         scores.append(_view_score(with_rim, whole, used, (rows, columns), networks, counts.get(name)))
     return scores
-
-
-def best_gains(truth: Tensor, image: Tensor, used: Tensor) -> Tensor:
-    """(3,) by which `image` fits `truth` best, both (H, W, 3), in each channel, where `used` (H, W) says so."""
-    seen, known = image[used], truth[used]
-    return ((seen * known).sum(0) / (seen * seen).sum(0).clamp_min(1e-12)).clamp_min(1e-3)
 
 
 def _view_score(

@@ -60,8 +60,7 @@ def reconstruct(
     - `scale`: two photographs and the metres between their cameras: `("a.jpg", "b.jpg", 0.5)`, of pictures their
       places in the list: `(0, 3, 0.5)`; or a printed marker, `splatnode.Marker(0.1)`; or `splatnode.Stereo`; or a
       list of these, which check one another. None: lengths have no unit.
-    - `budget_s`: the best scene within so many seconds. None: as long as it takes.
-    - `preset`: `preview`, `fast`, `balanced` or `quality`.
+    - `budget_s`: the best scene within so many seconds. `preset`: `preview`, `fast`, `balanced` or `quality`.
     - `config`: what differs from the preset, as `docs/configuration.md` lists it: a mapping, or a YAML file.
     - `views`: so many photographs or keyframes, evenly spread. `every_frame`: all that are sharp and no copies.
     - `only_seen`: leaves out what no two photographs confirm, and the far background.
