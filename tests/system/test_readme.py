@@ -659,6 +659,26 @@ def test_free_space_in_all():
     says(f"A map takes up to {max(row['seconds'] for row in rows):.1f} s of one core")
 
 
+def test_cameras_that_moved():
+    found = raw("audit")
+    kinds = {kind: [each for each in found["checks"] if each["kind"] == kind] for kind in found["summary"]["checks"]}
+    noticed = {kind: sum(each["noticed"] for each in checks) for kind, checks in kinds.items()}
+    real = {each["scene"] for each in found["checks"]} - {"built-in"}
+    assert len(real) == 7
+    says("of the built-in capture and of seven real scenes (6 views)")
+    says(f"| nothing moved | {noticed['still']} of {len(kinds['still'])} |")
+    says(f"they are made | {noticed['turned']} of {len(kinds['turned'])} |")
+    says(f"the built-in capture | {noticed['shifted']} of {len(kinds['shifted'])} |")
+    turns, shifts = found["summary"]["least_turn_deg"], found["summary"]["least_shift_percent"]
+    says(f"noticed is {part(turns[0], 2)} degrees and {part(shifts[0], 2)} % of the distance in the median")
+    says(f"at most {part(turns[1], 2)} degrees and {part(shifts[1], 2)} %")
+    says(f"the worst {part(turns[2], 2)} degrees and {shifts[2]:.1f} %")
+    beyond = [each["scene"] for each in kinds["pair"] if each["error_sigmas"] ** 2 >= 12.59]
+    says(f"in {len(kinds['pair']) - len(beyond)} of {len(kinds['pair'])} cases")
+    assert set(beyond) == {"llff_flower"} and len(beyond) == 4
+    says("The four others are all of llff_flower")
+
+
 def test_speed_of_parts():
     clock = raw("rasterize")["cases"]["50k_512x384_all"]["clock_ms"]
     says(f"| {clock['median']:.1f} ms in the median, {clock['min']:.1f} ms at best | `rasterize.json` |")
