@@ -16,15 +16,17 @@ Dataset: TypeAlias = Any  # ray.data.Dataset: ray is an extra
 __all__ = ["reconstruct_dataset", "recordings"]
 
 
-def recordings(sources: Sequence[str | PathLike[str]], results: str | PathLike[str] = "") -> list[dict[str, str]]:
+def recordings(
+    sources: Sequence[str | PathLike[str]], results: str | PathLike[str] | None = None
+) -> list[dict[str, str]]:
     """The rows of all recordings that these sources hold, as `splatnode batch` finds them: name and source.
 
     Sources are folders of photographs, videos, MCAP files, LeRobot data sets, folders that hold such, and lists (.txt).
-    What lies in the folder `results` is none. Raises FileNotFoundError, ValueError.
+    What lies in the folder `results`, if one is given, is none. Raises FileNotFoundError, ValueError.
     """
     from splatnode.recon.batch.sources import recordings as found
 
-    there = found([Path(source) for source in sources], Path(results) if str(results) else Path("/nowhere"))
+    there = found([Path(source) for source in sources], None if results is None else Path(results))
     return [{"name": each.name, "source": each.source} for each in there]
 
 

@@ -32,7 +32,7 @@ class Recording:
     source: str  # the absolute path of a folder of photographs, or of a film as `capture/film.py` names it
 
 
-def recordings(sources: Sequence[Path], out: Path, own_names: frozenset[str] = frozenset()) -> list[Recording]:
+def recordings(sources: Sequence[Path], out: Path | None, own_names: frozenset[str] = frozenset()) -> list[Recording]:
     """All recordings, once each, in the order of the sources; results that lie in `out` are none.
 
     A source is a folder of photographs, a video, an MCAP file (each of its image topics is a recording), a LeRobot data
@@ -48,7 +48,7 @@ def recordings(sources: Sequence[Path], out: Path, own_names: frozenset[str] = f
                 f"{str(source)!r} is not there; give a folder, a video, an MCAP file, a data set, or a list (.txt)"
             )
         before = len(found)
-        for path, label in _found(source, out.resolve()):
+        for path, label in _found(source, out and out.resolve()):
             found.setdefault(path.resolve(), label)
         if len(found) == before:
             raise ValueError(f"no photographs and no videos in {str(source)!r}, or only some that were named already")
@@ -59,7 +59,7 @@ def recordings(sources: Sequence[Path], out: Path, own_names: frozenset[str] = f
     ]
 
 
-def _found(source: Path, out: Path) -> Iterator[tuple[Path, str]]:
+def _found(source: Path, out: Path | None) -> Iterator[tuple[Path, str]]:
     """Paths of recordings, each with what it is called."""
     if source.is_dir():
         for path in _walked(source, out, set()):
@@ -100,7 +100,7 @@ def _listed(path: Path) -> Iterator[Path]:
             yield path.parent / name
 
 
-def _walked(folder: Path, out: Path, seen: set[Path]) -> Iterator[Path]:
+def _walked(folder: Path, out: Path | None, seen: set[Path]) -> Iterator[Path]:
     real = folder.resolve()
     if real in seen or real == out or (folder / REPORT).is_file():
         return
