@@ -26,7 +26,7 @@ Mask = npt.NDArray[np.bool_]
 _FARTHEST = 3.76  # standard deviations in three dimensions: what one has within 3 in one dimension, 99.7 %
 # What poses that scatter more than was given are believed to scatter at most: as a share of their spread, and degrees.
 _MOST_SHARE, _MOST_DEG = 0.05, 15.0
-_DRIFT_LEFT = 0.3  # of the drift at the end of the way, in one direction: what is left of it beside the best similarity
+_DRIFT_LEFT = 0.5  # of the drift at the end of the way, in one direction: what is left of it beside the best similarity
 _TO_SIGMA = 0.65  # standard deviation in one dimension over the median length in three
 _LEAST_FITTING = 0.6  # of the poses
 _MOST_PAIRS = 500  # of cameras, each of which proposes a similarity
