@@ -95,9 +95,11 @@ def told(choice: Choice, coverage: Coverage) -> list[str]:
 
 
 def _warnings(estimate: Estimate) -> list[str]:
-    lens, sigmas = estimate.lens, np.sqrt(np.diag(estimate.covariance))
+    lens = estimate.lens
+    by_focal = np.array([1 / lens.fx, -1 / lens.fy])
+    sigma = float(np.sqrt(by_focal @ estimate.covariance[:2, :2] @ by_focal))  # of fx / fy, relative
     apart = abs(lens.fx / lens.fy - 1)
-    if apart > max(_SQUARE, _SURE * float(np.hypot(sigmas[0] / lens.fx, sigmas[1] / lens.fy))):
+    if apart > max(_SQUARE, _SURE * sigma):
         return [
             f"fx and fy differ by {100 * apart:.1f} %, and in nearly all cameras they do not: was the board printed as "
             "wide as high? Measure ten squares across and down"

@@ -810,6 +810,21 @@ def test_a_cluster_that_loses_a_worker_and_a_node():
     )
 
 
+def test_calibration():
+    found = raw("calibrate")["results"]
+    lenses = list(dict.fromkeys(row["lens"] for row in found))
+    assert len(lenses) == 5 and not any(row["missing"] for row in found)
+    for lens in lenses:
+        rows = [row for row in found if row["lens"] == lens]
+        (model,) = {row["model"] for row in rows}
+        focal, corner = (max(row[error] for row in rows) for error in ("focal_error_pct", "corner_error_px"))
+        told = median(row["corner_sigma_px"] for row in rows)
+        assert len(rows) == 4 and focal < 0.2 and corner < 0.3
+        says(f"| {lens} | `{model}` | {focal:.3f} | {part(corner, 2)} | {part(told, 2)} |")
+    held = sum(row["corner_error_px"] <= 2 * row["corner_sigma_px"] for row in found)
+    says(f"within twice the standard deviation that is told in {held} of {len(found)}")
+
+
 def test_a_simulated_batch():
     row = raw("batch_simulation")
     last, count = row["last_life"], f"{row['recordings']:,}".replace(",", " ")
