@@ -15,6 +15,7 @@ from splatnode.recon.optimize.photometric_loss import PhotometricLoss
 from splatnode.recon.scene.scene import TrainingView
 
 _PROCESSOR = torch.device("cpu")
+_PRIOR = 0.1  # weight of a gain of 1 against what a render and its photograph say, of what exposure is left
 _WHOLLY_SHOWN = 1e-3  # tolerance on the share of a pixel that shows the scene, above the rounding of the resize
 
 
@@ -27,15 +28,26 @@ class TrainingImage:
 
 
 @dataclass(frozen=True, eq=False)
-class _AtLeastSoBright:
-    """The loss of a photograph that is saturated in places: a render that is brighter there is right."""
+class _Exposed:
+    """The loss of a photograph whose exposure was taken out.
+
+    A tone curve is no gain, so a part of the exposure is left in it: a gain a channel, the one that fits the render
+    best, under the prior that it is 1. Where the photograph is saturated, a render that is brighter is right.
+    """
 
     loss: PhotometricLoss
     target: Tensor  # (height, width, 3) the photograph
-    saturated: Tensor  # (height, width, 3) bool
+    told: Tensor  # (height, width, 3) bool: False where it is saturated, or does not show the scene
 
     def __call__(self, rgb: Tensor) -> Tensor:
-        return self.loss(torch.where(self.saturated, torch.minimum(rgb, self.target), rgb))
+        rgb = rgb * self._gains(rgb.detach())
+        return self.loss(torch.where(self.told, rgb, torch.minimum(rgb, self.target)))
+
+    def _gains(self, rgb: Tensor) -> Tensor:
+        """(3,) in closed form."""
+        seen, known = rgb * self.told, self.target * self.told
+        prior = _PRIOR * (known * known).sum((0, 1))
+        return ((seen * known).sum((0, 1)) + prior) / ((seen * seen).sum((0, 1)) + prior).clamp_min(1e-12)
 
 
 def training_image(
@@ -63,11 +75,13 @@ def training_image(
         weights = torch.from_numpy(np.floor(share + np.float32(_WHOLLY_SHOWN))).to(device)
     target = torch.tensor(image, device=device).float() / 255.0  # a copy: what is read from a file is read-only
     loss = PhotometricLoss(target, dssim, weights, keep_moments)
-    if view.exposure is None or view.exposure.saturated is None:
+    if view.exposure is None:
         return TrainingImage(K, width, height, loss)
-    share = cv2.resize(view.exposure.saturated.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-    saturated = torch.from_numpy(share > 0).to(device)
-    return TrainingImage(K, width, height, _AtLeastSoBright(loss, target, saturated))
+    told = torch.ones_like(target, dtype=torch.bool) if weights is None else (weights > 0)[..., None].expand_as(target)
+    if view.exposure.saturated is not None:
+        share = cv2.resize(view.exposure.saturated.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+        told = told & torch.from_numpy(share == 0).to(device)
+    return TrainingImage(K, width, height, _Exposed(loss, target, told))
 
 
 def scaled(K: Tensor, width: int, height: int, scale: float) -> tuple[Tensor, int, int]:

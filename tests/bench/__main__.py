@@ -40,6 +40,7 @@ BENCHMARKS = {
         "race",
         "movers",
         "fisheyes",
+        "light",
         "calibrate",
         "occupancy",
         "metres",

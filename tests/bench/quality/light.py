@@ -1,0 +1,131 @@
+"""Photographs under known gains: `python -m tests.bench light [SCENE:VIEWS ...] --out light.json`.
+
+The training photographs of each set get gains of .5 to 2, times .8 to 1.2 for each channel (clipped to
+8 bits, as a camera does), drawn with seed 0. `balanced` makes a scene of them as they were taken, with the gains, and
+with the gains while `light` is switched off. Held-out photographs are as they were taken; each render is brought to the
+exposure of its photograph (`--best-gain`) before it is scored. Errors of the gains are against those drawn, times what
+is found for the photographs as they were taken, and after the median.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import Frame
+from splatnode.capture.process.progress import say
+from splatnode.recon.config import Config, preset
+from splatnode.recon.evaluate.protocol import Run, Settings, evaluate, load_networks
+from splatnode.recon.evaluate.splits import Split, load_split
+from splatnode.recon.evaluate.start import Start, continued, find_start, foundation
+from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.scene import light
+
+SETS = ("fountain_p11:6", "llff_fern:6", "fox:12")
+LEAST, MOST, BALANCE = 0.5, 2.0, 0.2
+ON = preset("balanced")
+OFF = msgspec.structs.replace(ON, light=light.Config(enabled=False))
+
+
+@dataclass(frozen=True)
+class Row:
+    scene: str
+    views: int
+    kind: str  # one exposure; gains; gains, light off
+    verdict: str
+    psnr: float | None
+    ssim: float | None
+    lpips: float | None
+    num_gaussians: int | None
+    seconds: float  # of the processor, from depth on
+    saturated_percent: float  # of the training photographs' pixels
+    gain_error_percent: Sequence[float] = ()  # median and largest, over photographs and channels
+
+
+def drawn(count: int) -> npt.NDArray[np.float64]:
+    """(count, 3) the gains of photographs."""
+    generator = np.random.default_rng(0)
+    exposure = np.exp(generator.uniform(np.log(LEAST), np.log(MOST), count))
+    return exposure[:, None] * (1.0 + generator.uniform(-BALANCE, BALANCE, (count, 3)))
+
+
+def changed(frame: Frame, gains: npt.NDArray[np.float64]) -> Frame:
+    image = np.clip(np.rint(frame.image * gains), 0, 255).astype(np.uint8)
+    return replace(frame, image=image, encoded=None)
+
+
+def logs_of(start: Start) -> Mapping[str, npt.NDArray[np.float64]]:
+    """(3,) logarithms of the gains that are found, by photograph."""
+    maps = list(start.estimate.pointmaps.values())
+    images = {keyframe.name: keyframe.image for keyframe in start.estimate.graph.keyframes}
+    found = light.log_gains(maps, [images[each.name] for each in maps])
+    return {each.name: own for each, own in zip(maps, found, strict=True)}
+
+
+def gain_errors(plain: Start, under: Start, true: Mapping[str, npt.NDArray[np.float64]]) -> tuple[float, float]:
+    """Percent: median and largest."""
+    before, after = logs_of(plain), logs_of(under)
+    names = [name for name in after if name in before]
+    off = np.array([after[name] - before[name] - np.log(true[name]) for name in names])
+    errors = 100.0 * np.abs(np.expm1(off - np.median(off, axis=0)))
+    return round(float(np.median(errors)), 3), round(float(errors.max()), 3)
+
+
+def rows(scene: EvaluationScene, split: Split, shared: Path) -> list[Row]:
+    networks = load_networks(shared / "weights").quickest
+    frames = scene.frames(split.train)
+    gains = drawn(len(frames))
+    under = [changed(frame, own) for frame, own in zip(frames, gains, strict=True)]
+    starts = {kind: find_start(each, foundation(ON)) for kind, each in (("plain", frames), ("under", under))}
+    true = {frame.name: own for frame, own in zip(frames, gains, strict=True)}
+    errors = gain_errors(starts["plain"], starts["under"], true)
+
+    def scored(kind: str, start: Start, config: Config, shown: Sequence[Frame], *found: float) -> Row:
+        begun = time.process_time()
+        snapshot = list(continued(start, config))[-1]
+        seconds = time.process_time() - begun
+        run = Run("balanced", 0, None, {"total": seconds}, None)
+        row = evaluate(
+            snapshot, scene, split, run, rasterize=rasterize, networks=networks, settings=Settings(best_gain=True)
+        )
+        saturated = 100.0 * float(np.mean([(frame.image >= light.SATURATED).any(-1).mean() for frame in shown]))
+        scores = row.psnr, row.ssim, row.lpips_alex, row.num_gaussians
+        return Row(scene.name, len(frames), kind, row.verdict, *scores, round(seconds, 1), round(saturated, 2), found)
+
+    return [
+        scored("one exposure", starts["plain"], ON, frames),
+        scored("gains", starts["under"], ON, under, *errors),
+        scored("gains, light off", starts["under"], OFF, under),
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sets", nargs="*", default=SETS, metavar="SCENE:VIEWS", help=f"default: {' '.join(SETS)}")
+    parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    args = parser.parse_args()
+    found: list[Row] = []
+    for each in args.sets:
+        name, _, views = each.partition(":")
+        scene = load_scene(args.shared / "scenes" / name)
+        found += rows(scene, load_split(args.shared / "scenes" / name, list(scene.paths), int(views)), args.shared)
+        for row in found[-3:]:
+            say(f"{row.scene} {row.views}, {row.kind}: {row.verdict}, {row.psnr} dB")
+        command = shlex.join(["python", "-m", "tests.bench", "light", *sys.argv[1:]])
+        args.out.write_text(json.dumps({"command": command, "rows": [asdict(row) for row in found]}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
