@@ -40,6 +40,7 @@ ALLOWED = (
     AllowedSkip("viewer/test_window.py*", "*tkinter*", "some Pythons come without it"),
     AllowedSkip("viewer/web/test_browser.py*", "needs a browser*", "its package could not be installed", "browser"),
     AllowedSkip("capture/cameras/test_depthai.py*", "*", "its wheel could not be installed", "depthai"),
+    AllowedSkip("vm/test_calibrate.py*", "takes five minutes*", "test_command.py has it with a camera of Python"),
     AllowedSkip("vm/test_v4l2.py*", "needs a virtual machine*", "qemu or a kernel could not be had", "camera_driver"),
     AllowedSkip("recon/core/test_native_core.py*", "needs an aarch64 *", "no cross compiler could be had", "aarch64"),
 )  # fmt: skip
