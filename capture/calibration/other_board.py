@@ -31,12 +31,24 @@ def what_is_shown(images: Sequence[npt.NDArray[np.uint8]], board: Board) -> str:
         )
     if len(_markers([cv2.flip(grey, 1) for grey in greys], board.dictionary)) >= _LEAST_MARKERS:
         return "the pictures are mirrored, and markers can be read only as they are: turn mirroring off"
-    families = sorted({name.partition("_")[0] for name in DICTIONARIES} - {board.dictionary.partition("_")[0]})
-    counts = {family: len(_markers(greys, f"{family}_1000")) for family in families}
+    others = [name for name in DICTIONARIES if _family(name) != _family(board.dictionary)]
+    largest = {_family(name): name for name in sorted(others, key=_size)}
+    counts = {family: len(_markers(greys, name)) for family, name in largest.items()}
     most = max(counts, key=lambda family: counts[family])
     if counts[most] >= _LEAST_MARKERS:
-        return f"the board has markers of {most}, not of {board.dictionary}: give --dictionary, such as {most}_250"
+        advice = f"{most}_250" if f"{most}_250" in DICTIONARIES else largest[most]
+        return f"the board has markers of {most}, not of {board.dictionary}: give --dictionary, such as {advice}"
     return "no marker of any known kind can be read: show the board from nearer, in more light, and sharp"
+
+
+def _family(dictionary: str) -> str:
+    """5X5 of 5X5_100: of all that have markers of so many bits."""
+    return dictionary.partition("_")[0]
+
+
+def _size(dictionary: str) -> int:
+    """How many markers it has."""
+    return len(cv2.aruco.getPredefinedDictionary(DICTIONARIES[dictionary]).bytesList)
 
 
 def _markers(greys: Sequence[npt.NDArray], dictionary: str) -> list[int]:

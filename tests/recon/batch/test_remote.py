@@ -102,4 +102,5 @@ def test_options_that_do_not_go_together_are_told(tmp_path, given, said):
 
 _OF_REPLAY = (
     "config", "preset", "prior", "device", "size", "budget_s", "require", "max_gaussians", "max_mb", "seed", "views",
+    "marker",
 )  # fmt: skip

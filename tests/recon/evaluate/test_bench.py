@@ -82,6 +82,7 @@ def test_a_row_a_checkpoint_and_what_was_measured_is_kept(scene_folder, tmp_path
         "alignment_levels": 1,
         "continued_steps": 60,
         "start": "true",
+        "best_gain": False,
     }
     exact, broken = content["rows"][2], content["rows"][3]
     assert exact["psnr"] > 50 and exact["seconds"]["total"] > 0 and exact["peak_rss_mb"] > 10

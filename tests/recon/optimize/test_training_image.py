@@ -51,3 +51,16 @@ def test_a_render_may_be_brighter_where_the_photograph_is_saturated(scale):
         assert render.grad is not None
         left, right = (render.grad[:, part] for part in (slice(0, int(20 * scale)), slice(int(20 * scale), None)))
         assert bool((left != 0).all()) is expected and bool((right != 0).all())
+
+
+def test_what_is_left_of_the_exposure_is_a_gain_that_fits_the_render():
+    image = np.random.default_rng(0).integers(40, 200, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    K = torch.tensor([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
+    shown = np.ones((HEIGHT, WIDTH), bool)
+    render = 1.1 * torch.from_numpy(image).float() / 255
+    as_it_is = training_image(TrainingView("a", 0, image, torch.eye(4), K), shown, 1.0, 0.0)
+    exposed = training_image(
+        TrainingView("a", 0, image, torch.eye(4), K, exposure=Exposure((2.0, 2.0, 2.0), None)), shown, 1.0, 0.0
+    )
+    assert float(exposed.loss(render)) < 0.2 * float(as_it_is.loss(render))
+    assert float(exposed.loss(2 * render)) > float(exposed.loss(render))  # the prior: not any gain will do
