@@ -680,6 +680,18 @@ def test_cameras_that_moved():
     says(f"The four others are all of llff_flower, and up to {worst:.1f} standard deviations off")
 
 
+def test_photographs_of_different_exposure():
+    rows = raw("light")["rows"]
+    for first in range(0, len(rows), 3):
+        of_set = rows[first : first + 3]
+        assert [row["kind"] for row in of_set] == ["one exposure", "gains", "gains, light off"]
+        gains = of_set[1]
+        scores = [" / ".join((f"{r['psnr']:.1f}", part(r["ssim"], 3), part(r["lpips"], 3))) for r in of_set]
+        typical, largest = gains["gain_error_percent"]
+        told = f"{gains['saturated_percent']:.0f} % | {part(typical, 1)}, {largest:.1f}"
+        says(f"| {gains['scene']} | {gains['views']} | {' | '.join(scores)} | {told} |")
+
+
 def test_speed_of_parts():
     clock = raw("rasterize")["cases"]["50k_512x384_all"]["clock_ms"]
     says(f"| {clock['median']:.1f} ms in the median, {clock['min']:.1f} ms at best | `rasterize.json` |")
