@@ -20,7 +20,7 @@ from splatnode.recon.networks.depth_anything import load_metric
 from splatnode.recon.result.bounds_in_words import rounded_up
 from splatnode.recon.result.placement import Placement
 from splatnode.recon.result.scale import Scale
-from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
+from splatnode.recon.result.snapshot import Snapshot
 
 
 def in_metres(snapshot: Snapshot, config: Config, evidence: Evidence = NOTHING) -> Snapshot:
@@ -41,7 +41,8 @@ def in_metres(snapshot: Snapshot, config: Config, evidence: Evidence = NOTHING) 
     low, high = agreed.interval_95
     source = "; ".join([f"{agreed.source}, known to {rounded_up(100 * (high - 1.0))} %", *silent])
     unit = agreed.metres_per_unit
-    metric = _scaled(snapshot, unit) if aligned is None else _placed(snapshot, aligned.placed(unit))
+    to_metres = Similarity(unit, np.eye(3), np.zeros(3)) if aligned is None else aligned.placed(unit)
+    metric = _placed(snapshot, to_metres)
     return replace(metric, scale=Scale(True, source, (low, high)))
 
 
@@ -74,31 +75,13 @@ def _by_the_network(snapshot: Snapshot, sigma: float) -> Measurement | str:
 
 
 def _placed(snapshot: Snapshot, by: Similarity) -> Snapshot:
-    """The snapshot in the world that `by` leads to, in metres."""
-    placement = Placement(by.scale, by.rotation, by.translation)
+    """The snapshot, with all lengths in it, in the world that `by` leads to, in metres."""
+    placement, factor = Placement(by.scale, by.rotation, by.translation), np.float32(by.scale)
     landmarks = snapshot.landmarks and snapshot.landmarks.moved(by.scale, by.rotation, by.translation, metric=True)
     return replace(
         snapshot,
         cameras=tuple(map(placement.camera, snapshot.cameras)),
         gaussians=placement.gaussians(snapshot.gaussians),
         landmarks=landmarks,
+        depths={name: (depth * factor).astype(np.float16) for name, depth in snapshot.depths.items()},
     )
-
-
-def _scaled(snapshot: Snapshot, factor: float) -> Snapshot:
-    def moved(camera: CameraEstimate) -> CameraEstimate:
-        T_world_camera = camera.T_world_camera.copy()
-        T_world_camera[:3, 3] *= factor
-        bounds = camera.bounds and camera.bounds.scaled(factor)
-        return replace(camera, T_world_camera=T_world_camera, bounds=bounds)
-
-    gaussians = snapshot.gaussians
-    larger = replace(
-        gaussians,
-        means=(gaussians.means * factor).astype(np.float32),
-        scales=(gaussians.scales * factor).astype(np.float32),
-    )
-    landmarks = snapshot.landmarks and snapshot.landmarks.moved(factor, np.eye(3), np.zeros(3), metric=True)
-    depths = {name: (depth * np.float32(factor)).astype(np.float16) for name, depth in snapshot.depths.items()}
-    cameras = tuple(map(moved, snapshot.cameras))
-    return replace(snapshot, cameras=cameras, gaussians=larger, landmarks=landmarks, depths=depths)

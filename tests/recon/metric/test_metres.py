@@ -13,6 +13,7 @@ from splatnode.capture.process.config import ConfigError
 from splatnode.recon.config import Config as ReconConfig
 from splatnode.recon.config import overlaid
 from splatnode.recon.metric.config import Baseline, Config
+from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.measurement import Measurement
 from splatnode.recon.metric.metres import in_metres
 from splatnode.recon.metric.network import MetricDepth, by_network
@@ -158,3 +159,20 @@ def test_the_configuration_says_what_a_baseline_is():
     ):
         with pytest.raises(ConfigError, match="two different photographs and a positive distance"):
             overlaid(ReconConfig(), {"metric": {"baseline": wrong}})
+
+
+@pytest.mark.parametrize("by", ["a distance", "poses"])
+def test_depths_that_a_map_is_made_of_have_the_unit_of_the_cameras(seen, by):
+    places = np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 0.4, 0.1], [0.5, 0.3, 0.0], [0.2, 0.2, 0.3]])
+    Ts = np.tile(seen.cameras[0].T_world_camera, (5, 1, 1))
+    Ts[:, :3, 3] += places
+    cameras = tuple(replace(seen.cameras[0], name=f"{i}.jpg", frame_id=i, T_world_camera=T) for i, T in enumerate(Ts))
+    relative = replace(seen, cameras=cameras, depths={"0.jpg": np.full((2, 3), 1.5, np.float16)})
+    doubled = Ts.copy()
+    doubled[:, :3, 3] *= 2.0
+    poses = {camera.name: T for camera, T in zip(cameras, doubled, strict=True)}
+    asked = Config(baseline=Baseline("0.jpg", "1.jpg", 1.0)) if by == "a distance" else Config()
+    metric = in_metres(relative, asked, Evidence(poses=poses if by == "poses" else None))
+    assert metric.scale.metric and metric.scale.source
+    assert metric.cameras[1].T_world_camera == pytest.approx(doubled[1], abs=1e-3)
+    assert metric.depths["0.jpg"] == pytest.approx(np.full((2, 3), 3.0), abs=0.01)
