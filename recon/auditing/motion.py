@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from splatnode.recon.geometry import angles_deg
 from splatnode.recon.locating.camera_model import POSE
 from splatnode.recon.locating.locate import Placed
-from splatnode.recon.locating.refinement import CORRELATED, pose_covariance
+from splatnode.recon.locating.refinement import pose_covariance, refined
 from splatnode.recon.registration.cross_product import cross_matrix
 
 Array = npt.NDArray[np.float64]
@@ -24,11 +24,7 @@ Array = npt.NDArray[np.float64]
 # Chi-squared with 6 degrees of freedom that chance exceeds once in a million: the move is no chance beyond it.
 UNLIKELY = 38.26
 MIN_COMMON = 30  # landmarks that both photographs must show; with fewer, what is known of each by itself decides
-_STEPS = 15
-_CONVERGED = 1e-10  # squared length of a step, in standard deviations
-_ROBUST = 3.0  # scale of the Cauchy loss, in standard deviations
 _LEAST_NOISE = 2.5e-4  # of the longer side: no shift of a feature is known better than an eighth of 512 pixels' one
-_RAYLEIGH_MEDIAN = 1.1774  # median length of a 2D error whose components have sigma 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,30 +103,19 @@ def _common(before: Placed, after: Placed) -> tuple[npt.NDArray[np.int64], npt.N
 
 
 def _measured(before: Placed, own: npt.NDArray[np.int64], shifts: Array) -> Motion | None:
-    """The motion that explains the `shifts` (M, 2) of the landmarks in the picture; None where they do not tell it."""
-    start, points = before.camera, before.seen.points[own]
-    seen = start.project(points)[0] + shifts
-    least = _LEAST_NOISE * max(before.size)
-    camera, covariance = start, np.full((POSE, POSE), np.nan)
-    for _ in range(_STEPS):
-        residuals = seen - camera.project(points)[0]
-        lengths = np.linalg.norm(residuals, axis=1)
-        sigma = max(float(np.median(lengths)) / _RAYLEIGH_MEDIAN, least)
-        weights = 1.0 / (1.0 + (lengths / (_ROBUST * sigma)) ** 2) / sigma**2
-        rows = camera.derivatives(points)[0][:, :, :POSE]
-        information = np.einsum("m,mij,mik->jk", weights, rows, rows)
-        try:
-            covariance = np.linalg.inv(information)
-        except np.linalg.LinAlgError:
-            return None
-        step = covariance @ np.einsum("m,mij,mi->j", weights, rows, residuals)
-        if not np.isfinite(step).all():
-            return None
-        camera = camera.moved(np.concatenate([step, np.zeros(4)]))
-        if step @ information @ step < _CONVERGED:
-            break
-    T = np.linalg.inv(start.T_world_camera) @ camera.T_world_camera
-    return Motion(T, _carried(pose_covariance(camera, CORRELATED * covariance), T), len(own))
+    """The motion that explains the `shifts` (M, 2) of the landmarks in the picture; None where they do not tell it.
+
+    The landmarks, and the lens, count as exact: what is wrong with them is so in both photographs.
+    """
+    start, seen = before.camera, before.seen.of(own)
+    pixels = start.project(seen.points)[0] + shifts
+    exact = replace(seen, pixels=pixels, covariances=np.zeros_like(seen.covariances))
+    lens = replace(start.lens, log_focal_sigma=0.0, radial_sigma=0.0, shift_sigma=0.0)
+    fit = refined(start, lens, exact, _LEAST_NOISE * max(before.size))
+    if not np.isfinite(fit.covariance).all():
+        return None
+    T = np.linalg.inv(start.T_world_camera) @ fit.camera.T_world_camera
+    return Motion(T, _carried(pose_covariance(fit.camera, fit.covariance), T), len(own))
 
 
 def adjoint(T: Array) -> Array:
