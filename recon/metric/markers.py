@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
@@ -13,16 +12,17 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.process.lengths import in_words
+from splatnode.recon.frames.keyframe import REFERENCE_SIDE
 from splatnode.recon.metric.marker_detection import Sighting
 from splatnode.recon.metric.measurement import Measurement, together
 from splatnode.recon.metric.views import View, of_cameras
+from splatnode.recon.registration.triangulation import largest_angles, triangulate
 
 Array = npt.NDArray[np.float64]
 
 _SQUARE = np.array([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.5, 0.5, 0.0], [-0.5, 0.5, 0.0]])  # as corners are named
 _LEAST_PARALLAX_DEG = 1.0  # between the cameras, seen from the marker
 _CAMERA_PX = 0.3  # standard deviation, at REFERENCE_SIDE, of where a registered camera sees a known point
-_REFERENCE_SIDE = 1024.0  # pixels
 _MOST_PX = 4.0  # of the corners' error at REFERENCE_SIDE: beyond, the marker was moved, or is another one
 
 
@@ -83,7 +83,7 @@ def _by_marker(
 def _through(view: View, sighting: Sighting) -> _Seen:
     """What a camera sees of the marker; its corners are wrong each by itself, and all alike by the camera's error."""
     pixels, size = sighting.corners.pixels, (sighting.width, sighting.height)
-    px = max(size) / _REFERENCE_SIDE
+    px = max(size) / REFERENCE_SIDE
     alike = np.kron(np.ones((4, 4)), np.eye(2))
     per_ray = 1.0 / (view.focal * max(size))  # rays a pixel; what the lens bends of it is no matter
     covariance = (sighting.corners.covariance + (_CAMERA_PX * px) ** 2 * alike) * per_ray**2
@@ -96,12 +96,13 @@ def _square(seen: Sequence[_Seen]) -> tuple[float, float, float] | None:
 
     The pose and the side of a square whose corners are seen where they are. None without parallax.
     """
-    corners = np.stack([_triangulated([(each.view, each.rays[corner]) for each in seen]) for corner in range(4)])
+    count = len(seen)
+    matrices = np.stack([np.linalg.inv(each.view.T_world_camera)[:3] for each in seen])
+    cameras, rays = np.repeat(np.arange(count), 4), np.concatenate([each.rays for each in seen])
+    corners = triangulate(matrices, rays, cameras, np.tile(np.arange(4), count), 4)
     middle = corners.mean(0)
-    if (
-        not np.isfinite(corners).all()
-        or _parallax_deg(middle, [each.view.centre for each in seen]) < _LEAST_PARALLAX_DEG
-    ):
+    centres = np.stack([each.view.centre for each in seen])
+    if not np.isfinite(corners).all() or _parallax_deg(middle, centres) < _LEAST_PARALLAX_DEG:
         return None
     side = float(np.linalg.norm(corners - np.roll(corners, 1, 0), axis=1).mean())
     u, _, vt = np.linalg.svd((corners - middle).T @ _SQUARE)
@@ -134,20 +135,7 @@ def _off(seen: _Seen, corners: Array) -> Array:
     return (in_camera[:, :2] / depth - seen.rays).ravel()
 
 
-def _triangulated(rays: Sequence[tuple[View, Array]]) -> Array:
-    """(3,) the point nearest to all rays (Hartley and Sturm's linear method on rays at depth 1)."""
-    rows = []
-    for view, (x, y) in rays:
-        world_to_camera = np.linalg.inv(view.T_world_camera)[:3]
-        rows += [x * world_to_camera[2] - world_to_camera[0], y * world_to_camera[2] - world_to_camera[1]]
-    point = np.linalg.svd(np.array(rows))[2][-1]
-    return point[:3] / point[3] if abs(point[3]) > 1e-12 else np.full(3, np.nan)
-
-
-def _parallax_deg(point: Array, centres: Sequence[Array]) -> float:
-    """The largest angle between two cameras, seen from the point."""
-    directions = [(centre - point) / max(float(np.linalg.norm(centre - point)), 1e-12) for centre in centres]
-    return max(
-        math.degrees(math.acos(float(np.clip(first @ second, -1.0, 1.0))))
-        for first, second in combinations(directions, 2)
-    )
+def _parallax_deg(point: Array, centres: Array) -> float:
+    """The largest angle between two of the cameras at `centres` (C, 3), seen from the point."""
+    cameras = np.arange(len(centres))
+    return float(largest_angles(centres, point[None], cameras, np.zeros_like(cameras))[0])

@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.lengths import in_words
+from splatnode.recon.frames.keyframe import REFERENCE_SIDE
 from splatnode.recon.metric.measurement import Measurement
 from splatnode.recon.metric.stereo_pairs import Pair
 from splatnode.recon.metric.views import View, of_cameras
@@ -19,7 +20,6 @@ from splatnode.recon.result.landmarks import Landmarks
 
 Array = npt.NDArray[np.float64]
 
-_REFERENCE_SIDE = 1024.0  # pixels; errors count at this longer side
 _PATCHES = patch_alignment.Config(radius=6)
 _LEAST_CORRELATION, _MOST_SIGMA_PX = 0.85, 0.25  # of a patch with what it was aligned to
 _MOST_BACK_PX = 0.5  # between a point and where it comes from there and back
@@ -89,7 +89,7 @@ def _compared(view: View, landmarks: Landmarks, pair: Pair) -> _Disparities:
     right, found = _tracked(pair, left)
     rays = view.rays(left[found], width, height), view.rays(right[found], width, height)
     across, down = (rays[0] - rays[1]).T
-    return _Disparities(depths[found], across, down, 1.0 / (_REFERENCE_SIDE * view.focal))
+    return _Disparities(depths[found], across, down, 1.0 / (REFERENCE_SIDE * view.focal))
 
 
 def _tracked(pair: Pair, left: Array) -> tuple[Array, npt.NDArray[np.bool_]]:
