@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import LONGEST_NAME, printable
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.limits import MAX_CAMERAS
+from splatnode.recon.result.npz_file import opened
 
 DEPTHS = "depth.npz"  # in the result folder
 MOST_BYTES = 1 << 29  # of the arrays in a file that is read
@@ -47,18 +47,11 @@ def read_depths(folder: Path) -> dict[str, npt.NDArray[np.float16]]:
 def decode_depths(data: bytes, name: str = DEPTHS) -> dict[str, npt.NDArray[np.float16]]:
     """Reads depth.npz. Raises SceneFileError, which names the file as `name`, where it is something else."""
     with foreign(SceneFileError, name):
-        try:
-            with zipfile.ZipFile(io.BytesIO(data)) as archive:
-                size = sum(member.file_size for member in archive.infolist())
-            if size > MOST_BYTES:
-                raise SceneFileError(f"{name} holds {size} bytes; at most {MOST_BYTES} are read")
-            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                names = arrays["names"]
-                if names.ndim != 1 or names.dtype.kind != "S" or len(names) > MAX_CAMERAS:
-                    raise SceneFileError(f"{name}: names must be those of at most {MAX_CAMERAS} cameras")
-                depths = [arrays[f"depth_{index}"] for index in range(len(names))]
-        except (KeyError, ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
-            raise SceneFileError(f"{name} is not a file of depths, or is damaged: {error}") from error
+        with opened(data, MOST_BYTES, name, "depths") as arrays:
+            names = arrays["names"]
+            if names.ndim != 1 or names.dtype.kind != "S" or len(names) > MAX_CAMERAS:
+                raise SceneFileError(f"{name}: names must be those of at most {MAX_CAMERAS} cameras")
+            depths = [arrays[f"depth_{index}"] for index in range(len(names))]
         for depth in depths:
             sides = depth.shape if depth.ndim == 2 else (0,)
             if depth.dtype != np.float16 or not 1 <= min(sides) <= max(sides) <= _LONGEST_SIDE:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from splatnode.capture.process.printable import LONGEST_NAME, printable
 from splatnode.recon.result.camera_check import MAX_COORDINATE, camera_problem
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.landmarks import KnownLenses, Landmarks
+from splatnode.recon.result.npz_file import opened
 
 LANDMARKS = "landmarks.npz"  # in the result folder
 DESCRIPTORS_A_PHOTOGRAPH = 2000  # kept at most, in the mean: 160 kB of the file
@@ -60,15 +60,8 @@ def read_landmarks(folder: Path) -> Landmarks:
 def decode_landmarks(data: bytes, name: str = LANDMARKS) -> Landmarks:
     """Reads landmarks.npz. Raises SceneFileError, which names the file as `name`, where it is something else."""
     with foreign(SceneFileError, name):
-        try:
-            with zipfile.ZipFile(io.BytesIO(data)) as archive:
-                size = sum(member.file_size for member in archive.infolist())
-            if size > MOST_BYTES:
-                raise SceneFileError(f"{name} holds {size} bytes; at most {MOST_BYTES} are read")
-            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                found = {key: arrays[key] for key in _SHAPES}
-        except (KeyError, ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
-            raise SceneFileError(f"{name} is not a file of landmarks, or is damaged: {error}") from error
+        with opened(data, MOST_BYTES, name, "landmarks") as arrays:
+            found = {key: arrays[key] for key in _SHAPES}
         _check(found, name)
         return _decoded(found)
 
