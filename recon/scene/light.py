@@ -21,6 +21,7 @@ from splatnode.recon.priors import reprojection
 from splatnode.recon.priors.confirmed import AGREEING, LEAST_CONFIDENCE, MOST_PARTNERS
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.scene.scene import Exposure
+from splatnode.recon.verification.exposure import BRIGHT, DARK
 from splatnode.recon.workers import each
 
 Array = npt.NDArray[np.float64]
@@ -28,7 +29,6 @@ Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
 STEP = 3  # pixels between those that are compared
-DARKEST, BRIGHTEST = 12.0, 243.0  # grey levels between which a camera answers to light in proportion
 SATURATED = 250  # grey level from which a pixel does not tell how bright it was
 MIN_SAMPLES = 200  # pixels that two photographs must share
 INDEPENDENT = 50.0  # samples that count as one: neighbours show one surface
@@ -92,7 +92,7 @@ def log_ratio(
     column, row, z = column[inside], row[inside], z[inside]
     agree = np.abs(target.depth[row, column] - z) < AGREEING * z
     one, other = source_picture[own][inside][agree], target_picture[row[agree], column[agree]]
-    usable = ((np.minimum(one, other) > DARKEST) & (np.maximum(one, other) < BRIGHTEST)).all(axis=1)
+    usable = ((np.minimum(one, other) > DARK) & (np.maximum(one, other) < BRIGHT)).all(axis=1)
     if usable.sum() < MIN_SAMPLES:
         return None
     logs = np.log(one[usable] / other[usable]).astype(np.float64)
