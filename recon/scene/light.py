@@ -9,6 +9,7 @@ their logarithms). What they say is used only where it is more than light that d
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Annotated
 
 import cv2
@@ -25,6 +26,7 @@ from splatnode.recon.verification.exposure import BRIGHT, DARK
 from splatnode.recon.workers import each
 
 Array = npt.NDArray[np.float64]
+Float32 = npt.NDArray[np.float32]
 Image = npt.NDArray[np.uint8]
 Mask = npt.NDArray[np.bool_]
 
@@ -69,29 +71,42 @@ def log_gains(pointmaps: Sequence[Pointmap], pictures: Sequence[Image]) -> Array
     """(V, 3) logarithms of the photographs' gains; the median of each channel is 0."""
     known = [pointmap.masked(pointmap.confidence >= LEAST_CONFIDENCE) for pointmap in pointmaps]
     partners = reprojection.overlapping(known, MOST_PARTNERS)
-    smooth = [cv2.blur(picture.astype(np.float32), (3, 3)) for picture in pictures]
+    seen = each(lambda view: _seen(*view), list(zip(known, pictures, strict=True)))
     pairs = sorted({(min(i, j), max(i, j)) for i, others in enumerate(partners) for j in others})
-    found = each(lambda pair: log_ratio(*(part for k in pair for part in (known[k], smooth[k]))), pairs)
+    found = each(lambda pair: _log_ratio(seen[pair[0]], seen[pair[1]]), pairs)
     compared = [(pair, *ratio) for pair, ratio in zip(pairs, found, strict=True) if ratio is not None]
     logs = _solved(len(pictures), compared)
     return logs - np.median(logs, axis=0)
 
 
-def log_ratio(
-    source: Pointmap, source_picture: npt.NDArray[np.float32], target: Pointmap, target_picture: npt.NDArray[np.float32]
-) -> tuple[Array, Array] | None:
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """A photograph with its depth, and M of its points."""
+
+    picture: Float32  # (h, w, 3) without its noise, in grey levels
+    depth: Float32  # (h, w) z in the camera's frame, 0 where unknown
+    world_to_pixels: Array  # (3, 4)
+    points: Float32  # (M, 3) world
+    colours: Float32  # (M, 3)
+
+
+def _seen(pointmap: Pointmap, picture: Image) -> _Seen:
+    own = np.zeros(pointmap.depth.shape, bool)
+    own[::STEP, ::STEP] = pointmap.depth[::STEP, ::STEP] > 0
+    smooth = cv2.blur(picture.astype(np.float32), (3, 3))
+    to_pixels = pointmap.K @ np.linalg.inv(pointmap.T_world_camera)[:3]
+    return _Seen(np.asarray(smooth, np.float32), pointmap.depth, to_pixels, pointmap.points[own], smooth[own])
+
+
+def _log_ratio(source: _Seen, target: _Seen) -> tuple[Array, Array] | None:
     """(3,) logarithms of the source's gains over the target's, and their sigmas; None where they share too little."""
-    own = np.zeros(source.depth.shape, bool)
-    own[::STEP, ::STEP] = source.depth[::STEP, ::STEP] > 0
-    points = source.points[own]
-    T_target_world = np.linalg.inv(target.T_world_camera)
-    x, y, z = target.K @ (T_target_world[:3, :3] @ points.T + T_target_world[:3, 3:])
+    x, y, z = target.world_to_pixels[:, :3] @ source.points.T + target.world_to_pixels[:, 3:]
     height, width = target.depth.shape
     column, row = (np.floor(np.divide(each, z, out=np.full_like(z, -1.0), where=z > 0)).astype(int) for each in (x, y))
     inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
     column, row, z = column[inside], row[inside], z[inside]
     agree = np.abs(target.depth[row, column] - z) < AGREEING * z
-    one, other = source_picture[own][inside][agree], target_picture[row[agree], column[agree]]
+    one, other = source.colours[inside][agree], target.picture[row[agree], column[agree]]
     usable = ((np.minimum(one, other) > DARK) & (np.maximum(one, other) < BRIGHT)).all(axis=1)
     if usable.sum() < MIN_SAMPLES:
         return None
