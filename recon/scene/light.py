@@ -3,7 +3,9 @@
 A camera that opens its iris, or takes another white for white, between two photographs makes one surface two colours.
 Depth that two photographs agree on tells which pixels show one surface; the median ratio of their colours is the ratio
 of their gains, per channel, and all ratios together give each photograph's gains in closed form (least squares of
-their logarithms). What they say is used only where it is more than light that differs by where it is seen from.
+their logarithms). What they say is used only where it is more than light that differs by where it is seen from, and
+more than an automatic exposure that drifts along the way: photographs that were taken near each other share it, and
+new views between them have it too.
 """
 
 from __future__ import annotations
@@ -41,8 +43,10 @@ _ROUNDS, _HUBER = 10, 2.0  # of robust least squares; in standard deviations
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     enabled: bool = True  # bring photographs of different exposure or white balance to one light
-    # Gains that differ by less, as a share, from the median of all, in each channel, are left as they are
+    # Gains that differ by less, as a share, in each channel, from the median of all, or from those of the photograph
+    # taken nearest, are left as they are
     least: Annotated[float, Meta(ge=0)] = 0.3
+    most: Annotated[float, Meta(ge=0)] = 1.0  # share of the median above which they are not left, however they drift
 
 
 def differing(pointmaps: Sequence[Pointmap], images: Mapping[str, Image], config: Config) -> dict[str, Exposure]:
@@ -50,7 +54,9 @@ def differing(pointmaps: Sequence[Pointmap], images: Mapping[str, Image], config
     if not config.enabled or len(pointmaps) < 2:
         return {}
     logs = log_gains(pointmaps, [images[pointmap.name] for pointmap in pointmaps])
-    if np.abs(logs).max() < np.log1p(config.least):
+    sudden = logs - _nearest(logs, np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps]))
+    differ, differ_nearby = np.expm1(np.abs(logs).max()), np.expm1(np.abs(sudden).max())
+    if differ < config.most and min(differ, differ_nearby) < config.least:
         return {}
     gains = {pointmap.name: own for pointmap, own in zip(pointmaps, np.exp(logs), strict=True)}
     return {name: Exposure(tuple(own.tolist()), _saturated(images[name], own)) for name, own in gains.items()}
@@ -59,6 +65,13 @@ def differing(pointmaps: Sequence[Pointmap], images: Mapping[str, Image], config
 def alike(image: Image, exposure: Exposure) -> Image:
     """The photograph `image` (h, w, 3) as gains of 1 would have it."""
     return np.clip(np.rint(image / np.array(exposure.gains)), 0, 255).astype(np.uint8)
+
+
+def _nearest(logs: Array, centres: Array) -> Array:
+    """(V, 3) the logarithms of the photograph taken nearest to each, at `centres` (V, 3)."""
+    distances = np.linalg.norm(centres[:, None] - centres, axis=-1)
+    np.fill_diagonal(distances, np.inf)
+    return logs[distances.argmin(axis=1)]
 
 
 def _saturated(image: Image, gains: Array) -> Mask | None:

@@ -59,6 +59,17 @@ def test_a_small_difference_is_left_and_a_large_one_is_not_unless_it_is_switched
     assert differing(maps[:1], widely, Config()) == {}
 
 
+def test_an_exposure_that_drifts_along_the_way_is_left_unless_it_drifts_far():
+    maps, images = place()
+    along = np.arange(len(maps)) - len(maps) // 2
+    drifting = by_name(exposed(images, 1.2 ** along[:, None]))
+    assert differing(maps, drifting, Config()) == {}
+    far = by_name(exposed(images, 1.45 ** along[:, None]))
+    assert set(differing(maps, far, Config())) == set(far)
+    shuffled = by_name(exposed(images, 1.2 ** along[[2, 4, 0, 3, 1], None]))
+    assert set(differing(maps, shuffled, Config())) == set(shuffled)
+
+
 def test_one_light_gives_back_the_photographs():
     maps, images = place()
     changed = by_name(exposed(images))
