@@ -43,13 +43,17 @@ _PICTURE = 960, 720  # pixels, where no window is opened
 def view(args: argparse.Namespace) -> int:
     """Shows what `args.what` names. Raises what opening it raises."""
     _check_web(args)
-    if not (args.web or args.rerun or args.headless or args.export is not None):
+    if not (args.web or args.viser or args.rerun or args.headless or args.export is not None):
         return _in_window(args)
     with waiting("reading the scene"):
         finished, network = _finished(args), _network(args)
     if args.web:
         where = web.place(args.listen, web.PORT if args.port is None else args.port, args.key)
         web.show(_source(finished, network), where, _give_way, say)
+    if args.viser:
+        _give_way()
+        viser = import_module("splatnode.viewer.viser")  # an extra
+        viser.show(_source(finished, network), args.listen, viser.PORT if args.port is None else args.port, say)
     if args.rerun:
         _give_way()
         stream(_source(finished, network), args.rerun_url or URL)
@@ -114,13 +118,17 @@ def _folder(args: argparse.Namespace, finished: Moment | Maps | None) -> Path:
 
 def _check_web(args: argparse.Namespace) -> None:
     """Raises ValueError for options that do not go together."""
-    alone = [name for name in ("port", "listen", "key") if getattr(args, name) is not None]
-    if alone and not args.web:
-        raise ValueError(f"--{alone[0]} needs --web")
+    if args.key is not None and not args.web:
+        raise ValueError("--key needs --web")
+    alone = [name for name in ("port", "listen") if getattr(args, name) is not None]
+    if alone and not (args.web or args.viser):
+        raise ValueError(f"--{alone[0]} needs --web or --viser")
     if args.rerun_url is not None and not args.rerun:
         raise ValueError("--rerun-url needs --rerun")
-    if args.rerun and (args.web or args.headless or args.export is not None):
-        raise ValueError("--rerun shows it in the rerun viewer; leave out --web, --headless and --export")
+    if args.rerun and (args.web or args.viser or args.headless or args.export is not None):
+        raise ValueError("--rerun shows it in the rerun viewer; leave out --web, --viser, --headless and --export")
+    if args.viser and (args.web or args.headless or args.export is not None):
+        raise ValueError("--viser shows it in a browser; leave out --web, --headless and --export")
     if args.web and (args.headless or args.export is not None):
         raise ValueError("--web shows it in a browser; --headless and --export write pictures: one of them at a time")
 

@@ -31,13 +31,20 @@ def _view_arguments(parser: argparse.ArgumentParser) -> None:
         help="show it in a browser: this machine needs neither a display nor Open3D. The address that is printed is "
         "this machine's own; from another one, ssh -L leads to it",
     )
-    parser.add_argument("--port", type=port, metavar="N", help="of --web (default: 8347; 0: any that is free)")
+    parser.add_argument(
+        "--viser",
+        action="store_true",
+        help="show it in a browser by viser, with the means of that (needs the extra viser); --web lets in fewer",
+    )
+    parser.add_argument(
+        "--port", type=port, metavar="N", help="of --web or --viser (default: 8347 or 8080; 0: any that is free)"
+    )
     parser.add_argument(
         "--listen",
         type=address,
         metavar="ADDRESS",
         help="with --web: let other machines in at this address of this one (0.0.0.0: at all), with a key, which the "
-        "address that is printed has",
+        "address that is printed has; with --viser: likewise, without a key",
     )
     parser.add_argument(
         "--key",

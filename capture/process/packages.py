@@ -28,6 +28,7 @@ EXTRAS = {
     "ray": "ray",
     "rerun": "rerun",
     "safetensors": "learned",
+    "viser": "viser",
 }
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from os import PathLike
 from pathlib import Path
@@ -24,6 +24,7 @@ from splatnode.recon.result.verdict import Verdict
 
 if TYPE_CHECKING:
     from splatnode.api.photographs import Lens, Picture
+    from splatnode.api.window import Viewer
     from splatnode.recon.locating.outcome import Located, NotLocated
     from splatnode.recon.occupancy.occupancy_map import OccupancyMap
 
@@ -148,15 +149,30 @@ class Result:
             self._files.write(out)
         return out
 
-    def show(self) -> None:
-        """Opens the result in the Open3D window (a process of its own), and returns when that is closed.
+    def show(
+        self,
+        viewer: Viewer = "open3d",
+        *,
+        listen: str | None = None,
+        port: int | None = None,
+        opened: Callable[[str], object] = print,
+    ) -> None:
+        """Shows the result in a viewer, a process of its own; returns when that is closed, or ended by Ctrl-C.
 
-        Raises ModuleNotFoundError without Open3D (`pip install 'splatnode[viewer]'`), RuntimeError where no window can
-        be opened.
+        - `viewer`: "open3d", the window of `splatnode view`; "rerun", rerun's window with the recording that
+          `splatnode export --to rrd` makes; "browser", the page of `splatnode view --web`; "viser", that of viser.
+        - `listen`: of a browser's, the numeric address of this machine at which others are let in, as "0.0.0.0": with a
+          key by "browser", without one by "viser". None: only this machine is.
+        - `port`: likewise. None: 8347, of viser 8080; 0: any that is free.
+        - `opened`: of a browser's, called with a line that has the address to open, once it can be opened.
+
+        Raises ModuleNotFoundError where the viewer is not installed (`pip install 'splatnode[viewer]'` for Open3D,
+        `[rerun]`, `[viser]`), RuntimeError where no window can be opened or the viewer fails, ValueError where there is
+        no scene, or for other arguments.
         """
         from splatnode.api.window import show  # brings what finds windows
 
-        show(self)
+        show(self, viewer, listen=listen, port=port, opened=opened)
 
     def __repr__(self) -> str:
         counts = f"{len(self._snapshot.cameras)} cameras, {len(self._snapshot.gaussians)} Gaussians"

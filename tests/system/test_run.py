@@ -37,6 +37,7 @@ def calls(tmp_path):
         (["view", "out"], "[viewer]"),
         (["view", "out", "--headless"], ""),
         (["view", "--web"], ""),
+        (["view", "out", "--viser"], "[viser]"),
         (["view", "out", "--export=turntable.mp4"], ""),
         (["replay", "photos", "--out", "o", "--view"], "[viewer]"),
         (["replay", "view", "--out", "o", "--views", "3"], ""),
