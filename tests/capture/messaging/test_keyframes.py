@@ -16,6 +16,7 @@ import pytest
 import zmq
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.given_pose import given_pose
 from splatnode.capture.messaging.keyframe_messages import Delivery, FrameHeader, Refuse, Request, delivered
 from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
 from splatnode.capture.messaging.network import AlreadyRunning, Network, runtime_directory
@@ -30,12 +31,14 @@ from tests.support.strays import STRAYS
 
 INTRINSICS = Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0, "calibration", (0.1, -0.2))
 KEY = Key("0" * 32, 0)
+MOVED = np.array([[0.0, -1.0, 0.0, 1.5], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
 
 
 def frame(index, size=(6, 8)):
     image = np.random.default_rng(index).integers(0, 256, (*size, 3)).astype(np.uint8)
     lens, captured_at = (INTRINSICS, Stamp(index + 10**18, Clock.UTC)) if index % 2 else (None, None)
-    return Frame(index, f"{index}.png", index * 1000, image, lens, captured_at=captured_at)
+    pose = given_pose(MOVED, 0.02, 1.5) if index % 2 else None
+    return Frame(index, f"{index}.png", index * 1000, image, lens, captured_at=captured_at, given_pose=pose)
 
 
 def open_spool(folder, **limits):
@@ -187,6 +190,14 @@ def unusual_stamp(**parts):
     return made
 
 
+def unusual_pose(**parts):
+    """A pose that no process of ours gives."""
+    made = given_pose(MOVED)
+    for name, part in parts.items():
+        object.__setattr__(made, name, part)
+    return made
+
+
 NO_KEYFRAMES = {
     "no image": encode(HEADER),
     "two images": encode(HEADER, [IMAGE, IMAGE]),
@@ -200,6 +211,18 @@ NO_KEYFRAMES = {
     "negative stamp": encode(changed(HEADER, stamp_ns=-1), [IMAGE]),
     "capture": encode(changed(HEADER, captured_at=unusual_stamp(ns=5 * 10**18)), [IMAGE]),
     "clock": encode(changed(HEADER, captured_at=unusual_stamp(clock="sundial")), [IMAGE]),
+    "pose that is none": encode(changed(HEADER, given_pose=None), [IMAGE]),
+    "mirrored pose": encode(
+        changed(HEADER, given_pose=unusual_pose(T_world_camera=tuple(np.diag([1.0, 1, -1, 1]).ravel().tolist()))),
+        [IMAGE],
+    ),
+    "short pose": encode(changed(HEADER, given_pose=unusual_pose(T_world_camera=(1.0,) * 15)), [IMAGE]),
+    "far pose": encode(
+        changed(HEADER, given_pose=unusual_pose(T_world_camera=tuple((MOVED * [1, 1, 1, 1e7]).ravel().tolist()))),
+        [IMAGE],
+    ),
+    "pose without sigma": encode(changed(HEADER, given_pose=unusual_pose(sigma_m=0.0)), [IMAGE]),
+    "pose without end": encode(changed(HEADER, given_pose=unusual_pose(sigma_deg=float("inf"))), [IMAGE]),
     "id": encode(changed(HEADER, frame_id=2**63), [IMAGE]),
     "no name": encode(changed(HEADER, name=""), [IMAGE]),
     "terminal": encode(changed(HEADER, name="\x1b[2J"), [IMAGE]),
