@@ -97,7 +97,7 @@ def _square(seen: Sequence[_Seen]) -> tuple[float, float, float] | None:
     The pose and the side of a square whose corners are seen where they are. None without parallax.
     """
     count = len(seen)
-    matrices = np.stack([np.linalg.inv(each.view.T_world_camera)[:3] for each in seen])
+    matrices = np.asarray([np.linalg.inv(each.view.T_world_camera)[:3] for each in seen], np.float64)
     cameras, rays = np.repeat(np.arange(count), 4), np.concatenate([each.rays for each in seen])
     corners = triangulate(matrices, rays, cameras, np.tile(np.arange(4), count), 4)
     middle = corners.mean(0)

@@ -93,9 +93,9 @@ class _Seen:
 def _seen(pointmap: Pointmap, picture: Image) -> _Seen:
     own = np.zeros(pointmap.depth.shape, bool)
     own[::STEP, ::STEP] = pointmap.depth[::STEP, ::STEP] > 0
-    smooth = cv2.blur(picture.astype(np.float32), (3, 3))
+    smooth = np.asarray(cv2.blur(picture.astype(np.float32), (3, 3)), np.float32)
     to_pixels = pointmap.K @ np.linalg.inv(pointmap.T_world_camera)[:3]
-    return _Seen(np.asarray(smooth, np.float32), pointmap.depth, to_pixels, pointmap.points[own], smooth[own])
+    return _Seen(smooth, pointmap.depth, to_pixels, pointmap.points[own], smooth[own])
 
 
 def _log_ratio(source: _Seen, target: _Seen) -> tuple[Array, Array] | None:
