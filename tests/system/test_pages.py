@@ -16,7 +16,7 @@ from splatnode.capture.status import CaptureStatus
 from splatnode.recon.daemon.control import Retract
 from splatnode.recon.daemon.status import ReconStatus, State
 from splatnode.recon.result.export.format import format_names
-from splatnode.recon.result.message import BoundsRecord, CameraRecord, SceneHeader
+from splatnode.recon.result.message import BoundsRecord, CameraRecord, ScaleRecord, SceneHeader
 from splatnode.recon.result.verdict import Code
 from tests.conftest import ROOT
 
@@ -77,6 +77,7 @@ def test_no_verdict_is_explained_that_there_is_not():
 
 SECTIONS = {
     "SceneHeader": SceneHeader,
+    "ScaleRecord": ScaleRecord,
     "CameraRecord": CameraRecord,
     "BoundsRecord": BoundsRecord,
     "Want": state.Want,

@@ -27,6 +27,7 @@ from splatnode.capture.process.lock import Held
 from splatnode.capture.stamp import Clock, Stamp
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 from tests.conftest import ROOT
+from tests.support.schemas import without
 from tests.support.strays import STRAYS
 
 INTRINSICS = Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0, "calibration", (0.1, -0.2))
@@ -71,7 +72,11 @@ def settle(server, client, until=lambda: True):
 def assert_same(received, sent):
     assert (received.frame_id, received.name, received.stamp_ns) == (sent.frame_id, sent.name, sent.stamp_ns)
     assert received.captured_at == sent.captured_at
-    assert received.intrinsics == sent.intrinsics and np.array_equal(received.image, sent.image)
+    assert (
+        received.intrinsics == sent.intrinsics
+        and received.given_pose == sent.given_pose
+        and np.array_equal(received.image, sent.image)
+    )
 
 
 @pytest.mark.parametrize("make", [ipc, tcp], ids=["ipc", "tcp+curve"])
@@ -290,6 +295,20 @@ def test_what_does_not_say_which_frame_it_is_is_counted_and_the_journal_is_not_f
         assert client.refused == len(rubbish)
     told = [record for record in caplog.records if "refused a keyframe" in record.message]
     assert len(told) == len(rubbish).bit_length()  # the 1st, 2nd, 4th, ...
+
+
+def test_a_recon_of_before_poses_refuses_a_keyframe_with_one_by_a_sentence_and_takes_the_next(tmp_path, monkeypatch):
+    network, spool = ipc(tmp_path), open_spool(tmp_path)
+    with KeyframeServer(network, spool) as server, KeyframeClient(network) as client:
+        server.offer(frame(1))  # with a pose
+        server.offer(frame(2))
+        earlier = without(FrameHeader, "given_pose")
+        monkeypatch.setattr("splatnode.capture.messaging.keyframe_messages.FrameHeader", earlier)
+        (one,) = receive(server, client, 1)
+        assert one.frame.name == "2.png"
+        settle(server, client, lambda: server.set_aside)
+        (aside,) = spool.quarantine.newest(2)
+        assert aside.name == "1.png" and "header refused: Object contains unknown field `given_pose`" in aside.reason
 
 
 def test_refused_keyframes_make_way_and_are_named(tmp_path):
