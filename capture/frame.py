@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
 from splatnode.capture.stamp import Stamp
 
@@ -87,6 +88,7 @@ class Frame:
     encoded: bytes | None = field(default=None, repr=False)  # the JPEG or PNG that `image` was decoded from, if any
     captured_at: Stamp | None = None  # None: nobody knows
     mask: npt.NDArray[np.bool_] | None = field(default=None, repr=False)  # (H, W), False: not used; None: all is used
+    given_pose: GivenPose | None = None  # of its camera, by odometry or a tracker; None: nobody knows
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", printable(self.name, LONGEST_NAME))
@@ -148,14 +150,16 @@ def framed(
     encoded: bytes | None = None,
     captured_at: Stamp | None = None,
     mask: npt.NDArray[np.bool_] | None = None,
+    given_pose: GivenPose | None = None,
 ) -> Frame | DroppedFrame:
     """What a camera or a file gave as a Frame; left out, with the reason, where it keeps a Frame's bounds not."""
     try:
-        return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at, mask)
+        return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at, mask, given_pose)
     except ValueError as error:
         return DroppedFrame(name, f"it cannot be used: {error}")
 
 
 def renamed(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame | DroppedFrame:
     """The same image as another frame, which may be beyond a Frame's bounds."""
-    return framed(frame_id, name, stamp_ns, frame.image, frame.intrinsics, frame.encoded, frame.captured_at, frame.mask)
+    known = frame.image, frame.intrinsics, frame.encoded, frame.captured_at, frame.mask, frame.given_pose
+    return framed(frame_id, name, stamp_ns, *known)

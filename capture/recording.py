@@ -16,8 +16,10 @@ from pathlib import Path
 
 import cv2
 import msgspec
+from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
+from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_image_file
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.durable import sync_folder
@@ -44,6 +46,7 @@ class _Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="frame"
     file: str
     sha256: str
     captured_at: Stamp | None = None  # earlier recordings do not tell
+    given_pose: GivenPose | UnsetType = UNSET
 
 
 class _DroppedLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="dropped"):
@@ -91,7 +94,8 @@ class Recorder:
             temporary.unlink(missing_ok=True)
             raise OSError(error.errno, error.strerror, str(path)) from error
         digest = hashlib.sha256(content).hexdigest()
-        self._append(_Line(item.name, item.stamp_ns, item.intrinsics, path.name, digest, item.captured_at))
+        pose = UNSET if item.given_pose is None else item.given_pose
+        self._append(_Line(item.name, item.stamp_ns, item.intrinsics, path.name, digest, item.captured_at, pose))
         self.frames += 1
         if self.frames % _SYNC_EVERY == 0:
             self._sync()
@@ -150,7 +154,9 @@ class Recording:
             return DroppedFrame(line.name, f"cannot be read: {error.strerror}")
         if hashlib.sha256(content).hexdigest() != line.sha256:
             return DroppedFrame(line.name, f"{line.file} is not the file that was recorded")
-        return framed(frame_id, line.name, line.stamp_ns, image, line.intrinsics, content, line.captured_at)
+        pose = None if line.given_pose is UNSET else line.given_pose
+        known = image, line.intrinsics, content, line.captured_at
+        return framed(frame_id, line.name, line.stamp_ns, *known, given_pose=pose)
 
 
 def _shown(name: str) -> str:

@@ -22,6 +22,7 @@ from splatnode.capture.process.arguments import (
 from splatnode.capture.process.verb import Verb, lazily
 from splatnode.recon.batch.verb import BATCH
 from splatnode.recon.evaluate.verbs import BENCH, STABILITY
+from splatnode.recon.metric.arguments import add_marker
 from splatnode.recon.replay_verb import REPLAY
 from splatnode.recon.shared_arguments import add_device, add_only_seen
 
@@ -42,6 +43,7 @@ def _recon_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", type=Path, nargs="?", metavar="CONFIG", help="YAML: what differs from the defaults")
     parser.add_argument("--checkpoint", type=Path, metavar="DIR", help="what a killed daemon goes on from")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where finished scenes go (default: out)")
+    add_marker(parser)
 
 
 def _retract_arguments(parser: argparse.ArgumentParser) -> None:

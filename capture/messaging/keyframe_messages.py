@@ -11,8 +11,10 @@ from typing import Annotated
 
 import msgspec
 import zmq
+from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.messaging.mask_bits import arrays_of, mask_in
 from splatnode.capture.messaging.spool import Key
 from splatnode.capture.messaging.values import Name, Sequential, SessionId, Text
@@ -42,6 +44,8 @@ class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True,
     stamp_ns: Sequential
     intrinsics: Intrinsics | None
     captured_at: Stamp | None = None
+    # Left out where there is none: a receiver that does not know it takes all keyframes without one
+    given_pose: GivenPose | UnsetType = UNSET
 
 
 class DroppedHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="dropped"):
@@ -116,6 +120,7 @@ def to_message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
         stamp_ns=frame.stamp_ns,
         intrinsics=frame.intrinsics,
         captured_at=frame.captured_at,
+        given_pose=UNSET if frame.given_pose is None else frame.given_pose,
     )
     return encode(header, arrays_of(frame))
 
@@ -145,6 +150,7 @@ def received(key: Key, parts: list[zmq.Frame], limits: Limits) -> ReceivedFrame:
             header.intrinsics,
             captured_at=header.captured_at,
             mask=mask,
+            given_pose=None if header.given_pose is UNSET else header.given_pose,
         )
     except ValueError as error:
         raise WireError(str(error)) from error

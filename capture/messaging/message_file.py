@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from splatnode.capture.messaging.wire import MAGIC, Part
+from splatnode.capture.messaging.wire import MAGIC, VERSION, Part
 from splatnode.capture.process.durable import write_whole
 from splatnode.capture.process.private import read_own
 
@@ -16,8 +16,8 @@ LARGEST = 4 << 30  # bytes of a body, unless the reader knows better
 _HEAD = struct.Struct("<8sIQI")  # magic, parts, bytes of the body, its CRC-32
 _MAGIC = b"SPLSPOOL"
 _SIZE = struct.Struct("<Q")
-# Of files that versions 1 to 3 wrote: what they lack in today's headers has a default.
-_EARLIER = tuple(MAGIC[:-1] + bytes([version]) for version in (1, 2, 3))
+# Of files that earlier versions wrote: what they lack in today's headers has a default.
+_EARLIER = tuple(MAGIC[:-1] + bytes([version]) for version in range(1, VERSION))
 
 
 def size_in_file(parts: Sequence[Part]) -> int:

@@ -40,7 +40,7 @@ def check(value: object, depth: int = 0) -> None:
     elif isinstance(value, float):
         if not math.isfinite(value):
             raise ValueError(f"numbers must be finite, got {value}")
-    elif value is not None and not isinstance(value, enum.Enum):
+    elif value is not None and value is not msgspec.UNSET and not isinstance(value, enum.Enum):
         _check_all(_contents(value), depth + 1)
 
 

@@ -33,6 +33,7 @@ from splatnode.capture.process.problems import Problems, is_said
 from splatnode.capture.process.service_manager import ServiceManager
 from splatnode.capture.process.state_directory import state_directory
 from splatnode.capture.process.stop_signals import on_first
+from splatnode.recon.config import overlaid
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
 from splatnode.recon.daemon.control import Command
@@ -43,6 +44,7 @@ from splatnode.recon.daemon.output import Published
 from splatnode.recon.daemon.status import ReconStatus, State
 from splatnode.recon.daemon.watcher import Watcher
 from splatnode.recon.daemon.worker import Worker
+from splatnode.recon.metric.arguments import marker_changes
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.export.staged import completed
 from splatnode.recon.result.folder import result_folder
@@ -67,6 +69,9 @@ def recon(args: argparse.Namespace) -> int:
         config = msgspec.structs.replace(config, checkpoint=args.checkpoint)
     if args.out:
         config = msgspec.structs.replace(config, out=args.out)
+    if args.marker:
+        recipe = overlaid(config.reconstruction, {"metric": marker_changes(args)})
+        config = msgspec.structs.replace(config, reconstruction=recipe)
     stopping = threading.Event()
     on_first((signal.SIGTERM, signal.SIGINT), stopping.set)
     with Daemon(config, stopping) as daemon:

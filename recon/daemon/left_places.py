@@ -137,7 +137,7 @@ class LeftPlaces:
                 return self._make(store, found, pause)
             work.update(pause)
             snapshot = work.snapshot(store.dropped, final=False)
-            if not self._output.export(snapshot, work.remembered(), store, places.State.LEFT, work.names):
+            if not self._output.export(snapshot, work, store, places.State.LEFT, work.names):
                 return False
             self._output.save(store, work, final=False)
         work.release_scene()  # the checkpoint has it, and comparing takes memory, too
@@ -181,7 +181,7 @@ class LeftPlaces:
             work.show(_last(work, self._config, pause))
             work.estimate_soon(pause)
             snapshot = work.snapshot(store.dropped, final=True)
-            if not self._output.export(snapshot, work.remembered(), store, places.State.FINISHED, work.names):
+            if not self._output.export(snapshot, work, store, places.State.FINISHED, work.names):
                 return False
             self._output.save(store, work, final=True)
         if work.scene is None:  # one that is refused is of no use later

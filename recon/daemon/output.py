@@ -11,12 +11,9 @@ from splatnode.recon.daemon import places
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
+from splatnode.recon.daemon.metres import Metres
 from splatnode.recon.daemon.places import Place, Places, State, described
-from splatnode.recon.estimation import Estimate
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.metric.evidence import NOTHING, gathered
-from splatnode.recon.metric.metres import in_metres
-from splatnode.recon.modelling import with_landmarks
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.export import remove_result
 from splatnode.recon.result.snapshot import Snapshot
@@ -42,9 +39,13 @@ class Output:
         """`complain` is called where the disk is full: that costs a result, or time after a restart; no keyframe."""
         self._config, self._store, self._publish, self.complain = config, store, publish, complain
         self.places = Places(config.out, store.identity)
+        self._metres = Metres(config.reconstruction.metric)
 
-    def publish(self, snapshot: Snapshot) -> None:
-        self._publish(Published(snapshot, self._store.scene_id))
+    def publish(self, snapshot: Snapshot, work: IncrementalReconstruction) -> Snapshot:
+        """Shows what `work` has come to, in metres where these are known; what is shown."""
+        measured = self._metres.of_shown(snapshot, work)
+        self._publish(Published(measured, self._store.scene_id))
+        return measured
 
     def save(self, place: Store, work: IncrementalReconstruction, final: bool) -> None:
         """Writes the files of the place's checkpoint that a restart would else have to compute again."""
@@ -54,13 +55,17 @@ class Output:
             self.complain(f"the scene cannot be saved ({error.strerror}): make room on the disk")
 
     def export(
-        self, snapshot: Snapshot, estimate: Estimate | None, place: Store, state: State, kept: Sequence[str]
+        self,
+        snapshot: Snapshot,
+        work: IncrementalReconstruction,
+        place: Store,
+        state: State,
+        kept: Sequence[str],
     ) -> bool:
         """Writes the place's result folder, all of it or nothing; returns whether it was written.
 
         The result of a snapshot that is not final lies in a folder of its own, named so, until a final one replaces
-        it. `estimate` is that of its cameras, if it is known still, from which landmarks come;
-        `kept` are the names of the place's keyframes.
+        it. `work` knows its keyframes, from which metres and landmarks come; `kept` are the names of the place's.
         """
         recipe, folder = self._config.reconstruction, self._config.out / place.scene_id
         provisional = folder.with_name(folder.name + PROVISIONAL)
@@ -68,9 +73,7 @@ class Output:
         judged = snapshot.final or not snapshot.verdict.provisional
         before = self.places.cameras(place.scene_id) if judged else {}
         try:
-            keyframes = () if estimate is None else estimate.graph.keyframes
-            evidence = gathered((each.frame for each in keyframes), recipe.metric) if keyframes else NOTHING
-            measured = in_metres(with_landmarks(snapshot, estimate), recipe.metric, evidence)
+            measured = self._metres.of_written(snapshot, work)
             finish(measured, folder, seed=recipe.seed, preset_name="live")
             if snapshot.final:
                 remove_result(provisional)

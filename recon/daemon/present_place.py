@@ -191,7 +191,7 @@ class PresentPlace:
             return
         kept = sorted(names)
         if self._shown.verdict.publishable:
-            self._output.export(self._shown, self._work.remembered(), self._store, state, kept)
+            self._output.export(self._shown, self._work, self._store, state, kept)
         else:
             self._output.tell(self._shown, state, kept)
 
@@ -269,7 +269,7 @@ class PresentPlace:
         shown = self._work.scene is not None
         snapshot, kept = self._show(final=shown), sorted(self._store.names)
         if shown:
-            exported = self._output.export(snapshot, self._work.remembered(), self._store, places.State.HERE, kept)
+            exported = self._output.export(snapshot, self._work, self._store, places.State.HERE, kept)
             # What is kept as final is not exported after a restart.
             self._output.save(self._store, self._work, final=exported)
             self._final = frozenset(self._work.names) if exported else frozenset()
@@ -292,6 +292,6 @@ class PresentPlace:
     def _show(self, final: bool = False) -> Snapshot:
         self._work.estimate_soon(self._unless_stopping)
         snapshot = self._work.snapshot(self._store.dropped, final)
-        self._output.publish(snapshot)
-        self.finished, self._shown = Finished(snapshot, self._work.graph.keyframes) if final else None, snapshot
+        measured = self._output.publish(snapshot, self._work)
+        self.finished, self._shown = Finished(measured, self._work.graph.keyframes) if final else None, snapshot
         return snapshot

@@ -82,8 +82,7 @@ def metric_changes(args: argparse.Namespace) -> dict[str, Any]:
     if args.baseline is not None:
         first, *further = ([*names, _metres(metres)] for *names, metres in args.baseline)
         changes |= {"baseline": first, "further_baselines": further}
-    if args.marker is not None:
-        changes |= _measured("marker", args.marker)
+    changes |= marker_changes(args)
     if (args.stereo is None) != (args.stereo_baseline is None):
         raise ValueError("--stereo and --stereo-baseline belong together: the right photographs, and how far apart")
     if args.stereo_baseline is not None:
@@ -91,6 +90,11 @@ def metric_changes(args: argparse.Namespace) -> dict[str, Any]:
     if args.poses_sigma is not None:
         changes["poses_sigma_m"], changes["poses_sigma_deg"] = args.poses_sigma
     return changes
+
+
+def marker_changes(args: argparse.Namespace) -> dict[str, float]:
+    """What of it the marker's argument alone sets. Raises ValueError."""
+    return {} if args.marker is None else _measured("marker", args.marker)
 
 
 def _measured(what: str, text: str) -> dict[str, float]:

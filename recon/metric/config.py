@@ -25,15 +25,15 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     further_baselines: tuple[Baseline, ...] = ()  # more of them: they make the scale surer, and check one another
     # Standard deviation of each measured distance, as a share of it
     baseline_sigma: Annotated[float, msgspec.Meta(gt=0, le=0.5)] = 0.01
-    # Side of the black square of printed markers in the scene, metres; nothing: none are looked for
+    # Side of the black square of printed markers in the scene, metres; nothing: none are looked for. --marker sets it
     marker_m: Annotated[float, msgspec.Meta(gt=0, le=_LARGEST_MARKER)] | None = None
     # Standard deviation of that side as it was measured, metres: what a ruler can tell
     marker_sigma_m: Annotated[float, msgspec.Meta(ge=0, le=_LARGEST_MARKER)] = 0.0005
     marker_dictionary: str = "4X4_50"  # of OpenCV's ArUco dictionaries, as `splatnode marker` prints, or APRILTAG_36h11
-    # Standard deviation of given poses: of each position in each direction, metres
+    # Standard deviation of given poses that come without: of each position in each direction, metres
     poses_sigma_m: Annotated[float, msgspec.Meta(gt=0, le=_MAX_METRES)] = 0.01
     poses_sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = 2.0  # and of each orientation about each axis
-    # Standard deviation of how far given poses have drifted at the end of the way, as a share of the way; 0: not at all
+    # Standard deviation of how far given poses have drifted at the end of the way, as a share of it; 0: not at all
     poses_drift: Annotated[float, msgspec.Meta(ge=0, le=0.5)] = 0.02
     # Metres between the cameras of given stereo pairs; nothing: none are given
     stereo_m: Annotated[float, msgspec.Meta(gt=0, le=_MAX_METRES)] | None = None

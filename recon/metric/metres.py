@@ -54,9 +54,13 @@ def _said(snapshot: Snapshot, config: Config, evidence: Evidence) -> tuple[list[
     if config.marker_m is not None:
         said += by_markers(views_of(snapshot), evidence.sightings, config.marker_m, config.marker_sigma_m)
     aligned = None
-    if evidence.poses is not None:
+    if evidence.poses is not None or evidence.tracked:
+        given = evidence.poses or {}  # which are meant where the photographs came with others
+        tracked = {name: pose for name, pose in evidence.tracked.items() if name not in given}
+        poses = {**{name: pose.matrix for name, pose in tracked.items()}, **given}
         sigmas = Sigmas(config.poses_sigma_m, config.poses_sigma_deg, config.poses_drift)
-        found = by_poses(views_of(snapshot), evidence.poses, sigmas)
+        own = {name: (pose.sigma_m, pose.sigma_deg) for name, pose in tracked.items()}
+        found = by_poses(views_of(snapshot), poses, sigmas, own)
         aligned = None if isinstance(found, str) else found
         said += [found] if isinstance(found, str) else [found.unit, *found.told]
     if config.stereo_m is not None:

@@ -10,6 +10,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
@@ -73,34 +74,41 @@ class _Pairs:
             turned, self.given[:, :3, :3]
         )
 
-    def sigma_m(self, by: Similarity, position_m: float) -> Array:
+    def sigma_m(self, by: Similarity, position_m: Array) -> Array:
         """(C,) standard deviation of the difference in each direction."""
         return np.hypot(position_m, by.scale * self.bounds / TWO_SIDED_95)
 
 
-def by_poses(views: Mapping[str, View], poses: Mapping[str, Array], sigmas: Sigmas) -> Aligned | str:
+def by_poses(
+    views: Mapping[str, View],
+    poses: Mapping[str, Array],
+    sigmas: Sigmas,
+    own: Mapping[str, tuple[float, float]] = MappingProxyType({}),
+) -> Aligned | str:
     """What `poses` (4, 4) T_world_camera, metres, by the photograph's name, tell; or why they tell nothing.
 
     `views` are in the order of the way, along which poses drift. Where poses scatter more than `sigmas` say, what they
-    scatter counts.
+    scatter counts. `own` are the standard deviations, metres and degrees, of poses that have their own.
     """
     names = tuple(name for name in views if name in poses)
     if len(names) < 2:
         return f"poses were given, and {len(names) or 'none'} of them is of a camera of the scene; two are needed"
     scene = np.stack([views[name].T_world_camera for name in names])
     pairs = _Pairs(names, scene, np.stack([poses[name] for name in names]), np.array([views[n].bound for n in names]))
-    if spread(pairs.given[:, :3, 3]) <= sigmas.position_m:
+    usual = sigmas.position_m, sigmas.rotation_deg
+    position_m, rotation_deg = np.array([own.get(name, usual) for name in names]).T
+    if spread(pairs.given[:, :3, 3]) <= np.median(position_m):
         return f"poses of {len(names)} photographs were given, which are not farther apart than they are unsure"
-    by, kept, rotation_deg = _agreed(pairs, sigmas)
+    by, kept, scattered_deg = _agreed(pairs, position_m, rotation_deg, sigmas.drift)
     if kept.sum() < _enough(len(names)):
         return (
             f"poses of {len(names)} photographs were given, of which no more than {kept.sum()} fit the cameras of the "
             "scene: are they of the cameras, with x right, y down and z forward, and in metres?"
         )
-    by, sigma = _refined(pairs, by, kept, sigmas.position_m, rotation_deg, sigmas.drift)
+    by, sigma = _refined(pairs, by, kept, position_m, scattered_deg, sigmas.drift)
     off_m, off_deg = pairs.off(by)
     told = tuple(
-        f"the pose of {name} was left out: it is {_by_how_much(off_m[i], off_deg[i], rotation_deg)} off"
+        f"the pose of {name} was left out: it is {_by_how_much(off_m[i], off_deg[i], scattered_deg[i])} off"
         for i, name in enumerate(names)
         if not kept[i]
     )
@@ -113,20 +121,20 @@ def _by_how_much(metres: float, degrees: float, rotation_deg: float) -> str:
     return " and ".join(filter(None, (f"{metres:.2g} m", turned)))
 
 
-def _agreed(pairs: _Pairs, sigmas: Sigmas) -> tuple[Similarity, Mask, float]:
-    """The similarity, which poses fit it, and the standard deviation of an orientation among them, degrees.
+def _agreed(pairs: _Pairs, position_m: Array, rotation_deg: Array, drift: float) -> tuple[Similarity, Mask, Array]:
+    """The similarity, which poses fit it, and the standard deviations (C,) of the orientations among them, degrees.
 
     First with what was given; where too few fit then, with what the poses scatter.
     """
     way = float(np.linalg.norm(np.diff(pairs.given[:, :3, 3], axis=0), axis=1).sum())
-    position_m, rotation_deg = math.hypot(sigmas.position_m, _DRIFT_LEFT * sigmas.drift * way), sigmas.rotation_deg
+    position_m = np.hypot(position_m, _DRIFT_LEFT * drift * way)
     by = _proposed(pairs, position_m, rotation_deg)
     by, kept = _settled(pairs, by, position_m, rotation_deg)
     if kept.sum() < _enough(len(kept)):
         off_m, off_deg = pairs.off(_proposed(pairs, position_m, rotation_deg, by_most=True))
-        most_m = max(position_m, _MOST_SHARE * spread(pairs.given[:, :3, 3]))
-        position_m = min(most_m, max(position_m, _TO_SIGMA * float(np.median(off_m))))
-        rotation_deg = min(max(rotation_deg, _MOST_DEG), max(rotation_deg, _TO_SIGMA * float(np.median(off_deg))))
+        least_m = min(_MOST_SHARE * spread(pairs.given[:, :3, 3]), _TO_SIGMA * float(np.median(off_m)))
+        least_deg = min(_MOST_DEG, _TO_SIGMA * float(np.median(off_deg)))
+        position_m, rotation_deg = np.maximum(position_m, least_m), np.maximum(rotation_deg, least_deg)
         by, kept = _settled(pairs, _proposed(pairs, position_m, rotation_deg), position_m, rotation_deg)
     return by, kept, rotation_deg
 
@@ -136,7 +144,7 @@ def _enough(count: int) -> int:
     return max(2, math.ceil(_LEAST_FITTING * count))
 
 
-def _settled(pairs: _Pairs, by: Similarity, position_m: float, rotation_deg: float) -> tuple[Similarity, Mask]:
+def _settled(pairs: _Pairs, by: Similarity, position_m: Array, rotation_deg: Array) -> tuple[Similarity, Mask]:
     """The similarity that the poses which fit it agree on."""
     kept = np.zeros(len(pairs.names), bool)
     for _ in range(_ROUNDS):
@@ -149,7 +157,7 @@ def _settled(pairs: _Pairs, by: Similarity, position_m: float, rotation_deg: flo
     return by, kept
 
 
-def _proposed(pairs: _Pairs, position_m: float, rotation_deg: float, by_most: bool = False) -> Similarity:
+def _proposed(pairs: _Pairs, position_m: Array, rotation_deg: Array, by_most: bool = False) -> Similarity:
     """Of the similarities of two cameras each, and that of all, the one that the poses fit best.
 
     What does not fit counts no more than what hardly does; `by_most`: by the median, however far the others are off.
@@ -168,7 +176,7 @@ def _proposed(pairs: _Pairs, position_m: float, rotation_deg: float, by_most: bo
 
 
 def _refined(
-    pairs: _Pairs, by: Similarity, kept: Mask, position_m: float, rotation_deg: float, drift: float = 0.0
+    pairs: _Pairs, by: Similarity, kept: Mask, position_m: Array, rotation_deg: Array, drift: float = 0.0
 ) -> tuple[Similarity, float]:
     """The similarity with the least weighted squares over the poses that are kept; sigma of its log scale.
 
@@ -188,7 +196,7 @@ def _refined(
         to = moved(values)
         positions = whitening @ (to(scene[:, :3, 3]) - given[:, :3, 3])
         turns = Rotation.from_matrix(np.swapaxes(given[:, :3, :3], 1, 2) @ to.rotation @ scene[:, :3, :3]).as_rotvec()
-        return np.concatenate([positions.ravel(), (turns / math.radians(rotation_deg)).ravel()])
+        return np.concatenate([positions.ravel(), (turns / np.radians(rotation_deg[kept])[:, None]).ravel()])
 
     found = least_squares(errors, np.zeros(7), method="lm", x_scale=np.full(7, 0.01))
     of_values = np.linalg.pinv(found.jac.T @ found.jac)

@@ -14,6 +14,7 @@ import cv2
 import msgspec
 import numpy as np
 import numpy.typing as npt
+from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import LARGEST_SIDE, DroppedFrame
 from splatnode.capture.messaging.jpeg import from_jpeg, to_jpeg
@@ -24,6 +25,7 @@ from splatnode.capture.process.printable import LONGEST_NAME, printable
 from splatnode.capture.stamp import Stamp
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.camera_check import camera_problem
+from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
 
@@ -76,6 +78,14 @@ class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"camera {self.name[:60]!a}: {why}")
 
 
+class ScaleRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A Scale."""
+
+    metric: bool  # lengths are metres: a unit has one
+    source: Text | None  # of the metres, or why there are none although they were asked for
+    interval_95: tuple[Amount, Amount] | None  # of metres: a true length is that many times the stated one
+
+
 class SceneHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True):
     scene_id: Name  # another one is another place
     code: Code
@@ -89,6 +99,7 @@ class SceneHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True)
     iterations: Count
     seconds: Annotated[dict[Name, Amount], msgspec.Meta(max_length=64)]
     final: bool
+    scale: ScaleRecord | UnsetType = UNSET  # left out of a relative scene of which nothing is to be said
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +134,7 @@ def to_message(
         iterations=snapshot.iterations,
         seconds=snapshot.seconds,
         final=snapshot.final,
+        scale=_scale_record(snapshot.scale),
     )
     thumbnails = [to_jpeg(thumbnail(snapshot.images[camera.name]), THUMBNAIL_QUALITY) for camera in snapshot.cameras]
     return header, [*(getattr(snapshot.gaussians, name) for name in GAUSSIAN_FIELDS), *thumbnails]
@@ -160,6 +172,7 @@ def _live_scene(message: Message[SceneHeader]) -> LiveScene:
         iterations=header.iterations,
         seconds=header.seconds,
         final=header.final,
+        scale=RELATIVE if header.scale is UNSET else Scale(**msgspec.structs.asdict(header.scale)),
     )
     return LiveScene(snapshot, header.scene_id, header.session, header.mono_ns)
 
@@ -169,6 +182,13 @@ def thumbnail(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     scale = min(1.0, THUMBNAIL_SIDE / max(image.shape[:2]))
     size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _scale_record(scale: Scale) -> ScaleRecord | UnsetType:
+    if scale == RELATIVE:
+        return UNSET
+    source = None if scale.source is None else printable(scale.source)
+    return ScaleRecord(scale.metric, source, scale.interval_95)
 
 
 def bounds_record(bounds: Bounds | None) -> BoundsRecord | None:

@@ -24,7 +24,7 @@ class NodeUpdate:
     """A scene of a node, as it has just become."""
 
     scene_id: str  # another one is another place, with a world of its own
-    result: Result  # `result.final`: verified with all evidence, and refined; lengths are relative
+    result: Result  # `result.final`: verified with all evidence, and refined; `result.scale_interval`: None, or metres
 
 
 @dataclass(frozen=True, eq=False)

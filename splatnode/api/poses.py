@@ -13,6 +13,8 @@ import numpy.typing as npt
 from splatnode.api.photographs import Images, names_of
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.given_pose import GivenPose, given_pose
+from splatnode.recon.metric.config import Config
 from splatnode.recon.metric.poses_file import named, poses_of, read_poses
 
 Matrix: TypeAlias = "npt.NDArray[np.floating]"
@@ -23,9 +25,20 @@ def sigmas_of(poses_sigma: tuple[float, float] | None) -> dict[str, float] | Non
     """What of the configuration's `metric` the standard deviations set. Raises TypeError."""
     if poses_sigma is None:
         return None
-    if not isinstance(poses_sigma, (tuple, list)) or len(poses_sigma) != 2:
-        raise TypeError(f"poses_sigma must be metres and degrees, (0.01, 2.0), got {poses_sigma!r}")
-    return dict(zip(("poses_sigma_m", "poses_sigma_deg"), map(float, poses_sigma), strict=True))
+    return dict(zip(("poses_sigma_m", "poses_sigma_deg"), _two(poses_sigma, "poses_sigma"), strict=True))
+
+
+def pose_of(pose: npt.ArrayLike | None, sigma: tuple[float, float] | None, config: Config) -> GivenPose | None:
+    """The pose of one photograph, T_world_camera (4, 4), metres; `sigma` None: as `config` has it.
+
+    Raises TypeError, ValueError.
+    """
+    if pose is None:
+        if sigma is not None:
+            raise ValueError("pose_sigma says how unsure a pose is: give pose, too")
+        return None
+    usual = config.poses_sigma_m, config.poses_sigma_deg
+    return given_pose(_matrix(pose), *(usual if sigma is None else _two(sigma, "pose_sigma")))
 
 
 def poses_given(
@@ -55,3 +68,9 @@ def _matrix(T: Any) -> npt.NDArray[np.float64]:
     if matrix.shape != (4, 4):
         raise TypeError(f"a pose must be T_world_camera (4, 4) or None, got shape {matrix.shape}")
     return matrix
+
+
+def _two(sigmas: Any, what: str) -> tuple[float, float]:
+    if not isinstance(sigmas, (tuple, list)) or len(sigmas) != 2:
+        raise TypeError(f"{what} must be metres and degrees, (0.01, 2.0), got {sigmas!r}")
+    return float(sigmas[0]), float(sigmas[1])

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy.typing as npt
 
 from splatnode.api.photographs import Lens, Picture, frame, intrinsics_of, lenses, seen_through
+from splatnode.api.poses import pose_of
 from splatnode.api.reconstruction import Changes, check_count, configured
 from splatnode.api.result import Result, result_of
 from splatnode.api.scale import Scale, is_stereo
@@ -74,12 +77,22 @@ class Session:
         self._snapshot: Snapshot | None = None
         self._lock = threading.RLock()
 
-    def add(self, image: Picture, *, name: str | None = None, captured_at: Stamp | None = None) -> Update:
+    def add(
+        self,
+        image: Picture,
+        *,
+        name: str | None = None,
+        captured_at: Stamp | None = None,
+        pose: npt.ArrayLike | None = None,
+        pose_sigma: tuple[float, float] | None = None,
+    ) -> Update:
         """Shows the session a photograph: a NumPy array (H, W, 3) uint8 RGB, or a PIL image.
 
-        Returns what became of it once the scene has grown, which takes seconds where it is taken, and milliseconds
-        where it is not. Raises TypeError and ValueError where it is no image, or a name comes again, and
-        RuntimeError after `finish` or `close`.
+        `pose` is where odometry or a tracker says that its camera was, T_world_camera (4, 4) in metres, all in one
+        world, and `pose_sigma` how unsure that is, metres and degrees; default: what `config` says. Two poses or more
+        give the scene metres and their axes. Returns what became of the photograph once the scene has grown, which
+        takes seconds where it is taken, and milliseconds where it is not. Raises TypeError and ValueError where it is
+        no image, its pose is none, or a name comes again, and RuntimeError after `finish` or `close`.
         """
         with self._lock, limits.at_most(self._threads):
             work = self._open()
@@ -87,6 +100,8 @@ class Session:
             frame = self._framed(image, number, name or f"{number:04d}.png", captured_at)
             if frame.name in self._given:
                 raise ValueError(f"name must be new for each photograph; {frame.name!r} was given before")
+            given = pose_of(pose, pose_sigma, self._config.metric)
+            frame = replace(frame, given_pose=given)
             self._given.add(frame.name)
             decision = self._selector.decide(frame)
             if decision.take:

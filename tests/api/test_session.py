@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import splatnode
+from splatnode.capture.cameras import synthetic
 from tests.api.conftest import QUICK, SMALL
 from tests.support.synthetic import errors
 
@@ -88,3 +89,31 @@ def test_its_cameras_are_right(walked):
     snapshot = finished._snapshot
     cameras = tuple(replace(camera, frame_id=numbers[camera.name]) for camera in snapshot.cameras)
     assert errors(replace(snapshot, cameras=cameras), SMALL).rotation_deg < 1.0
+
+
+def test_poses_give_a_session_metres_and_their_axes(arrays):
+    true = [T for T, _ in synthetic.scene_cameras(SMALL)]
+    with splatnode.Session(config=QUICK, seed=0) as session:
+        for image, T in zip(arrays[:2], true, strict=False):
+            update = session.add(image, pose=T, pose_sigma=(0.02, 1.0))
+        result = update.result
+    assert result.metric and result.scale_interval is not None
+    low, high = result.scale_interval
+    first, last = result.cameras
+    apart = np.linalg.norm(true[1][:3, 3] - true[0][:3, 3]) / np.linalg.norm(last.centre - first.centre)
+    assert low <= apart <= high < 1.2
+    assert np.linalg.norm(first.centre - true[0][:3, 3]) < 0.1
+
+
+def test_what_is_no_pose_is_said_and_the_photograph_can_come_again(arrays):
+    with splatnode.Session(config=QUICK) as session:
+        for bad, kind, why in (
+            ({"pose": np.eye(3)}, TypeError, r"a pose must be T_world_camera \(4, 4\) or None, got shape \(3, 3\)"),
+            ({"pose": np.diag([1.0, 1, -1, 1])}, ValueError, "a given pose must be a rigid motion"),
+            ({"pose": np.eye(4), "pose_sigma": 0.1}, TypeError, "pose_sigma must be metres and degrees"),
+            ({"pose": np.eye(4), "pose_sigma": (0.0, 1.0)}, ValueError, "sigmas of a given pose must be above 0"),
+            ({"pose_sigma": (0.1, 1.0)}, ValueError, "give pose, too"),
+        ):
+            with pytest.raises(kind, match=why):
+                session.add(arrays[0], name="a.png", **bad)
+        assert session.add(arrays[0], name="a.png", pose=np.eye(4)).taken

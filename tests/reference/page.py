@@ -46,7 +46,8 @@ This page is made from the code and its comments by `python -m tests.reference`;
 _CAPTURE = "The camera's process: `splatnode capture FILE` and `splatnode record FILE`."
 _DAEMON = (
     "The node's process that makes scenes: `splatnode recon FILE`. It also has all options of the next part, "
-    "with `reconstruction.` before their names: `reconstruction.size`."
+    "with `reconstruction.` before their names: `reconstruction.size`, `reconstruction.metric.marker_m` (which "
+    "`--marker 100mm` sets, too). Poses come with the keyframes (`given_pose`, [Metres](metres.md#live))."
 )
 _RECONSTRUCTION = (
     "One reconstruction: `splatnode replay PHOTOGRAPHS --config FILE`, and the part `reconstruction` of the node's "

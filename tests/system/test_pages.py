@@ -9,13 +9,14 @@ import pytest
 import yaml
 
 from splatnode.capture.frame import Intrinsics
+from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.messaging import commands, keyframe_messages, services, state, wire
 from splatnode.capture.preview import PreviewHeader
 from splatnode.capture.status import CaptureStatus
 from splatnode.recon.daemon.control import Retract
 from splatnode.recon.daemon.status import ReconStatus, State
 from splatnode.recon.result.export.format import format_names
-from splatnode.recon.result.message import BoundsRecord, CameraRecord, SceneHeader
+from splatnode.recon.result.message import BoundsRecord, CameraRecord, ScaleRecord, SceneHeader
 from splatnode.recon.result.verdict import Code
 from tests.conftest import ROOT
 
@@ -76,6 +77,7 @@ def test_no_verdict_is_explained_that_there_is_not():
 
 SECTIONS = {
     "SceneHeader": SceneHeader,
+    "ScaleRecord": ScaleRecord,
     "CameraRecord": CameraRecord,
     "BoundsRecord": BoundsRecord,
     "Want": state.Want,
@@ -125,7 +127,8 @@ def test_every_service_state_and_field_of_a_lens_is_told():
     both = [*offered, *(each.requests for each in offered if each.pattern is services.Pattern.STATE)]
     rows = re.findall(r"^\| `([\w.]+)` \| \w+ \| (\w+) \| \+(\d) \|", page, re.MULTILINE)
     assert {(each.name, each.pattern.name.lower(), str(each.tcp_port)) for each in both} == set(rows)
-    named = [f"`{each.value}`" for each in State] + [f"`{name}`" for name in Intrinsics.__dataclass_fields__]
+    of_records = [*Intrinsics.__dataclass_fields__, *GivenPose.__dataclass_fields__]
+    named = [f"`{each.value}`" for each in State] + [f"`{name}`" for name in of_records]
     assert not [name for name in named if name not in page]
     assert f"`SPLAT`, then one byte with the version ({wire.VERSION})" in page and all(
         f"`{dtype}`" in page for dtype in wire.DTYPES

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.messaging.mask_bits import arrays_of, mask_in
 from splatnode.capture.messaging.message_file import read_message, write_message
 from splatnode.capture.messaging.wire import WireError, decode, encode
@@ -28,6 +30,7 @@ class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stamp_ns: int
     intrinsics: Intrinsics | None
     captured_at: Stamp | None = None
+    given_pose: GivenPose | UnsetType = UNSET  # left out where there is none, as in a message
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +46,8 @@ def file_name(number: int) -> str:
 
 def write_frame(path: Path, key: tuple[str, int], frame: Frame) -> None:
     """Whole or not at all; `key` is its session and sequence. Raises OSError."""
-    header = FrameRecord(VERSION, *key, frame.name, frame.stamp_ns, frame.intrinsics, frame.captured_at)
+    pose = UNSET if frame.given_pose is None else frame.given_pose
+    header = FrameRecord(VERSION, *key, frame.name, frame.stamp_ns, frame.intrinsics, frame.captured_at, pose)
     write_message(path, encode(header, arrays_of(frame)))
 
 
@@ -55,5 +59,6 @@ def read_frame(path: Path) -> StoredFrame:
         raise WireError(f"frame {number} is of version {header.version}")
     mask = mask_in(message.arrays)
     known = header.stamp_ns, message.arrays[0], header.intrinsics
-    frame = Frame(number, header.name, *known, captured_at=header.captured_at, mask=mask)
+    pose = None if header.given_pose is UNSET else header.given_pose
+    frame = Frame(number, header.name, *known, captured_at=header.captured_at, mask=mask, given_pose=pose)
     return StoredFrame(number, (header.session, header.sequence), frame)

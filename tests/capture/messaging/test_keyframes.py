@@ -16,6 +16,7 @@ import pytest
 import zmq
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.given_pose import given_pose
 from splatnode.capture.messaging.keyframe_messages import Delivery, FrameHeader, Refuse, Request, delivered
 from splatnode.capture.messaging.keyframes import KeyframeClient, KeyframeServer
 from splatnode.capture.messaging.network import AlreadyRunning, Network, runtime_directory
@@ -26,16 +27,19 @@ from splatnode.capture.process.lock import Held
 from splatnode.capture.stamp import Clock, Stamp
 from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 from tests.conftest import ROOT
+from tests.support.schemas import without
 from tests.support.strays import STRAYS
 
 INTRINSICS = Intrinsics(8, 6, 10.0, 10.0, 4.0, 3.0, "calibration", (0.1, -0.2))
 KEY = Key("0" * 32, 0)
+MOVED = np.array([[0.0, -1.0, 0.0, 1.5], [1.0, 0.0, 0.0, -2.0], [0.0, 0.0, 1.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
 
 
 def frame(index, size=(6, 8)):
     image = np.random.default_rng(index).integers(0, 256, (*size, 3)).astype(np.uint8)
     lens, captured_at = (INTRINSICS, Stamp(index + 10**18, Clock.UTC)) if index % 2 else (None, None)
-    return Frame(index, f"{index}.png", index * 1000, image, lens, captured_at=captured_at)
+    pose = given_pose(MOVED, 0.02, 1.5) if index % 2 else None
+    return Frame(index, f"{index}.png", index * 1000, image, lens, captured_at=captured_at, given_pose=pose)
 
 
 def open_spool(folder, **limits):
@@ -68,7 +72,11 @@ def settle(server, client, until=lambda: True):
 def assert_same(received, sent):
     assert (received.frame_id, received.name, received.stamp_ns) == (sent.frame_id, sent.name, sent.stamp_ns)
     assert received.captured_at == sent.captured_at
-    assert received.intrinsics == sent.intrinsics and np.array_equal(received.image, sent.image)
+    assert (
+        received.intrinsics == sent.intrinsics
+        and received.given_pose == sent.given_pose
+        and np.array_equal(received.image, sent.image)
+    )
 
 
 @pytest.mark.parametrize("make", [ipc, tcp], ids=["ipc", "tcp+curve"])
@@ -187,6 +195,14 @@ def unusual_stamp(**parts):
     return made
 
 
+def unusual_pose(**parts):
+    """A pose that no process of ours gives."""
+    made = given_pose(MOVED)
+    for name, part in parts.items():
+        object.__setattr__(made, name, part)
+    return made
+
+
 NO_KEYFRAMES = {
     "no image": encode(HEADER),
     "two images": encode(HEADER, [IMAGE, IMAGE]),
@@ -200,6 +216,18 @@ NO_KEYFRAMES = {
     "negative stamp": encode(changed(HEADER, stamp_ns=-1), [IMAGE]),
     "capture": encode(changed(HEADER, captured_at=unusual_stamp(ns=5 * 10**18)), [IMAGE]),
     "clock": encode(changed(HEADER, captured_at=unusual_stamp(clock="sundial")), [IMAGE]),
+    "pose that is none": encode(changed(HEADER, given_pose=None), [IMAGE]),
+    "mirrored pose": encode(
+        changed(HEADER, given_pose=unusual_pose(T_world_camera=tuple(np.diag([1.0, 1, -1, 1]).ravel().tolist()))),
+        [IMAGE],
+    ),
+    "short pose": encode(changed(HEADER, given_pose=unusual_pose(T_world_camera=(1.0,) * 15)), [IMAGE]),
+    "far pose": encode(
+        changed(HEADER, given_pose=unusual_pose(T_world_camera=tuple((MOVED * [1, 1, 1, 1e7]).ravel().tolist()))),
+        [IMAGE],
+    ),
+    "pose without sigma": encode(changed(HEADER, given_pose=unusual_pose(sigma_m=0.0)), [IMAGE]),
+    "pose without end": encode(changed(HEADER, given_pose=unusual_pose(sigma_deg=float("inf"))), [IMAGE]),
     "id": encode(changed(HEADER, frame_id=2**63), [IMAGE]),
     "no name": encode(changed(HEADER, name=""), [IMAGE]),
     "terminal": encode(changed(HEADER, name="\x1b[2J"), [IMAGE]),
@@ -267,6 +295,20 @@ def test_what_does_not_say_which_frame_it_is_is_counted_and_the_journal_is_not_f
         assert client.refused == len(rubbish)
     told = [record for record in caplog.records if "refused a keyframe" in record.message]
     assert len(told) == len(rubbish).bit_length()  # the 1st, 2nd, 4th, ...
+
+
+def test_a_recon_of_before_poses_refuses_a_keyframe_with_one_by_a_sentence_and_takes_the_next(tmp_path, monkeypatch):
+    network, spool = ipc(tmp_path), open_spool(tmp_path)
+    with KeyframeServer(network, spool) as server, KeyframeClient(network) as client:
+        server.offer(frame(1))  # with a pose
+        server.offer(frame(2))
+        earlier = without(FrameHeader, "given_pose")
+        monkeypatch.setattr("splatnode.capture.messaging.keyframe_messages.FrameHeader", earlier)
+        (one,) = receive(server, client, 1)
+        assert one.frame.name == "2.png"
+        settle(server, client, lambda: server.set_aside)
+        (aside,) = spool.quarantine.newest(2)
+        assert aside.name == "1.png" and "header refused: Object contains unknown field `given_pose`" in aside.reason
 
 
 def test_refused_keyframes_make_way_and_are_named(tmp_path):

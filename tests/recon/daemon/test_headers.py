@@ -13,6 +13,7 @@ from msgspec import inspect
 
 from splatnode.capture import preview, status
 from splatnode.capture.frame import Intrinsics
+from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.messaging import commands, keyframe_messages
 from splatnode.capture.messaging.state import Want
 from splatnode.capture.messaging.wire import Header
@@ -26,7 +27,7 @@ SCHEMAS = [
     preview.PreviewHeader, status.CaptureStatus, status.Heartbeat, commands.Seen, commands.Answer, control.Retract,
     Want, ReconStatus, SceneHeader,
 ]  # fmt: skip
-CHECKED_BY_THEMSELVES = (Intrinsics,)  # whose __post_init__ knows all their bounds
+CHECKED_BY_THEMSELVES = (Intrinsics, GivenPose)  # whose __post_init__ knows all their bounds
 
 
 def unbounded(kind: inspect.Type, where: str) -> Iterator[str]:

@@ -9,8 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.cameras import synthetic
+from splatnode.capture.frame import Frame
+from splatnode.capture.given_pose import given_pose
 from splatnode.recon.metric.config import Baseline, Config
-from splatnode.recon.metric.evidence import Evidence
+from splatnode.recon.metric.evidence import Evidence, gathered
 from splatnode.recon.metric.metres import in_metres
 from splatnode.recon.metric.poses import Aligned, Sigmas, by_poses
 from splatnode.recon.metric.views import View, views_of
@@ -53,6 +55,35 @@ def test_true_poses_give_the_unit_and_the_axes():
     for camera, T in zip(metric.cameras, TRUE, strict=True):
         np.testing.assert_allclose(camera.T_world_camera, T, atol=1e-6)
     assert metric.scale.metric and (metric.scale.source or "").startswith("poses of 8 photographs, known to")
+
+
+def test_a_pose_counts_by_its_own_sigma():
+    wrong = dict(zip(NAMES, (T.copy() for T in TRUE), strict=True))
+    wrong[NAMES[3]][:3, 3] += [0.15, 0.0, 0.0]
+    tracker = replace(SIGMAS, drift=0.0)  # with the drift of odometry, so much is to be expected on this way
+    sure = by_poses(views(), wrong, tracker)
+    unsure = by_poses(views(), wrong, tracker, {NAMES[3]: (0.3, 10.0)})
+    drifting_at_most = by_poses(views(), wrong, SIGMAS)
+    assert isinstance(sure, Aligned) and isinstance(unsure, Aligned) and isinstance(drifting_at_most, Aligned)
+    assert [told.split(" was ")[0] for told in sure.told] == [f"the pose of {NAMES[3]}"]
+    assert unsure.told == () and unsure.unit.metres_per_unit == pytest.approx(UNIT, rel=0.003)
+    assert drifting_at_most.told == () and drifting_at_most.unit.sigma > 1.5 * sure.unit.sigma
+    alike = by_poses(views(), wrong, tracker, dict.fromkeys(NAMES, (0.01, 2.0)))
+    assert isinstance(alike, Aligned) and alike.unit == sure.unit
+
+
+def test_poses_that_came_with_photographs_count_and_those_that_are_given_replace_them():
+    tracked = {name: given_pose(T, 0.02, 1.0) for name, T in zip(NAMES, TRUE, strict=True)}
+    metric = in_metres(scene(), Config(), Evidence(tracked=tracked))
+    np.testing.assert_allclose(metric.cameras[5].T_world_camera, TRUE[5], atol=1e-6)
+    twice = {}
+    for name, T in zip(NAMES, TRUE, strict=True):
+        twice[name] = T.copy()
+        twice[name][:3, 3] *= 2.0
+    other = in_metres(scene(), Config(), Evidence(tracked=tracked, poses=twice))
+    np.testing.assert_allclose(other.cameras[5].T_world_camera, twice[NAMES[5]], atol=1e-6)
+    frames = [Frame(0, NAMES[0], 0, np.zeros((8, 8, 3), np.uint8), None, given_pose=tracked[NAMES[0]])]
+    assert gathered(frames, Config()).tracked == {NAMES[0]: tracked[NAMES[0]]}
 
 
 def test_odometry_that_drifts_by_2_percent_gives_metres_within_2_percent():

@@ -14,8 +14,10 @@ from splatnode.capture.messaging.wire import Message, Numbering, WireError, deco
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.message import SceneHeader, from_message, to_message
+from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
+from tests.support.schemas import without
 
 RANDOM = np.random.default_rng(0)
 NUMBERED = Numbering(session="0123456789abcdef" * 2).next() | {"sequence": 7}
@@ -87,6 +89,35 @@ def test_a_scene_comes_out_as_it_went_in():
             other.height,
         )
         assert one.bounds == other.bounds is not None and one.captured_at == other.captured_at
+
+
+@pytest.mark.parametrize(
+    "scale",
+    [
+        Scale(True, "poses of 3 photographs, known to 2.1 %", (0.9797, 1.0207)),
+        Scale(False, "marker 0 contradicts poses of 3 photographs"),
+    ],
+)
+def test_metres_and_the_reason_why_there_are_none_come_out_as_they_went_in(scale):
+    assert from_message(sent(replace(snapshot(), scale=scale))).snapshot.scale == scale
+
+
+def test_a_relative_scene_is_the_message_of_a_splatnode_that_knows_no_live_metres():
+    header, arrays = to_message(snapshot(), "scene-0002", NUMBERED)
+    fields, _ = msgspec.msgpack.decode(encode(header, arrays)[1])
+    assert "scale" not in fields
+    assert from_message(sent(snapshot())).snapshot.scale == RELATIVE
+
+
+def test_a_viewer_of_before_live_metres_refuses_a_metric_scene_with_a_sentence():
+    earlier = without(SceneHeader, "scale")
+    metric = replace(snapshot(), scale=Scale(True, "marker 0 of 100 mm", (0.98, 1.02)))
+    relative, new = (
+        encode(*to_message(scene, "scene-0002", NUMBERED)) for scene in (replace(metric, scale=RELATIVE), metric)
+    )
+    assert decode(relative, earlier).header.publishable
+    with pytest.raises(WireError, match="^header refused: Object contains unknown field `scale`"):
+        decode(new, earlier)
 
 
 def test_thumbnails_are_small_and_look_like_the_photograph():

@@ -1,0 +1,60 @@
+"""Where others say that a camera was: odometry, a tracker, a drone's log."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated
+
+import msgspec
+import numpy as np
+import numpy.typing as npt
+
+LARGEST_M = 1e6  # of a coordinate, and of its standard deviation
+SIGMA_M, SIGMA_DEG = 0.01, 2.0  # standard deviations where nobody tells any
+_RIGID = 1e-2  # largest difference of a rotation times its transpose from the identity
+_EXACT = 1e-6  # by which the last row may differ from 0 0 0 1
+
+
+@dataclass(frozen=True)
+class GivenPose:
+    """T_world_camera in metres, row by row, and how unsure it is; the camera looks along z, x is right, y down.
+
+    All poses of a stream have one world. Raises ValueError where it is no rigid motion, or a number is out of bounds.
+    """
+
+    T_world_camera: Annotated[tuple[float, ...], msgspec.Meta(min_length=16, max_length=16)]  # row by row, metres
+    sigma_m: float = SIGMA_M  # standard deviation of the position in each direction, metres
+    sigma_deg: float = SIGMA_DEG  # of the orientation about each axis, degrees
+
+    def __post_init__(self) -> None:
+        numbers = (*self.T_world_camera, self.sigma_m, self.sigma_deg)
+        if len(self.T_world_camera) != 16 or not all(map(math.isfinite, numbers)):
+            raise ValueError("a given pose must be T_world_camera, 16 finite numbers row by row, and finite sigmas")
+        if not (0 < self.sigma_m <= LARGEST_M and 0 < self.sigma_deg <= 180):
+            raise ValueError(
+                f"the sigmas of a given pose must be above 0, up to {LARGEST_M:g} m and 180 degrees; "
+                f"got {self.sigma_m:g} m and {self.sigma_deg:g} degrees"
+            )
+        matrix = self.matrix
+        if np.abs(matrix).max() > LARGEST_M:
+            raise ValueError(f"a given pose must be within {LARGEST_M:g} m")
+        rotation = matrix[:3, :3]
+        turned = np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID or np.linalg.det(rotation) < 0
+        if turned or np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > _EXACT:
+            raise ValueError("a given pose must be a rigid motion: a rotation, a translation, and 0 0 0 1")
+
+    @property
+    def matrix(self) -> npt.NDArray[np.float64]:
+        """T_world_camera (4, 4)."""
+        return np.array(self.T_world_camera, np.float64).reshape(4, 4)
+
+
+def given_pose(
+    T_world_camera: npt.NDArray[np.floating], sigma_m: float = SIGMA_M, sigma_deg: float = SIGMA_DEG
+) -> GivenPose:
+    """The pose of a matrix (4, 4), metres and degrees. Raises ValueError."""
+    matrix = np.asarray(T_world_camera, np.float64)
+    if matrix.shape != (4, 4):
+        raise ValueError(f"a given pose must be T_world_camera (4, 4), got {matrix.shape}")
+    return GivenPose(tuple(matrix.ravel().tolist()), float(sigma_m), float(sigma_deg))
