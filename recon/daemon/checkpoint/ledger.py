@@ -14,7 +14,9 @@ from splatnode.capture.messaging.wire import Limits, decode, encode
 
 log = logging.getLogger(__name__)
 
-VERSION = 5  # of a checkpoint's files: 1 knew no time of capture, 2 no parts of places, 3 no masks, 4 no fisheyes
+# Of a checkpoint's files: 1 knew no time of capture, 2 no parts of places, 3 no masks, 4 no fisheyes, 5 no lens that
+# was estimated
+VERSION = 6
 FILE = "ledger"
 # Of what this process wrote itself.
 LIMITS = Limits(header_bytes=64 << 20, arrays=1 << 20, total_bytes=4 << 30, own=True)
