@@ -16,6 +16,7 @@ from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior, without_hidden
 from splatnode.recon.registration import continuation
 from splatnode.recon.registration.register import Registration, register
+from splatnode.recon.registration.straightened import straightened
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.verdict import Verdict
@@ -142,9 +143,10 @@ def estimate_depth(
     if estimate.registration is None or not estimate.verdict.publishable:
         return estimate
     pause = pausing_until(until, pause) if prior.ends_early else pause
-    pointmaps = prior.pointmaps(estimate.graph, estimate.registration, pause)
+    graph, registration = straightened(estimate.graph, estimate.registration)
+    pointmaps = prior.pointmaps(graph, registration, pause)
     give_back_memory()
-    return replace(estimate, pointmaps=without_hidden(pointmaps, estimate.graph))
+    return replace(estimate, pointmaps=without_hidden(pointmaps, graph))
 
 
 def continued(known: Estimate, graph: ViewGraph, config: Config) -> Estimate | None:

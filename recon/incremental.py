@@ -246,12 +246,12 @@ class IncrementalReconstruction:
         estimate, scene = self.estimate_soon(pause), self.scene
         if scene is None or estimate.registration is None or not estimate.verdict.publishable:
             return False
-        graph, pointmaps = self.graph, self._known.pointmaps
-        placed = warping.registration_in_scene_world(scene, estimate.registration, graph)
-        carried = warping.updated_pointmaps(pointmaps, placed, graph) if placed else {}
-        moved = warping.warped_scene(scene, pointmaps, carried, MAX_CAMERA_SHIFT)
-        if placed is None or moved is None:
+        beside = warping.beside(scene, estimate.registration, self.graph, estimate.verdict.provisional)
+        carried = warping.updated_pointmaps(self._known.pointmaps, beside.registration, beside.graph) if beside else {}
+        moved = beside and warping.warped_scene(beside.scene, self._known.pointmaps, carried, MAX_CAMERA_SHIFT)
+        if beside is None or moved is None:
             return False
+        graph, placed = beside.graph, beside.registration
         pointmaps = carried | without_hidden(self._prior.further_pointmaps(graph, placed, carried), graph)
         grown = growth.grow(moved, pointmaps, graph, placed, self.config.initialisation)
         self._known = replace(self._known, pointmaps=pointmaps, show=shown(grown, self.config))

@@ -20,6 +20,7 @@ from splatnode.recon.optimize.torch_threads import single_torch_thread
 from splatnode.recon.optimize.watch import examine, watch
 from splatnode.recon.priors.confirmed import confirmed_depths
 from splatnode.recon.rasterize.device import chosen
+from splatnode.recon.registration.straightened import straightened
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.scene import growth, light
@@ -50,7 +51,7 @@ def looked_at_first(estimate: Estimate, config: Config) -> Shown | None:
     """A coarse scene as soon as there are cameras, with a verdict that says so; None where no scene is published."""
     if estimate.registration is None or not estimate.verdict.publishable:
         return None
-    scene = first_look(estimate.graph, estimate.registration, config.most_gaussians)
+    scene = first_look(*straightened(estimate.graph, estimate.registration), config.most_gaussians)
     return Shown(scene, replace(estimate.verdict, message=f"{estimate.verdict.message} {COARSE}"))
 
 
@@ -63,11 +64,13 @@ def begin_scene(estimate: Estimate, config: Config, one_light: bool = True) -> S
     if estimate.registration is None or not estimate.verdict.publishable:
         return None
     pointmaps = tuple(estimate.pointmaps.values())
-    images = {keyframe.name: keyframe.image for keyframe in estimate.graph.keyframes}
-    masks = {keyframe.name: keyframe.mask for keyframe in estimate.graph.keyframes}
+    keyframes = straightened(estimate.graph, estimate.registration)[0].keyframes
+    images = {keyframe.name: keyframe.image for keyframe in keyframes}
+    masks = {keyframe.name: keyframe.mask for keyframe in keyframes}
+    lenses = {keyframe.name: keyframe.lens for keyframe in keyframes}
     exposures = light.differing(pointmaps, images, config.light) if one_light else {}
     alike = {name: light.alike(images[name], exposure) for name, exposure in exposures.items()}
-    return initial_scene(pointmaps, images | alike, config.initialisation, masks, exposures)
+    return initial_scene(pointmaps, images | alike, config.initialisation, masks, exposures, lenses)
 
 
 def refined(

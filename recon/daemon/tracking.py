@@ -16,12 +16,14 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtr
 
+from splatnode.capture.frame import Intrinsics
 from splatnode.recon import poselib
 from splatnode.recon.frames.keyframe import PLAIN, Keyframe
 from splatnode.recon.geometry import MIN_DEPTH, project, to_camera
 from splatnode.recon.matching import features, nearest_neighbours
+from splatnode.recon.registration.straightened import straight_pixels
 from splatnode.recon.result.rendering import render_arrays
-from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
 Array = npt.NDArray[np.float64]
 
@@ -91,7 +93,7 @@ def landmarks(snapshot: Snapshot, keyframes: Sequence[Keyframe], config: Config)
         render = render_arrays(
             snapshot.gaussians, camera.T_world_camera, camera.K, camera.width, camera.height, channels=("depth",)
         )
-        pixels = found.points[found.point_of] * keyframe.scale
+        pixels = _shown_at(found.points[found.point_of], keyframe, camera)
         column, row = np.clip(pixels.astype(int), 0, [camera.width - 1, camera.height - 1]).T
         depth = render.depth[row, column].astype(np.float64)
         good = (depth > 0) & (render.alpha[row, column] >= config.min_alpha)
@@ -100,6 +102,14 @@ def landmarks(snapshot: Snapshot, keyframes: Sequence[Keyframe], config: Config)
         points = (rays * depth[:, None])[good] @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]
         known.append(Landmarks(keyframe.name, points, found.descriptors[good]))
     return known
+
+
+def _shown_at(points: Array, keyframe: Keyframe, camera: CameraEstimate) -> Array:
+    """(M, 2) pixels of the camera's picture for pixels (M, 2) of the keyframe, as it was photographed."""
+    if camera.lens is None:
+        return points * keyframe.scale
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    return straight_pixels(points, camera.lens, Intrinsics(camera.width, camera.height, fx, fy, cx, cy, "estimated"))
 
 
 def locate(

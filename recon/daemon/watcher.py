@@ -19,6 +19,7 @@ from splatnode.capture.process.problems import Problems, is_said
 from splatnode.capture.stamp import Stamp
 from splatnode.recon.daemon.tracking import Config, Motion, Tracker, landmarks
 from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.frames.undistort import without_distortion
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
 log = logging.getLogger(__name__)
@@ -71,7 +72,7 @@ class Watcher:
             if watched is None or message is None:
                 continue
             try:
-                image = decode_preview(message)
+                image = without_distortion(decode_preview(message), watched.snapshot.cameras[-1].lens)
                 tracker = tracker or Tracker(landmarks(watched.snapshot, watched.keyframes, self._config), self._config)
                 self._track(tracker, image, message.header.captured_at, watched.snapshot)
             except Exception as error:  # of one picture; the next one may do

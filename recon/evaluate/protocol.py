@@ -16,6 +16,7 @@ from splatnode.recon.evaluate.appearance import Appearance, Rasterize, appearanc
 from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
 from splatnode.recon.evaluate.metrics import best_gains, psnr, ssim
 from splatnode.recon.evaluate.regions import UNKNOWN, Counts, ErrorMaps, RegionScore, error_maps, region_scores
+from splatnode.recon.evaluate.same_lens import of_one_lens, seen_by
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.start_pose import between_neighbours
 from splatnode.recon.evaluate.test_pose import find_test_pose
@@ -140,9 +141,9 @@ def evaluate(
     errors = _camera_errors(estimated, scene)
     appearance = appearance_of(snapshot, rasterize)
     found = {} if found is None else found
-    views = _score_test_views(
-        appearance, snapshot.cameras, estimated, scene, split, networks, settings, show, found, shown or {}
-    )
+    cameras = of_one_lens(snapshot.cameras)
+    counts = {} if shown is None or (cameras and cameras[0].lens) else shown  # they are of the photographs as they are
+    views = _score_test_views(appearance, cameras, estimated, scene, split, networks, settings, show, found, counts)
     return Row(
         scene=scene.name,
         views=len(split.train),
@@ -199,7 +200,8 @@ def _score_test_views(
     by the similarity that aligns the training cameras; or from between its neighbours, if `settings` says so. No view
     can be scored with fewer than two of them. Photographs are compared where they show the scene: a black rim that
     undistortion left is cut off, for the search too, and what a mask hides counts as well rendered in SSIM and LPIPS,
-    and not at all in PSNR and in the scores by region.
+    and not at all in PSNR and in the scores by region. A distortion that
+    was taken out of the training photographs is taken out of these, too.
     """
     if appearance is None or len(estimated) < 2:
         return []
@@ -208,7 +210,7 @@ def _score_test_views(
         np.stack([camera.T_world_camera for camera in estimated]),
     )
     names = [name for name in split.test if name in scene.cameras]
-    given = [scene.masked_image(name) for name in names]
+    given = [seen_by(cameras[0].lens, *scene.masked_image(name)) for name in names]
     photographs = [modelled_image(image, settings.longer_side) for image, _ in given]
     rims = border.valid_masks(photographs)
     scores = []
@@ -282,7 +284,7 @@ def _camera_errors(estimated: Sequence[CameraEstimate], scene: EvaluationScene) 
     return camera_errors(
         np.array([camera.T_world_camera for camera in estimated]).reshape(-1, 4, 4),
         np.array([camera.T_world_camera for camera in true]).reshape(-1, 4, 4),
-        np.array([camera.K for camera in estimated]).reshape(-1, 3, 3),
+        np.array([camera.K_photographed for camera in estimated]).reshape(-1, 3, 3),
         np.array([t.K_for(camera.width, camera.height) for t, camera in zip(true, estimated, strict=True)]).reshape(
             -1, 3, 3
         ),

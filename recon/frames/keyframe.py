@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import Frame, Intrinsics
 
 # Thresholds in pixels hold at this longer side of an image: an error counts as error * REFERENCE_SIDE / longer side.
 REFERENCE_SIDE = 1024
@@ -43,6 +43,7 @@ class Keyframe:
     frame: Frame  # undistorted, at full size
     image: npt.NDArray[np.uint8]  # (h, w, 3) RGB at modelled size
     features: Features
+    lens: Intrinsics | None = None  # estimated, whose distortion was taken out of all of it; None: nothing was
 
     @property
     def name(self) -> str:

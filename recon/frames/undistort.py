@@ -63,6 +63,11 @@ def undistorted(frame: Frame) -> Frame:
     return replace(frame, image=image.astype(np.uint8), intrinsics=pinhole, mask=mask)
 
 
+def without_distortion(image: npt.NDArray[np.uint8], lens: Intrinsics | None) -> npt.NDArray[np.uint8]:
+    """A photograph (H, W, 3), at any size, as `undistorted` shows it; itself without a lens. Raises likewise."""
+    return image if lens is None else undistorted(Frame(0, "photograph", 0, image, lens)).image
+
+
 def _carried(mask: npt.NDArray[np.bool_], columns: npt.NDArray, rows: npt.NDArray) -> npt.NDArray[np.bool_]:
     """The mask (H, W) as its photograph is resampled; a pixel is used where all that it is made of is."""
     return cv2.remap(mask.astype(np.float32), columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) > 0.999

@@ -56,8 +56,10 @@ def views_of(snapshot: Snapshot) -> Mapping[str, View]:
     found = {}
     for camera in sorted(snapshot.cameras, key=lambda camera: camera.frame_id):
         side, size = max(camera.width, camera.height), np.array([camera.width, camera.height])
-        shift = (camera.K[:2, 2] - size / 2.0) / side
-        found[camera.name] = View(camera.T_world_camera, float(camera.K[0, 0]) / side, 0.0, shift, bounds[camera.name])
+        K = camera.K_photographed
+        shift = (K[:2, 2] - size / 2.0) / side
+        radial = 0.0 if camera.lens is None else camera.lens.distortion[0]
+        found[camera.name] = View(camera.T_world_camera, float(K[0, 0]) / side, radial, shift, bounds[camera.name])
     landmarks = snapshot.landmarks
     if landmarks is None:
         return found

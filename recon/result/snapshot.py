@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.frame import DroppedFrame, Intrinsics
 from splatnode.capture.stamp import Stamp
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.landmarks import Landmarks
@@ -30,6 +30,14 @@ class CameraEstimate:
     height: int
     bounds: Bounds | None = None  # of its errors; None: not estimated
     captured_at: Stamp | None = None  # of its photograph; None: nobody knows
+    # Estimated, of the photograph in full size: its distortion was taken out of the image, whose pinhole is K. None: K
+    # is estimated of the photograph as it came, or without the distortion that was given
+    lens: Intrinsics | None = None
+
+    @property
+    def K_photographed(self) -> npt.NDArray[np.float64]:
+        """(3, 3) of the photograph at `width` x `height` before an estimated distortion was taken out of it."""
+        return self.K if self.lens is None else self.lens.resized(self.width, self.height).K
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,9 +34,8 @@ def first_look(graph: ViewGraph, registration: Registration, max_gaussians: int 
         source[registration.observed_point[mine]] = keyframe.frame.frame_id
         T_world_camera = torch.tensor(camera.T_world_camera, dtype=torch.float32)
         K = torch.tensor(modelled_K(graph, camera), dtype=torch.float32)
-        views.append(
-            TrainingView(keyframe.name, keyframe.frame.frame_id, keyframe.image, T_world_camera, K, mask=keyframe.mask)
-        )
+        shown = keyframe.name, keyframe.frame.frame_id, keyframe.image
+        views.append(TrainingView(*shown, T_world_camera, K, mask=keyframe.mask, lens=keyframe.lens))
     seen = np.flatnonzero(source >= 0)
     most = min(len(seen), MAX_GAUSSIANS, max_gaussians or MAX_GAUSSIANS)
     chosen = seen[np.linspace(0, len(seen) - 1, most).round().astype(np.int64)]

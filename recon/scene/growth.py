@@ -48,6 +48,7 @@ def grow(
             background=msgspec.structs.replace(config.background, spacing_deg=0.0),
         ),
         {graph.keyframes[index].name: graph.keyframes[index].mask for index in shown},
+        lenses={graph.keyframes[index].name: graph.keyframes[index].lens for index in shown},
     )
     views = tuple(view for view in begun.views if view.name in further)
     ids = torch.tensor([view.frame_id for view in views], dtype=torch.int32)

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from splatnode.capture.frame import Intrinsics
 from splatnode.recon.frames import border
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.scene import background, completion, pixelwise, seeding
@@ -38,12 +39,14 @@ def initial_scene(
     config: Config,
     masks: Mapping[str, Mask | None] = MappingProxyType({}),
     exposures: Mapping[str, Exposure] = MappingProxyType({}),
+    lenses: Mapping[str, Intrinsics | None] = MappingProxyType({}),
 ) -> Scene:
     """The scene with a training view for each point map, and Gaussians seeded from all of them.
 
     `images` (h, w, 3) are found by the point maps' names. Pixels of a dark rim, which do not show the
     scene, seed nothing. Nor do those that `masks` (h, w) hide, of which the point maps know nothing; where no view
-    sees behind them, the fill goes on there. `exposures` were taken out of the images.
+    sees behind them, the fill goes on there. `exposures`, and the distortion of
+    `lenses`, were taken out of the images.
     """
     pictures = [images[pointmap.name] for pointmap in pointmaps]
     valid = border.valid_masks(pictures)
@@ -59,13 +62,15 @@ def initial_scene(
     del usable
     if config.pixelwise is not None:
         surfaces = pixelwise.pixelwise_gaussians(dense, pictures, config.pixelwise, limit)
-        return Scene(_views(dense, images, masks, exposures), concatenate([surfaces, *shells]))
+        return Scene(_views(dense, images, masks, exposures, lenses), concatenate([surfaces, *shells]))
     surfaces = seeding.initial_gaussians(dense, pictures, config.seeding)
     num_unlimited = len(surfaces) + sum(map(len, shells))
     if limit is not None and len(surfaces) > limit:
         surfaces = seeding.initial_gaussians(dense, pictures, config.seeding, limit)
     return Scene(
-        _views(pointmaps, images, masks, exposures), concatenate([surfaces, *shells]), num_unlimited=num_unlimited
+        _views(pointmaps, images, masks, exposures, lenses),
+        concatenate([surfaces, *shells]),
+        num_unlimited=num_unlimited,
     )
 
 
@@ -79,6 +84,7 @@ def _views(
     images: Mapping[str, Image],
     masks: Mapping[str, Mask | None],
     exposures: Mapping[str, Exposure],
+    lenses: Mapping[str, Intrinsics | None],
 ) -> tuple[TrainingView, ...]:
     return tuple(
         TrainingView(
@@ -90,6 +96,7 @@ def _views(
             pointmap=pointmap,
             mask=masks.get(pointmap.name),
             exposure=exposures.get(pointmap.name),
+            lens=lenses.get(pointmap.name),
         )
         for pointmap in pointmaps
     )

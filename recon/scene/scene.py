@@ -11,6 +11,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from splatnode.capture.frame import Intrinsics
 from splatnode.capture.stamp import Stamp
 from splatnode.recon.frames import border
 from splatnode.recon.priors.pointmap import Pointmap
@@ -38,7 +39,8 @@ class TrainingView:
     K: Tensor  # (3, 3) at modelled size
     pointmap: Pointmap | None = None  # with the camera as registered; None: there is none
     mask: npt.NDArray[np.bool_] | None = None  # (h, w), True: the scene is fitted to it; None: to all pixels
-    exposure: Exposure | None = None  # that was taken out of the photograph; None: `image` is the photograph
+    exposure: Exposure | None = None  # that was taken out of the photograph; None: nothing was
+    lens: Intrinsics | None = None  # estimated, whose distortion was taken out of the photograph; None: nothing was
 
     @property
     def width(self) -> int:
@@ -89,6 +91,7 @@ class Scene:
                 height=view.height,
                 bounds=bounds.get(view.name),
                 captured_at=captured_at.get(view.name),
+                lens=view.lens,
             )
             for view in self.views
         )

@@ -15,12 +15,36 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.registered_camera import modelled_K, sparse_points
 from splatnode.recon.registration.register import RegisteredCamera, Registration
+from splatnode.recon.registration.straightened import corner_shift, straightened, with_lenses
 from splatnode.recon.result.sources import frame_of
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
 
 MIN_POINTS = 8  # with a known depth at their pixels, that tell how much farther a camera's point map lies now
+MAX_LENS_SHIFT = 0.002  # of the longer side, a pixel of 512, by which a new lens may move the corner of a photograph
 MAX_STRETCH = 2.0  # largest ratio of depths that a scene is warped by; beyond it, the scene is rebuilt
+
+
+@dataclass(frozen=True, eq=False)
+class Beside:
+    """A scene, and what is known by now in its world; its photographs are those of the graph, straight as they are."""
+
+    scene: Scene
+    graph: ViewGraph
+    registration: Registration
+
+
+def beside(scene: Scene, registration: Registration, graph: ViewGraph, provisional: bool) -> Beside | None:
+    """What a new registration says, in the world of the scene; None where it cannot be brought there.
+
+    Photographs are straightened. The lenses of a provisional registration are those of the scene, where it has some.
+    """
+    if provisional:
+        registration = with_lenses(registration, graph, {view.name: view.lens for view in scene.views})
+    graph, registration = straightened(graph, registration)
+    straight = with_photographs(scene, graph)
+    placed = None if straight is None else registration_in_scene_world(straight, registration, graph)
+    return None if straight is None or placed is None else Beside(straight, graph, placed)
 
 
 def registration_in_scene_world(scene: Scene, registration: Registration, graph: ViewGraph) -> Registration | None:
@@ -48,6 +72,22 @@ def registration_in_scene_world(scene: Scene, registration: Registration, graph:
         ),
         points=similarity(registration.points),
     )
+
+
+def with_photographs(scene: Scene, graph: ViewGraph) -> Scene | None:
+    """The scene with its photographs as `graph` has them, without the distortion that is estimated by now.
+
+    None where that moves the corner of one by more than MAX_LENS_SHIFT, or `graph` lacks one.
+    """
+    keyframes, views = {keyframe.name: keyframe for keyframe in graph.keyframes}, []
+    for view in scene.views:
+        keyframe = keyframes.get(view.name)
+        if keyframe is None or abs(corner_shift(keyframe.lens) - corner_shift(view.lens)) > MAX_LENS_SHIFT:
+            return None
+        if keyframe.lens is not None and view.exposure is None:
+            view = replace(view, image=keyframe.image, mask=keyframe.mask, lens=keyframe.lens)
+        views.append(view)
+    return replace(scene, views=tuple(views))
 
 
 def updated_pointmaps(

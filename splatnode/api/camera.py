@@ -28,7 +28,8 @@ class Camera:
     K: Array  # (3, 3) of the photograph at `width` x `height`, without distortion; the top-left pixel is at (0.5, 0.5)
     width: int  # of the photograph as the scene was fitted to it, pixels
     height: int  # likewise, pixels
-    lens: Intrinsics | None = None  # as it was given, with its distortion; None: it was estimated, without any
+    # As it was given; or estimated with a distortion that was taken out of the photograph. None: estimated, without any
+    lens: Intrinsics | None = None
     bounds: Bounds | None = None  # the claim: its errors are smaller with 95 %; None: nothing is claimed
     captured_at: Stamp | None = None  # nanoseconds, and of which clock; None: nobody knows
 
@@ -59,7 +60,7 @@ def camera_of(estimate: CameraEstimate, lens: Intrinsics | None = None) -> Camer
         K=estimate.K.copy(),
         width=estimate.width,
         height=estimate.height,
-        lens=lens,
+        lens=lens or estimate.lens,
         bounds=estimate.bounds,
         captured_at=estimate.captured_at,
     )

@@ -41,6 +41,7 @@ BENCHMARKS = {
         "movers",
         "fisheyes",
         "light",
+        "bent",
         "calibrate",
         "occupancy",
         "metres",

@@ -692,6 +692,25 @@ def test_photographs_of_different_exposure():
         says(f"| {gains['scene']} | {gains['views']} | {' | '.join(scores)} | {told} |")
 
 
+def test_lenses_that_bend_lines():
+    rows = raw("bent")["rows"]
+    taken_out = [row for row in rows if row["kind"] == "straight"]
+    as_they_were = [row for row in rows if row["kind"] == "as photographed"]
+    for row, other in zip(taken_out, as_they_were, strict=True):
+        assert row["straightened"] and (row["scene"], row["k1"]) == (other["scene"], other["k1"])
+        scores = [" / ".join((f"{r['psnr']:.1f}", part(r["ssim"], 3), part(r["lpips"], 3))) for r in (row, other)]
+        lens = f"−{part(-row['k1'], 2)} | −{part(-row['estimated_k1'], 3)} | {-row['corner_shift_px']:.0f} px"
+        says(f"| {row['scene']} | {lens} | {' | '.join(scores)} |")
+    untouched = [row for row in rows if row["kind"] == "as it came"]
+    assert not any(row["straightened"] for row in untouched)
+    (bent,) = [row for row in untouched if row["k1"]]
+    says(f"{bent['scene']} bent by −{part(-bent['k1'], 2)} is estimated as −{part(-bent['estimated_k1'], 2)}")
+    says(f"which moves a corner by {-bent['corner_shift_px']:.1f} pixels")
+    plain = [abs(row["corner_shift_px"]) for row in untouched if not row["k1"]]
+    assert len(plain) == 7
+    says(f"none moves by more than {max(plain) + 0.05:.1f} pixels")
+
+
 def test_speed_of_parts():
     clock = raw("rasterize")["cases"]["50k_512x384_all"]["clock_ms"]
     says(f"| {clock['median']:.1f} ms in the median, {clock['min']:.1f} ms at best | `rasterize.json` |")

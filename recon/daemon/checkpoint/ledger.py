@@ -14,7 +14,8 @@ from splatnode.capture.messaging.wire import Limits, decode, encode
 
 log = logging.getLogger(__name__)
 
-# Of a checkpoint's files: 1 knew no time of capture, 2 no parts of places, 3 no masks, 4 no fisheyes, 5 no given poses.
+# Of a checkpoint's files: 1 knew no time of capture, 2 no parts of places, 3 no masks, 4 no fisheyes, 5 neither given
+# poses nor lenses that were estimated.
 VERSION = 6
 FILE = "ledger"
 # Of what this process wrote itself.

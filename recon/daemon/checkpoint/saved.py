@@ -11,10 +11,12 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
+from splatnode.capture.frame import Intrinsics
 from splatnode.capture.messaging.wire import Message
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.registration.straightened import straight
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
 
@@ -37,6 +39,7 @@ class SceneRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     views: list[str]  # their names
     iterations: int
     final: bool
+    lenses: list[Intrinsics | None] = []  # estimated, of each view; empty: of none
 
 
 def graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
@@ -75,7 +78,8 @@ def scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDAr
     views = [view.name for view in scene.views]
     cameras = [torch.stack([view.T_world_camera for view in scene.views]), torch.stack([v.K for v in scene.views])]
     gaussians = [getattr(scene.gaussians, field.name) for field in fields(Gaussians)]
-    return SceneRecord(views, scene.iterations, final), [tensor.numpy() for tensor in (*cameras, *gaussians)]
+    lenses = [view.lens for view in scene.views]
+    return SceneRecord(views, scene.iterations, final, lenses), [tensor.numpy() for tensor in (*cameras, *gaussians)]
 
 
 def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe]) -> Scene | None:
@@ -86,18 +90,17 @@ def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe])
     if len(message.arrays) != 2 + len(fields(Gaussians)):
         raise ValueError(f"a scene of {len(message.arrays)} arrays is of another version")
     Ts_world_camera, Ks, *gaussians = (torch.from_numpy(np.array(array)) for array in message.arrays)
+    lenses = header.lenses or [None] * len(header.views)
     views = tuple(
-        TrainingView(
-            name=name,
-            frame_id=keyframes[name].frame.frame_id,
-            image=keyframes[name].image,
-            T_world_camera=T_world_camera,
-            K=K,
-            mask=keyframes[name].mask,
-        )
-        for name, T_world_camera, K in zip(header.views, Ts_world_camera, Ks, strict=True)
+        _view(keyframes[name] if lens is None else straight(keyframes[name], lens), T_world_camera, K)
+        for name, lens, T_world_camera, K in zip(header.views, lenses, Ts_world_camera, Ks, strict=True)
     )
     return Scene(views, Gaussians(*gaussians), header.iterations)
+
+
+def _view(keyframe: Keyframe, T_world_camera: torch.Tensor, K: torch.Tensor) -> TrainingView:
+    shown = keyframe.name, keyframe.frame.frame_id, keyframe.image
+    return TrainingView(*shown, T_world_camera, K, mask=keyframe.mask, lens=keyframe.lens)
 
 
 def taken_apart(value: Any) -> tuple[Numbers, list[npt.NDArray]]:

@@ -134,7 +134,7 @@ def whole_errors(cameras: Sequence[CameraEstimate], truth: Mapping[str, TrueCame
     return camera_errors(
         np.array([camera.T_world_camera for camera in cameras]).reshape(-1, 4, 4),
         np.array([each.T_world_camera for each in true]).reshape(-1, 4, 4),
-        np.array([camera.K for camera in cameras]).reshape(-1, 3, 3),
+        np.array([camera.K_photographed for camera in cameras]).reshape(-1, 3, 3),
         np.array(Ks).reshape(-1, 3, 3),
     )
 
@@ -149,5 +149,5 @@ def _of_distance(distance: float, similarity: Similarity) -> float:
 
 
 def _focal_pct(camera: CameraEstimate, true: TrueCamera) -> float:
-    K, K_true = camera.K, true.K_for(camera.width, camera.height)
+    K, K_true = camera.K_photographed, true.K_for(camera.width, camera.height)
     return 100.0 * abs(math.sqrt(K[0, 0] * K[1, 1] / (K_true[0, 0] * K_true[1, 1])) - 1.0)

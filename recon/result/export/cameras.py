@@ -13,6 +13,7 @@ from typing import Annotated, TypeAlias
 import msgspec
 import numpy as np
 
+from splatnode.capture.frame import Intrinsics
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import LONGEST_TEXT, is_printable, printable
 from splatnode.capture.stamp import LARGEST_NS, Clock, Stamp
@@ -40,6 +41,11 @@ BOUNDS_MEANING = (
     "are the semi-axes of the ellipsoid around the centre, in the file's unit and world"
 )
 
+LENS_MEANING = (
+    "estimated, in pixels of the photograph in full size: its distortion (OpenCV's k1 k2 p1 p2) was taken out of the "
+    "picture that K, width and height are of; null: nothing estimated was"
+)
+
 
 def camera_record(camera: CameraEstimate) -> dict[str, object]:
     """A camera as cameras.json and report.json hold it."""
@@ -51,6 +57,7 @@ def camera_record(camera: CameraEstimate) -> dict[str, object]:
         "K": camera.K.tolist(),
         "width": camera.width,
         "height": camera.height,
+        "lens": None if camera.lens is None else asdict(camera.lens),
         "bounds": None if camera.bounds is None else asdict(camera.bounds),
     }
 
@@ -68,6 +75,7 @@ def encode_cameras(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -
             "axes": "OpenCV: x right, y down, z forward",
             "T_world_camera": "p_world = T_world_camera @ p_camera",
             "stamp_ns": STAMP_MEANING,
+            "lens": LENS_MEANING,
             "bounds": BOUNDS_MEANING,
             "pixel_origin": "the centre of the top-left pixel is (0.5, 0.5)",
             "cameras": [camera_record(camera) for camera in cameras],
@@ -93,6 +101,7 @@ class _Camera(msgspec.Struct, frozen=True):
     bounds: _Bounds | None = None
     stamp_ns: Annotated[int, msgspec.Meta(ge=0, le=LARGEST_NS)] | None = None
     clock: Clock | None = None
+    lens: Intrinsics | None = None
 
 
 class _File(msgspec.Struct, frozen=True):
@@ -145,4 +154,4 @@ def _camera(record: _Camera, name: str) -> CameraEstimate:
     bounds = record.bounds and Bounds(**msgspec.structs.asdict(record.bounds))
     captured_at = None if record.stamp_ns is None or record.clock is None else Stamp(record.stamp_ns, record.clock)
     size = record.width, record.height
-    return CameraEstimate(record.name, record.frame_id, T_world_camera, K, *size, bounds, captured_at)
+    return CameraEstimate(record.name, record.frame_id, T_world_camera, K, *size, bounds, captured_at, record.lens)

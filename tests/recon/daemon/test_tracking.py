@@ -9,6 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatnode.capture.cameras import synthetic
+from splatnode.capture.frame import Intrinsics
+from splatnode.capture.lenses import opencv
 from splatnode.recon.daemon.tracking import Config, Landmarks, Tracker, landmarks, locate, motion
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import features
@@ -143,3 +145,11 @@ def test_landmarks_lie_on_what_the_gaussians_show():
     np.testing.assert_allclose(found.points[:, 2], 2.0, rtol=1e-3)
     projected = found.points[:, :2] / found.points[:, 2:] * 300 + [160, 120]
     np.testing.assert_allclose(projected[0], keyframe.features.points[0], atol=0.1)
+    lens = Intrinsics(640, 480, 610.0, 610.0, 320.0, 240.0, "estimated", (-0.2, 0.0, 0.0, 0.0))
+    large = replace(frame, image=np.repeat(np.repeat(frame.image, 2, 0), 2, 1))
+    plain = keyframe.features
+    keyframe = Keyframe(large, frame.image, replace(plain, points=2 * plain.points))  # as it was photographed
+    (found,) = landmarks(replace(snapshot, cameras=(replace(camera, lens=lens),)), [keyframe], CONFIG)
+    rays = opencv.unproject(keyframe.features.points, lens)
+    expected = 2.0 * rays[:, :2] / rays[:, 2:]
+    np.testing.assert_allclose(found.points[0, :2], expected[plain.point_of[plain.tilt == 1.0]][0], rtol=1e-3)

@@ -13,11 +13,15 @@ import numpy as np
 import pytest
 import torch
 
+from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.evaluate.metrics import psnr
 from splatnode.recon.evaluate.protocol import Run, evaluate, mean_intrinsics
+from splatnode.recon.evaluate.stability.places import Photo
+from splatnode.recon.evaluate.stability.warps import distorted
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.frames import border
+from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.cameras import encode_cameras
@@ -114,6 +118,25 @@ def test_frames_tell_a_reconstruction_nothing_but_pixels(scene_folder):
 
 
 # --- scores
+
+
+def test_an_estimated_distortion_is_taken_out_of_held_out_photographs_too(scene_folder, tmp_path):
+    scene = load_scene(scene_folder)
+    shutil.copytree(scene_folder, tmp_path / "blobs")
+    shutil.copy(scene_folder.parent / "splits.json", tmp_path)
+    for name in NAMES:
+        photo = distorted(Photo(name, scene.image(name), scene.cameras[name]), -0.3)
+        cv2.imwrite(str(tmp_path / "blobs" / "images" / name), photo.image[..., ::-1])
+    focal = photo.camera.K[0, 0]
+    lens = Intrinsics(WIDTH, HEIGHT, focal, focal, 48.0, 36.0, "estimated", (-0.3, 0.0, 0.0, 0.0))
+    pinhole = undistorted(Frame(0, "a", 0, photo.image, lens)).intrinsics.K
+    snapshot = perfect_snapshot()
+    straight = tuple(replace(camera, K=pinhole, lens=lens) for camera in snapshot.cameras)
+    row = score(replace(snapshot, cameras=straight), tmp_path / "blobs")
+    as_they_are = tuple(replace(camera, K=lens.K) for camera in snapshot.cameras)
+    other = score(replace(snapshot, cameras=as_they_are), tmp_path / "blobs")
+    assert row.psnr > 32.0 and row.psnr > other.psnr + 5.0
+    assert row.focal_error_pct == pytest.approx(100.0 * (focal / 90.0 - 1.0))  # of the photographs as they were taken
 
 
 def test_perfect_reconstruction_scores_perfectly(scene_folder):

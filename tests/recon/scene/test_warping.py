@@ -9,9 +9,17 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from splatnode.capture.frame import Intrinsics
 from splatnode.recon.geometry import Similarity
+from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.register import Registration
-from splatnode.recon.scene.warping import registration_in_scene_world, updated_pointmaps, warped_scene
+from splatnode.recon.registration.straightened import straight
+from splatnode.recon.scene.warping import (
+    registration_in_scene_world,
+    updated_pointmaps,
+    warped_scene,
+    with_photographs,
+)
 from tests.support.row_of_views import HEIGHT, STEP, WIDTH, camera, graph_of, maps_of, registration_of, scene_of
 
 WORLD = Similarity(1.7, Rotation.from_euler("xyz", [20, -40, 10], degrees=True).as_matrix(), np.array([0.3, -1.0, 2.0]))
@@ -105,3 +113,21 @@ def test_a_scene_that_would_not_hold_together_is_not_moved(what):
     else:
         del after["02.png"]
     assert warped_scene(scene, before, after, 0.1) is None
+
+
+def test_photographs_follow_a_lens_that_changed_little_and_a_scene_begins_anew_after_another():
+    graph = graph_of(2)
+    scene = scene_of(2, graph)
+    assert with_photographs(scene, graph).views == scene.views
+
+    def bent(radial: float) -> ViewGraph:
+        lens = Intrinsics(WIDTH, HEIGHT, 35.0, 35.0, 16.0, 12.0, "estimated", (radial, 0.0, 0.0, 0.0))
+        return replace(graph, keyframes=tuple(straight(keyframe, lens) for keyframe in graph.keyframes))
+
+    assert with_photographs(scene, bent(-0.2)) is None  # it was not bent before
+    first, second = bent(-0.2), bent(-0.205)
+    views = [replace(view, image=k.image, lens=k.lens) for view, k in zip(scene.views, first.keyframes, strict=True)]
+    found = with_photographs(replace(scene, views=tuple(views)), second)
+    assert [view.lens for view in found.views] == [keyframe.lens for keyframe in second.keyframes]
+    assert all(view.image is keyframe.image for view, keyframe in zip(found.views, second.keyframes, strict=True))
+    assert with_photographs(replace(scene, views=tuple(views)), graph_of(1)) is None

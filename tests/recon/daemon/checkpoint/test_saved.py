@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from splatnode.capture.frame import Intrinsics
 from splatnode.capture.messaging.wire import Message, decode, encode
 from splatnode.recon.daemon.checkpoint.saved import (
     GraphRecord,
@@ -18,6 +19,7 @@ from splatnode.recon.daemon.checkpoint.saved import (
     scene_message,
 )
 from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.registration.straightened import straight
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
 from tests.support.synthetic import photographs, tiny_scene, view_graph
@@ -72,6 +74,21 @@ def test_the_scene_comes_back_to_the_bit(graph, scene):
         assert (one.name, one.frame_id) == (other.name, other.frame_id)
         assert np.array_equal(one.image, other.image)
     found.gaussians.means.add_(1)  # it can be optimised: its memory is its own
+
+
+def test_straightened_photographs_are_straightened_again(graph, scene):
+    keyframes = {keyframe.name: keyframe for keyframe in graph.keyframes}
+    lens = Intrinsics(320, 240, 300.0, 300.0, 160.0, 120.0, "estimated", (-0.2, 0.0, 0.0, 0.0))
+    bent = straight(graph.keyframes[1], lens)
+    first, second, third = scene.views
+    views = first, replace(second, image=bent.image, lens=lens), third
+    found = scene_from(over_the_disk(*scene_message(replace(scene, views=views), final=False)), keyframes)
+    assert [view.lens for view in found.views] == [None, lens, None]
+    for one, other in zip(found.views, views, strict=True):
+        assert np.array_equal(one.image, other.image)
+    header, arrays = scene_message(scene, final=False)
+    earlier = SceneRecord(header.views, header.iterations, header.final)  # of a version that knew no lenses
+    assert all(view.lens is None for view in scene_from(over_the_disk(earlier, arrays), keyframes).views)
 
 
 def test_a_scene_of_which_a_frame_is_gone_is_made_anew(graph, scene):

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
+from splatnode.capture.frame import Intrinsics
 from splatnode.recon.result.export import SceneFileError, export_scene, read_cameras
 from tests.support.exported import make_snapshot, stamped, write
 
@@ -18,6 +20,24 @@ def test_cameras_read_back_exactly(tmp_path):
         assert np.array_equal(read.K, camera.K)
         assert (read.name, read.frame_id, read.width, read.height) == (camera.name, camera.frame_id, 512, 384)
         assert read.bounds == camera.bounds is not None
+
+
+def test_an_estimated_lens_reads_back_exactly_and_a_file_without_is_that_of_an_earlier_version(tmp_path):
+    lens = Intrinsics(4000, 3000, 3200.5, 3200.5, 2001.0, 1499.0, "estimated", (-0.1, 0.0, 0.0, 0.0))
+    snapshot = make_snapshot()
+    first, *others = snapshot.cameras
+    write(replace(snapshot, cameras=(replace(first, lens=lens), *others)), tmp_path)
+    file = tmp_path / "cameras.json"
+    assert [camera.lens for camera in read_cameras(file)] == [lens, None]
+    content = json.loads(file.read_text())
+    for camera in content["cameras"]:
+        camera.pop("lens")
+    file.write_text(json.dumps(content))
+    assert [camera.lens for camera in read_cameras(file)] == [None, None]
+    content["cameras"][0]["lens"] = {**asdict(lens), "fx": -1.0}
+    file.write_text(json.dumps(content))
+    with pytest.raises(SceneFileError, match="cameras.json"):
+        read_cameras(file)
 
 
 def test_times_of_capture_read_back_to_the_nanosecond_and_are_in_the_other_files(tmp_path):

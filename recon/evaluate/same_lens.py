@@ -1,0 +1,29 @@
+"""Held-out photographs as a scene shows them: without the distortion that was taken out of its own photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.recon.frames.undistort import undistorted
+from splatnode.recon.result.snapshot import CameraEstimate
+
+Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
+
+
+def of_one_lens(cameras: Sequence[CameraEstimate]) -> Sequence[CameraEstimate]:
+    """Those whose photographs had a distortion taken out, if they are most; else those whose had none."""
+    bent = [camera for camera in cameras if camera.lens is not None]
+    return bent if 2 * len(bent) > len(cameras) else [camera for camera in cameras if camera.lens is None]
+
+
+def seen_by(lens: Intrinsics | None, image: Image, mask: Mask) -> tuple[Image, Mask]:
+    """A photograph (H, W, 3), and where it is used (H, W), without the distortion of `lens`; None: as they are."""
+    if lens is None:
+        return image, mask
+    frame = undistorted(Frame(0, "photograph", 0, image, lens, mask=mask))
+    return frame.image, mask if frame.mask is None else frame.mask

@@ -1,0 +1,211 @@
+"""Photographs by a lens that bends lines and is not told: `python -m tests.bench bent --out bent.json`.
+
+Scenes whose photographs were all taken by a pinhole are bent by a radial coefficient k1, training and held-out
+photographs alike. `balanced` makes a scene with the distortion that registration estimates taken out of the photographs
+("straight"), and of the same cameras with the photographs as they are ("as photographed"). Held-out photographs are
+scored as their scene shows them: straight, or as they are. There only pixels count that the straight ones show, too; in
+SSIM and LPIPS the others count as well rendered, which favours the scenes of photographs as they are.
+
+Scenes as they came follow: how far the estimated distortion moves a corner, and whether photographs are straightened.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.process.progress import say
+from splatnode.recon.config import preset
+from splatnode.recon.estimation import Estimate, estimate_depth
+from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
+from splatnode.recon.evaluate.splits import Split, load_split
+from splatnode.recon.evaluate.stability.places import Photo
+from splatnode.recon.evaluate.stability.warps import distorted
+from splatnode.recon.evaluate.start import Start, continued, find_start, foundation
+from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.incremental import IncrementalReconstruction
+from splatnode.recon.preparation import load_prior
+from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.registration.straightened import corner_shift, straight_pixels, straightened
+
+SETS = (
+    "fountain_p11:6:-0.1",
+    "fountain_p11:6:-0.25",
+    "llff_fern:6:-0.1",
+    "llff_fern:6:-0.25",
+    "fountain_p11:6:0",
+    "llff_fern:6:0",
+    "llff_flower:6:0",
+    "fox:12:0",
+    "sceaux:6:0",
+    "tum_fr3_office:6:0",
+    "castle_p30:6:0",
+)
+EVERY = 2  # of the held-out photographs
+SIDE = 512  # pixels at which shifts are told
+CONFIG = preset("balanced")
+
+
+@dataclass(frozen=True)
+class Row:
+    scene: str
+    views: int
+    k1: float  # by which the photographs were bent
+    verdict: str
+    estimated_k1: float | None  # None: no cameras
+    corner_shift_px: float | None  # of SIDE, as estimated, away from the middle
+    straightened: bool  # whether it was taken out of the photographs
+    kind: str = "as it came"  # straight; as photographed
+    psnr: float | None = None
+    ssim: float | None = None
+    lpips: float | None = None
+    focal_error_pct: float | None = None
+    num_gaussians: int | None = None
+    seconds: float | None = None  # of the processor, from depth on
+
+
+@dataclass(frozen=True, eq=False)
+class Bent(EvaluationScene):
+    """A scene whose photographs were bent, and their true cameras with them."""
+
+    photos: Mapping[str, Photo] = field(default_factory=dict)  # by name, bent
+    seen_by: tuple[Intrinsics, Intrinsics] | None = None  # a lens and the pinhole of its straight photographs
+
+    def image(self, name: str) -> npt.NDArray[np.uint8]:
+        return self.photos[name].image
+
+    def masked_image(self, name: str) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
+        """All of it counts; or, with `seen_by`, what the straight photograph shows."""
+        image = self.image(name)
+        if self.seen_by is None:
+            return image, np.ones(image.shape[:2], bool)
+        lens, pinhole = self.seen_by
+        height, width = image.shape[:2]
+        pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
+        shown = straight_pixels(pixels, lens.resized(width, height), pinhole)
+        inside = np.all((shown >= 0) & (shown <= (pinhole.width, pinhole.height)), axis=1)
+        return image, inside.reshape(height, width)
+
+
+def bent(scene: EvaluationScene, names: Sequence[str], k1: float) -> Bent:
+    """The photographs of these names as a lens with the radial coefficient `k1` shows them."""
+    photos = {name: distorted(Photo(name, scene.image(name), scene.cameras[name]), k1) for name in names}
+    cameras = {name: photo.camera for name, photo in photos.items() if photo.camera is not None}
+    return Bent(scene.name, scene.paths, cameras, None, photos)
+
+
+def as_photographed(estimate: Estimate) -> Estimate:
+    """The same cameras, of which nothing is known but that they are pinholes."""
+    if estimate.registration is None:
+        raise ValueError("there are no cameras")
+    cameras = tuple(replace(camera, radial=0.0) for camera in estimate.registration.cameras)
+    known = replace(estimate, registration=replace(estimate.registration, cameras=cameras), pointmaps={})
+    return estimate_depth(known, load_prior(CONFIG))
+
+
+def told(scene: EvaluationScene, views: int, k1: float, estimate: Estimate) -> Row:
+    """What was estimated of the lens."""
+    registration, code = estimate.registration, estimate.verdict.code.value
+    if registration is None or not estimate.publishable:
+        return Row(scene.name, views, k1, code, None, None, False)
+    camera = registration.cameras[0]
+    frame = estimate.graph.keyframes[camera.index].frame
+    lens = lens_of(estimate, frame)
+    straight = straightened(estimate.graph, registration)[0] is not estimate.graph
+    shift = SIDE * corner_shift(lens)
+    return Row(scene.name, views, k1, code, round(camera.radial, 4), round(shift, 2), straight)
+
+
+def lens_of(estimate: Estimate, frame: Frame) -> Intrinsics:
+    """The lens of the first camera, as it was estimated."""
+    if estimate.registration is None:
+        raise ValueError("there are no cameras")
+    camera = estimate.registration.cameras[0]
+    focal, (cx, cy) = camera.focal, camera.principal.tolist()
+    return Intrinsics(frame.width, frame.height, focal, focal, cx, cy, "estimated", (camera.radial, 0.0, 0.0, 0.0))
+
+
+def scored(start: Start, kind: str, scene: Bent, split: Split, networks: Networks, known: Row) -> Row:
+    begun = time.process_time()
+    snapshot = list(continued(start, CONFIG))[-1]
+    seconds = time.process_time() - begun
+    run = Run("balanced", 0, None, {"total": seconds}, None)
+    row = evaluate(snapshot, scene, split, run, rasterize=rasterize, networks=networks, settings=Settings())
+    return replace(
+        known,
+        kind=kind,
+        straightened=any(camera.lens is not None for camera in snapshot.cameras),
+        psnr=row.psnr,
+        ssim=row.ssim,
+        lpips=row.lpips_alex,
+        focal_error_pct=row.focal_error_pct,
+        num_gaussians=row.num_gaussians,
+        seconds=round(seconds, 1),
+    )
+
+
+def rows(scene: EvaluationScene, split: Split, k1: float, networks: Networks) -> list[Row]:
+    if not k1:
+        work = IncrementalReconstruction(foundation(CONFIG))
+        for frame in scene.frames(split.train):
+            work.take(frame)
+        return [told(scene, len(split.train), k1, work.estimate_thoroughly())]
+    split = replace(split, test=split.test[::EVERY])
+    place = bent(scene, (*split.train, *split.test), k1)
+    start = find_start(place.frames(split.train), foundation(CONFIG))
+    known = told(scene, len(split.train), k1, start.estimate)
+    if not known.straightened or start.estimate.registration is None:
+        return [known]
+    graph, _ = straightened(start.estimate.graph, start.estimate.registration)
+    straight = graph.keyframes[start.estimate.registration.cameras[0].index]
+    if straight.lens is None or straight.frame.intrinsics is None:
+        raise AssertionError("a straightened keyframe has its lens and its pinhole")
+    seen = replace(place, seen_by=(straight.lens, straight.frame.intrinsics))
+    other = replace(start, estimate=as_photographed(start.estimate))
+    return [
+        scored(start, "straight", place, split, networks, known),
+        scored(other, "as photographed", seen, split, networks, known),
+    ]
+
+
+def in_words(row: Row) -> str:
+    estimated = f"{row.scene} {row.views}, bent by {row.k1:g}: {row.verdict}"
+    if row.corner_shift_px is not None:
+        estimated += f", estimated {row.estimated_k1:+.4f}, {row.corner_shift_px:+.1f} px"
+    if row.psnr is None or row.ssim is None:
+        return f"{estimated}, {'straightened' if row.straightened else 'as they are'}"
+    return f"{estimated}, {row.kind}: {row.psnr:.2f} dB, SSIM {row.ssim:.3f}, focal {row.focal_error_pct:.1f} %"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sets", nargs="*", default=SETS, metavar="SCENE:VIEWS:K1", help=f"default: {' '.join(SETS)}")
+    parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    args = parser.parse_args()
+    networks = load_networks(args.shared / "weights").quickest
+    found: list[Row] = []
+    for each in args.sets:
+        name, views, k1 = each.split(":")
+        scene = load_scene(args.shared / "scenes" / name)
+        split = load_split(args.shared / "scenes" / name, list(scene.paths), int(views))
+        further = rows(scene, split, float(k1), networks)
+        for row in further:
+            say(in_words(row))
+        found += further
+        command = shlex.join(["python", "-m", "tests.bench", "bent", *sys.argv[1:]])
+        args.out.write_text(json.dumps({"command": command, "rows": [asdict(row) for row in found]}, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
