@@ -19,7 +19,7 @@ from splatnode.viewer.canvas import BACKGROUND
 from splatnode.viewer.colours import source_colour
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.shapes import TRACKED_COLOUR, Colour, frustum_depth
-from splatnode.viewer.viewpoint import Viewpoint, at_camera, overview, scene_up
+from splatnode.viewer.viewpoint import Viewpoint, at_camera, overview
 
 _LIVE = "/live camera"
 _NEAR = 0.01  # world units, of what is drawn
@@ -47,14 +47,10 @@ class Stage:
 
     def draw(self, moment: Moment) -> None:
         """Shows the moment in place of the one before. Where it is another scene, visitors are taken to it."""
-        view, snapshot, server = overview(moment), moment.snapshot, self.server
+        snapshot, server = moment.snapshot, self.server
         self._centres = np.array([camera.T_world_camera[:3, 3] for camera in snapshot.cameras]).reshape(-1, 3)
         self._depth = frustum_depth(snapshot.cameras)
         with server.atomic():
-            server.scene.set_up_direction(tuple(scene_up(snapshot.cameras)))
-            first = server.initial_camera  # of who comes later, and what "Reset view" goes to
-            first.up, first.position, first.look_at = view.up, view.T_world_camera[:3, 3], view.pivot
-            first.fov = _field(view.lens[0], view.lens[2])
             before, self._nodes, self._frusta = self._nodes, {}, []
             if len(snapshot.gaussians):
                 self._nodes["/gaussians"] = server.scene.add_gaussian_splats("/gaussians", **sent(snapshot.gaussians))
@@ -65,10 +61,19 @@ class Stage:
             for text in self._texts:
                 text.remove()
             self._texts = [_text(server, title, text) for title, text in _told(snapshot)]
-        if moment.scene_id != self._scene_id:
+        if moment.scene_id != self._scene_id and self._nodes:  # before, there was nothing to be taken to
             self._scene_id = moment.scene_id
-            for client in server.get_clients().values():
-                _go(client, view)
+            self._begin(overview(moment))
+
+    def _begin(self, view: Viewpoint) -> None:
+        """Takes visitors there, and those who come later. Not within a scene: viser moves all who look already."""
+        server, first = self.server, self.server.initial_camera
+        with server.atomic():
+            server.scene.set_up_direction(tuple(view.up))
+            first.up, first.position, first.look_at = view.up, view.T_world_camera[:3, 3], view.pivot
+            first.fov = _field(view.lens[0], view.lens[2])
+        for client in server.get_clients().values():
+            _go(client, view)
 
     def track(self, camera: CameraEstimate | None) -> None:
         """Shows where the live camera is; None: that is not known."""

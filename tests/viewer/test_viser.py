@@ -155,6 +155,10 @@ def test_a_browser_shows_what_the_projects_own_rasteriser_does():
             theirs = cv2.cvtColor(page.picture(), cv2.COLOR_BGR2RGB)[:height, :width]
             difference = np.abs(ours.astype(int) - theirs)[middle].mean()
         assert difference < 8.0 and ours[middle].std() > 30.0
+        stage.draw(place(cameras=whole.snapshot.cameras[:1]))  # the same scene: the visitor stays
+        assert page.wait(f"{texts}.some(each => each.includes('1 cameras'))")
+        time.sleep(0.5)  # a visitor who is moved tells of it
+        assert np.allclose(visitor.camera.position, view.T_world_camera[:3, 3], atol=1e-6)
         assert page.complaints == []
 
 
