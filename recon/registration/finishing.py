@@ -18,6 +18,7 @@ Array = npt.NDArray[np.float64]
 _ROBUST_PER_MEDIAN = 3.0  # scale of the robust loss over the median error
 _TOLERANCES = (3.0, 2.0, 1.0)  # of observations, in one adjustment after the other: multiples of `max_error_px`
 _REFINED_ADJUSTMENTS = 3  # with subpixel observations; each drops outliers, and the next one fits better
+_WIDEST_RADIAL = 0.3  # prior standard deviation of a radial coefficient before observations tell how large it is
 _MIN_OBSERVATIONS = 6  # of a registered camera: three fix a pose, twice as many check it
 
 
@@ -31,7 +32,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # otherwise than the model moves whole regions alike. With this number, errors of real cameras are as large as
     # their sigmas say (tests/bench/quality/poses.py).
     correlated: float = 100.0
-    radial_sigma: float = 0.02  # prior standard deviation of the radial coefficient of a lens that is not calibrated
+    # Prior standard deviation of the radial coefficient of a lens that is not calibrated, where pictures tell little
+    radial_sigma: float = 0.02
     shift_sigma: float = 0.004  # that of its principal point, as a share of the longer side
 
 
@@ -55,6 +57,7 @@ def finish(
     loss = _loss(problem, partial.estimate, config)
     for tolerance in _TOLERANCES:
         partial = incremental.adjust(problem, partial, problem.final_tracks, loss, tolerance, config.triangulation)
+        partial = replace(partial, prior=_by_evidence(partial.prior, partial.estimate, config))
         if len(partial.estimate.points) < config.min_points:
             return None
         loss = _loss(problem, partial.estimate, config)
@@ -64,6 +67,7 @@ def finish(
             partial = replace(partial, estimate=refined)
             for _ in range(_REFINED_ADJUSTMENTS):
                 partial = _adjust_and_filter(problem, partial, config)
+                partial = replace(partial, prior=_by_evidence(partial.prior, partial.estimate, config))
             loss = _loss(problem, partial.estimate, config)
     errors = _errors(problem, partial.estimate)
     return Finished(partial, loss, float(np.sqrt(np.mean(errors**2))))
@@ -76,8 +80,18 @@ def _free_lenses(problem: MappingProblem, prior: bundle.LensPrior, config: Confi
         [max(view.longer_side for view in problem.views if view.lens == g) for g in range(len(problem.lenses))]
     )
     return replace(
-        prior, radial_sigmas=config.radial_sigma * unknown, shift_sigmas=config.shift_sigma * longer_side * unknown
+        prior, radial_sigmas=_WIDEST_RADIAL * unknown, shift_sigmas=config.shift_sigma * longer_side * unknown
     )
+
+
+def _by_evidence(prior: bundle.LensPrior, estimate: bundle.Problem, config: Config) -> bundle.LensPrior:
+    """The prior under which a radial coefficient is as likely as it was found, and at least as `config` has it.
+
+    A prior as wide as what is found lets a coefficient stay where observations tell it to within half of what it is;
+    any other falls, adjustment by adjustment, to where `config` holds it (MacKay, "Bayesian interpolation", 1992).
+    """
+    found = np.maximum(np.abs(estimate.radials), config.radial_sigma)
+    return replace(prior, radial_sigmas=np.where(prior.radial_sigmas > 0, found, 0.0))
 
 
 def _loss(problem: MappingProblem, estimate: bundle.Problem, config: Config) -> bundle.Config:

@@ -39,7 +39,9 @@ def _inverse(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
     return T
 
 
-def photographed(num_views: int = 5, step_deg: float = 9.0, num_points: int = 400, seed: int = 0) -> Photographed:
+def photographed(
+    num_views: int = 5, step_deg: float = 9.0, num_points: int = 400, seed: int = 0, radial: float = 0.0
+) -> Photographed:
     generator = np.random.default_rng(seed)
     points = generator.uniform(-1.0, 1.0, (num_points, 3)) * [2.0, 1.4, 1.2]
     rotations, translations, pixels, visible = [], [], [], []
@@ -48,7 +50,9 @@ def photographed(num_views: int = 5, step_deg: float = 9.0, num_points: int = 40
         rotation = cv2.Rodrigues(np.array([0.03 * view, angle, 0.02]))[0]
         translation = np.array([0.1 * view, -0.05 * view, 6.0])
         in_camera = points @ rotation.T + translation
-        seen = FOCAL * in_camera[:, :2] / in_camera[:, 2:] + generator.normal(size=(num_points, 2)) * NOISE_PX
+        straight = in_camera[:, :2] / in_camera[:, 2:]
+        bent = straight * (1.0 + radial * (straight**2).sum(1, keepdims=True))
+        seen = FOCAL * bent + generator.normal(size=(num_points, 2)) * NOISE_PX
         inside = (np.abs(seen) < np.array(SIZE) / 2).all(1) & (generator.random(num_points) < 0.8)
         clutter = (generator.random((num_points, 2)) - 0.5) * SIZE
         rotations.append(rotation)
@@ -161,6 +165,19 @@ def test_cameras_are_found_whatever_the_first_focal_length(taken, pairs, focals)
     assert np.exp(found.estimate.log_focals[0]) == pytest.approx(FOCAL, rel=0.01)
     assert found.rms_px == pytest.approx(NOISE_PX * np.sqrt(2.0), rel=0.25)
     assert min(found.inlier_ratios.values()) > 0.95
+
+
+@pytest.mark.parametrize(("radial", "num_points"), [(-0.3, 400), (-0.2, 400), (0.1, 1200)])
+def test_a_lens_that_bends_lines_much_more_than_others_do_is_found(radial, num_points):
+    taken = photographed(num_views=6, num_points=num_points, radial=radial)
+    found = built(taken, compared(taken), (FOCAL,))
+    assert found.estimate.radials[0] == pytest.approx(radial, abs=0.04)
+    assert np.exp(found.estimate.log_focals[0]) == pytest.approx(FOCAL, rel=0.015)
+
+
+def test_a_lens_of_which_little_is_told_is_taken_for_one_that_bends_no_lines(taken, pairs):
+    found = built(taken, pairs, (FOCAL,))
+    assert abs(found.estimate.radials[0]) < 0.01
 
 
 def test_what_is_known_of_a_lens_stays(taken, pairs):
