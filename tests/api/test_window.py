@@ -64,7 +64,7 @@ def test_what_the_viewer_ends_with_is_told(result, with_a_window, capfd):
 
 
 @pytest.mark.parametrize("viewer", ["browser", "viser"])
-def test_a_browser_is_answered_until_ctrl_c(result, viewer):
+def test_a_browser_is_answered_until_ctrl_c(result, interruptible, viewer):
     if viewer == "viser" and find_spec("viser") is None:
         pytest.skip("needs viser")
     answers: list[int] = []

@@ -162,7 +162,7 @@ def test_a_browser_shows_what_the_projects_own_rasteriser_does():
         assert page.complaints == []
 
 
-def test_ctrl_c_ends_it_without_a_word(tmp_path):
+def test_ctrl_c_ends_it_without_a_word(tmp_path, interruptible):
     write(make_snapshot(), tmp_path / "out")
     command = [sys.executable, "-m", "splatnode", "view", str(tmp_path / "out"), "--viser", "--port", "0"]
     child = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

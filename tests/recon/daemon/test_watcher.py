@@ -37,7 +37,7 @@ def test_the_live_camera_has_the_time_of_the_picture_in_which_it_was_found(tmp_p
     monkeypatch.setattr(watcher, "landmarks", lambda *_: None)
     monkeypatch.setattr(watcher, "Tracker", Standing)
     network, stopping, numbering = ipc(tmp_path), threading.Event(), Numbering()
-    finished = Finished(SimpleNamespace(cameras=[SimpleNamespace(width=8, height=6, K=np.eye(3))]), [])
+    finished = Finished(SimpleNamespace(cameras=[SimpleNamespace(width=8, height=6, K=np.eye(3), lens=None)]), [])
     watching = Watcher(network, Tracking(every_s=0.01), lambda: finished, Problems(), stopping)
     thread = threading.Thread(target=watching.run)
     thread.start()
