@@ -46,7 +46,7 @@ BENCHMARKS = {
         "occupancy",
         "metres",
     ),
-    "speed": ("rasterize", "stereo", "growth"),
+    "speed": ("rasterize", "stereo", "growth", "throughput"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),
 }
 MODULES = {name: f"tests.bench.{folder}.{name}" for folder, names in BENCHMARKS.items() for name in names}

@@ -853,6 +853,15 @@ def test_calibration():
     says(f"within twice the standard deviation that is told in {held} of {len(found)}")
 
 
+def test_the_throughput_of_a_batch():
+    row = raw("throughput")
+    assert row["processors"] == 2
+    says(
+        f"a batch of {row['recordings']} real recordings (built-in capture, preset `{row['preset']}`), two at a time",
+        f"{row['times_one_core']:.2f} times as many an hour as one at a time",
+    )
+
+
 def test_a_simulated_batch():
     row = raw("batch_simulation")
     last, count = row["last_life"], f"{row['recordings']:,}".replace(",", " ")
