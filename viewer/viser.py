@@ -113,7 +113,6 @@ def _only_its_own_page(address: str) -> Iterator[list[int]]:
     """
     original = websockets.serve
     loopback = Access(address, 0, None) if ipaddress.ip_address(address).is_loopback else None
-
     ports: list[int] = []
 
     def guarded(handler: object, host: str, port: int, *, process_request: Callable[..., Any], **options: Any) -> Any:

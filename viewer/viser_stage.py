@@ -102,9 +102,8 @@ class Stage:
             client.camera.near = 2.0 * self._depth if (away < self._depth).any() else _NEAR
 
     def _draw_camera(self, index: int, camera: CameraEstimate, moment: Moment) -> None:
-        name = (
-            f"/cameras/{printable(camera.name).replace('/', '∕')}"  # a stroke in a name would be a branch of the tree
-        )
+        own = printable(camera.name).replace("/", "∕")  # a stroke in a name would be a branch of the tree
+        name = f"/cameras/{own}"
         photograph = moment.snapshot.images.get(camera.name)
         shown = photograph if self._switched[1] else None
         frustum = _frustum(self.server, name, camera, self._depth, source_colour(index), shown)

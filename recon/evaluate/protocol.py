@@ -200,8 +200,8 @@ def _score_test_views(
     by the similarity that aligns the training cameras; or from between its neighbours, if `settings` says so. No view
     can be scored with fewer than two of them. Photographs are compared where they show the scene: a black rim that
     undistortion left is cut off, for the search too, and what a mask hides counts as well rendered in SSIM and LPIPS,
-    and not at all in PSNR and in the scores by region. A distortion that
-    was taken out of the training photographs is taken out of these, too.
+    and not at all in PSNR and in the scores by region. A distortion that was taken out of the training photographs is
+    taken out of these, too.
     """
     if appearance is None or len(estimated) < 2:
         return []

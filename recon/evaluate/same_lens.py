@@ -22,7 +22,10 @@ def of_one_lens(cameras: Sequence[CameraEstimate]) -> Sequence[CameraEstimate]:
 
 
 def seen_by(lens: Intrinsics | None, image: Image, mask: Mask) -> tuple[Image, Mask]:
-    """A photograph (H, W, 3), and where it is used (H, W), without the distortion of `lens`; None: as they are."""
+    """A photograph (H, W, 3), and where it is used (H, W), without the distortion of `lens`; None: as they are.
+
+    Raises ValueError where `lens` folds its picture over.
+    """
     if lens is None:
         return image, mask
     frame = undistorted(Frame(0, "photograph", 0, image, lens, mask=mask))

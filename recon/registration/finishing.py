@@ -57,7 +57,7 @@ def finish(
     loss = _loss(problem, partial.estimate, config)
     for tolerance in _TOLERANCES:
         partial = incremental.adjust(problem, partial, problem.final_tracks, loss, tolerance, config.triangulation)
-        partial = replace(partial, prior=_by_evidence(partial.prior, partial.estimate, config))
+        partial = _held_by_evidence(partial, config)
         if len(partial.estimate.points) < config.min_points:
             return None
         loss = _loss(problem, partial.estimate, config)
@@ -66,8 +66,7 @@ def finish(
         if len(refined.points) >= config.min_points and _all_observed(refined, partial.registered):
             partial = replace(partial, estimate=refined)
             for _ in range(_REFINED_ADJUSTMENTS):
-                partial = _adjust_and_filter(problem, partial, config)
-                partial = replace(partial, prior=_by_evidence(partial.prior, partial.estimate, config))
+                partial = _held_by_evidence(_adjust_and_filter(problem, partial, config), config)
             loss = _loss(problem, partial.estimate, config)
     errors = _errors(problem, partial.estimate)
     return Finished(partial, loss, float(np.sqrt(np.mean(errors**2))))
@@ -84,14 +83,15 @@ def _free_lenses(problem: MappingProblem, prior: bundle.LensPrior, config: Confi
     )
 
 
-def _by_evidence(prior: bundle.LensPrior, estimate: bundle.Problem, config: Config) -> bundle.LensPrior:
-    """The prior under which a radial coefficient is as likely as it was found, and at least as `config` has it.
+def _held_by_evidence(partial: PartialMap, config: Config) -> PartialMap:
+    """The map with a prior under which a radial coefficient is as likely as it was found, or as `config` has it.
 
     A prior as wide as what is found lets a coefficient stay where observations tell it to within half of what it is;
     any other falls, adjustment by adjustment, to where `config` holds it (MacKay, "Bayesian interpolation", 1992).
     """
-    found = np.maximum(np.abs(estimate.radials), config.radial_sigma)
-    return replace(prior, radial_sigmas=np.where(prior.radial_sigmas > 0, found, 0.0))
+    found = np.maximum(np.abs(partial.estimate.radials), config.radial_sigma)
+    sigmas = np.where(partial.prior.radial_sigmas > 0, found, 0.0)
+    return replace(partial, prior=replace(partial.prior, radial_sigmas=sigmas))
 
 
 def _loss(problem: MappingProblem, estimate: bundle.Problem, config: Config) -> bundle.Config:

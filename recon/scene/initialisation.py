@@ -45,8 +45,8 @@ def initial_scene(
 
     `images` (h, w, 3) are found by the point maps' names. Pixels of a dark rim, which do not show the
     scene, seed nothing. Nor do those that `masks` (h, w) hide, of which the point maps know nothing; where no view
-    sees behind them, the fill goes on there. `exposures`, and the distortion of
-    `lenses`, were taken out of the images.
+    sees behind them, the fill goes on there. `exposures`, and the distortion of `lenses`, were taken out of the
+    images.
     """
     pictures = [images[pointmap.name] for pointmap in pointmaps]
     valid = border.valid_masks(pictures)

@@ -43,7 +43,7 @@ def show(
     """As `Result.show`. `command` shows what it gets as its last argument; None: what the viewer is."""
     if viewer not in get_args(Viewer):
         raise ValueError(f"viewer must be one of {', '.join(get_args(Viewer))}; got {viewer!r}")
-    if viewer not in _IN_BROWSER and not listen is port is None:
+    if viewer not in _IN_BROWSER and (listen is not None or port is not None):
         raise ValueError(f"listen and port are of {' and '.join(_IN_BROWSER)}; {viewer} opens a window on this machine")
     if not result.verdict.publishable:
         raise ValueError(f"there is no scene to show: {result.verdict.code.value}. Ask verdict.publishable first")

@@ -11,32 +11,27 @@ Scenes as they came follow: how far the estimated distortion moves a corner, and
 
 from __future__ import annotations
 
-import argparse
-import json
-import shlex
-import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.capture.process.progress import say
 from splatnode.recon.config import preset
 from splatnode.recon.estimation import Estimate, estimate_depth
-from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
-from splatnode.recon.evaluate.splits import Split, load_split
+from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate
+from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.stability.places import Photo
 from splatnode.recon.evaluate.stability.warps import distorted
 from splatnode.recon.evaluate.start import Start, continued, find_start, foundation
-from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.preparation import load_prior
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.registration.straightened import corner_shift, straight_pixels, straightened
+from tests.bench.quality.real_sets import measure
 
 SETS = (
     "fountain_p11:6:-0.1",
@@ -154,7 +149,8 @@ def scored(start: Start, kind: str, scene: Bent, split: Split, networks: Network
     )
 
 
-def rows(scene: EvaluationScene, split: Split, k1: float, networks: Networks) -> list[Row]:
+def rows(scene: EvaluationScene, split: Split, rest: Sequence[str], networks: Networks) -> list[Row]:
+    k1 = float(rest[0])
     if not k1:
         work = IncrementalReconstruction(foundation(CONFIG))
         for frame in scene.frames(split.train):
@@ -188,23 +184,7 @@ def in_words(row: Row) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sets", nargs="*", default=SETS, metavar="SCENE:VIEWS:K1", help=f"default: {' '.join(SETS)}")
-    parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
-    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
-    args = parser.parse_args()
-    networks = load_networks(args.shared / "weights").quickest
-    found: list[Row] = []
-    for each in args.sets:
-        name, views, k1 = each.split(":")
-        scene = load_scene(args.shared / "scenes" / name)
-        split = load_split(args.shared / "scenes" / name, list(scene.paths), int(views))
-        further = rows(scene, split, float(k1), networks)
-        for row in further:
-            say(in_words(row))
-        found += further
-        command = shlex.join(["python", "-m", "tests.bench", "bent", *sys.argv[1:]])
-        args.out.write_text(json.dumps({"command": command, "rows": [asdict(row) for row in found]}, indent=1) + "\n")
+    measure("bent", __doc__, SETS, "SCENE:VIEWS:K1", rows, in_words)
 
 
 if __name__ == "__main__":

@@ -9,28 +9,23 @@ is found for the photographs as they were taken, and after the median.
 
 from __future__ import annotations
 
-import argparse
-import json
-import shlex
-import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Frame
-from splatnode.capture.process.progress import say
 from splatnode.recon.config import Config, preset
-from splatnode.recon.evaluate.protocol import Run, Settings, evaluate, load_networks
-from splatnode.recon.evaluate.splits import Split, load_split
+from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate
+from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.start import Start, continued, find_start, foundation
-from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.scene import light
+from tests.bench.quality.real_sets import measure
 
 SETS = ("fountain_p11:6", "llff_fern:6", "fox:12")
 LEAST, MOST, BALANCE = 0.5, 2.0, 0.2
@@ -82,8 +77,7 @@ def gain_errors(plain: Start, under: Start, true: Mapping[str, npt.NDArray[np.fl
     return round(float(np.median(errors)), 3), round(float(errors.max()), 3)
 
 
-def rows(scene: EvaluationScene, split: Split, shared: Path) -> list[Row]:
-    networks = load_networks(shared / "weights").quickest
+def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Networks) -> list[Row]:
     frames = scene.frames(split.train)
     gains = drawn(len(frames))
     under = [changed(frame, own) for frame, own in zip(frames, gains, strict=True)]
@@ -110,21 +104,12 @@ def rows(scene: EvaluationScene, split: Split, shared: Path) -> list[Row]:
     ]
 
 
+def in_words(row: Row) -> str:
+    return f"{row.scene} {row.views}, {row.kind}: {row.verdict}, {row.psnr} dB"
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sets", nargs="*", default=SETS, metavar="SCENE:VIEWS", help=f"default: {' '.join(SETS)}")
-    parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
-    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
-    args = parser.parse_args()
-    found: list[Row] = []
-    for each in args.sets:
-        name, _, views = each.partition(":")
-        scene = load_scene(args.shared / "scenes" / name)
-        found += rows(scene, load_split(args.shared / "scenes" / name, list(scene.paths), int(views)), args.shared)
-        for row in found[-3:]:
-            say(f"{row.scene} {row.views}, {row.kind}: {row.verdict}, {row.psnr} dB")
-        command = shlex.join(["python", "-m", "tests.bench", "light", *sys.argv[1:]])
-        args.out.write_text(json.dumps({"command": command, "rows": [asdict(row) for row in found]}, indent=1) + "\n")
+    measure("light", __doc__, SETS, "SCENE:VIEWS", rows, in_words)
 
 
 if __name__ == "__main__":
