@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
+from splatnode.capture.right_image import RightImage
 from splatnode.capture.stamp import Stamp
 
 LARGEST_NUMBER = 2**62  # of ids and stamps
@@ -89,6 +90,7 @@ class Frame:
     captured_at: Stamp | None = None  # None: nobody knows
     mask: npt.NDArray[np.bool_] | None = field(default=None, repr=False)  # (H, W), False: not used; None: all is used
     given_pose: GivenPose | None = None  # of its camera, by odometry or a tracker; None: nobody knows
+    right: RightImage | None = field(default=None, repr=False)  # of a stereo camera, whose left image is `image`
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", printable(self.name, LONGEST_NAME))
@@ -100,6 +102,8 @@ class Frame:
             raise ValueError(f"image must have at most {LARGEST_IMAGE} pixels, got {self.width} x {self.height}")
         if self.mask is not None and (self.mask.shape != self.image.shape[:2] or self.mask.dtype != np.bool_):
             raise ValueError(f"mask must be {self.image.shape[:2]} bool, got {self.mask.shape} {self.mask.dtype}")
+        if self.right is not None and self.right.image.shape != self.image.shape[:2]:
+            raise ValueError(f"the right image must be {self.image.shape[:2]}, got {self.right.image.shape}")
         if not self.name:
             raise ValueError("a frame must have a name")
         for what, number in (("frame_id", self.frame_id), ("stamp_ns", self.stamp_ns)):
@@ -151,15 +155,16 @@ def framed(
     captured_at: Stamp | None = None,
     mask: npt.NDArray[np.bool_] | None = None,
     given_pose: GivenPose | None = None,
+    right: RightImage | None = None,
 ) -> Frame | DroppedFrame:
     """What a camera or a file gave as a Frame; left out, with the reason, where it keeps a Frame's bounds not."""
     try:
-        return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at, mask, given_pose)
+        return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at, mask, given_pose, right)
     except ValueError as error:
         return DroppedFrame(name, f"it cannot be used: {error}")
 
 
 def renamed(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame | DroppedFrame:
     """The same image as another frame, which may be beyond a Frame's bounds."""
-    known = frame.image, frame.intrinsics, frame.encoded, frame.captured_at, frame.mask, frame.given_pose
+    known = frame.image, frame.intrinsics, frame.encoded, frame.captured_at, frame.mask, frame.given_pose, frame.right
     return framed(frame_id, name, stamp_ns, *known)

@@ -16,6 +16,8 @@ from pathlib import Path
 
 import cv2
 import msgspec
+import numpy as np
+import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
@@ -25,6 +27,7 @@ from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.durable import sync_folder
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import LONGEST_NAME, is_printable, marked_name, printable
+from splatnode.capture.right_image import Baseline, RightImage, grey
 from splatnode.capture.stamp import Stamp
 
 log = logging.getLogger(__name__)
@@ -39,6 +42,14 @@ class RecordingError(ValueError):
     """A folder that is no recording; the message names the file and the line."""
 
 
+class _Right(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A frame's right image: a file of the same folder."""
+
+    baseline: Baseline
+    file: str
+    sha256: str
+
+
 class _Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="frame"):
     name: str
     stamp_ns: int
@@ -47,6 +58,7 @@ class _Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="frame"
     sha256: str
     captured_at: Stamp | None = None  # earlier recordings do not tell
     given_pose: GivenPose | UnsetType = UNSET
+    right: _Right | UnsetType = UNSET
 
 
 class _DroppedLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="dropped"):
@@ -86,19 +98,18 @@ class Recorder:
             return
         content = _file_of(item)
         path = self.folder / f"{self.frames:06d}{'.jpg' if content.startswith(_JPEG) else '.png'}"
-        temporary = path.with_name(f".{path.name}.tmp")
-        try:
-            temporary.write_bytes(content)
-            temporary.replace(path)
-        except OSError as error:
-            temporary.unlink(missing_ok=True)
-            raise OSError(error.errno, error.strerror, str(path)) from error
-        digest = hashlib.sha256(content).hexdigest()
+        digest = _write(path, content)
         pose = UNSET if item.given_pose is None else item.given_pose
-        self._append(_Line(item.name, item.stamp_ns, item.intrinsics, path.name, digest, item.captured_at, pose))
+        right = UNSET if item.right is None else self._write_right(item.right)
+        known = path.name, digest, item.captured_at, pose, right
+        self._append(_Line(item.name, item.stamp_ns, item.intrinsics, *known))
         self.frames += 1
         if self.frames % _SYNC_EVERY == 0:
             self._sync()
+
+    def _write_right(self, right: RightImage) -> _Right:
+        path = self.folder / f"{self.frames:06d}-right.png"
+        return _Right(right.baseline, path.name, _write(path, _png(right.image)))
 
     def _append(self, line: _Line | _DroppedLine) -> None:
         self._index.write(msgspec.json.encode(line) + b"\n")
@@ -112,11 +123,27 @@ class Recorder:
 def _file_of(frame: Frame) -> bytes:
     if frame.encoded is not None and frame.encoded.startswith((_JPEG, _PNG)):
         return frame.encoded
-    bgr = cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR)
-    written, png = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    return _png(cv2.cvtColor(frame.image, cv2.COLOR_RGB2BGR).astype(np.uint8, copy=False))
+
+
+def _png(image: npt.NDArray[np.uint8]) -> bytes:
+    """Of an image (H, W, 3) BGR, or (H, W)."""
+    written, png = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not written:
-        raise AssertionError("PNG takes every (H, W, 3) uint8 image")
+        raise AssertionError("PNG takes every uint8 image")
     return png.tobytes()
+
+
+def _write(path: Path, content: bytes) -> str:
+    """Whole or not at all; gives the content's SHA-256. Raises OSError that names the file."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        temporary.write_bytes(content)
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    return hashlib.sha256(content).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -146,22 +173,37 @@ class Recording:
         if isinstance(line, _DroppedLine):
             return DroppedFrame(line.name, line.reason)
         try:
-            content = read_image_file(self.folder / line.file, max_pixels)
-            image = decode_image(content, max_pixels).image
+            content, image = self._image(line.file, line.sha256, max_pixels)
+            right = None
+            if line.right is not UNSET:
+                beside = self._image(line.right.file, line.right.sha256, max_pixels)[1]
+                right = RightImage(grey(beside), line.right.baseline)
         except UnusableImage as error:
             return DroppedFrame(line.name, str(error))
         except OSError as error:
             return DroppedFrame(line.name, f"cannot be read: {error.strerror}")
-        if hashlib.sha256(content).hexdigest() != line.sha256:
-            return DroppedFrame(line.name, f"{line.file} is not the file that was recorded")
         pose = None if line.given_pose is UNSET else line.given_pose
         known = image, line.intrinsics, content, line.captured_at
-        return framed(frame_id, line.name, line.stamp_ns, *known, given_pose=pose)
+        return framed(frame_id, line.name, line.stamp_ns, *known, given_pose=pose, right=right)
+
+    def _image(self, file: str, sha256: str, max_pixels: int) -> tuple[bytes, npt.NDArray[np.uint8]]:
+        """The file, and its image (H, W, 3) RGB. Raises UnusableImage where it is not the recorded one, and OSError."""
+        content = read_image_file(self.folder / file, max_pixels)
+        image = decode_image(content, max_pixels).image
+        if hashlib.sha256(content).hexdigest() != sha256:
+            raise UnusableImage(f"{file} is not the file that was recorded")
+        return content, image
 
 
 def _shown(name: str) -> str:
     """The recorded name, which is printable if it is ours; another one is changed, into one that no other becomes."""
     return name if name and is_printable(name, LONGEST_NAME) else marked_name(name)
+
+
+def _files_of(line: _Line | _DroppedLine) -> tuple[str, ...]:
+    if isinstance(line, _DroppedLine):
+        return ()
+    return (line.file,) if line.right is UNSET else (line.file, line.right.file)
 
 
 def is_recording(folder: Path) -> bool:
@@ -177,8 +219,9 @@ def read(folder: Path) -> Recording:
         where = f"{folder / INDEX}, line {number}"
         with foreign(RecordingError, where):
             line = msgspec.json.decode(text, type=_Line | _DroppedLine)
-        if isinstance(line, _Line) and (Path(line.file).name != line.file or not is_printable(line.file, LONGEST_NAME)):
-            raise RecordingError(f"{where}: {printable(line.file, LONGEST_NAME)!r} is not a file of this folder")
+        for file in _files_of(line):
+            if Path(file).name != file or not is_printable(file, LONGEST_NAME):
+                raise RecordingError(f"{where}: {printable(file, LONGEST_NAME)!r} is not a file of this folder")
         lines.append(msgspec.structs.replace(line, name=_shown(line.name)))
     if not lines:
         raise RecordingError(f"the recording {str(folder)!r} is empty")

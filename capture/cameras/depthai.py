@@ -1,4 +1,4 @@
-"""The colour stream of a Luxonis OAK camera, through DepthAI v3."""
+"""The colour stream of a Luxonis OAK camera, or the pairs of its stereo cameras, through DepthAI v3."""
 
 from __future__ import annotations
 
@@ -8,18 +8,21 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import timedelta
+from functools import partial
 from types import ModuleType
 from typing import Annotated, Any
 
 import cv2
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.pace import FramesPerSecond
 from splatnode.capture.process.logs import event
+from splatnode.capture.right_image import Baseline, RightImage, grey
 from splatnode.capture.stamp import wall_clock
 from splatnode.capture.unavailable import CameraUnavailable
 
@@ -43,6 +46,20 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     iso: Annotated[int, msgspec.Meta(ge=100, le=1600)] = 400  # sensitivity, with exposure_us
     focus: Annotated[int, msgspec.Meta(ge=0, le=255)] | None = None  # position of the lens; None: as it is at the start
     silence_s: Annotated[float, msgspec.Meta(gt=0)] = 4.0  # so long without a frame, the camera counts as lost
+    # The left one of the stereo cameras instead of the colour camera: the right one's picture goes with each frame, and
+    # lengths are in metres by the baseline that the camera carries. Rectified on the camera; grey where the sensors are
+    stereo: bool = False
+
+
+@dataclass(frozen=True)
+class Source:
+    """What of a pipeline is read and commanded."""
+
+    queue: Any
+    cameras: tuple[Any, ...]  # nodes
+    to_frame: Callable[[Any, int], Frame | DroppedFrame]
+    # Of a message of the queue, the ImgFrame that tells its exposure
+    lead: Callable[[Any], Any] = lambda message: message
 
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
@@ -54,24 +71,61 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     info = _chosen(dai, config.device)
     try:
         with dai.Device(info) as device, dai.Pipeline(device) as pipeline:
-            camera = pipeline.create(dai.node.Camera).build(dai.CameraBoardSocket.CAM_A)
-            output = camera.requestOutput(
-                (config.width, config.height),
-                dai.ImgFrame.Type.BGR888i,
-                dai.ImgResizeMode.CROP,
-                fps=config.frames_per_second,
-                enableUndistortion=config.undistort,
-            )
-            queue = output.createOutputQueue(maxSize=2, blocking=False)
-            controls = camera.inputControl.createInputQueue()
+            source = _pairs(dai, device, pipeline, config) if config.stereo else _colour(dai, pipeline, config)
+            controls = [camera.inputControl.createInputQueue() for camera in source.cameras]
             pipeline.start()
             if config.focus is not None:
-                controls.send(_control(dai, focus=config.focus))
-            yield from read(dai, queue, config, hold=lambda: controls.send(holding(dai, config)))
+                _send(controls, _control(dai, focus=config.focus))
+            yield from read(dai, source, config, hold=lambda: _send(controls, holding(dai, config)))
     except RuntimeError as error:
         if isinstance(error, CameraUnavailable):
             raise
         raise CameraUnavailable(f"the camera {info.getDeviceId()} failed: {error}") from error
+
+
+def _send(controls: list[Any], command: Any) -> None:
+    for each in controls:
+        each.send(command)
+
+
+def _colour(dai: ModuleType, pipeline: Any, config: Config) -> Source:
+    camera = pipeline.create(dai.node.Camera).build(dai.CameraBoardSocket.CAM_A)
+    output = camera.requestOutput(
+        (config.width, config.height),
+        dai.ImgFrame.Type.BGR888i,
+        dai.ImgResizeMode.CROP,
+        fps=config.frames_per_second,
+        enableUndistortion=config.undistort,
+    )
+    return Source(output.createOutputQueue(maxSize=2, blocking=False), (camera,), to_frame)
+
+
+def _pairs(dai: ModuleType, device: Any, pipeline: Any, config: Config) -> Source:
+    """The left and right pictures of one moment, which the camera rectifies. Raises CameraUnavailable."""
+    left, right = dai.CameraBoardSocket.CAM_B, dai.CameraBoardSocket.CAM_C
+    baseline = _baseline(dai, device, left, right)
+    cameras = tuple(pipeline.create(dai.node.Camera).build(socket) for socket in (left, right))
+    stereo, sync = pipeline.create(dai.node.StereoDepth), pipeline.create(dai.node.Sync)
+    stereo.setRectification(True)
+    size = (config.width, config.height)
+    for camera, side in zip(cameras, (stereo.left, stereo.right), strict=True):
+        camera.requestOutput(size, resizeMode=dai.ImgResizeMode.CROP, fps=config.frames_per_second).link(side)
+    stereo.rectifiedLeft.link(sync.inputs["left"])
+    stereo.rectifiedRight.link(sync.inputs["right"])
+    sync.setSyncThreshold(timedelta(seconds=0.5 / config.frames_per_second))
+    queue = sync.out.createOutputQueue(maxSize=2, blocking=False)
+    return Source(queue, cameras, partial(to_pair, baseline), lambda group: group["left"])
+
+
+def _baseline(dai: ModuleType, device: Any, left: Any, right: Any) -> Baseline:
+    try:  # by the calibration of this very camera, not by the design of its board
+        metres = device.readCalibration().getBaselineDistance(right, left, False, dai.LengthUnit.METER)
+        return Baseline(abs(float(metres)))
+    except (RuntimeError, ValueError) as error:
+        raise CameraUnavailable(
+            f"the camera's stereo baseline is not known ({error}). Calibrate it with Luxonis' tools, or set "
+            "camera.stereo to false"
+        ) from error
 
 
 def find() -> list[dict[str, str]]:
@@ -84,12 +138,12 @@ def find() -> list[dict[str, str]]:
     ]
 
 
-def read(dai: ModuleType, queue: Any, config: Config, hold: Callable[[], None]) -> Iterator[Frame | DroppedFrame]:
-    """The frames of a running pipeline's `queue`; `hold` is called once the camera has settled."""
+def read(dai: ModuleType, source: Source, config: Config, hold: Callable[[], None]) -> Iterator[Frame | DroppedFrame]:
+    """The frames of a running pipeline's source; `hold` is called once the camera has settled."""
     settled, held, frame_id = time.monotonic() + config.settle_s, not config.lock, 0
     while True:
         try:
-            message = queue.get(timedelta(seconds=config.silence_s))
+            message = source.queue.get(timedelta(seconds=config.silence_s))
         except dai.MessageQueue.QueueException as error:
             raise CameraUnavailable(f"the camera ended its stream: {error}") from error
         if message is None:
@@ -99,10 +153,11 @@ def read(dai: ModuleType, queue: Any, config: Config, hold: Callable[[], None]) 
         if not held:
             hold()
             held = True
-            exposure_us = message.getExposureTime() / timedelta(microseconds=1)
-            event(log, logging.INFO, "locked", exposure_us=exposure_us, iso=message.getSensitivity())
+            lead = source.lead(message)
+            exposure_us = lead.getExposureTime() / timedelta(microseconds=1)
+            event(log, logging.INFO, "locked", exposure_us=exposure_us, iso=lead.getSensitivity())
             continue  # it was exposed before
-        item = to_frame(message, frame_id)
+        item = source.to_frame(message, frame_id)
         frame_id += isinstance(item, Frame)
         yield item
 
@@ -110,10 +165,27 @@ def read(dai: ModuleType, queue: Any, config: Config, hold: Callable[[], None]) 
 def to_frame(message: Any, frame_id: int) -> Frame | DroppedFrame:
     """An ImgFrame as a Frame: its stamp is of the host's monotonic clock, synchronised by DepthAI."""
     stamp_ns = message.getTimestamp() // timedelta(microseconds=1) * 1000
-    image = cv2.cvtColor(message.getCvFrame(), cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+    image = _rgb(message.getCvFrame())
     intrinsics = _intrinsics(message.getTransformation(), image.shape[1], image.shape[0])
     name = f"{stamp_ns / 1e9:.6f}"
     return framed(frame_id, name, stamp_ns, image, intrinsics, captured_at=wall_clock(stamp_ns))
+
+
+def to_pair(baseline: Baseline, group: Any, frame_id: int) -> Frame | DroppedFrame:
+    """A group of a left and a right ImgFrame as the left one's Frame, with the right image."""
+    left, seen = to_frame(group["left"], frame_id), _rgb(group["right"].getCvFrame())
+    if isinstance(left, DroppedFrame):
+        return left
+    try:
+        return replace(left, right=RightImage(grey(seen), baseline))
+    except ValueError as error:
+        return DroppedFrame(left.name, f"its right image cannot be used: {error}")
+
+
+def _rgb(image: Any) -> npt.NDArray[np.uint8]:
+    """(H, W, 3) of what DepthAI gives, BGR or grey."""
+    code = cv2.COLOR_GRAY2RGB if image.ndim == 2 else cv2.COLOR_BGR2RGB
+    return cv2.cvtColor(image, code).astype(np.uint8, copy=False)
 
 
 def holding(dai: ModuleType, config: Config) -> Any:

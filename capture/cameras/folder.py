@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -24,10 +24,26 @@ from splatnode.capture.image_file import (
 from splatnode.capture.name_time import name_time
 from splatnode.capture.pace import FramesPerSecond, Pace, paced
 from splatnode.capture.process.printable import printable, printable_name
+from splatnode.capture.right_image import LONGEST_M, SIGMA_M, Baseline, RightImage, grey
 
 DEFAULT_STEP_NS = 100_000_000  # between two loops of a single photograph, which has no rate
 # Photographs that cannot be decoded here; they are reported as dropped.
 FOREIGN_SUFFIXES = {".jxl", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf"}
+
+
+class Right(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The photographs of the right half of a stereo camera, rectified; those of a pair have one name."""
+
+    folder: Path  # with the right photographs
+    baseline_m: Annotated[float, msgspec.Meta(gt=0, le=LONGEST_M)]  # between the two cameras, metres
+    baseline_sigma_m: Annotated[float, msgspec.Meta(ge=0, le=LONGEST_M)] = SIGMA_M  # standard deviation, metres
+
+    def __post_init__(self) -> None:
+        self.baseline  # noqa: B018 (raises ValueError)
+
+    @property
+    def baseline(self) -> Baseline:
+        return Baseline(self.baseline_m, self.baseline_sigma_m)
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -40,6 +56,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     frames_per_second: FramesPerSecond = 10.0
     pace: Pace = "fastest"  # recorded: at the pace of the stamps; fastest: as fast as they are taken
     loops: Annotated[int, msgspec.Meta(ge=1)] = 1  # how many times all are shown, each time under other names
+    # Of a stereo camera, whose left photographs lie in `folder`: what the right one saw, by which lengths are in metres
+    right: Right | None = None
 
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
@@ -49,10 +67,26 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     Raises FileNotFoundError or ValueError, with what to do, where there is nothing to stream.
     """
     if recording.is_recording(config.folder):
+        if config.right is not None:
+            raise ValueError(
+                f"{str(config.folder)!r} is a recording, which has its right images in it: leave out right"
+            )
         recorded = recording.read(config.folder)
         return paced(_looped(lambda: recorded.frames(config.names, config.max_pixels), config.loops), config.pace)
     paths = chosen_images(config.folder, config.names)  # before the first frame, so that mistakes show at once
-    return paced(_looped(lambda: _frames(paths, config), config.loops), config.pace)
+    partners = {} if config.right is None else _partners(config.right.folder, paths)
+    return paced(_looped(lambda: _frames(paths, partners, config), config.loops), config.pace)
+
+
+def _partners(folder: Path, lefts: list[Path]) -> dict[str, Path]:
+    """The right photographs by their names without suffix. Raises where no left one has a partner."""
+    partners = {path.stem: path for path in chosen_images(folder)}
+    if not any(path.stem in partners for path in lefts):
+        raise ValueError(
+            f"no photograph of {str(folder)!r} has the name of a left one, such as {frame_name(lefts[0])}; "
+            "name both of a pair alike"
+        )
+    return partners
 
 
 def _looped(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: int) -> Iterator[Frame | DroppedFrame]:
@@ -73,7 +107,7 @@ def _looped(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: int) -> I
         first_id, first_ns = first_id + last.frame_id + 1, first_ns + last.stamp_ns + step
 
 
-def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]:
+def _frames(paths: list[Path], partners: Mapping[str, Path], config: Config) -> Iterator[Frame | DroppedFrame]:
     frame_id = 0
     for path in paths:
         if (unreadable := foreign_file(path)) is not None:
@@ -83,6 +117,7 @@ def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]
         try:
             data = read_image_file(path, config.max_pixels)
             image, intrinsics, captured_at = decode_photograph(data, config.max_pixels)
+            right = _right_of(path, partners, config)
         except UnusableImage as error:
             yield DroppedFrame(name, str(error))
         except OSError as error:
@@ -92,9 +127,19 @@ def _frames(paths: list[Path], config: Config) -> Iterator[Frame | DroppedFrame]
             if config.intrinsics is not None and same_aspect(config.intrinsics, width, height):
                 intrinsics = config.intrinsics.resized(width, height)
             stamp_ns = round(frame_id / config.frames_per_second * 1e9)
-            item = framed(frame_id, name, stamp_ns, image, intrinsics, data, captured_at or name_time(name))
+            captured_at = captured_at or name_time(name)
+            item = framed(frame_id, name, stamp_ns, image, intrinsics, data, captured_at, right=right)
             frame_id += isinstance(item, Frame)
             yield item
+
+
+def _right_of(path: Path, partners: Mapping[str, Path], config: Config) -> RightImage | None:
+    """What the right camera saw when the photograph was taken; None where that is not there. Raises as reading does."""
+    partner = partners.get(path.stem)
+    if partner is None or config.right is None:
+        return None
+    seen = decode_photograph(read_image_file(partner, config.max_pixels), config.max_pixels)[0]
+    return RightImage(grey(seen), config.right.baseline)
 
 
 def foreign_file(path: Path) -> DroppedFrame | None:

@@ -22,10 +22,13 @@ from splatnode.capture.diorama.solids import Solid
 from splatnode.capture.diorama.through_lens import cast_through
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.pace import FramesPerSecond
+from splatnode.capture.right_image import Baseline, RightImage, grey
 from splatnode.capture.stamp import Clock, Stamp
 
 TARGET = np.array([1.05, 1.05, 0.82])  # what the photographer looks at: the table in the corner, metres
 
+
+_RIGHT_SEED = 100_000  # of the noise of right images: not that of left ones
 
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
@@ -39,6 +42,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     samples: Count = 2  # rays a pixel in each direction
     frames_per_second: FramesPerSecond = 2.0  # by the stamps
     lens: Intrinsics | None = None  # that photographs are taken through, and carry; nothing: a pinhole's, unknown
+    # Of a stereo camera, metres: what its right half sees goes with each photograph; nothing: there is but one camera
+    baseline_m: Annotated[float, msgspec.Meta(gt=0, le=1)] | None = None
 
 
 def stream(config: Config) -> Iterator[Frame]:
@@ -46,7 +51,8 @@ def stream(config: Config) -> Iterator[Frame]:
     for index, camera in enumerate(scene_cameras(config)):
         stamp_ns = round(index / config.frames_per_second * 1e9)
         image, captured_at = photograph(config, camera, index), Stamp(stamp_ns, Clock.RECORDING)
-        yield Frame(index, frame_name(index), stamp_ns, image, lens_of(config), captured_at=captured_at)
+        right = None if config.baseline_m is None else _right_image(config, camera, index, config.baseline_m)
+        yield Frame(index, frame_name(index), stamp_ns, image, lens_of(config), captured_at=captured_at, right=right)
 
 
 def lens_of(config: Config) -> Intrinsics | None:
@@ -86,6 +92,14 @@ def photograph(config: Config, camera: Camera, noise_seed: int = 0) -> npt.NDArr
     image = cv2.resize(colours, (config.width, config.height), interpolation=cv2.INTER_AREA)
     grain = np.random.default_rng([config.seed, noise_seed]).normal(scale=config.noise, size=image.shape)
     return np.clip(np.rint(image + grain), 0, 255).astype(np.uint8)
+
+
+def _right_image(config: Config, camera: Camera, index: int, baseline_m: float) -> RightImage:
+    """What a second camera sees, with the same axes and lens."""
+    T_world_camera, K = camera
+    beside = T_world_camera.copy()
+    beside[:3, 3] += baseline_m * T_world_camera[:3, 0]
+    return RightImage(grey(photograph(config, (beside, K), _RIGHT_SEED + index)), Baseline(baseline_m))
 
 
 def depth(config: Config, index: int) -> npt.NDArray[np.float32]:

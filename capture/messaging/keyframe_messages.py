@@ -15,7 +15,7 @@ from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.given_pose import GivenPose
-from splatnode.capture.messaging.mask_bits import arrays_of, mask_in
+from splatnode.capture.messaging.frame_arrays import arrays_of, frame_in
 from splatnode.capture.messaging.spool import Key
 from splatnode.capture.messaging.values import Name, Sequential, SessionId, Text
 from splatnode.capture.messaging.wire import (
@@ -30,6 +30,7 @@ from splatnode.capture.messaging.wire import (
     plain_header,
 )
 from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
+from splatnode.capture.right_image import Baseline
 from splatnode.capture.stamp import Stamp
 
 MOST_HELD = 64  # frames that a client may hold without acknowledging them
@@ -37,7 +38,7 @@ DELIVERY_PARTS = 2  # that come before a frame's own
 
 
 class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="frame"):
-    """A Frame; its arrays are its image and, where it has one, its mask (mask_bits.py)."""
+    """A Frame; its arrays are its image and, where it has these, its mask and its right image (frame_arrays.py)."""
 
     frame_id: Sequential
     name: Name
@@ -46,6 +47,7 @@ class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True,
     captured_at: Stamp | None = None
     # Left out where there is none: a receiver that does not know it takes all keyframes without one
     given_pose: GivenPose | UnsetType = UNSET
+    baseline: Baseline | UnsetType = UNSET  # likewise; where it is there, the last array is the right image
 
 
 class DroppedHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="dropped"):
@@ -121,6 +123,7 @@ def to_message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
         intrinsics=frame.intrinsics,
         captured_at=frame.captured_at,
         given_pose=UNSET if frame.given_pose is None else frame.given_pose,
+        baseline=UNSET if frame.right is None else frame.right.baseline,
     )
     return encode(header, arrays_of(frame))
 
@@ -141,20 +144,9 @@ def received(key: Key, parts: list[zmq.Frame], limits: Limits) -> ReceivedFrame:
             raise WireError("a dropped frame has no image")
         return ReceivedFrame(*key, DroppedFrame(header.name, header.reason))
     try:
-        mask = mask_in(message.arrays)
-        frame = Frame(
-            header.frame_id,
-            header.name,
-            header.stamp_ns,
-            message.arrays[0],
-            header.intrinsics,
-            captured_at=header.captured_at,
-            mask=mask,
-            given_pose=None if header.given_pose is UNSET else header.given_pose,
-        )
+        return ReceivedFrame(*key, frame_in(header, header.frame_id, message.arrays))
     except ValueError as error:
         raise WireError(str(error)) from error
-    return ReceivedFrame(*key, frame)
 
 
 def name_in(parts: list[Part]) -> str:

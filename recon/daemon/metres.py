@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import reduce
 from weakref import WeakKeyDictionary
 
@@ -28,14 +29,15 @@ class Metres:
     def of_shown(self, snapshot: Snapshot, work: IncrementalReconstruction) -> Snapshot:
         """What viewers get, in metres where a source has spoken, else as it is.
 
-        A network, which takes seconds, is asked about a final scene alone; so are landmarks gathered, by which a final
-        scene is measured in its files, too.
+        A network, which takes seconds, is asked about a final scene alone. Landmarks are gathered for a final scene, by
+        which it is measured in its files, too; for others where stereo pairs are measured by them.
         """
         evidence = self.told_by(work.graph.keyframes)
         config = self._config if snapshot.final else msgspec.structs.replace(self._config, network=False)
-        if snapshot.final and (config != Config() or evidence.tracked):
+        if evidence.pairs or (snapshot.final and (config != Config() or evidence.tracked)):
             snapshot = with_landmarks(snapshot, work.remembered())
-        return in_metres(snapshot, config, evidence)
+        measured = in_metres(snapshot, config, evidence)
+        return measured if snapshot.final else replace(measured, landmarks=None)
 
     def of_written(self, snapshot: Snapshot, work: IncrementalReconstruction) -> Snapshot:
         """What a result folder gets: with the landmarks of its estimate, if that is known still."""
@@ -43,7 +45,7 @@ class Metres:
         return in_metres(with_all, self._config, self.told_by(work.graph.keyframes))
 
     def told_by(self, keyframes: Sequence[Keyframe]) -> Evidence:
-        """Of what is configured, and the poses that came with the keyframes."""
+        """Of what is configured, and what came with the keyframes: poses, right images."""
         for frame in (each.frame for each in keyframes):
             if frame not in self._told:
                 self._told[frame] = gathered((frame,), self._config)

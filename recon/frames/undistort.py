@@ -12,6 +12,7 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import opencv
 from splatnode.capture.lenses.lens import project
 from splatnode.capture.masks import Mask, filled
+from splatnode.capture.right_image import RightImage, grey
 from splatnode.recon.frames.wide_pinhole import wide_pinhole
 
 Array = npt.NDArray[np.float64]
@@ -28,8 +29,18 @@ def undistorted(frame: Frame) -> Frame:
 
     It has the same size in pixels and shows the largest rectangle without unseen corners, whose pixels would be
     invented. A fisheye's has as many pixels in another shape, and a mask where the fisheye saw nothing
-    (wide_pinhole.py). Raises ValueError for coefficients that fold the picture over.
+    (wide_pinhole.py). Its right image, if it has one, is taken the same way, since both have one lens. Raises
+    ValueError for coefficients that fold the picture over.
     """
+    if frame.right is None:
+        return _straight(frame)
+    seen = cv2.cvtColor(frame.right.image, cv2.COLOR_GRAY2RGB).astype(np.uint8, copy=False)
+    left, right = _straight(replace(frame, right=None)), _straight(replace(frame, image=seen, mask=None, right=None))
+    return replace(left, right=RightImage(grey(right.image), frame.right.baseline))
+
+
+def _straight(frame: Frame) -> Frame:
+    """As `undistorted`, of a frame without a right image."""
     given = frame.intrinsics
     if given is None:
         return frame

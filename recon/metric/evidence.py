@@ -13,7 +13,7 @@ from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.process.progress import Step, Tell, told_to_nobody
 from splatnode.recon.metric.config import Config
 from splatnode.recon.metric.marker_detection import Sighting, sightings
-from splatnode.recon.metric.stereo_pairs import Pair
+from splatnode.recon.metric.stereo_pairs import Pair, pair_with
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +37,14 @@ NOTHING = Evidence()
 
 
 def gathered(frames: Iterable[Frame | DroppedFrame], config: Config, tell: Tell = told_to_nobody) -> Evidence:
-    """What the frames tell of what `config` asks for, and the poses that came with them.
+    """What the frames tell of what `config` asks for, and the poses and right images that came with them.
 
     Raises ValueError where intrinsics cannot be used.
     """
     known = [each for each in frames if isinstance(each, Frame)]
     tracked = {each.name: each.given_pose for each in known if each.given_pose is not None}
+    paired = tuple(pair for pair in map(pair_with, known) if pair is not None)
     if config.marker_m is None:
-        return Evidence(tracked=tracked)
+        return Evidence(tracked=tracked, pairs=paired)
     tell(Step("looking for markers"))
-    return Evidence(tuple(sightings(known, config.marker_dictionary)), tracked=tracked)
+    return Evidence(tuple(sightings(known, config.marker_dictionary)), tracked=tracked, pairs=paired)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from splatnode.capture.right_image import Baseline
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.metric.config import Config
 from splatnode.recon.metric.distances import by_distance
@@ -15,6 +16,7 @@ from splatnode.recon.metric.measurement import Measurement, together
 from splatnode.recon.metric.network import MetricDepth, by_network
 from splatnode.recon.metric.poses import Aligned, Sigmas, by_poses
 from splatnode.recon.metric.stereo import by_stereo
+from splatnode.recon.metric.stereo_pairs import Pair
 from splatnode.recon.metric.views import views_of
 from splatnode.recon.networks.depth_anything import load_metric
 from splatnode.recon.result.bounds_in_words import rounded_up
@@ -63,12 +65,22 @@ def _said(snapshot: Snapshot, config: Config, evidence: Evidence) -> tuple[list[
         found = by_poses(views_of(snapshot), poses, sigmas, own)
         aligned = None if isinstance(found, str) else found
         said += [found] if isinstance(found, str) else [found.unit, *found.told]
-    if config.stereo_m is not None:
-        stereo = config.stereo_m, config.stereo_sigma_m
-        said.append(by_stereo(views_of(snapshot), snapshot.landmarks, evidence.pairs, *stereo))
+    for baseline, pairs in _rigs(config, evidence).items():
+        stereo = baseline.metres, baseline.sigma_m
+        said.append(by_stereo(views_of(snapshot), snapshot.landmarks, pairs, *stereo))
     if config.network:
         said.append(_by_the_network(snapshot, config.network_sigma))
     return said, aligned
+
+
+def _rigs(config: Config, evidence: Evidence) -> dict[Baseline, list[Pair]]:
+    """The stereo pairs by how far apart their cameras are."""
+    usual = None if config.stereo_m is None else Baseline(config.stereo_m, config.stereo_sigma_m)
+    rigs: dict[Baseline, list[Pair]] = {} if usual is None else {usual: []}
+    for pair in evidence.pairs:
+        if (baseline := pair.baseline or usual) is not None:
+            rigs.setdefault(baseline, []).append(pair)
+    return rigs
 
 
 def _by_the_network(snapshot: Snapshot, sigma: float) -> Measurement | str:

@@ -6,13 +6,13 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, reduced
 from splatnode.capture.process.printable import printable
+from splatnode.capture.right_image import Baseline, grey
 from splatnode.recon.frames.undistort import undistorted
 
 Grey = npt.NDArray[np.uint8]  # (H, W)
@@ -27,6 +27,7 @@ class Pair:
     photograph: str
     left: Grey
     right: Grey
+    baseline: Baseline | None = None  # that came with it; None: as it is configured for all
 
 
 def pairs_of(frames: Sequence[Frame | DroppedFrame], rights: Iterable[Frame | DroppedFrame]) -> tuple[Pair, ...]:
@@ -40,6 +41,15 @@ def pairs_of(frames: Sequence[Frame | DroppedFrame], rights: Iterable[Frame | Dr
         first = printable(next(iter(lefts), "none"), 100)
         raise ValueError(f"no right photograph has the name of a left one, such as {first}; name both of a pair alike")
     return tuple(found)
+
+
+def pair_with(frame: Frame) -> Pair | None:
+    """The frame and the right image that came with it; None where none did. Raises ValueError for a folded lens."""
+    straight = undistorted(frame)
+    if straight.right is None:
+        return None
+    right = straight.right
+    return Pair(frame.name, _compared(straight.image), _compared(right.image), right.baseline)
 
 
 def rights_in(path: Path, frames: Sequence[Frame | DroppedFrame]) -> Iterator[Frame | DroppedFrame]:
@@ -65,6 +75,10 @@ def _pair(left: Frame, right: Frame | DroppedFrame) -> Pair:
             f"both photographs of a pair must have one size: {left.name} has {left.width} x {left.height} pixels, "
             f"its partner {size}"
         )
-    both = undistorted(left), undistorted(replace(right, intrinsics=left.intrinsics))
-    seen = [cv2.cvtColor(reduced(each.image, _LONGEST_SIDE), cv2.COLOR_RGB2GRAY) for each in both]
-    return Pair(left.name, np.asarray(seen[0], np.uint8), np.asarray(seen[1], np.uint8))
+    partner = undistorted(replace(right, intrinsics=left.intrinsics))
+    return Pair(left.name, _compared(undistorted(left).image), _compared(partner.image))
+
+
+def _compared(image: npt.NDArray[np.uint8]) -> Grey:
+    """The picture (H, W, 3) or (H, W) as it is compared with its partner."""
+    return grey(reduced(image, _LONGEST_SIDE))

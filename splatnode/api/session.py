@@ -16,6 +16,7 @@ from splatnode.api.scale import Scale, is_stereo
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.progress import Tell, told_to_nobody
 from splatnode.capture.quality import Limits
+from splatnode.capture.right_image import Baseline, RightImage, grey
 from splatnode.capture.selection import Config as Selection
 from splatnode.capture.selection import Selector
 from splatnode.capture.stamp import Stamp
@@ -23,6 +24,7 @@ from splatnode.recon import threads as limits
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.metric.evidence import NOTHING, gathered
 from splatnode.recon.metric.metres import in_metres
+from splatnode.recon.modelling import with_landmarks
 from splatnode.recon.offline import Reconstructed
 from splatnode.recon.pipeline import made_anew
 from splatnode.recon.replay_source import Source
@@ -66,7 +68,7 @@ class Session:
         """
         check_count("threads", threads)
         if is_stereo(scale):
-            raise TypeError("stereo pairs go with reconstruct(); of a session, give a distance or a Marker")
+            raise TypeError("a session gets stereo pairs with add(image, right=..., baseline_m=...), not as its scale")
         self._config = configured(preset, config, {"seed": seed}, scale, of_pictures=True)
         self._preset, self._lens, self._threads, self._tell = preset, intrinsics, threads, tell or told_to_nobody
         self._selector = Selector(Selection(every_frame=every_frame, per_second=_EACH), Limits())
@@ -85,14 +87,18 @@ class Session:
         captured_at: Stamp | None = None,
         pose: npt.ArrayLike | None = None,
         pose_sigma: tuple[float, float] | None = None,
+        right: Picture | None = None,
+        baseline_m: float | None = None,
     ) -> Update:
         """Shows the session a photograph: a NumPy array (H, W, 3) uint8 RGB, or a PIL image.
 
         `pose` is where odometry or a tracker says that its camera was, T_world_camera (4, 4) in metres, all in one
         world, and `pose_sigma` how unsure that is, metres and degrees; default: what `config` says. Two poses or more
-        give the scene metres and their axes. Returns what became of the photograph once the scene has grown, which
-        takes seconds where it is taken, and milliseconds where it is not. Raises TypeError and ValueError where it is
-        no image, its pose is none, or a name comes again, and RuntimeError after `finish` or `close`.
+        give the scene metres and their axes. `right` is what the right half of a stereo camera saw at that moment,
+        rectified, of the image's size, and `baseline_m` how far it stands from the left one, metres: such pairs give
+        the scene metres, too. Returns what became of the photograph once the scene has grown, which takes seconds
+        where it is taken, and milliseconds where it is not. Raises TypeError and ValueError where it is no image, its
+        pose or its right image is none, or a name comes again, and RuntimeError after `finish` or `close`.
         """
         with self._lock, limits.at_most(self._threads):
             work = self._open()
@@ -101,7 +107,7 @@ class Session:
             if frame.name in self._given:
                 raise ValueError(f"name must be new for each photograph; {frame.name!r} was given before")
             given = pose_of(pose, pose_sigma, self._config.metric)
-            frame = replace(frame, given_pose=given)
+            frame = replace(frame, given_pose=given, right=_right_of(right, baseline_m))
             self._given.add(frame.name)
             decision = self._selector.decide(frame)
             if decision.take:
@@ -109,7 +115,8 @@ class Session:
                 self._evidence = self._evidence.and_also(gathered((frame,), self._config.metric))
                 work.take(frame)
                 work.update()
-                self._snapshot = work.snapshot()
+                made = work.snapshot()  # stereo pairs are measured by landmarks
+                self._snapshot = with_landmarks(made, work.remembered()) if self._evidence.pairs else made
             taken = frame.name in work.names
             left_out = {each.name: each.reason for each in work.dropped}
             return Update(frame.name, taken, left_out.get(frame.name, decision.reason), self.result)
@@ -160,3 +167,11 @@ class Session:
         if self._lens is None:
             return made
         return seen_through(made, intrinsics_of(self._lens, made.width, made.height))
+
+
+def _right_of(picture: Picture | None, baseline_m: float | None) -> RightImage | None:
+    if picture is None and baseline_m is None:
+        return None
+    if picture is None or baseline_m is None:
+        raise TypeError("right and baseline_m belong together: what the right camera saw, and how far away it stands")
+    return RightImage(grey(frame(picture, 0, "right", 0).image), Baseline(float(baseline_m)))

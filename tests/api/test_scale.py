@@ -37,5 +37,5 @@ def test_pairs_are_a_folder_or_one_picture_for_each(folder, arrays):
     assert pairs_given(splatnode.Marker(0.1), arrays, listed) == ()
     with pytest.raises(ValueError, match="right must have one picture for each"):
         pairs_given(splatnode.Stereo(arrays[:2], 0.1), arrays, listed)
-    with pytest.raises(TypeError, match="stereo pairs go with reconstruct"):
+    with pytest.raises(TypeError, match="a session gets stereo pairs with add"):
         splatnode.Session(scale=stereo)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+
+import msgspec
 import numpy as np
 import pytest
 
@@ -117,3 +120,34 @@ def test_what_is_no_pose_is_said_and_the_photograph_can_come_again(arrays):
             with pytest.raises(kind, match=why):
                 session.add(arrays[0], name="a.png", **bad)
         assert session.add(arrays[0], name="a.png", pose=np.eye(4)).taken
+
+
+def test_stereo_pairs_give_a_session_metres():
+    true = [T for T, _ in synthetic.scene_cameras(SMALL)]
+    frames = itertools.islice(synthetic.stream(msgspec.structs.replace(SMALL, baseline_m=0.15)), 2)
+    with splatnode.Session(config=QUICK, seed=0) as session:
+        for each in frames:
+            update = session.add(each.image, right=each.right.image, baseline_m=0.15)
+        result = session.finish()
+    assert update.taken and result.metric and result.scale_interval is not None
+    low, high = result.scale_interval
+    first, last = result.cameras
+    apart = np.linalg.norm(true[1][:3, 3] - true[0][:3, 3]) / np.linalg.norm(last.centre - first.centre)
+    assert low <= apart <= high < 1.05
+
+
+def test_what_is_no_right_image_is_said(arrays):
+    with splatnode.Session(config=QUICK) as session:
+        for bad, kind, why in (
+            ({"right": arrays[0]}, TypeError, "right and baseline_m belong together"),
+            ({"baseline_m": 0.1}, TypeError, "right and baseline_m belong together"),
+            ({"right": arrays[0], "baseline_m": -1.0}, ValueError, "a baseline must be above 0"),
+            (
+                {"right": arrays[0][:50, :60], "baseline_m": 0.1},
+                ValueError,
+                r"the right image must be .*got \(50, 60\)",
+            ),
+        ):
+            with pytest.raises(kind, match=why):
+                session.add(arrays[0], name="a.png", **bad)
+        assert session.add(arrays[0], name="a.png").taken

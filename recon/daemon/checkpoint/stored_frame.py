@@ -11,9 +11,10 @@ from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.given_pose import GivenPose
-from splatnode.capture.messaging.mask_bits import arrays_of, mask_in
+from splatnode.capture.messaging.frame_arrays import arrays_of, frame_in
 from splatnode.capture.messaging.message_file import read_message, write_message
 from splatnode.capture.messaging.wire import WireError, decode, encode
+from splatnode.capture.right_image import Baseline
 from splatnode.capture.stamp import Stamp
 from splatnode.recon.daemon.checkpoint.ledger import LIMITS, VERSION, is_readable
 
@@ -21,7 +22,7 @@ FILE = re.compile(r"[0-9]{12,18}\.frame")
 
 
 class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A stored keyframe; its arrays are its image and, where it has one, its mask."""
+    """A stored keyframe; its arrays are its image and, where it has these, its mask and its right image."""
 
     version: int
     session: str
@@ -31,6 +32,7 @@ class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     intrinsics: Intrinsics | None
     captured_at: Stamp | None = None
     given_pose: GivenPose | UnsetType = UNSET  # left out where there is none, as in a message
+    baseline: Baseline | UnsetType = UNSET  # likewise
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,9 @@ def file_name(number: int) -> str:
 def write_frame(path: Path, key: tuple[str, int], frame: Frame) -> None:
     """Whole or not at all; `key` is its session and sequence. Raises OSError."""
     pose = UNSET if frame.given_pose is None else frame.given_pose
-    header = FrameRecord(VERSION, *key, frame.name, frame.stamp_ns, frame.intrinsics, frame.captured_at, pose)
+    baseline = UNSET if frame.right is None else frame.right.baseline
+    known = frame.name, frame.stamp_ns, frame.intrinsics, frame.captured_at
+    header = FrameRecord(VERSION, *key, *known, pose, baseline)
     write_message(path, encode(header, arrays_of(frame)))
 
 
@@ -57,8 +61,4 @@ def read_frame(path: Path) -> StoredFrame:
     header = message.header
     if not is_readable(header.version):
         raise WireError(f"frame {number} is of version {header.version}")
-    mask = mask_in(message.arrays)
-    known = header.stamp_ns, message.arrays[0], header.intrinsics
-    pose = None if header.given_pose is UNSET else header.given_pose
-    frame = Frame(number, header.name, *known, captured_at=header.captured_at, mask=mask, given_pose=pose)
-    return StoredFrame(number, (header.session, header.sequence), frame)
+    return StoredFrame(number, (header.session, header.sequence), frame_in(header, number, message.arrays))

@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import depthai as oak
-from splatnode.capture.cameras.depthai import Config, find, read, stream, to_frame
-from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.cameras.depthai import Config, Source, find, read, stream, to_frame, to_pair
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.right_image import Baseline
 from splatnode.capture.stamp import Clock
 from splatnode.capture.unavailable import CameraUnavailable
 from tests.conftest import ROOT
@@ -75,6 +76,7 @@ class FakeDepthai:
         self.CameraBoardSocket = SimpleNamespace(CAM_A="A")
         self.ImgFrame = SimpleNamespace(Type=SimpleNamespace(BGR888i="BGR"))
         self.ImgResizeMode = SimpleNamespace(CROP="crop")
+        self.LengthUnit = SimpleNamespace(METER="m")
         self.MessageQueue = SimpleNamespace(QueueException=QueueException)
         self.CameraControl = _Control
 
@@ -226,9 +228,109 @@ def test_depthais_own_replay(tmp_path, monkeypatch):
         pipeline.start()
         frames = []
         with pytest.raises(CameraUnavailable, match="ended its stream"):
-            for frame in read(dai, queue, Config(lock=False), hold=lambda: None):
+            for frame in read(dai, Source(queue, (), to_frame), Config(lock=False), hold=lambda: None):
                 frames.append(frame)
     assert len(frames) >= 10
     assert all(frame.image.shape == (120, 160, 3) and frame.intrinsics is None for frame in frames)
     assert np.allclose([frame.image[60, 80, 2] for frame in frames], 20 * np.arange(len(frames)), atol=6)
     assert (np.diff([frame.stamp_ns for frame in frames]) > 0).all()
+
+
+class FakeStereo(FakeDepthai):
+    """A device with two stereo cameras; `baseline` is what its calibration tells."""
+
+    def __init__(self, messages, baseline=0.075):
+        super().__init__(["only"])
+        self.links: list[str] = []
+        supply = iter(messages)
+        queue = SimpleNamespace(get=lambda timeout: self._next(supply))
+        nodes = {"Camera": self._camera, "StereoDepth": self._stereo, "Sync": lambda: self._sync(queue)}
+        pipeline = SimpleNamespace(create=lambda node: nodes[node](), start=lambda: self.told.append("start"))
+        found = self.Device.getAllAvailableDevices
+        calibration = SimpleNamespace(getBaselineDistance=lambda *asked: self._baseline(asked, baseline))
+        self.Device = _Opened(lambda info: None, SimpleNamespace(readCalibration=lambda: calibration))
+        self.Device.getAllAvailableDevices = found
+        self.Pipeline = _Opened(lambda device: None, pipeline)
+        self.node = SimpleNamespace(Camera="Camera", StereoDepth="StereoDepth", Sync="Sync")
+        self.CameraBoardSocket = SimpleNamespace(CAM_B="B", CAM_C="C")
+
+    @staticmethod
+    def _baseline(asked, baseline):
+        assert asked == ("C", "B", False, "m")
+        if baseline is None:
+            raise RuntimeError("no calibration data")
+        return baseline
+
+    def _camera(self):
+        sockets = []
+        camera = SimpleNamespace(
+            build=lambda socket: sockets.append(socket) or camera,
+            requestOutput=lambda size, **how: self.told.append((size, how)) or self._linked(f"camera {sockets[0]}"),
+            inputControl=SimpleNamespace(createInputQueue=lambda: SimpleNamespace(send=self.told.append)),
+        )
+        return camera
+
+    def _stereo(self):
+        return SimpleNamespace(
+            left="left",
+            right="right",
+            setRectification=lambda on: self.told.append(("rectified", on)),
+            rectifiedLeft=self._linked("rectified left"),
+            rectifiedRight=self._linked("rectified right"),
+        )
+
+    def _sync(self, queue):
+        return SimpleNamespace(
+            inputs={"left": "sync left", "right": "sync right"},
+            setSyncThreshold=lambda apart: self.told.append(("together within", apart)),
+            out=SimpleNamespace(createOutputQueue=lambda **how: queue),
+        )
+
+    def _linked(self, name):
+        return SimpleNamespace(link=lambda to: self.links.append(f"{name} -> {to}"))
+
+
+def pair(index=0, left=60, right=90, shape=(120, 160)):
+    """A group of the messages of two grey cameras."""
+    group = {"left": message(index), "right": message(index)}
+    group["left"].getCvFrame = lambda: np.full((120, 160), left, np.uint8)
+    group["right"].getCvFrame = lambda: np.full(shape, right, np.uint8)
+    return group
+
+
+def test_stereo_cameras_give_pairs_with_the_baseline_of_their_calibration(monkeypatch):
+    fake = use(monkeypatch, FakeStereo([pair(index) for index in range(4)]))
+    first, second = itertools.islice(stream(Config(stereo=True, settle_s=0, width=160, height=120)), 2)
+    assert isinstance(first, Frame) and (first.frame_id, second.name) == (0, "100000.000002")
+    assert first.image.shape == (120, 160, 3) and np.unique(first.image).tolist() == [60]
+    assert first.right is not None and np.unique(first.right.image).tolist() == [90]
+    assert first.right.baseline == Baseline(0.075)
+    linked = ["camera B -> left", "camera C -> right", "rectified left -> sync left", "rectified right -> sync right"]
+    assert fake.links == linked
+    assert ("rectified", True) in fake.told and ("together within", timedelta(seconds=0.05)) in fake.told
+    assert [each.calls[0][0] for each in fake.told if isinstance(each, _Control)] == ["setAutoExposureLock"] * 2
+
+
+@pytest.mark.parametrize("baseline", [None, 0.0, float("nan")])
+def test_stereo_cameras_without_a_calibration_say_so(monkeypatch, baseline):
+    use(monkeypatch, FakeStereo([pair()], baseline))
+    with pytest.raises(CameraUnavailable, match="stereo baseline is not known.*set camera.stereo to false"):
+        next(stream(Config(stereo=True)))
+
+
+def test_a_right_picture_of_another_size_leaves_the_pair_out():
+    left_out = to_pair(Baseline(0.075), pair(shape=(60, 80)), 0)
+    assert isinstance(left_out, DroppedFrame) and "its right image cannot be used" in left_out.reason
+
+
+def test_depthai_has_what_pairs_need():
+    """The names are DepthAI's own; only a device could run them."""
+    dai = pytest.importorskip("depthai", reason="needs the extra oak")
+    with dai.Pipeline(False) as pipeline:
+        sync = pipeline.create(dai.node.Sync)
+        sync.setSyncThreshold(timedelta(seconds=0.05))
+        assert sync.inputs["left"] and sync.inputs["right"]
+    stereo = dai.node.StereoDepth
+    assert stereo.setRectification and stereo.rectifiedLeft and stereo.rectifiedRight and stereo.left and stereo.right
+    assert dai.CalibrationHandler().getBaselineDistance and dai.LengthUnit.METER
+    assert dai.CameraBoardSocket.CAM_B and dai.CameraBoardSocket.CAM_C

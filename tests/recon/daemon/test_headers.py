@@ -17,6 +17,7 @@ from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.messaging import commands, keyframe_messages
 from splatnode.capture.messaging.state import Want
 from splatnode.capture.messaging.wire import Header
+from splatnode.capture.right_image import Baseline
 from splatnode.recon.daemon import control
 from splatnode.recon.daemon.status import ReconStatus
 from splatnode.recon.result.message import SceneHeader
@@ -27,7 +28,7 @@ SCHEMAS = [
     preview.PreviewHeader, status.CaptureStatus, status.Heartbeat, commands.Seen, commands.Answer, control.Retract,
     Want, ReconStatus, SceneHeader,
 ]  # fmt: skip
-CHECKED_BY_THEMSELVES = (Intrinsics, GivenPose)  # whose __post_init__ knows all their bounds
+CHECKED_BY_THEMSELVES = (Intrinsics, GivenPose, Baseline)  # whose __post_init__ knows all their bounds
 
 
 def unbounded(kind: inspect.Type, where: str) -> Iterator[str]:

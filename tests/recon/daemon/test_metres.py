@@ -59,6 +59,20 @@ def test_poses_of_keyframes_give_what_is_shown_and_what_is_written_metres(config
         np.testing.assert_allclose(camera.T_world_camera, shown.T_world_camera, atol=1e-9)
 
 
+def test_right_images_of_keyframes_give_what_is_shown_and_what_is_written_metres(config, peer):  # noqa: F811
+    frames = list(synthetic.stream(msgspec.structs.replace(SMALL, baseline_m=0.15)))[:3]
+    with running(config):
+        for frame in frames:
+            peer.server.offer(frame)
+        scene = peer.wait(finished(3), "a final scene").snapshot
+        first = next(heard.snapshot for heard in peer.heard if len(heard.snapshot.cameras) == 3)
+    for shown in (first, scene):
+        assert shown.scale.metric and "3 stereo pairs with 150 mm between the cameras" in shown.scale.source
+        low, high = shown.scale.interval_95
+        assert low <= apart_truly() / apart(shown.cameras) <= high and high < 1.05
+    assert decode_scale((config.out / "scene-0001" / "cameras.json").read_bytes()) == scene.scale
+
+
 def test_poses_against_a_distance_leave_the_scene_relative_with_the_reason(config, peer):  # noqa: F811
     names = [frame.name for frame in photographs()[:3]]
     metric = msgspec.convert({"baseline": [names[0], names[2], apart_truly()]}, Metric)

@@ -6,21 +6,23 @@ from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from splatnode.capture.cameras import synthetic
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
+from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.metric.config import Config
-from splatnode.recon.metric.evidence import Evidence
+from splatnode.recon.metric.evidence import Evidence, gathered
 from splatnode.recon.metric.measurement import Measurement
 from splatnode.recon.metric.metres import in_metres
 from splatnode.recon.metric.stereo import by_stereo
 from splatnode.recon.metric.stereo_pairs import Pair, pairs_of, rights_in
 from splatnode.recon.metric.views import View
 from splatnode.recon.result.landmarks import KnownLenses, Landmarks
-from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from tests.recon.result.test_preview import snapshot as ball_snapshot
 from tests.support import synthetic as support
 from tests.support.stereo import right_photographs
@@ -85,13 +87,16 @@ def test_the_scale_is_what_the_baseline_says_within_half_a_percent(stated):
     assert abs(np.log(told.metres_per_unit / (stated * UNIT))) < 1.96 * told.sigma < 0.02
 
 
-def test_a_scene_gets_metres_from_its_pairs():
+def snapshot() -> Snapshot:
     cameras = tuple(
         CameraEstimate(name, index, view.T_world_camera, np.diag([1.0, 1.0, 1.0]), 320, 240)
         for index, (name, view) in enumerate(known().items())
     )
-    snapshot = replace(ball_snapshot(1), cameras=cameras, landmarks=landmarks())
-    metric = in_metres(snapshot, Config(stereo_m=BASELINE_M), Evidence(pairs=pairs()))
+    return replace(ball_snapshot(1), cameras=cameras, landmarks=landmarks())
+
+
+def test_a_scene_gets_metres_from_its_pairs():
+    metric = in_metres(snapshot(), Config(stereo_m=BASELINE_M), Evidence(pairs=pairs()))
     assert metric.scale.metric and "2 stereo pairs with 150 mm between the cameras" in (metric.scale.source or "")
 
 
@@ -123,3 +128,20 @@ def test_partners_have_one_name(tmp_path: Path):
         pairs_of(frames, [replace(rights()[0], name="x.png")])
     with pytest.raises(ValueError, match="must have one size"):
         pairs_of(frames, [replace(rights()[0], image=rights()[0].image[:100])])
+
+
+def test_right_images_that_came_with_the_frames_give_metres_without_a_configuration():
+    frames = list(synthetic.stream(msgspec.structs.replace(PLACE, baseline_m=BASELINE_M)))
+    told = in_metres(snapshot(), Config(), gathered(frames, Config())).scale
+    assert told.metric and "2 stereo pairs with 150 mm between the cameras" in (told.source or "")
+    assert told.interval_95 is not None and 1.0 < told.interval_95[1] < 1.02
+
+
+def test_a_right_image_is_taken_out_of_the_lens_as_its_left_one_is():
+    lens = Intrinsics(320, 240, 300.0, 310.0, 160.0, 120.0, "calibration", (-0.2, 0.05, 0.0, 0.0))
+    frame = next(synthetic.stream(msgspec.structs.replace(PLACE, lens=lens, baseline_m=BASELINE_M)))
+    assert frame.right is not None
+    straight = undistorted(frame)
+    alone = undistorted(replace(frame, image=np.repeat(frame.right.image[:, :, None], 3, 2), right=None))
+    assert straight.right is not None and straight.right.baseline == frame.right.baseline
+    assert np.array_equal(straight.right.image, alone.image[:, :, 0])
