@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from splatnode.api.camera import Camera
+    from splatnode.api.live_map import NodeMap
     from splatnode.api.loading import load
     from splatnode.api.node import Node, NodeUpdate, connect
     from splatnode.api.reconstruction import reconstruct
@@ -26,6 +27,7 @@ __all__ = [
     "Located",
     "Marker",
     "Node",
+    "NodeMap",
     "NodeUpdate",
     "NotLocated",
     "OccupancyMap",
@@ -46,6 +48,7 @@ _MODULES = {
     "Located": "splatnode.recon.locating.outcome",
     "Marker": "splatnode.api.scale",
     "Node": "splatnode.api.node",
+    "NodeMap": "splatnode.api.live_map",
     "NodeUpdate": "splatnode.api.node",
     "NotLocated": "splatnode.recon.locating.outcome",
     "OccupancyMap": "splatnode.recon.occupancy.occupancy_map",

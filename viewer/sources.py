@@ -79,9 +79,10 @@ class Live:
         self._refusals = Problems()
         self._newest: Moment | None = None
         self._tracked: CameraEstimate | None = None
+        self.scene: tuple[str, int] | None = None  # session and sequence of the newest message with a scene
         self._lock = threading.Condition()
         self._error: BaseException | None = None
-        self._closing = threading.Event()
+        self.closed = threading.Event()  # by `close`
         self._thread = threading.Thread(target=self._listen, name="live scene", daemon=True)
         self._thread.start()
 
@@ -105,11 +106,11 @@ class Live:
     def wait(self, timeout_s: float | None = None) -> Moment | None:
         """As `take`, but waits until one comes; None where none comes in time, or when it is closed."""
         with self._lock:
-            self._lock.wait_for(lambda: self._newest or self._error or self._closing.is_set(), timeout_s)
+            self._lock.wait_for(lambda: self._newest or self._error or self.closed.is_set(), timeout_s)
         return self.take()
 
     def close(self) -> None:
-        self._closing.set()
+        self.closed.set()
         with self._lock:
             self._lock.notify_all()
         self._thread.join()
@@ -119,7 +120,7 @@ class Live:
     def _listen(self) -> None:
         last: CameraRecord | None = None  # of the last heartbeat: what has not changed is not drawn again
         try:
-            while not self._closing.is_set():
+            while not self.closed.is_set():
                 message = self._client.poll(_POLL_S)
                 heartbeat = self._heartbeats.latest(0)
                 if heartbeat is not None and heartbeat.header.tracked != last:
@@ -127,6 +128,7 @@ class Live:
                     self._tracked = last and camera_from(last)
                 if message is None:
                     continue
+                self.scene = message.header.session, message.header.sequence
                 try:
                     live = from_message(message)
                     moment = Moment(_safe(live.snapshot), time.monotonic(), live.scene_id)

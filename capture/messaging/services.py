@@ -32,3 +32,4 @@ RECON_SCENE = Service("recon.scene", Pattern.STATE, 3)  # and 4, for requests
 RECON_STATUS = Service("recon.status", Pattern.BROADCAST, 5)
 RECON_CONTROL = Service("recon.control", Pattern.COMMANDS, 6)
 CAPTURE_CONTROL = Service("capture.control", Pattern.COMMANDS, 7)
+RECON_MAP = Service("recon.map", Pattern.STATE, 8)  # and 9, for requests; where it is configured

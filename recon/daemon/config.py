@@ -9,6 +9,7 @@ import msgspec
 
 from splatnode.capture.messaging.network import Network
 from splatnode.recon.config import Config as Reconstruction
+from splatnode.recon.daemon.free_space import Config as FreeSpace
 from splatnode.recon.daemon.tracking import Config as Tracking
 from splatnode.recon.result.message import MAX_CAMERAS
 
@@ -19,6 +20,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     network: Network = Network()  # the same as in capture's configuration
     reconstruction: Reconstruction = Reconstruction()
     tracking: Tracking = Tracking()  # of the live camera against a finished scene
+    map: FreeSpace = FreeSpace()  # which space is free, occupied, or not seen
     # What a restart goes on from. None: the folder recon in $STATE_DIRECTORY, else in $XDG_STATE_HOME/splatnode, else
     # in ~/.local/state/splatnode.
     checkpoint: Path | None = None

@@ -3,7 +3,7 @@
 intake    capture.keyframes -> checkpoint, acknowledged -> inbox
 worker    inbox -> scenes, saved and exported
 watcher   capture.preview -> has the camera moved?
-main      recon.scene, recon.status, recon.control; the service manager; signals
+main      recon.scene, recon.map, recon.status, recon.control; the service manager; signals
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import msgspec
 
 from splatnode.capture.messaging.broadcast import Publisher
 from splatnode.capture.messaging.commands import Answer, CommandServer, Seen
-from splatnode.capture.messaging.services import RECON_CONTROL, RECON_SCENE, RECON_STATUS
+from splatnode.capture.messaging.services import RECON_CONTROL, RECON_MAP, RECON_SCENE, RECON_STATUS
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.process.after_ready import after_ready
@@ -38,8 +38,10 @@ from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
 from splatnode.recon.daemon.control import Command
 from splatnode.recon.daemon.disk_space import DiskSpace
+from splatnode.recon.daemon.free_space import NOT_FINAL, Mapped
 from splatnode.recon.daemon.inbox import Inbox, LeftOut
 from splatnode.recon.daemon.intake import Intake
+from splatnode.recon.daemon.map_offer import MapOffer
 from splatnode.recon.daemon.output import Published
 from splatnode.recon.daemon.status import ReconStatus, State
 from splatnode.recon.daemon.watcher import Watcher
@@ -54,7 +56,7 @@ from splatnode.recon.result.snapshot import CameraEstimate
 log = logging.getLogger(__name__)
 
 SERVE_S = 0.05  # between looks at what the threads have produced
-_FILES, _THREADS = 128, 20  # of which the daemon has need: five endpoints, its own threads, those that compute
+_FILES, _THREADS = 128, 20  # of which the daemon has need: six endpoints, its own threads, those that compute
 END_S = 20.0  # for the threads to end; an export takes seconds
 STUCK_S = (
     300.0  # without progress the worker counts as stuck; its longest step, verifying all views, takes tens of seconds
@@ -89,6 +91,7 @@ class Daemon:
             make_sure_of_room(_FILES, _THREADS)
             network = config.network
             self._scenes = self._resources.enter_context(StateServer(RECON_SCENE, network))
+            maps = self._resources.enter_context(StateServer(RECON_MAP, network)) if config.map.live else None
             self._heartbeat = self._resources.enter_context(Publisher(RECON_STATUS, network))
             self._commands = self._resources.enter_context(CommandServer(RECON_CONTROL, network, Command))
             self._store = Store(config.checkpoint or state_directory() / "recon")
@@ -104,6 +107,8 @@ class Daemon:
         self._worker = Worker(config, self._store, self._inbox, self._newest.put, stopping)
         self._watcher = Watcher(network, config.tracking, lambda: self._worker.place.finished, self._problems, stopping)
         self._numbering = Numbering()
+        self._maps = None if maps is None else MapOffer(maps, self._numbering)
+        self._sequence = 0  # of the last scene's message
         self._started_s = time.monotonic()
         self._shown: Published | None = None
         self._errors: list[BaseException] = []
@@ -129,7 +134,10 @@ class Daemon:
             while not self._stopping.is_set():
                 self._scenes.serve(SERVE_S)
                 self._commands.serve(0, self._answer)
+                if self._maps is not None:
+                    self._maps.serve()
                 self._publish()
+                self._tell_map(self._worker.mapped)
                 if time.monotonic() >= next_status_s:
                     next_status_s = time.monotonic() + self._config.status_every_s
                     status = self._status()
@@ -169,12 +177,19 @@ class Daemon:
         if shown is None:
             return
         self._shown = shown
+        self._tell_map(NOT_FINAL)  # first: no map of another scene is there when this one comes
+        numbers = self._numbering.next()
+        self._sequence = int(numbers["sequence"])
         try:
-            header, arrays = to_message(shown.snapshot, shown.scene_id, self._numbering.next())
+            header, arrays = to_message(shown.snapshot, shown.scene_id, numbers)
             self._scenes.publish(header, arrays)
         except Exception as error:  # of one snapshot; the next one may do
             if is_said(self._problems.add("scenes that could not be shown", f"{type(error).__name__}: {error}")):
                 log.exception("a scene could not be shown")
+
+    def _tell_map(self, found: Mapped | str) -> None:
+        if self._maps is not None:
+            self._maps.tell(found, self._shown, self._sequence)
 
     def _answer(self, command: Command) -> Answer:
         if isinstance(command, Seen):

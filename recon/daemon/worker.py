@@ -17,6 +17,7 @@ from splatnode.recon.daemon.atlas.links import Kind
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
+from splatnode.recon.daemon.free_space import FreeSpace, Mapped
 from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
 from splatnode.recon.daemon.left_places import LeftPlaces
 from splatnode.recon.daemon.output import Output, Published
@@ -44,6 +45,7 @@ class Worker:
         self._config, self._store, self._inbox, self._stopping = config, store, inbox, stopping
         self._output = Output(config, store, publish, self._complain)
         self.place = PresentPlace(config, self._recipe, store, self._output, self._pause)
+        self._free_space = FreeSpace(config.map)
         self._atlas = Atlas(store.directory, self._recipe, self._output.places)
         self._left = LeftPlaces(store, self._recipe, self._output, self._atlas)
         self._quiet_since_s = time.monotonic()  # when what came last was worked in
@@ -69,6 +71,11 @@ class Worker:
     def newest_places(self) -> tuple[PlaceStatus, ...]:
         """What is known of the newest places, each as it was when it was last worked on."""
         return tuple(each.status for each in self._output.places.newest(PLACES))
+
+    @property
+    def mapped(self) -> Mapped | str:
+        """The map of the present scene as it is now, or why there is none."""
+        return self._free_space.current(self.place.finished, self.place.state)
 
     def scenes_left_with(self, name: str) -> list[str]:
         """The ids of the scenes, of places that the camera has left, that have a camera of this photograph."""
@@ -101,11 +108,17 @@ class Worker:
     def _rest(self) -> None:
         """What there is time for while nothing is to be done for the present place."""
         if not (
-            self._left.judge_next(self._meanwhile)
+            self._map()
+            or self._left.judge_next(self._meanwhile)
             or self.place.compare(self._atlas)
             or self._left.finish_next(self._meanwhile)
         ):
             self.rests += 1
+
+    def _map(self) -> bool:
+        """Maps the present scene, if it is final; False where that was done. Abandoned when something comes."""
+        folder = self._config.out / self._store.scene_id
+        return self._free_space.make(self.place.finished, self.place.state, folder, lambda: self._pause(-math.inf))
 
     def _turn(self, wait_s: float) -> bool:
         """Works in what has come, or makes the scene better if it is time; False where there was nothing to do."""
@@ -137,6 +150,8 @@ class Worker:
         self._pause(math.inf)
         began = time.monotonic()
         self._turn(0.0)
+        if self.place.settled:
+            self._guarded(self._map, present=False)
         self._left.leave_out(time.monotonic() - began)
 
     def _pause(self, until_s: float) -> None:

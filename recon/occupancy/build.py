@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.occupancy.carving import passed
+from splatnode.recon.occupancy.carving import passed, without_pause
 from splatnode.recon.occupancy.layout import laid_out
 from splatnode.recon.occupancy.occupancy_map import OccupancyMap, State
 from splatnode.recon.occupancy.sight import Sight, sights
@@ -25,13 +27,17 @@ class NoMap(ValueError):
 
 
 def occupancy_map(
-    snapshot: Snapshot, voxel: float | None = None, up: npt.NDArray[np.float64] | None = None
+    snapshot: Snapshot,
+    voxel: float | None = None,
+    up: npt.NDArray[np.float64] | None = None,
+    pause: Callable[[], None] = without_pause,
 ) -> OccupancyMap:
     """The map of what the photographs show at depths that two of them confirm; nothing else makes a voxel known.
 
     A voxel is free where a camera looks through all of it, and occupied where a confirmed surface is in it, which
     counts for more. `voxel` is its side in the result's unit; None: a 64th of the median depth. `up` (3,) is the
-    direction of up in the world, where it is known. Raises NoMap, and ValueError for arguments that cannot be used.
+    direction of up in the world, where it is known. `pause` is called several times a second, and may raise to abandon
+    the work. Raises NoMap, and ValueError for arguments that cannot be used.
     """
     seen = _sights(snapshot)
     points = np.concatenate([sight.points for sight in seen]).astype(np.float64)
@@ -42,7 +48,8 @@ def occupancy_map(
     layout = laid_out(_in_map(points, T), _in_map(centres, T), unit, snapshot.scale.metric, voxel)
     states = np.zeros(layout.shape, np.uint8)
     for sight in seen:
-        states[passed(sight, layout, T)] = State.FREE
+        states[passed(sight, layout, T, pause)] = State.FREE
+    pause()
     ends = np.concatenate([blurred(sight) for sight in seen])
     states[surfaces(_in_map(ends, T), layout)] = State.OCCUPIED
     return OccupancyMap(states, layout.voxel, layout.origin, frame, snapshot.scale)

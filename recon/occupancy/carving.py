@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +20,14 @@ _RADII = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64)  # pixels, of the squares th
 _AT_ONCE = 2_000_000  # voxels
 
 
-def passed(sight: Sight, layout: Layout, T_world_map: npt.NDArray[np.float64]) -> Mask:
-    """(X, Y, Z) the voxels that the camera looks through.
+def without_pause() -> None:
+    """What is called between the parts of work that nobody interrupts."""
+
+
+def passed(
+    sight: Sight, layout: Layout, T_world_map: npt.NDArray[np.float64], pause: Callable[[], None] = without_pause
+) -> Mask:
+    """(X, Y, Z) the voxels that the camera looks through; `pause` is called in between, and may raise.
 
     A voxel is covered by the pixels around its centre that its bounding sphere reaches. Each of them must end beyond
     the sphere, by the depth's uncertainty and a voxel; KNOWN_SHARE of them must have a depth.
@@ -32,6 +40,7 @@ def passed(sight: Sight, layout: Layout, T_world_map: npt.NDArray[np.float64]) -
     free = np.zeros(layout.shape, bool)
     rows = max(1, _AT_ONCE // (layout.shape[1] * layout.shape[2]))
     for first in range(0, layout.shape[0], rows):
+        pause()
         part = slice(first, min(first + rows, layout.shape[0]))
         free[part] = _passed(_coordinates(start, steps, part, layout.shape), sight.K, limits, reach)
     return free

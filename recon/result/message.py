@@ -134,7 +134,7 @@ def to_message(
         iterations=snapshot.iterations,
         seconds=snapshot.seconds,
         final=snapshot.final,
-        scale=_scale_record(snapshot.scale),
+        scale=UNSET if snapshot.scale == RELATIVE else scale_record(snapshot.scale),
     )
     thumbnails = [to_jpeg(thumbnail(snapshot.images[camera.name]), THUMBNAIL_QUALITY) for camera in snapshot.cameras]
     return header, [*(getattr(snapshot.gaussians, name) for name in GAUSSIAN_FIELDS), *thumbnails]
@@ -172,7 +172,7 @@ def _live_scene(message: Message[SceneHeader]) -> LiveScene:
         iterations=header.iterations,
         seconds=header.seconds,
         final=header.final,
-        scale=RELATIVE if header.scale is UNSET else Scale(**msgspec.structs.asdict(header.scale)),
+        scale=RELATIVE if header.scale is UNSET else scale_from(header.scale),
     )
     return LiveScene(snapshot, header.scene_id, header.session, header.mono_ns)
 
@@ -184,11 +184,13 @@ def thumbnail(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def _scale_record(scale: Scale) -> ScaleRecord | UnsetType:
-    if scale == RELATIVE:
-        return UNSET
+def scale_record(scale: Scale) -> ScaleRecord:
     source = None if scale.source is None else printable(scale.source)
     return ScaleRecord(scale.metric, source, scale.interval_95)
+
+
+def scale_from(record: ScaleRecord) -> Scale:
+    return Scale(**msgspec.structs.asdict(record))
 
 
 def bounds_record(bounds: Bounds | None) -> BoundsRecord | None:

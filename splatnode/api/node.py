@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 
 from splatnode.api.camera import Camera, camera_of
+from splatnode.api.live_map import LiveMap, NodeMap
 from splatnode.api.result import Result, result_of
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.process.config import read_yaml, typed
@@ -17,6 +19,8 @@ from splatnode.viewer.moment import Moment
 from splatnode.viewer.sources import Live
 
 FIRST_PORT = Network().first_port
+OUTDATED = "the scene has changed since its map was made"
+_LOOK_S = 0.05  # between looks at whether a map has come
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +50,11 @@ class Node:
 
     def __init__(self, network: Network) -> None:
         self._live = Live(network)
+        try:
+            self._map = LiveMap(network)
+        except BaseException:
+            self._live.close()
+            raise
 
     def __iter__(self) -> Iterator[NodeUpdate]:
         """Each update as it comes, the present scene first; ends when the connection is closed by another thread.
@@ -73,6 +82,26 @@ class Node:
         return None if tracked is None else camera_of(tracked)
 
     @property
+    def map(self) -> NodeMap:
+        """Which space is free, occupied, or not seen, where the node's configuration has `map.live`.
+
+        A map is of a scene that is final, as this program has heard it last; else there is none, and `why` says so.
+        Raises PermissionError where the node does not let this program in.
+        """
+        heard = self._map.newest
+        if heard.told.occupancy is not None and heard.scene != self._live.scene:
+            return NodeMap(heard.told.scene_id, None, OUTDATED)
+        return heard.told
+
+    def wait_for_map(self, timeout_s: float | None = None) -> NodeMap:
+        """As `map`, as soon as there is one; what is known after so many seconds, or when the connection is closed."""
+        until = None if timeout_s is None else time.monotonic() + timeout_s
+        while (found := self.map).occupancy is None and not self._live.closed.wait(_LOOK_S):
+            if until is not None and time.monotonic() >= until:
+                return self.map
+        return found
+
+    @property
     def silent_s(self) -> float:
         """Seconds since anything was heard of the node, which speaks each second; infinite before the first time."""
         return self._live.age_s
@@ -80,6 +109,7 @@ class Node:
     def close(self) -> None:
         """Ends the connection, and whoever waits for an update."""
         self._live.close()
+        self._map.close()
 
     def __enter__(self) -> Node:
         return self

@@ -40,6 +40,7 @@ _CLASSES = (
     "Update",
     "Node",
     "NodeUpdate",
+    "NodeMap",
     "Located",
     "NotLocated",
     "OccupancyMap",

@@ -1,4 +1,4 @@
-"""The programs that docs/messages.md shows: each prints the scene that a node publishes."""
+"""The programs that docs/messages.md shows: each prints the scene, or the map, that a node publishes."""
 
 from __future__ import annotations
 
@@ -6,39 +6,61 @@ import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_SCENE
+from splatnode.capture.messaging.services import RECON_MAP, RECON_SCENE
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
+from splatnode.recon.occupancy.message import to_message as map_message
 from splatnode.recon.result.message import to_message
 from tests.conftest import ROOT
 from tests.support.exported import make_snapshot
+from tests.support.occupied import small_map
 
 PROGRAMS = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "messages.md").read_text(encoding="utf-8"), re.DOTALL)
 WAIT_S = 30
 
 
-@pytest.mark.parametrize("program", PROGRAMS, ids=["with splatnode", "without splatnode"])
+@pytest.mark.parametrize("program", PROGRAMS[:2], ids=["with splatnode", "without splatnode"])
 def test_a_program_of_the_page_prints_the_scene(program, tmp_path):
     scene = make_snapshot()
     scene = replace(scene, images={camera.name: np.zeros((48, 64, 3), np.uint8) for camera in scene.cameras})
-    numbers, output = Numbering(), tmp_path / "printed"
-    command = [sys.executable, "-u", "-c", program.replace("/tmp/splatnode-1000", str(tmp_path))]
-    environment = os.environ | {"RUNTIME_DIRECTORY": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    numbers = Numbering()
+    with StateServer(RECON_SCENE, Network(directory=tmp_path)) as node:
+        printed = printed_by(
+            program, node, lambda: to_message(scene, "scene-0001", numbers.next()), scene.cameras[-1].name, tmp_path
+        )
+    assert scene.verdict.code.value in printed and scene.cameras[-1].name in printed
+
+
+def test_the_program_for_maps_prints_the_map(tmp_path):
+    made, numbers = small_map(np.array([[[0, 1, 1, 2]]])), Numbering()
+    with StateServer(RECON_MAP, Network(directory=tmp_path)) as node:
+        said = printed_by(
+            PROGRAMS[2], node, lambda: map_message(made, "scene-0001", 0, numbers.next()), "occupied", tmp_path
+        )
+    assert "scene-0001 {'not_seen': 0.25, 'free': 0.5, 'occupied': 0.25}" in said
+
+
+def printed_by(program: str, node: StateServer, message: Callable[[], tuple], until: str, folder: Path) -> str:
+    """What the program has printed when `until` is in it, or time is up; the message is published again and again."""
+    output = folder / "printed"
+    command = [sys.executable, "-u", "-c", program.replace("/tmp/splatnode-1000", str(folder))]
+    environment = os.environ | {"RUNTIME_DIRECTORY": str(folder), "PYTHONPATH": str(ROOT)}
     with (
-        StateServer(RECON_SCENE, Network(directory=tmp_path)) as node,
         output.open("w") as printed,
         subprocess.Popen(command, env=environment, stdout=printed, stderr=printed) as listener,
     ):
         for _ in range(10 * WAIT_S):
-            node.publish(*to_message(scene, "scene-0001", numbers.next()))
+            node.publish(*message())
             node.serve(0.1)
-            if listener.poll() is not None or scene.cameras[-1].name in output.read_text():
+            if listener.poll() is not None or until in output.read_text():
                 break
         listener.kill()
-    assert scene.verdict.code.value in output.read_text() and scene.cameras[-1].name in output.read_text()
+    return output.read_text()

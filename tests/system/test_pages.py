@@ -15,6 +15,7 @@ from splatnode.capture.preview import PreviewHeader
 from splatnode.capture.status import CaptureStatus
 from splatnode.recon.daemon.control import Retract
 from splatnode.recon.daemon.status import ReconStatus, State
+from splatnode.recon.occupancy.message import MapHeader, MapRecord
 from splatnode.recon.result.export.format import format_names
 from splatnode.recon.result.message import BoundsRecord, CameraRecord, ScaleRecord, SceneHeader
 from splatnode.recon.result.verdict import Code
@@ -78,6 +79,8 @@ def test_no_verdict_is_explained_that_there_is_not():
 SECTIONS = {
     "SceneHeader": SceneHeader,
     "ScaleRecord": ScaleRecord,
+    "MapHeader": MapHeader,
+    "MapRecord": MapRecord,
     "CameraRecord": CameraRecord,
     "BoundsRecord": BoundsRecord,
     "Want": state.Want,

@@ -16,5 +16,6 @@ def test_names_and_ports_stay():
         "recon.status": 5,
         "recon.control": 6,
         "capture.control": 7,
+        "recon.map": 8,
     }
     assert services.RECON_SCENE.requests == Service("recon.scene.requests", services.Pattern.STATE, 4)

@@ -39,6 +39,8 @@ from splatnode.recon.daemon.control import Command
 from splatnode.recon.daemon.status import ReconStatus
 from splatnode.recon.evaluate.json_file import EvaluationFileError
 from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.occupancy.message import MapHeader
+from splatnode.recon.occupancy.message import from_message as map_from
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.message import SceneHeader, from_message
@@ -91,6 +93,10 @@ def _read_scene(parts: Any, folder: Path) -> object:
     return _safe(from_message(decode(parts, SceneHeader, _LIMITS)).snapshot)
 
 
+def _read_map(parts: Any, folder: Path) -> object:
+    return map_from(decode(parts, MapHeader, _LIMITS))
+
+
 def _decoding(schema: Any) -> Callable[[Any, Path], object]:
     return lambda parts, folder: decode(parts, schema, _LIMITS)
 
@@ -108,6 +114,11 @@ def _scene(rng: random.Random, header: Any) -> list[messages.Row]:
     found = header.get("cameras") if isinstance(header, dict) else None
     thumbnails = [_preview(rng, header)[0] for _ in found] if isinstance(found, list) and len(found) < 10 else []
     return [*messages.gaussian_rows(rng), *thumbnails]
+
+
+def _states(rng: random.Random, header: Any) -> list[messages.Row]:
+    found = isinstance(header, dict) and header.get("map") is not None
+    return [("u1", [2, 3, 4], bytes(rng.randrange(4) for _ in range(24)))] if found else []
 
 
 def _reading(name: str, read: Callable[[Path], object]) -> Callable[[Any, Path], object]:
@@ -251,6 +262,7 @@ _MESSAGES = (
     Boundary("keyframe answers", _of(Served), _decoding(Served), _WIRE, 10, 1),
     Boundary("previews", _of(PreviewHeader, _preview), _read_preview, _PREVIEWS, 200, 1),
     Boundary("scenes", _of(SceneHeader, _scene), _read_scene, _SCENES, 50, 3),
+    Boundary("maps", _of(MapHeader, _states), _read_map, _WIRE, 20, 1),
     Boundary("recon's heartbeats", _of(ReconStatus), _decoding(ReconStatus), _WIRE, 10, 2),
     Boundary("capture's heartbeats", _of(CaptureStatus), _decoding(CaptureStatus), _WIRE, 10, 1),
     Boundary("any heartbeats", _of(CaptureStatus), _decoding(Heartbeat), _WIRE, 10, 1),

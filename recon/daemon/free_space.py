@@ -1,0 +1,91 @@
+"""The map of the present scene: which space is free, occupied, or not seen; made in spare moments, of final scenes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+
+from splatnode.capture.process.logs import event
+from splatnode.recon.daemon.status import State
+from splatnode.recon.daemon.watcher import Finished
+from splatnode.recon.occupancy.build import occupancy_map
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap
+from splatnode.recon.result.depth_file import read_depths
+from splatnode.recon.result.export import read_cameras
+from splatnode.recon.result.snapshot import Snapshot
+
+log = logging.getLogger(__name__)
+
+NOT_FINAL = "a map is made of a scene that is final: when no keyframe has come for a while"
+LOST = "the last keyframes do not belong to the scene: where the robot is now is not known"
+
+
+class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    live: bool = False  # send the map of each scene that is final, as the service recon.map
+    # Side of a voxel, in the unit of the scene; nothing: as `splatnode map` chooses it
+    voxel: Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Mapped:
+    """What became of the map of a scene."""
+
+    of: Finished
+    occupancy: OccupancyMap | None
+    why: str = ""  # there is none
+
+
+class FreeSpace:
+    """Maps the present scene. `make` is for the thread that works; any thread may ask for `current`."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._made: Mapped | None = None
+
+    def make(self, finished: Finished | None, state: State, folder: Path, pause: Callable[[], None]) -> bool:
+        """Maps the final scene, of which `folder` is the result; False where there was nothing to do.
+
+        What `pause` raises ends the work.
+        """
+        if not self._config.live or finished is None or state is State.LOST or self._is_of(finished):
+            return False
+        try:
+            snapshot = _with_depths(finished.snapshot, folder)
+            occupancy, why = occupancy_map(snapshot, self._config.voxel, pause=pause), ""
+        except ValueError as error:
+            occupancy, why = None, str(error)
+        self._made = Mapped(finished, occupancy, why)
+        shares = {} if occupancy is None else {name: round(share, 4) for name, share in occupancy.shares.items()}
+        event(log, logging.INFO, "map", why=why, **shares)
+        return True
+
+    def current(self, finished: Finished | None, state: State) -> Mapped | str:
+        """The map of this scene as it is now, or why there is none."""
+        if state is State.LOST:
+            return LOST
+        made = self._made
+        return made if made is not None and made.of is finished else NOT_FINAL
+
+    def _is_of(self, finished: Finished) -> bool:
+        return self._made is not None and self._made.of is finished
+
+
+def _with_depths(snapshot: Snapshot, folder: Path) -> Snapshot:
+    """With the confirmed depths; those of a scene that an earlier process made final are in its result alone."""
+    if snapshot.depths or not folder.is_dir():
+        return snapshot
+    try:
+        depths, written = read_depths(folder), read_cameras(folder / "cameras.json")
+    except (OSError, ValueError) as error:
+        log.warning("the depths in %s cannot be read: %s", folder, error)
+        return snapshot
+    poses = {camera.name: camera.T_world_camera for camera in written}
+    ours = [(camera.T_world_camera, poses.get(camera.name)) for camera in snapshot.cameras]
+    same = all(pose is not None and np.allclose(shown, pose, rtol=0, atol=1e-6) for shown, pose in ours)
+    return replace(snapshot, depths=depths) if same else snapshot

@@ -1,0 +1,83 @@
+"""What a node says of free space, as a thread hears it."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from dataclasses import dataclass
+
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.services import RECON_MAP
+from splatnode.capture.messaging.state import StateClient
+from splatnode.capture.messaging.wire import WireError
+from splatnode.capture.process.problems import Problems, is_said
+from splatnode.recon.occupancy.message import MapHeader, from_message
+from splatnode.recon.occupancy.occupancy_map import OccupancyMap
+
+log = logging.getLogger(__name__)
+
+SILENT = "the node has said nothing of a map: set map.live in the configuration of splatnode recon"
+_POLL_S = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class NodeMap:
+    """What a node knows of free space now."""
+
+    scene_id: str  # of the place; empty where the node has said nothing
+    occupancy: OccupancyMap | None  # in the world of that scene, as it is now
+    why: str  # there is no map; empty where there is one
+
+
+NOTHING_HEARD = NodeMap("", None, SILENT)
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """What was said, and of which message of recon.scene."""
+
+    told: NodeMap
+    scene: tuple[str, int] | None = None  # session and sequence
+
+
+class LiveMap:
+    """Hears the maps of a node; keeps the newest."""
+
+    def __init__(self, network: Network) -> None:
+        """Raises what opening the network raises."""
+        self._client = StateClient(RECON_MAP, network, MapHeader)
+        self._refusals = Problems()
+        self._heard = Heard(NOTHING_HEARD)
+        self._error: BaseException | None = None
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._listen, name="live map", daemon=True)
+        self._thread.start()
+
+    @property
+    def newest(self) -> Heard:
+        """Raises what the connection failed with, for example PermissionError."""
+        if self._error is not None:
+            raise self._error
+        return self._heard
+
+    def close(self) -> None:
+        self._closing.set()
+        self._thread.join()
+        self._client.close()
+
+    def _listen(self) -> None:
+        try:
+            while not self._closing.is_set():
+                message = self._client.poll(_POLL_S)
+                if message is None:
+                    continue
+                header: MapHeader = message.header
+                try:
+                    told = NodeMap(header.scene_id, from_message(message), header.why)
+                except WireError as error:
+                    if is_said(self._refusals.add("maps that were refused", error)):
+                        log.warning("a map of the node was refused: %s", error)
+                    told = NodeMap(header.scene_id, None, f"the node's map was refused: {error}")
+                self._heard = Heard(told, header.map and (header.session, header.map.scene_sequence))
+        except Exception as error:
+            self._error = error
