@@ -253,7 +253,7 @@ class IncrementalReconstruction:
             return False
         graph, placed = beside.graph, beside.registration
         pointmaps = carried | without_hidden(self._prior.further_pointmaps(graph, placed, carried), graph)
-        grown = growth.grow(moved, pointmaps, graph, placed, self.config.initialisation)
+        grown = growth.grow(moved, pointmaps, graph, placed, self.config.initialisation, self.config.light)
         self._known = replace(self._known, pointmaps=pointmaps, show=shown(grown, self.config))
         self.clock.lap("points")
         return True
@@ -261,7 +261,7 @@ class IncrementalReconstruction:
     def rebuild(self, pause: Pause = without_pause) -> None:
         """Begins a scene from all keyframes, which is not shown yet; none where the verdict forbids it."""
         estimate = self.estimate_with_depth(pause)
-        begun = begin_scene(estimate, self.config, one_light=False)
+        begun = begin_scene(estimate, self.config)
         self._known = replace(self._known, pointmaps=estimate.pointmaps or self._known.pointmaps, begun=begun)
         self.clock.lap("points")
 

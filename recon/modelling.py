@@ -56,10 +56,10 @@ def looked_at_first(estimate: Estimate, config: Config) -> Shown | None:
 
 
 @single_torch_thread()
-def begin_scene(estimate: Estimate, config: Config, one_light: bool = True) -> Scene | None:
+def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
     """The scene of all cameras that were placed, not optimised yet; None where the verdict forbids one.
 
-    Photographs that were exposed differently are brought to one light first, unless others will join them as they are.
+    Photographs that were exposed differently are brought to one light first.
     """
     if estimate.registration is None or not estimate.verdict.publishable:
         return None
@@ -68,7 +68,7 @@ def begin_scene(estimate: Estimate, config: Config, one_light: bool = True) -> S
     images = {keyframe.name: keyframe.image for keyframe in keyframes}
     masks = {keyframe.name: keyframe.mask for keyframe in keyframes}
     lenses = {keyframe.name: keyframe.lens for keyframe in keyframes}
-    exposures = light.differing(pointmaps, images, config.light) if one_light else {}
+    exposures = light.differing(pointmaps, images, config.light)
     alike = {name: light.alike(images[name], exposure) for name, exposure in exposures.items()}
     return initial_scene(pointmaps, images | alike, config.initialisation, masks, exposures, lenses)
 

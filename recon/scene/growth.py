@@ -12,7 +12,7 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.result.sources import frame_of
-from splatnode.recon.scene import initialisation
+from splatnode.recon.scene import initialisation, light
 from splatnode.recon.scene.gaussians import concatenate
 from splatnode.recon.scene.scene import Scene
 
@@ -25,12 +25,13 @@ def grow(
     graph: ViewGraph,
     registration: Registration,
     config: initialisation.Config,
+    lighting: light.Config,
 ) -> Scene:
     """The scene with a view, and Gaussians seeded from it, for each registered camera that it does not have.
 
     `registration` and `pointmaps`, of which each of its cameras has one by name, are in the scene's world. A further
-    view seeds Gaussians where none of its neighbours sees a surface better, as when a scene begins. The far shell
-    stays. `config.max_gaussians` does not count here; see `limited`.
+    view seeds Gaussians where none of its neighbours sees a surface better, as when a scene begins, and is brought to
+    the scene's light first. The far shell stays. `config.max_gaussians` does not count here; see `limited`.
     """
     known = {view.name for view in scene.views}
     registered = {camera.index: graph.keyframes[camera.index].name for camera in registration.cameras}
@@ -39,15 +40,22 @@ def grow(
         return scene
     shown = set(further.values()).union(*(_neighbours(graph, index, registered) for index in further.values()))
     cameras = tuple(camera for camera in registration.cameras if camera.index in shown)
+    seen = [pointmaps[graph.keyframes[camera.index].name] for camera in cameras]
+    images = {view.name: view.image for view in scene.views} | {
+        name: graph.keyframes[index].image for name, index in further.items()
+    }
+    lit = any(view.exposure is not None for view in scene.views)
+    exposures = light.joining(seen, images, further, lit, lighting)
     begun = initialisation.initial_scene(
-        [pointmaps[graph.keyframes[camera.index].name] for camera in cameras],
-        {graph.keyframes[index].name: graph.keyframes[index].image for index in shown},
+        seen,
+        images | {name: light.alike(images[name], exposure) for name, exposure in exposures.items()},
         initialisation.Config(
             completion=config.completion,
             seeding=config.seeding,
             background=msgspec.structs.replace(config.background, spacing_deg=0.0),
         ),
         {graph.keyframes[index].name: graph.keyframes[index].mask for index in shown},
+        exposures,
         lenses={graph.keyframes[index].name: graph.keyframes[index].lens for index in shown},
     )
     views = tuple(view for view in begun.views if view.name in further)

@@ -10,7 +10,7 @@ new views between them have it too.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -38,6 +38,7 @@ MIN_SAMPLES = 200  # pixels that two photographs must share
 INDEPENDENT = 50.0  # samples that count as one: neighbours show one surface
 LEAST_SIGMA = 0.01  # of the logarithm of a ratio: surfaces shine differently in different directions
 PRIOR_SIGMA = 1.0  # of a logarithm of a gain: a photograph that shares nothing keeps its light
+KNOWN_SIGMA = 1e-3  # likewise, of a photograph that is in the scene's light already
 _ROUNDS, _HUBER = 10, 2.0  # of robust least squares; in standard deviations
 
 
@@ -58,8 +59,44 @@ def differing(pointmaps: Sequence[Pointmap], images: Mapping[str, Image], config
     differ, differ_nearby = np.expm1(np.abs(logs).max()), np.expm1(np.abs(sudden).max())
     if differ < config.most and min(differ, differ_nearby) < config.least:
         return {}
-    gains = {pointmap.name: own for pointmap, own in zip(pointmaps, np.exp(logs), strict=True)}
-    return {name: Exposure(tuple(own.tolist()), _saturated(images[name], own)) for name, own in gains.items()}
+    return {
+        pointmap.name: exposed(images[pointmap.name], own)
+        for pointmap, own in zip(pointmaps, np.exp(logs), strict=True)
+    }
+
+
+def joining(
+    pointmaps: Sequence[Pointmap], images: Mapping[str, Image], further: Collection[str], lit: bool, config: Config
+) -> dict[str, Exposure]:
+    """The exposures of the photographs `further`, which join others that have one light already; none needs to differ.
+
+    `lit`: the light of one of the others was changed, so that each further one's is. Otherwise it is where it differs
+    by `config.least` from theirs.
+    """
+    if not config.enabled:
+        return {}
+    priors = np.array([PRIOR_SIGMA if pointmap.name in further else KNOWN_SIGMA for pointmap in pointmaps])
+    logs = _logs(pointmaps, [images[pointmap.name] for pointmap in pointmaps], priors)
+    differ = np.expm1(np.abs(logs).max(axis=1))
+    return {
+        pointmap.name: exposed(images[pointmap.name], np.exp(own))
+        for pointmap, own, by in zip(pointmaps, logs, differ, strict=True)
+        if pointmap.name in further and (lit or by >= config.least)
+    }
+
+
+def exposed(image: Image, gains: Array) -> Exposure:
+    """The exposure of a photograph `image` (h, w, 3) whose `gains` (3,) are known."""
+    red, green, blue = gains.tolist()
+    return Exposure((red, green, blue), _saturated(image, gains))
+
+
+def relit(image: Image, gains: Sequence[float] | None) -> tuple[Image, Exposure | None]:
+    """The photograph `image` in the light of its scene, and the exposure taken out; as it is without gains."""
+    if gains is None:
+        return image, None
+    exposure = exposed(image, np.array(gains))
+    return alike(image, exposure), exposure
 
 
 def alike(image: Image, exposure: Exposure) -> Image:
@@ -82,14 +119,19 @@ def _saturated(image: Image, gains: Array) -> Mask | None:
 
 def log_gains(pointmaps: Sequence[Pointmap], pictures: Sequence[Image]) -> Array:
     """(V, 3) logarithms of the photographs' gains; the median of each channel is 0."""
+    logs = _logs(pointmaps, pictures, np.full(len(pointmaps), PRIOR_SIGMA))
+    return logs - np.median(logs, axis=0)
+
+
+def _logs(pointmaps: Sequence[Pointmap], pictures: Sequence[Image], priors: Array) -> Array:
+    """(V, 3) logarithms of the photographs' gains, each with its standard deviation around 0 in `priors` (V,)."""
     known = [pointmap.masked(pointmap.confidence >= LEAST_CONFIDENCE) for pointmap in pointmaps]
     partners = reprojection.overlapping(known, MOST_PARTNERS)
     seen = each(lambda view: _seen(*view), list(zip(known, pictures, strict=True)))
     pairs = sorted({(min(i, j), max(i, j)) for i, others in enumerate(partners) for j in others})
     found = each(lambda pair: _log_ratio(seen[pair[0]], seen[pair[1]]), pairs)
     compared = [(pair, *ratio) for pair, ratio in zip(pairs, found, strict=True) if ratio is not None]
-    logs = _solved(len(pictures), compared)
-    return logs - np.median(logs, axis=0)
+    return _solved(priors, compared)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,13 +171,13 @@ def _log_ratio(source: _Seen, target: _Seen) -> tuple[Array, Array] | None:
     return median, np.hypot(spread / np.sqrt(len(logs) / INDEPENDENT), LEAST_SIGMA)
 
 
-def _solved(count: int, compared: Sequence[tuple[tuple[int, int], Array, Array]]) -> Array:
-    """(count, 3) logarithms whose differences are the compared ones, by robust least squares under the prior."""
-    result = np.zeros((count, 3))
+def _solved(priors: Array, compared: Sequence[tuple[tuple[int, int], Array, Array]]) -> Array:
+    """(V, 3) logarithms whose differences are the compared ones, by robust least squares under the `priors` (V,)."""
+    result = np.zeros((len(priors), 3))
     for channel in range(3):
         weights = np.ones(len(compared))
         for _ in range(_ROUNDS):
-            information, gradient = np.eye(count) / PRIOR_SIGMA**2, np.zeros(count)
+            information, gradient = np.diag(priors**-2), np.zeros(len(priors))
             for weight, ((i, j), ratio, sigma) in zip(weights, compared, strict=True):
                 share = weight / sigma[channel] ** 2
                 information[[i, j], [i, j]] += share

@@ -24,7 +24,7 @@ from splatnode.recon.scene.gaussians import Gaussians
 class Exposure:
     """How a photograph differs from its image in a scene of one light."""
 
-    gains: tuple[float, ...]  # red, green, blue: of the photograph over the image
+    gains: tuple[float, float, float]  # red, green, blue: of the photograph over the image
     saturated: npt.NDArray[np.bool_] | None  # (h, w, 3), True: what it shows is at least so bright; None: nowhere
 
 

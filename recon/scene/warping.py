@@ -17,6 +17,7 @@ from splatnode.recon.priors.registered_camera import modelled_K, sparse_points
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 from splatnode.recon.registration.straightened import corner_shift, straightened, with_lenses
 from splatnode.recon.result.sources import frame_of
+from splatnode.recon.scene import light
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
 
@@ -84,8 +85,9 @@ def with_photographs(scene: Scene, graph: ViewGraph) -> Scene | None:
         keyframe = keyframes.get(view.name)
         if keyframe is None or abs(corner_shift(keyframe.lens) - corner_shift(view.lens)) > MAX_LENS_SHIFT:
             return None
-        if keyframe.lens is not None and view.exposure is None:
-            view = replace(view, image=keyframe.image, mask=keyframe.mask, lens=keyframe.lens)
+        if keyframe.lens is not None:
+            image, exposure = light.relit(keyframe.image, view.exposure and view.exposure.gains)
+            view = replace(view, image=image, exposure=exposure, mask=keyframe.mask, lens=keyframe.lens)
         views.append(view)
     return replace(scene, views=tuple(views))
 

@@ -12,6 +12,7 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.recon.config import overlaid, preset
 from splatnode.recon.geometry import align_cameras
+from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.offline import run
 from splatnode.recon.result.preview import render_rgb
 from splatnode.recon.result.report import build_report
@@ -70,3 +71,25 @@ def test_photographs_of_one_exposure_are_untouched():
     assert snapshot.gains == {} and all(
         np.array_equal(snapshot.images[frame.name], frame.image) for frame in photographs()
     )
+
+
+LATER = (1.0, 1.0, 1.0, 0.6, 0.5, 1.0)  # the camera closes its iris on the way
+
+
+def grown(enabled: bool) -> IncrementalReconstruction:
+    """A scene that took its photographs one at a time, and was begun with those of one exposure."""
+    work = IncrementalReconstruction(overlaid(CONFIG, {"light": {"enabled": enabled}}))
+    for frame in photographs():
+        dimmed = np.rint(frame.image * LATER[frame.frame_id]).astype(np.uint8)
+        work.take(replace(frame, image=dimmed, encoded=None))
+        work.update()
+    return work
+
+
+def test_photographs_that_join_a_live_scene_are_brought_to_its_light():
+    work = grown(True)
+    snapshot = work.snapshot()
+    assert len(snapshot.cameras) == SMALL.views
+    found = np.array([snapshot.gains.get(camera.name, (1.0, 1.0, 1.0)) for camera in snapshot.cameras])
+    assert found / found[0] == pytest.approx(np.repeat(np.array(LATER)[:, None], 3, 1), rel=0.05)
+    assert held_out_psnr(snapshot) > held_out_psnr(grown(False).snapshot()) + 0.5

@@ -17,6 +17,7 @@ from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.straightened import straight
+from splatnode.recon.scene import light
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
 
@@ -40,6 +41,7 @@ class SceneRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     iterations: int
     final: bool
     lenses: list[Intrinsics | None] = []  # estimated, of each view; empty: of none
+    gains: list[tuple[float, float, float] | None] = []  # of each view's photograph over its image; empty: of none
 
 
 def graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
@@ -79,7 +81,9 @@ def scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDAr
     cameras = [torch.stack([view.T_world_camera for view in scene.views]), torch.stack([v.K for v in scene.views])]
     gaussians = [getattr(scene.gaussians, field.name) for field in fields(Gaussians)]
     lenses = [view.lens for view in scene.views]
-    return SceneRecord(views, scene.iterations, final, lenses), [tensor.numpy() for tensor in (*cameras, *gaussians)]
+    gains = [view.exposure and view.exposure.gains for view in scene.views]
+    header = SceneRecord(views, scene.iterations, final, lenses, gains)
+    return header, [tensor.numpy() for tensor in (*cameras, *gaussians)]
 
 
 def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe]) -> Scene | None:
@@ -91,16 +95,20 @@ def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe])
         raise ValueError(f"a scene of {len(message.arrays)} arrays is of another version")
     Ts_world_camera, Ks, *gaussians = (torch.from_numpy(np.array(array)) for array in message.arrays)
     lenses = header.lenses or [None] * len(header.views)
+    gains = header.gains or [None] * len(header.views)
     views = tuple(
-        _view(keyframes[name] if lens is None else straight(keyframes[name], lens), T_world_camera, K)
-        for name, lens, T_world_camera, K in zip(header.views, lenses, Ts_world_camera, Ks, strict=True)
+        _view(keyframes[name] if lens is None else straight(keyframes[name], lens), own, T_world_camera, K)
+        for name, lens, own, T_world_camera, K in zip(header.views, lenses, gains, Ts_world_camera, Ks, strict=True)
     )
     return Scene(views, Gaussians(*gaussians), header.iterations)
 
 
-def _view(keyframe: Keyframe, T_world_camera: torch.Tensor, K: torch.Tensor) -> TrainingView:
-    shown = keyframe.name, keyframe.frame.frame_id, keyframe.image
-    return TrainingView(*shown, T_world_camera, K, mask=keyframe.mask, lens=keyframe.lens)
+def _view(
+    keyframe: Keyframe, gains: tuple[float, float, float] | None, T_world_camera: torch.Tensor, K: torch.Tensor
+) -> TrainingView:
+    image, exposure = light.relit(keyframe.image, gains)
+    shown = keyframe.name, keyframe.frame.frame_id, image
+    return TrainingView(*shown, T_world_camera, K, mask=keyframe.mask, exposure=exposure, lens=keyframe.lens)
 
 
 def taken_apart(value: Any) -> tuple[Numbers, list[npt.NDArray]]:

@@ -3,15 +3,17 @@
 The training photographs of each set get gains of .5 to 2, times .8 to 1.2 for each channel (clipped to
 8 bits, as a camera does), drawn with seed 0. `balanced` makes a scene of them as they were taken, with the gains, and
 with the gains while `light` is switched off. Held-out photographs are as they were taken; each render is brought to the
-exposure of its photograph (`--best-gain`) before it is scored. Errors of the gains are against those drawn, times what
-is found for the photographs as they were taken, and after the median.
+exposure of its photograph (`--best-gain`) before it is scored. Live, the photographs come one at a time: scored are the
+scene that has grown with them, and the one that is made of all in the end. Errors of the gains are against those drawn,
+times what is found for the photographs as they were taken, and after the median.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import msgspec
 import numpy as np
@@ -23,7 +25,9 @@ from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.start import Start, continued, find_start, foundation
 from splatnode.recon.evaluate.truth import EvaluationScene
+from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import light
 from tests.bench.quality.real_sets import measure
 
@@ -37,7 +41,7 @@ OFF = msgspec.structs.replace(ON, light=light.Config(enabled=False))
 class Row:
     scene: str
     views: int
-    kind: str  # one exposure; gains; gains, light off
+    kind: str  # one exposure; gains; gains, light off; and the same live, grown or in the end
     verdict: str
     psnr: float | None
     ssim: float | None
@@ -77,6 +81,24 @@ def gain_errors(plain: Start, under: Start, true: Mapping[str, npt.NDArray[np.fl
     return round(float(np.median(errors)), 3), round(float(errors.max()), 3)
 
 
+def grown(frames: Sequence[Frame], config: Config) -> IncrementalReconstruction:
+    """A reconstruction that got the photographs one at a time."""
+    work = IncrementalReconstruction(config)
+    for frame in frames:
+        work.take(frame)
+        work.update()
+    return work
+
+
+def finished(work: IncrementalReconstruction) -> Snapshot:
+    """Of the scene that is made of all photographs, as the node makes it when no further one comes."""
+    work.estimate_thoroughly()
+    work.rebuild()
+    for show in work.refine(work.begun, work.config.optimize):
+        work.show(show)
+    return work.snapshot(final=True)
+
+
 def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Networks) -> list[Row]:
     frames = scene.frames(split.train)
     gains = drawn(len(frames))
@@ -85,9 +107,9 @@ def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Netwo
     true = {frame.name: own for frame, own in zip(frames, gains, strict=True)}
     errors = gain_errors(starts["plain"], starts["under"], true)
 
-    def scored(kind: str, start: Start, config: Config, shown: Sequence[Frame], *found: float) -> Row:
+    def scored(kind: str, made: Callable[[], Snapshot], shown: Sequence[Frame], *found: float) -> Row:
         begun = time.process_time()
-        snapshot = list(continued(start, config))[-1]
+        snapshot = made()
         seconds = time.process_time() - begun
         run = Run("balanced", 0, None, {"total": seconds}, None)
         row = evaluate(
@@ -97,11 +119,19 @@ def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Netwo
         scores = row.psnr, row.ssim, row.lpips_alex, row.num_gaussians
         return Row(scene.name, len(frames), kind, row.verdict, *scores, round(seconds, 1), round(saturated, 2), found)
 
-    return [
-        scored("one exposure", starts["plain"], ON, frames),
-        scored("gains", starts["under"], ON, under, *errors),
-        scored("gains, light off", starts["under"], OFF, under),
+    def offline(kind: str, config: Config) -> Callable[[], Snapshot]:
+        return lambda: list(continued(starts[kind], config))[-1]
+
+    result = [
+        scored("one exposure", offline("plain", ON), frames),
+        scored("gains", offline("under", ON), under, *errors),
+        scored("gains, light off", offline("under", OFF), under),
     ]
+    for kind, shown, config in (("one exposure", frames, ON), ("gains", under, ON), ("gains, light off", under, OFF)):
+        work = grown(shown, config)
+        result.append(scored(f"{kind}, live, grown", work.snapshot, shown))
+        result.append(scored(f"{kind}, live, in the end", partial(finished, work), shown))
+    return result
 
 
 def in_words(row: Row) -> str:

@@ -6,18 +6,19 @@ import numpy as np
 import torch
 
 from splatnode.recon.result.sources import frame_of
-from splatnode.recon.scene import background
+from splatnode.recon.scene import background, light
 from splatnode.recon.scene.growth import NUM_NEIGHBOURS, grow, limited, without_views
 from splatnode.recon.scene.initialisation import Config
 from tests.support.row_of_views import STEP, WIDTH, graph_of, maps_of, registration_of, scene_of
 
 CONFIG = Config()
+LIGHT = light.Config()
 
 
 def test_growing_adds_a_further_views_gaussians_and_leaves_all_others_as_they_are():
     graph, before = graph_of(4), 3
     scene = scene_of(before, graph)
-    grown = grow(scene, maps_of(range(4)), graph, registration_of(4), CONFIG)
+    grown = grow(scene, maps_of(range(4)), graph, registration_of(4), CONFIG, LIGHT)
     count = len(scene.gaussians)
     assert [view.name for view in grown.views] == ["00.png", "01.png", "02.png", "03.png"]
     assert torch.equal(grown.gaussians.means[:count], scene.gaussians.means)
@@ -32,21 +33,21 @@ def test_a_further_view_is_compared_with_its_neighbours_only():
     count = NUM_NEIGHBOURS + 3
     graph = graph_of(count)
     near = maps_of(range(count - NUM_NEIGHBOURS - 1, count))  # growing does not ask for the maps of the others
-    grown = grow(scene_of(count - 1, graph), near, graph, registration_of(count), CONFIG)
+    grown = grow(scene_of(count - 1, graph), near, graph, registration_of(count), CONFIG, LIGHT)
     assert len(grown.views) == count
 
 
 def test_without_a_further_view_nothing_changes():
     graph = graph_of(3)
     scene = scene_of(3, graph)
-    assert grow(scene, {}, graph, registration_of(3), CONFIG) is scene
+    assert grow(scene, {}, graph, registration_of(3), CONFIG, LIGHT) is scene
 
 
 def test_a_bound_on_gaussians_keeps_those_that_cover_most():
     graph = graph_of(4)
     scene = scene_of(3, graph)
     limit = len(scene.gaussians) // 2
-    grown = limited(grow(scene, maps_of(range(4)), graph, registration_of(4), CONFIG), limit)
+    grown = limited(grow(scene, maps_of(range(4)), graph, registration_of(4), CONFIG, LIGHT), limit)
     assert len(grown.gaussians) == limit
     assert int((grown.gaussians.source_frame == background.SHELL).sum()) > 0
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.scene.light import Config, alike, differing, log_gains
+from splatnode.recon.scene.light import Config, alike, differing, joining, log_gains, relit
 
 PLACE = synthetic.Config(views=5, width=240, height=180)
 GAINS = np.array([[0.5, 0.45, 0.5], [1.0, 1.0, 1.1], [2.0, 2.0, 1.8], [1.0, 1.0, 1.0], [0.8, 0.9, 0.8]])
@@ -94,3 +94,27 @@ def test_photographs_that_share_nothing_keep_their_light():
     away[:3, 3] = 100.0
     apart = [maps[0], replace(maps[1], T_world_camera=away)]
     assert np.array_equal(log_gains(apart, exposed(images)[:2]), np.zeros((2, 3)))
+
+
+def test_a_photograph_that_joins_others_gets_the_exposure_by_which_it_differs_from_them():
+    maps, images = place()
+    changed = by_name(exposed(images, np.where(np.arange(5)[:, None] == 4, [0.6, 0.5, 0.7], 1.0)))
+    found = joining(maps, changed, {"4"}, False, Config())
+    assert set(found) == {"4"} and np.abs(np.array(found["4"].gains) / [0.6, 0.5, 0.7] - 1.0).max() < 0.03
+
+
+def test_a_photograph_that_joins_as_the_others_are_is_left_as_it_is_where_they_are():
+    maps, images = place()
+    alike_all = by_name(exposed(images, np.ones((5, 3))))
+    assert joining(maps, alike_all, {"4"}, False, Config()) == {}
+    assert joining(maps, alike_all, {"4"}, True, Config(enabled=False)) == {}
+    (found,) = joining(maps, alike_all, {"4"}, True, Config()).values()
+    assert np.abs(np.array(found.gains) - 1.0).max() < 0.03
+
+
+def test_a_photograph_is_brought_to_the_light_of_its_scene_by_its_gains_alone():
+    image = np.minimum(2 * exposed(place()[1])[2].astype(int), 255).astype(np.uint8)
+    assert relit(image, None) == (image, None)
+    shown, exposure = relit(image, (2.0, 2.0, 1.8))
+    assert exposure is not None and np.array_equal(shown, alike(image, exposure))
+    assert exposure.saturated is not None and np.array_equal(exposure.saturated, image >= 250)

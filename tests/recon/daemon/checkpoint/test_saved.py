@@ -20,6 +20,7 @@ from splatnode.recon.daemon.checkpoint.saved import (
 )
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration.straightened import straight
+from splatnode.recon.scene import light
 from splatnode.recon.scene.gaussians import Gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
 from tests.support.synthetic import photographs, tiny_scene, view_graph
@@ -108,3 +109,16 @@ def test_what_another_version_wrote_is_told(graph, scene):
         scene_from(
             Message(SceneRecord(record.views, 1, False), tuple(arrays[1:])), {k.name: k for k in graph.keyframes}
         )
+
+
+def test_the_gains_of_a_scenes_photographs_come_back(graph, scene):
+    keyframes = {keyframe.name: keyframe for keyframe in graph.keyframes}
+    image, exposure = light.relit(graph.keyframes[1].image, (2.0, 1.5, 0.5))
+    first, second, third = scene.views
+    lit = replace(scene, views=(first, replace(second, image=image, exposure=exposure), third))
+    header, arrays = scene_message(lit, final=False)
+    found = scene_from(over_the_disk(header, arrays), keyframes)
+    assert [view.exposure and view.exposure.gains for view in found.views] == [None, (2.0, 1.5, 0.5), None]
+    assert np.array_equal(found.views[1].image, image)
+    earlier = SceneRecord(header.views, header.iterations, header.final)  # of a version that knew no gains
+    assert all(view.exposure is None for view in scene_from(over_the_disk(earlier, arrays), keyframes).views)
