@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
-from splatnode.capture.frame import LARGEST_SIDE, DroppedFrame
+from splatnode.capture.frame import LARGEST_SIDE, DroppedFrame, Intrinsics
 from splatnode.capture.messaging.jpeg import from_jpeg, to_jpeg
 from splatnode.capture.messaging.values import Amount, Count, Finite, Name, Text
 from splatnode.capture.messaging.wire import Header, Message, WireError
@@ -67,6 +67,7 @@ class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     height: Pixels
     bounds: BoundsRecord | None
     captured_at: Stamp | None = None
+    lens: Intrinsics | UnsetType = UNSET  # estimated, whose distortion was taken out; left out where nothing was
 
     def __post_init__(self) -> None:
         """Raises ValueError, of which msgspec makes its own error, where nothing can be seen through it."""
@@ -211,6 +212,7 @@ def camera_record(camera: CameraEstimate) -> CameraRecord:
         height=camera.height,
         bounds=bounds_record(camera.bounds),
         captured_at=camera.captured_at,
+        lens=UNSET if camera.lens is None else camera.lens,
     )
 
 
@@ -224,6 +226,7 @@ def camera_from(record: CameraRecord) -> CameraEstimate:
         height=record.height,
         bounds=bounds_from(record.bounds),
         captured_at=record.captured_at,
+        lens=None if record.lens is UNSET else record.lens,
     )
 
 

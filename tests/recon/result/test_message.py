@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.frame import DroppedFrame, Intrinsics
 from splatnode.capture.messaging.jpeg import to_jpeg
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
 from splatnode.capture.stamp import Clock, Stamp
@@ -89,6 +89,16 @@ def test_a_scene_comes_out_as_it_went_in():
             other.height,
         )
         assert one.bounds == other.bounds is not None and one.captured_at == other.captured_at
+
+
+def test_a_camera_tells_the_lens_that_was_taken_out_of_its_photograph():
+    scene = snapshot()
+    lens = Intrinsics(1280, 800, 900.0, 900.0, 640.0, 400.0, "estimated", (-0.2,))
+    first, *others = scene.cameras
+    live = from_message(sent(replace(scene, cameras=(replace(first, lens=lens), *others)))).snapshot
+    assert [camera.lens for camera in live.cameras] == [lens, *(None for _ in others)]
+    plain, _ = to_message(scene, "scene-0002", NUMBERED)
+    assert "lens" not in msgspec.to_builtins(plain.cameras[0])  # as a viewer that knows none expects it
 
 
 @pytest.mark.parametrize(
