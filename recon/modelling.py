@@ -136,6 +136,7 @@ def snapshot(
         landmarks=conclusion.landmarks if scene and final else None,
         depths=_confirmed(scene) if scene and final else {},
         masked=conclusion.masked,
+        moving=conclusion.moving,
         gains={view.name: view.exposure.gains for view in scene.views if view.exposure is not None} if scene else {},
     )
 
