@@ -31,6 +31,7 @@ MIN_MATCHES = 40  # of one thing in two photographs: a plane among fewer may be 
 MOST_COMMON = 0.3  # share of a thing's matches that may fit the scene's motion, too
 SMALLER = 0.6  # the thing's patch over the scene's, in both photographs: beyond, nobody can tell which one moves
 VOTES = 2  # pairs of photographs that find a point on a thing
+MIN_SHOWN = 3  # photographs that a thing must be found in, if there are so many
 ROUNDS = 3  # things of different motion that are looked for, one after the other
 KNOWN_SHARE = 0.5  # of a patch's points that are known to move, for the others of it to move, too
 SAME_LINE_PX = 3.0  # distance from an epipolar line within which a match fits, pixels at REFERENCE_SIDE
@@ -105,7 +106,7 @@ def moving_points(graph: ViewGraph) -> list[Mask]:
                 for side, index in enumerate(group.pair):
                     votes[index][group.matches[:, side]] += 1
         new = _spread([own >= needed for own in votes], groups)
-        if not any(own.any() for own in new):
+        if sum(own.sum() >= _MIN_POINTS for own in new) < min(MIN_SHOWN, len(new)):
             break
         moving = [before | own for before, own in zip(moving, new, strict=True)]
         matches = {
