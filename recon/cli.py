@@ -44,6 +44,7 @@ from splatnode.recon.rasterize.dispatch import rasterizer
 from splatnode.recon.replay_source import Request, Source, asked_for, source
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.folder import result_folder
+from splatnode.recon.result.moving_in_words import moving_in_words
 from splatnode.recon.result.size import largest_result_bytes
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.write import finish
@@ -227,6 +228,8 @@ def _tell(snapshot: Snapshot, out: Path) -> None:
     say(f"{verdict.code.value}: {verdict.message}" + (f" {verdict.advice}" if verdict.advice else ""))
     for frame in snapshot.dropped:
         say(f"left out: {frame.name}: {frame.reason}")
+    if moved := moving_in_words(snapshot.moving):
+        say(moved)
     for hit in snapshot.budget:
         say(hit["message"])
     if verdict.publishable:

@@ -17,7 +17,7 @@ from splatnode.recon.priors import classical
 from splatnode.recon.rasterize.device import Device
 from splatnode.recon.registration import config as registration
 from splatnode.recon.result.export.formats.ply import most_in_ply
-from splatnode.recon.scene import background, completion, initialisation, light, pixelwise, seeding
+from splatnode.recon.scene import background, completion, denied, initialisation, light, pixelwise, seeding
 from splatnode.recon.verification import decision, verify
 
 
@@ -61,6 +61,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     decision: decision.Config = decision.Config()
     ladder: Ladder = Ladder()
     light: light.Config = light.Config()
+    denied: denied.Config = denied.Config()
     completion: completion.Config = completion.Config()
     seeding: seeding.Config = seeding.Config()
     background: background.Config = background.Config()

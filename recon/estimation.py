@@ -31,6 +31,7 @@ from splatnode.recon.verification.verify import verify, verify_further
 # that were taken for this one had up to 20.
 MIN_CONFIRMED_POINTS = 50
 PROVISIONALLY_WIDER = 2.0  # factor of a provisional estimate's bounds, whose sources are quick or taken over
+_NOTHING = 1e-6  # share of a keyframe that rounding leaves
 PROVISIONAL = "Provisional: checked again with all evidence when the camera rests."
 
 
@@ -44,6 +45,7 @@ class Conclusion:
     captured_at: Mapping[str, Stamp] = field(default_factory=dict)  # by keyframe, where it is known
     landmarks: Landmarks | None = None  # of a scene that is to be saved
     masked: Mapping[str, float] = field(default_factory=dict)  # share that a mask hides, by keyframe that has one
+    moving: Mapping[str, float] = field(default_factory=dict)  # share that was found to move, by keyframe
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +90,19 @@ class Estimate:
         """What snapshots tell of it."""
         stamps = {keyframe.name: keyframe.frame.captured_at for keyframe in self.graph.keyframes}
         known = {name: stamp for name, stamp in stamps.items() if stamp is not None}
-        masks = {keyframe.name: keyframe.frame.mask for keyframe in self.graph.keyframes}
-        masked = {name: 1.0 - float(mask.mean()) for name, mask in masks.items() if mask is not None}
-        return Conclusion(self.verdict, self.bounds, self.evidence_record, known, masked=masked)
+        masked, moving = self._hidden
+        return Conclusion(self.verdict, self.bounds, self.evidence_record, known, masked=masked, moving=moving)
+
+    @property
+    def _hidden(self) -> tuple[dict[str, float], dict[str, float]]:
+        """The share of each keyframe that a given mask hides, if it has one, and that moves, if anything was found."""
+        masked, moving = {}, {}
+        for keyframe in self.graph.keyframes:
+            if keyframe.moving:
+                moving[keyframe.name] = keyframe.moving
+            if (mask := keyframe.frame.mask) is not None:
+                masked[keyframe.name] = 1.0 - float(mask.mean()) - keyframe.moving
+        return {name: share for name, share in masked.items() if share > _NOTHING or name not in moving}, moving
 
     @property
     def conclusion_to_save(self) -> Conclusion:

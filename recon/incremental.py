@@ -261,7 +261,7 @@ class IncrementalReconstruction:
     def rebuild(self, pause: Pause = without_pause) -> None:
         """Begins a scene from all keyframes, which is not shown yet; none where the verdict forbids it."""
         estimate = self.estimate_with_depth(pause)
-        begun = begin_scene(estimate, self.config)
+        begun = begin_scene(estimate, self.config, all_at_hand=False)
         self._known = replace(self._known, pointmaps=estimate.pointmaps or self._known.pointmaps, begun=begun)
         self.clock.lap("points")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,25 +10,31 @@ import numpy.typing as npt
 import torch
 
 from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.masks import filled
 from splatnode.recon.budget import Hit
 from splatnode.recon.config import Config
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.estimation import Conclusion, Estimate
+from splatnode.recon.frames import border
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.optimize import refinement
 from splatnode.recon.optimize.torch_threads import single_torch_thread
 from splatnode.recon.optimize.watch import examine, watch
 from splatnode.recon.priors.confirmed import confirmed_depths
+from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.device import chosen
 from splatnode.recon.registration.straightened import straightened
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Verdict
-from splatnode.recon.scene import growth, light
+from splatnode.recon.scene import denied, growth, light
 from splatnode.recon.scene.first_look import first_look
 from splatnode.recon.scene.initialisation import initial_scene
 from splatnode.recon.scene.scene import Scene
 
 COARSE = "Coarse so far: the matched points alone; depth and refinement follow."
+
+Image = npt.NDArray[np.uint8]
+Mask = npt.NDArray[np.bool_]
 
 _PROCESSOR = torch.device("cpu")
 
@@ -56,10 +62,11 @@ def looked_at_first(estimate: Estimate, config: Config) -> Shown | None:
 
 
 @single_torch_thread()
-def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
+def begin_scene(estimate: Estimate, config: Config, all_at_hand: bool = True) -> Scene | None:
     """The scene of all cameras that were placed, not optimised yet; None where the verdict forbids one.
 
-    Photographs that were exposed differently are brought to one light first.
+    Photographs that were exposed differently are brought to one light first. Of photographs that are all at hand, what
+    verified views see through is left out.
     """
     if estimate.registration is None or not estimate.verdict.publishable:
         return None
@@ -70,7 +77,30 @@ def begin_scene(estimate: Estimate, config: Config) -> Scene | None:
     lenses = {keyframe.name: keyframe.lens for keyframe in keyframes}
     exposures = light.differing(pointmaps, images, config.light)
     alike = {name: light.alike(images[name], exposure) for name, exposure in exposures.items()}
-    return initial_scene(pointmaps, images | alike, config.initialisation, masks, exposures, lenses)
+    images |= alike
+    seen_through = _seen_through(pointmaps, images, masks, config) if all_at_hand else {}
+    for name, hidden in seen_through.items():
+        free, own = ~hidden, masks[name]
+        masks[name] = free if own is None else free & own
+        images[name] = filled(images[name], free)
+    scene = initial_scene(pointmaps, images, config.initialisation, masks, exposures, lenses)
+    shares = {name: float(hidden.mean()) for name, hidden in seen_through.items()}
+    return replace(scene, views=tuple(replace(view, moved=shares.get(view.name, 0.0)) for view in scene.views))
+
+
+def _seen_through(
+    pointmaps: Sequence[Pointmap], images: Mapping[str, Image], masks: Mapping[str, Mask | None], config: Config
+) -> dict[str, Mask]:
+    """For each photograph that shows what others see through: the mask (h, w), True there, that no other mask hides."""
+    if not config.denied.enabled:
+        return {}
+    pictures = [images[pointmap.name] for pointmap in pointmaps]
+    used = []
+    for pointmap, rim in zip(pointmaps, border.valid_masks(pictures), strict=True):
+        mask = masks[pointmap.name]
+        used.append(rim if mask is None else rim & mask)
+    found = zip(pointmaps, denied.denied(pointmaps, pictures, used), used, strict=True)
+    return {pointmap.name: hidden & own for pointmap, hidden, own in found if hidden is not None}
 
 
 def refined(
@@ -136,8 +166,18 @@ def snapshot(
         landmarks=conclusion.landmarks if scene and final else None,
         depths=_confirmed(scene) if scene and final else {},
         masked=conclusion.masked,
+        moving=_moving(conclusion, scene),
         gains={view.name: view.exposure.gains for view in scene.views if view.exposure is not None} if scene else {},
     )
+
+
+def _moving(conclusion: Conclusion, scene: Scene | None) -> dict[str, float]:
+    """By photograph the share that was left out of matching, or of the scene, because it moved."""
+    shares = dict(conclusion.moving)
+    for view in scene.views if scene else ():
+        if view.moved:
+            shares[view.name] = shares.get(view.name, 0.0) + view.moved
+    return shares
 
 
 def _confirmed(scene: Scene) -> dict[str, npt.NDArray[np.float16]]:

@@ -22,6 +22,7 @@ from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.ladder.ladder import climbed
 from splatnode.recon.matching.match import match
+from splatnode.recon.matching.moving import without_moving
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.modelling import begin_scene, looked_at_first, refined, shown, snapshot
 from splatnode.recon.preparation import check_device, load_prior, prepare
@@ -76,6 +77,7 @@ def _estimate_cameras(
     deadline = clock.deadline(config.budget_s) or math.inf
     half = clock.started + (deadline - clock.started) / 2  # the least that cameras take is not bound by a budget
     graph = match(keyframes, config.matching, prior.matcher, until=half, tell=tell)
+    graph = without_moving(graph, prior.matcher, half)
     for line in _shared(graph):
         tell(line)
     estimate = estimate_cameras(graph, rejected, config, _doing("finding and checking the cameras", tell))

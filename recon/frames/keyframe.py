@@ -44,6 +44,7 @@ class Keyframe:
     image: npt.NDArray[np.uint8]  # (h, w, 3) RGB at modelled size
     features: Features
     lens: Intrinsics | None = None  # estimated, whose distortion was taken out of all of it; None: nothing was
+    moving: float = 0.0  # share of the frame that its mask hides because it was found to move
 
     @property
     def name(self) -> str:

@@ -86,7 +86,7 @@ def straight(keyframe: Keyframe, lens: Intrinsics) -> Keyframe:
     if shown.shape[:2] != (height, width):
         shown = cv2.resize(shown, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
     points = straight_pixels(keyframe.features.points, lens, _pinhole(frame))
-    return Keyframe(frame, shown, _moved(keyframe.features, points), lens)
+    return Keyframe(frame, shown, _moved(keyframe.features, points), lens, keyframe.moving)
 
 
 def straight_pixels(pixels: Array, lens: Intrinsics, pinhole: Intrinsics) -> Array:

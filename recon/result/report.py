@@ -49,6 +49,7 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
         "frames_used": [camera.name for camera in snapshot.cameras],
         "frames_dropped": [{"name": frame.name, "reason": frame.reason} for frame in snapshot.dropped],
         "masked": {name: round(share, 4) for name, share in snapshot.masked.items()},
+        "moving": {name: round(share, 4) for name, share in snapshot.moving.items()},
         "gains": {name: [round(gain, 4) for gain in gains] for name, gains in snapshot.gains.items()},
         "seed": seed,
         "preset": preset,

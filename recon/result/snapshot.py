@@ -85,4 +85,5 @@ class Snapshot:
     # By camera (h, w), one value for 2 x 2 pixels: z where a second photograph confirms it, else 0. Empty: not gathered
     depths: Mapping[str, npt.NDArray[np.float16]] = field(default_factory=dict)
     masked: Mapping[str, float] = field(default_factory=dict)  # share that a mask hides, by photograph that has one
+    moving: Mapping[str, float] = field(default_factory=dict)  # share left out because it moved, by photograph
     gains: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # taken out of photographs: red, green, blue

@@ -41,6 +41,7 @@ class TrainingView:
     mask: npt.NDArray[np.bool_] | None = None  # (h, w), True: the scene is fitted to it; None: to all pixels
     exposure: Exposure | None = None  # that was taken out of the photograph; None: nothing was
     lens: Intrinsics | None = None  # estimated, whose distortion was taken out of the photograph; None: nothing was
+    moved: float = 0.0  # share of the photograph that the mask hides because other views see through it
 
     @property
     def width(self) -> int:

@@ -12,19 +12,16 @@ import argparse
 import json
 import time
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import cv2
-import numpy as np
-
-from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.capture.masks import masked
 from splatnode.recon.config import preset
 from splatnode.recon.evaluate.protocol import Networks, Settings
 from splatnode.recon.offline import run
 from tests.bench.quality.held_out import Case, Folders, Scoring, load_case
+from tests.support.moving import look_of, pasted
 
 SCENES = ("fountain_p11", "llff_fern", "fox")
 SHARES = (0.05, 0.15, 0.30)  # of every photograph
@@ -45,25 +42,6 @@ class Result:
     seconds: float
 
 
-def pasted(frame: Frame, share: float, seed: int) -> tuple[Frame, np.ndarray]:
-    """The frame with the thing over `share` of it, and the mask (H, W) of what it leaves free."""
-    place = np.random.default_rng(seed)
-    height, width = frame.image.shape[:2]
-    radius = np.sqrt(share / np.pi) * np.array([width, height])
-    centre = place.uniform(radius, np.array([width, height]) - radius)
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    inside = ((x - centre[0]) / radius[0]) ** 2 + ((y - centre[1]) / radius[1]) ** 2 <= 1.0
-    config = synthetic.Config()
-    look = synthetic.photograph(config, synthetic.scene_cameras(config)[0])
-    rows, columns = np.nonzero(inside)
-    top, left = rows.min(), columns.min()
-    size = int(columns.max() - left + 1), int(rows.max() - top + 1)
-    thing = cv2.resize(look, size, interpolation=cv2.INTER_AREA)
-    image = frame.image.copy()
-    image[rows, columns] = thing[rows - top, columns - left]
-    return replace(frame, image=image, encoded=None), ~inside
-
-
 def measured(case: Case, frames: Sequence[Frame], share: float, masks: bool) -> Result:
     """One reconstruction, scored."""
     began_s = time.monotonic()
@@ -77,10 +55,10 @@ def measured(case: Case, frames: Sequence[Frame], share: float, masks: bool) -> 
 
 def results(case: Case) -> Iterable[Result]:
     """Of the photographs as they are, then with the thing, without and with masks."""
-    frames = case.scene.frames(case.split.train)
+    frames, look = case.scene.frames(case.split.train), look_of(0)
     yield measured(case, frames, 0.0, False)
     for share in SHARES:
-        moved = [pasted(frame, share, seed) for seed, frame in enumerate(frames)]
+        moved = [pasted(frame, share, seed, look) for seed, frame in enumerate(frames)]
         for masks in (True, False):
             kept = [masked(frame, mask) if masks else frame for frame, mask in moved]
             yield measured(case, [frame for frame in kept if isinstance(frame, Frame)], share, masks)

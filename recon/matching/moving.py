@@ -1,0 +1,216 @@
+"""Things that moved between photographs, by their matches: a second motion beside that of the scene.
+
+What stands still agrees on one geometry for each two photographs. What moves by itself, a person or a vehicle, gives
+matches that agree with each other and not with it. Of two such motions the one on the smaller patch of both
+photographs is the thing's. Walls repeat, too: a point counts as moving where two pairs of photographs say so of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.masks import masked
+from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side, modelled_image, principal_point
+from splatnode.recon.matching import features, two_view
+from splatnode.recon.matching.match import Matcher, match
+from splatnode.recon.matching.view_graph import Pair, ViewGraph
+from splatnode.recon.workers import each
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+Index = npt.NDArray[np.int64]
+
+MIN_MATCHES = 40  # of one thing in two photographs: a plane among fewer may be chance
+MOST_COMMON = 0.3  # share of a thing's matches that may fit the scene's motion, too
+SMALLER = 0.6  # the thing's patch over the scene's, in both photographs: beyond, nobody can tell which one moves
+VOTES = 2  # pairs of photographs that find a point on a thing
+MIN_SHOWN = 3  # photographs that a thing must be found in, if there are so many
+ROUNDS = 3  # things of different motion that are looked for, one after the other
+KNOWN_SHARE = 0.5  # of a patch's points that are known to move, for the others of it to move, too
+SAME_LINE_PX = 3.0  # distance from an epipolar line within which a match fits, pixels at REFERENCE_SIDE
+
+_MAP_SIDE = 256  # pixels: the longer side of the small picture in which points become patches
+_REACH = 0.05  # between points of one patch, over the longer side
+_MARGIN = 0.025  # around a patch: its outline has no points of its own
+_MIN_POINTS = 8  # of a patch: fewer are wrong matches
+MOST_HIDDEN = 0.6  # share of a photograph: what covers more is the scene
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Matches of two photographs that agree on a motion other than the scene's, or may."""
+
+    pair: Pair
+    matches: Index  # (M, 2) point numbers
+    moves: bool  # whether it is the smaller patch beyond doubt
+
+
+def without_moving(graph: ViewGraph, matcher: Matcher | None, until: float = math.inf) -> ViewGraph:
+    """The complete view graph without what moved between the photographs: matched again where there is such a thing.
+
+    Such a keyframe has a mask over it, and its share in `moving`. `until` as for `match.completed`.
+    """
+    masks = moving_masks(graph)
+    if not masks:
+        return graph
+    keyframes = [_without(keyframe, masks.get(keyframe.name)) for keyframe in graph.keyframes]
+    return match(keyframes, graph.config, matcher, until=until)
+
+
+def _without(keyframe: Keyframe, mask: Mask | None) -> Keyframe:
+    """The keyframe without what the mask (H, W) hides; itself where hardly anything would remain."""
+    frame = keyframe.frame if mask is None else masked(keyframe.frame, mask)
+    if isinstance(frame, DroppedFrame) or frame is keyframe.frame or frame.mask is None:
+        return keyframe
+    before = 1.0 if keyframe.frame.mask is None else float(keyframe.frame.mask.mean())
+    return replace(
+        keyframe,
+        frame=frame,
+        image=modelled_image(frame.image, max(keyframe.image.shape[:2])),
+        features=features.used(keyframe.features, frame.mask),
+        moving=before - float(frame.mask.mean()),
+    )
+
+
+def moving_masks(graph: ViewGraph) -> dict[str, Mask]:
+    """For each keyframe that shows a thing which moved: the mask (H, W) at full size, False on the thing."""
+    if not graph.config.moving.enabled:
+        return {}
+    moving = moving_points(graph)
+    found = {}
+    for keyframe, points in zip(graph.keyframes, moving, strict=True):
+        hidden = _patches(keyframe, points)
+        if 0 < hidden.sum() <= MOST_HIDDEN * hidden.size:
+            found[keyframe.name] = ~hidden
+    return found
+
+
+def moving_points(graph: ViewGraph) -> list[Mask]:
+    """(M,) for each keyframe which of its points lie on a thing that moved."""
+    moving = [np.zeros(len(keyframe.features.points), bool) for keyframe in graph.keyframes]
+    matches = {pair: graph.tilted.get(pair, plain).matches for pair, plain in sorted(graph.plain.items())}
+    needed = min(VOTES, len(matches))
+    for _ in range(ROUNDS):
+        asked = [(graph, pair, found) for pair, found in matches.items()]
+        groups = [group for found in each(lambda one: list(_groups(*one)), asked) for group in found]
+        votes = [np.zeros(len(points), int) for points in moving]
+        for group in groups:
+            if group.moves:
+                for side, index in enumerate(group.pair):
+                    votes[index][group.matches[:, side]] += 1
+        new = _spread([own >= needed for own in votes], groups)
+        if sum(own.sum() >= _MIN_POINTS for own in new) < min(MIN_SHOWN, len(new)):
+            break
+        moving = [before | own for before, own in zip(moving, new, strict=True)]
+        matches = {
+            (i, j): found[~(moving[i][found[:, 0]] | moving[j][found[:, 1]])] for (i, j), found in matches.items()
+        }
+    return moving
+
+
+def _groups(graph: ViewGraph, pair: Pair, matches: Index) -> Iterator[_Group]:
+    """The plane that most matches agree on, or what else agrees, if one of the two may move beside the other."""
+    first, second = (graph.keyframes[index] for index in pair)
+    if len(matches) < 2 * MIN_MATCHES:
+        return
+    points1, points2 = first.features.points[matches[:, 0]], second.features.points[matches[:, 1]]
+    config, scale = graph.config.pair_matching.two_view, longer_side(second.frame) / REFERENCE_SIDE
+    plane_px = config.homography_px * scale
+    plane = _plane(points1, points2, plane_px)
+    if plane.sum() < MIN_MATCHES:
+        return
+    (others,) = np.nonzero(~plane)
+    size = second.frame.width, second.frame.height
+    own1, own2 = points1 - principal_point(first.frame), points2 - principal_point(second.frame)
+    geometry, _ = two_view.estimate(own1[others], own2[others], matches[others], size, config)
+    if geometry is None:
+        yield _Group(pair, matches[plane], moves=False)
+        return
+    if _share_on_lines(geometry, own1[plane], own2[plane], SAME_LINE_PX * scale) > MOST_COMMON:
+        return
+    rest = np.isin(matches[:, 0], geometry.matches[:, 0]) & ~plane
+    patches = np.array([[_patch(points1[own], first), _patch(points2[own], second)] for own in (plane, rest)])
+    if (patches[0] < SMALLER * patches[1]).all():
+        yield _Group(pair, matches[plane], moves=True)
+    elif (patches[1] < SMALLER * patches[0]).all():
+        thing = np.flatnonzero(rest)[_plane(points1[rest], points2[rest], plane_px)]
+        if len(thing) >= MIN_MATCHES:
+            yield _Group(pair, matches[thing], moves=True)
+    else:
+        yield _Group(pair, matches[plane], moves=False)
+
+
+def _plane(points1: Array, points2: Array, threshold: float) -> Mask:
+    """(M,) which matches the homography that explains most of them explains; none where they are too few for one."""
+    if len(points1) < MIN_MATCHES:
+        return np.zeros(len(points1), bool)
+    _, inliers = cv2.findHomography(points1, points2, cv2.USAC_MAGSAC, threshold)
+    return np.zeros(len(points1), bool) if inliers is None else inliers.ravel() > 0
+
+
+def _share_on_lines(geometry: two_view.TwoView, points1: Array, points2: Array, threshold: float) -> float:
+    """The share of matches, pixels (M, 2) from the principal points, within `threshold` of the geometry's lines."""
+    fundamental, _ = cv2.findFundamentalMat(geometry.points1, geometry.points2, cv2.FM_LMEDS)
+    if fundamental is None or fundamental.shape != (3, 3):
+        return 1.0  # nothing is known of what the geometry explains
+    ones = np.ones((len(points1), 1))
+    first, second = np.hstack([points1, ones]), np.hstack([points2, ones])
+    lines2, lines1 = first @ fundamental.T, second @ fundamental
+    norms = np.linalg.norm(np.hstack([lines1[:, :2], lines2[:, :2]]), axis=1)
+    return float((np.abs((second * lines2).sum(1)) < threshold * norms).mean())
+
+
+def _patch(points: Array, keyframe: Keyframe) -> float:
+    """The share of the photograph in the convex hull of `points` (M, 2)."""
+    hull = cv2.convexHull(points.astype(np.float32))
+    return cv2.contourArea(hull) / (keyframe.frame.width * keyframe.frame.height)
+
+
+def _spread(moving: Sequence[Mask], groups: Sequence[_Group]) -> list[Mask]:
+    """With the points of every group of which one photograph knows that it moves, until nothing is added."""
+    moving = [own.copy() for own in moving]
+    waiting = list(groups)
+    while True:
+        known = [
+            group
+            for group in waiting
+            if any(moving[i][group.matches[:, side]].mean() >= KNOWN_SHARE for side, i in enumerate(group.pair))
+        ]
+        if not known:
+            return moving
+        for group in known:
+            for side, index in enumerate(group.pair):
+                moving[index][group.matches[:, side]] = True
+        waiting = [group for group in waiting if group not in known]
+
+
+def _patches(keyframe: Keyframe, moving: Mask) -> Mask:
+    """(H, W) at full size: the hull of each cluster of the moving points, and a margin around it."""
+    height, width = keyframe.frame.image.shape[:2]
+    scale = min(1.0, _MAP_SIDE / max(height, width))
+    size = max(1, round(width * scale)), max(1, round(height * scale))
+    points = keyframe.features.points[moving] * np.array(size) / (width, height)
+    columns, rows = np.clip(points.astype(int), 0, np.array(size) - 1).T
+    dots = np.zeros(size[::-1], np.uint8)
+    dots[rows, columns] = 1
+    _, labels = cv2.connectedComponents(cv2.dilate(dots, _disc(_REACH / 2 * max(size))))
+    cluster = labels[rows, columns]
+    result = np.zeros(size[::-1], np.uint8)
+    for label in np.unique(cluster):
+        if (own := cluster == label).sum() >= _MIN_POINTS:
+            hull = cv2.convexHull(np.column_stack([columns[own], rows[own]]).astype(np.int32))
+            cv2.fillConvexPoly(result, hull, (1,))
+    result = cv2.dilate(result, _disc(_MARGIN * max(size)))
+    return cv2.resize(result, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _disc(radius: float) -> npt.NDArray[np.uint8]:
+    side = 2 * max(1, round(radius)) + 1
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)
