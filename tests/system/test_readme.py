@@ -682,14 +682,20 @@ def test_cameras_that_moved():
 
 def test_photographs_of_different_exposure():
     rows = raw("light")["rows"]
-    for first in range(0, len(rows), 3):
-        of_set = rows[first : first + 3]
+    for first in range(0, len(rows), 9):
+        of_set, live = rows[first : first + 3], rows[first + 3 : first + 9]
         assert [row["kind"] for row in of_set] == ["one exposure", "gains", "gains, light off"]
         gains = of_set[1]
         scores = [" / ".join((f"{r['psnr']:.1f}", part(r["ssim"], 3), part(r["lpips"], 3))) for r in of_set]
         typical, largest = gains["gain_error_percent"]
         told = f"{gains['saturated_percent']:.0f} % | {part(typical, 1)}, {largest:.1f}"
         says(f"| {gains['scene']} | {gains['views']} | {' | '.join(scores)} | {told} |")
+        assert [row["kind"] for row in live[2:4]] == ["gains, live, grown", "gains, live, in the end"]
+        says(f"| {gains['scene']} | {gains['views']} | {' | '.join(_twice(live[i : i + 2]) for i in (0, 2, 4))} |")
+
+
+def _twice(rows: list[dict]) -> str:
+    return " → ".join(f"{row['psnr']:.1f}" for row in rows)
 
 
 def test_lenses_that_bend_lines():
