@@ -20,7 +20,10 @@ from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.given_pose import GivenPose
+from splatnode.capture.gravity import Gravity
 from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_image_file
+from splatnode.capture.left_out import or_left_out, or_none
+from splatnode.capture.motion import Motion
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.durable import sync_folder
 from splatnode.capture.process.foreign import foreign
@@ -47,6 +50,8 @@ class _Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="frame"
     sha256: str
     captured_at: Stamp | None = None  # earlier recordings do not tell
     given_pose: GivenPose | UnsetType = UNSET
+    motion: Motion | UnsetType = UNSET
+    gravity: Gravity | UnsetType = UNSET
 
 
 class _DroppedLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="dropped"):
@@ -94,8 +99,8 @@ class Recorder:
             temporary.unlink(missing_ok=True)
             raise OSError(error.errno, error.strerror, str(path)) from error
         digest = hashlib.sha256(content).hexdigest()
-        pose = UNSET if item.given_pose is None else item.given_pose
-        self._append(_Line(item.name, item.stamp_ns, item.intrinsics, path.name, digest, item.captured_at, pose))
+        moved = or_left_out(item.given_pose), or_left_out(item.motion), or_left_out(item.gravity)
+        self._append(_Line(item.name, item.stamp_ns, item.intrinsics, path.name, digest, item.captured_at, *moved))
         self.frames += 1
         if self.frames % _SYNC_EVERY == 0:
             self._sync()
@@ -154,9 +159,9 @@ class Recording:
             return DroppedFrame(line.name, f"cannot be read: {error.strerror}")
         if hashlib.sha256(content).hexdigest() != line.sha256:
             return DroppedFrame(line.name, f"{line.file} is not the file that was recorded")
-        pose = None if line.given_pose is UNSET else line.given_pose
         known = image, line.intrinsics, content, line.captured_at
-        return framed(frame_id, line.name, line.stamp_ns, *known, given_pose=pose)
+        moved = or_none(line.given_pose), or_none(line.motion), or_none(line.gravity)
+        return framed(frame_id, line.name, line.stamp_ns, *known, None, *moved)
 
 
 def _shown(name: str) -> str:

@@ -33,7 +33,7 @@ class Metres:
         """
         evidence = self.told_by(work.graph.keyframes)
         config = self._config if snapshot.final else msgspec.structs.replace(self._config, network=False)
-        if snapshot.final and (config != Config() or evidence.tracked):
+        if snapshot.final and (config != Config() or evidence.tracked or evidence.motions):
             snapshot = with_landmarks(snapshot, work.remembered())
         return in_metres(snapshot, config, evidence)
 
@@ -43,7 +43,7 @@ class Metres:
         return in_metres(with_all, self._config, self.told_by(work.graph.keyframes))
 
     def told_by(self, keyframes: Sequence[Keyframe]) -> Evidence:
-        """Of what is configured, and the poses that came with the keyframes."""
+        """Of what is configured, and the poses, motions and gravity that came with the keyframes."""
         for frame in (each.frame for each in keyframes):
             if frame not in self._told:
                 self._told[frame] = gathered((frame,), self._config)

@@ -11,9 +11,12 @@ from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.given_pose import GivenPose
+from splatnode.capture.gravity import Gravity
+from splatnode.capture.left_out import or_left_out, or_none
 from splatnode.capture.messaging.mask_bits import arrays_of, mask_in
 from splatnode.capture.messaging.message_file import read_message, write_message
 from splatnode.capture.messaging.wire import WireError, decode, encode
+from splatnode.capture.motion import Motion
 from splatnode.capture.stamp import Stamp
 from splatnode.recon.daemon.checkpoint.ledger import LIMITS, VERSION, is_readable
 
@@ -30,7 +33,9 @@ class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stamp_ns: int
     intrinsics: Intrinsics | None
     captured_at: Stamp | None = None
-    given_pose: GivenPose | UnsetType = UNSET  # left out where there is none, as in a message
+    given_pose: GivenPose | UnsetType = UNSET  # left out where there is none, as in a message; and the next two
+    motion: Motion | UnsetType = UNSET
+    gravity: Gravity | UnsetType = UNSET
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +51,8 @@ def file_name(number: int) -> str:
 
 def write_frame(path: Path, key: tuple[str, int], frame: Frame) -> None:
     """Whole or not at all; `key` is its session and sequence. Raises OSError."""
-    pose = UNSET if frame.given_pose is None else frame.given_pose
-    header = FrameRecord(VERSION, *key, frame.name, frame.stamp_ns, frame.intrinsics, frame.captured_at, pose)
+    moved = or_left_out(frame.given_pose), or_left_out(frame.motion), or_left_out(frame.gravity)
+    header = FrameRecord(VERSION, *key, frame.name, frame.stamp_ns, frame.intrinsics, frame.captured_at, *moved)
     write_message(path, encode(header, arrays_of(frame)))
 
 
@@ -59,6 +64,6 @@ def read_frame(path: Path) -> StoredFrame:
         raise WireError(f"frame {number} is of version {header.version}")
     mask = mask_in(message.arrays)
     known = header.stamp_ns, message.arrays[0], header.intrinsics
-    pose = None if header.given_pose is UNSET else header.given_pose
-    frame = Frame(number, header.name, *known, captured_at=header.captured_at, mask=mask, given_pose=pose)
+    moved = or_none(header.given_pose), or_none(header.motion), or_none(header.gravity)
+    frame = Frame(number, header.name, *known, None, header.captured_at, mask, *moved)
     return StoredFrame(number, (header.session, header.sequence), frame)
