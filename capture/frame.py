@@ -10,6 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.given_pose import GivenPose
+from splatnode.capture.gravity import Gravity
+from splatnode.capture.motion import Motion
 from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
 from splatnode.capture.right_image import RightImage
 from splatnode.capture.stamp import Stamp
@@ -90,6 +92,8 @@ class Frame:
     captured_at: Stamp | None = None  # None: nobody knows
     mask: npt.NDArray[np.bool_] | None = field(default=None, repr=False)  # (H, W), False: not used; None: all is used
     given_pose: GivenPose | None = None  # of its camera, by odometry or a tracker; None: nobody knows
+    motion: Motion | None = None  # of its camera since earlier frames, by wheels or an IMU; None: nobody knows
+    gravity: Gravity | None = None  # in its camera's frame; None: nobody knows
     right: RightImage | None = field(default=None, repr=False)  # of a stereo camera, whose left image is `image`
 
     def __post_init__(self) -> None:
@@ -155,16 +159,20 @@ def framed(
     captured_at: Stamp | None = None,
     mask: npt.NDArray[np.bool_] | None = None,
     given_pose: GivenPose | None = None,
+    motion: Motion | None = None,
+    gravity: Gravity | None = None,
     right: RightImage | None = None,
 ) -> Frame | DroppedFrame:
     """What a camera or a file gave as a Frame; left out, with the reason, where it keeps a Frame's bounds not."""
     try:
-        return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at, mask, given_pose, right)
+        came = given_pose, motion, gravity, right
+        return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at, mask, *came)
     except ValueError as error:
         return DroppedFrame(name, f"it cannot be used: {error}")
 
 
 def renamed(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame | DroppedFrame:
     """The same image as another frame, which may be beyond a Frame's bounds."""
-    known = frame.image, frame.intrinsics, frame.encoded, frame.captured_at, frame.mask, frame.given_pose, frame.right
-    return framed(frame_id, name, stamp_ns, *known)
+    known = frame.image, frame.intrinsics, frame.encoded, frame.captured_at, frame.mask
+    came = frame.given_pose, frame.motion, frame.gravity, frame.right
+    return framed(frame_id, name, stamp_ns, *known, *came)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -28,26 +29,32 @@ class GivenPose:
     sigma_deg: float = SIGMA_DEG  # of the orientation about each axis, degrees
 
     def __post_init__(self) -> None:
-        numbers = (*self.T_world_camera, self.sigma_m, self.sigma_deg)
-        if len(self.T_world_camera) != 16 or not all(map(math.isfinite, numbers)):
-            raise ValueError("a given pose must be T_world_camera, 16 finite numbers row by row, and finite sigmas")
         if not (0 < self.sigma_m <= LARGEST_M and 0 < self.sigma_deg <= 180):
             raise ValueError(
-                f"the sigmas of a given pose must be above 0, up to {LARGEST_M:g} m and 180 degrees; "
+                f"the sigmas of a given pose must be above 0 and finite, up to {LARGEST_M:g} m and 180 degrees; "
                 f"got {self.sigma_m:g} m and {self.sigma_deg:g} degrees"
             )
-        matrix = self.matrix
-        if np.abs(matrix).max() > LARGEST_M:
-            raise ValueError(f"a given pose must be within {LARGEST_M:g} m")
-        rotation = matrix[:3, :3]
-        turned = np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID or np.linalg.det(rotation) < 0
-        if turned or np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > _EXACT:
-            raise ValueError("a given pose must be a rigid motion: a rotation, a translation, and 0 0 0 1")
+        if problem := rigid_problem(self.T_world_camera):
+            raise ValueError(f"a given pose must be {problem}")
 
     @property
     def matrix(self) -> npt.NDArray[np.float64]:
         """T_world_camera (4, 4)."""
         return np.array(self.T_world_camera, np.float64).reshape(4, 4)
+
+
+def rigid_problem(numbers: Sequence[float]) -> str:
+    """What 16 numbers, a matrix row by row in metres, must be and are not; empty where nothing is wrong with them."""
+    if len(numbers) != 16 or not all(map(math.isfinite, numbers)):
+        return "a matrix of 16 finite numbers row by row"
+    matrix = np.array(numbers, np.float64).reshape(4, 4)
+    if np.abs(matrix).max() > LARGEST_M:
+        return f"within {LARGEST_M:g} m"
+    rotation = matrix[:3, :3]
+    turned = np.abs(rotation @ rotation.T - np.eye(3)).max() > _RIGID or np.linalg.det(rotation) < 0
+    if turned or np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > _EXACT:
+        return "a rigid motion: a rotation, a translation, and 0 0 0 1"
+    return ""
 
 
 def given_pose(

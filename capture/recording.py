@@ -22,7 +22,10 @@ from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.given_pose import GivenPose
+from splatnode.capture.gravity import Gravity
 from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image, read_image_file
+from splatnode.capture.left_out import or_left_out, or_none
+from splatnode.capture.motion import Motion
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.durable import sync_folder
 from splatnode.capture.process.foreign import foreign
@@ -58,6 +61,8 @@ class _Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="frame"
     sha256: str
     captured_at: Stamp | None = None  # earlier recordings do not tell
     given_pose: GivenPose | UnsetType = UNSET
+    motion: Motion | UnsetType = UNSET
+    gravity: Gravity | UnsetType = UNSET
     right: _Right | UnsetType = UNSET
 
 
@@ -99,9 +104,9 @@ class Recorder:
         content = _file_of(item)
         path = self.folder / f"{self.frames:06d}{'.jpg' if content.startswith(_JPEG) else '.png'}"
         digest = _write(path, content)
-        pose = UNSET if item.given_pose is None else item.given_pose
+        moved = or_left_out(item.given_pose), or_left_out(item.motion), or_left_out(item.gravity)
         right = UNSET if item.right is None else self._write_right(item.right)
-        known = path.name, digest, item.captured_at, pose, right
+        known = path.name, digest, item.captured_at, *moved, right
         self._append(_Line(item.name, item.stamp_ns, item.intrinsics, *known))
         self.frames += 1
         if self.frames % _SYNC_EVERY == 0:
@@ -182,9 +187,9 @@ class Recording:
             return DroppedFrame(line.name, str(error))
         except OSError as error:
             return DroppedFrame(line.name, f"cannot be read: {error.strerror}")
-        pose = None if line.given_pose is UNSET else line.given_pose
         known = image, line.intrinsics, content, line.captured_at
-        return framed(frame_id, line.name, line.stamp_ns, *known, given_pose=pose, right=right)
+        moved = or_none(line.given_pose), or_none(line.motion), or_none(line.gravity)
+        return framed(frame_id, line.name, line.stamp_ns, *known, None, *moved, right)
 
     def _image(self, file: str, sha256: str, max_pixels: int) -> tuple[bytes, npt.NDArray[np.uint8]]:
         """The file, and its image (H, W, 3) RGB. Raises UnusableImage where it is not the recorded one, and OSError."""

@@ -8,6 +8,7 @@ splatnode.capture.diorama; this file photographs it.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Annotated
 
 import cv2
@@ -18,9 +19,13 @@ import numpy.typing as npt
 from splatnode.capture.diorama.cast import Camera, Matrix, cast
 from splatnode.capture.diorama.layout import place
 from splatnode.capture.diorama.look_at import look_at
+from splatnode.capture.diorama.odometry import Config as Odometry
+from splatnode.capture.diorama.odometry import odometry
 from splatnode.capture.diorama.solids import Solid
 from splatnode.capture.diorama.through_lens import cast_through
 from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.gravity import Gravity
+from splatnode.capture.motion import Motion
 from splatnode.capture.pace import FramesPerSecond
 from splatnode.capture.right_image import Baseline, RightImage, grey
 from splatnode.capture.stamp import Clock, Stamp
@@ -41,6 +46,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     noise: float = 1.0  # standard deviation of the sensor noise, grey levels
     samples: Count = 2  # rays a pixel in each direction
     frames_per_second: FramesPerSecond = 2.0  # by the stamps
+    odometry: Odometry | None = None  # of the camera, which photographs then carry; nothing: they carry none
     lens: Intrinsics | None = None  # that photographs are taken through, and carry; nothing: a pinhole's, unknown
     # Of a stereo camera, metres: what its right half sees goes with each photograph; nothing: there is but one camera
     baseline_m: Annotated[float, msgspec.Meta(gt=0, le=1)] | None = None
@@ -48,11 +54,21 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def stream(config: Config) -> Iterator[Frame]:
     """The photographs in the order of the path."""
+    measured = measured_motions(config)
     for index, camera in enumerate(scene_cameras(config)):
         stamp_ns = round(index / config.frames_per_second * 1e9)
         image, captured_at = photograph(config, camera, index), Stamp(stamp_ns, Clock.RECORDING)
         right = None if config.baseline_m is None else _right_image(config, camera, index, config.baseline_m)
-        yield Frame(index, frame_name(index), stamp_ns, image, lens_of(config), captured_at=captured_at, right=right)
+        frame = Frame(index, frame_name(index), stamp_ns, image, lens_of(config), captured_at=captured_at, right=right)
+        yield replace(frame, motion=measured[index][0], gravity=measured[index][1]) if measured else frame
+
+
+def measured_motions(config: Config) -> list[tuple[Motion, Gravity]]:
+    """What the photographs of the stream carry of their camera's way; nothing where no odometry is configured."""
+    if config.odometry is None:
+        return []
+    Ts = [T for T, _ in scene_cameras(config)]
+    return odometry([frame_name(index) for index in range(config.views)], Ts, config.odometry, config.seed)
 
 
 def lens_of(config: Config) -> Intrinsics | None:

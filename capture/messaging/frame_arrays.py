@@ -11,6 +11,9 @@ from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.given_pose import GivenPose
+from splatnode.capture.gravity import Gravity
+from splatnode.capture.left_out import or_none
+from splatnode.capture.motion import Motion
 from splatnode.capture.right_image import Baseline, RightImage
 from splatnode.capture.stamp import Stamp
 
@@ -30,6 +33,10 @@ class FrameFields(Protocol):
     def captured_at(self) -> Stamp | None: ...
     @property
     def given_pose(self) -> GivenPose | UnsetType: ...
+    @property
+    def motion(self) -> Motion | UnsetType: ...
+    @property
+    def gravity(self) -> Gravity | UnsetType: ...
     @property
     def baseline(self) -> Baseline | UnsetType: ...
 
@@ -59,7 +66,9 @@ def frame_in(header: FrameFields, frame_id: int, arrays: Sequence[npt.NDArray]) 
         header.intrinsics,
         captured_at=header.captured_at,
         mask=_mask(image, masks[0]) if masks else None,
-        given_pose=None if header.given_pose is UNSET else header.given_pose,
+        given_pose=or_none(header.given_pose),
+        motion=or_none(header.motion),
+        gravity=or_none(header.gravity),
         right=None if header.baseline is UNSET else RightImage(arrays[-1], header.baseline),
     )
 

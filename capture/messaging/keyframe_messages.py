@@ -15,6 +15,8 @@ from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.given_pose import GivenPose
+from splatnode.capture.gravity import Gravity
+from splatnode.capture.left_out import or_left_out
 from splatnode.capture.messaging.frame_arrays import arrays_of, frame_in
 from splatnode.capture.messaging.spool import Key
 from splatnode.capture.messaging.values import Name, Sequential, SessionId, Text
@@ -29,6 +31,7 @@ from splatnode.capture.messaging.wire import (
     encode,
     plain_header,
 )
+from splatnode.capture.motion import Motion
 from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
 from splatnode.capture.right_image import Baseline
 from splatnode.capture.stamp import Stamp
@@ -47,6 +50,8 @@ class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True,
     captured_at: Stamp | None = None
     # Left out where there is none: a receiver that does not know it takes all keyframes without one
     given_pose: GivenPose | UnsetType = UNSET
+    motion: Motion | UnsetType = UNSET
+    gravity: Gravity | UnsetType = UNSET
     baseline: Baseline | UnsetType = UNSET  # likewise; where it is there, the last array is the right image
 
 
@@ -122,7 +127,9 @@ def to_message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
         stamp_ns=frame.stamp_ns,
         intrinsics=frame.intrinsics,
         captured_at=frame.captured_at,
-        given_pose=UNSET if frame.given_pose is None else frame.given_pose,
+        given_pose=or_left_out(frame.given_pose),
+        motion=or_left_out(frame.motion),
+        gravity=or_left_out(frame.gravity),
         baseline=UNSET if frame.right is None else frame.right.baseline,
     )
     return encode(header, arrays_of(frame))

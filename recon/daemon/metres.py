@@ -34,7 +34,8 @@ class Metres:
         """
         evidence = self.told_by(work.graph.keyframes)
         config = self._config if snapshot.final else msgspec.structs.replace(self._config, network=False)
-        if evidence.pairs or (snapshot.final and (config != Config() or evidence.tracked)):
+        came = evidence.tracked or evidence.motions
+        if evidence.pairs or (snapshot.final and (config != Config() or came)):
             snapshot = with_landmarks(snapshot, work.remembered())
         measured = in_metres(snapshot, config, evidence)
         return measured if snapshot.final else replace(measured, landmarks=None)
@@ -45,7 +46,7 @@ class Metres:
         return in_metres(with_all, self._config, self.told_by(work.graph.keyframes))
 
     def told_by(self, keyframes: Sequence[Keyframe]) -> Evidence:
-        """Of what is configured, and what came with the keyframes: poses, right images."""
+        """Of what is configured, and what came with the keyframes: poses, motions, gravity, right images."""
         for frame in (each.frame for each in keyframes):
             if frame not in self._told:
                 self._told[frame] = gathered((frame,), self._config)

@@ -11,8 +11,10 @@ from splatnode.recon.geometry import Similarity
 from splatnode.recon.metric.config import Config
 from splatnode.recon.metric.distances import by_distance
 from splatnode.recon.metric.evidence import NOTHING, Evidence
+from splatnode.recon.metric.gravity import by_gravity
 from splatnode.recon.metric.markers import by_markers
 from splatnode.recon.metric.measurement import Measurement, together
+from splatnode.recon.metric.motions import by_motions
 from splatnode.recon.metric.network import MetricDepth, by_network
 from splatnode.recon.metric.poses import Aligned, Sigmas, by_poses
 from splatnode.recon.metric.stereo import by_stereo
@@ -30,8 +32,14 @@ def in_metres(snapshot: Snapshot, config: Config, evidence: Evidence = NOTHING) 
 
     `evidence` is what its photographs tell of what `config` asks for. A source that can say nothing is left out where
     another can. Where sources contradict each other the scene stays relative. Where poses are among what counts, the
-    world is theirs.
+    world is theirs. Gravity, where it came with photographs, tells where up is.
     """
+    measured = _in_metres(snapshot, config, evidence)
+    up = by_gravity(views_of(measured), evidence.gravities)
+    return measured if up is None else replace(measured, up=up)
+
+
+def _in_metres(snapshot: Snapshot, config: Config, evidence: Evidence) -> Snapshot:
     said, aligned = _said(snapshot, config, evidence) if len(snapshot.cameras) else ([], None)
     if not said:
         return snapshot
@@ -65,6 +73,7 @@ def _said(snapshot: Snapshot, config: Config, evidence: Evidence) -> tuple[list[
         found = by_poses(views_of(snapshot), poses, sigmas, own)
         aligned = None if isinstance(found, str) else found
         said += [found] if isinstance(found, str) else [found.unit, *found.told]
+    said += by_motions(views_of(snapshot), evidence.motions, config.motions_shared)
     for baseline, pairs in _rigs(config, evidence).items():
         stereo = baseline.metres, baseline.sigma_m
         said.append(by_stereo(views_of(snapshot), snapshot.landmarks, pairs, *stereo))

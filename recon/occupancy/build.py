@@ -17,6 +17,7 @@ from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code
 
 SURE = (Code.OK, Code.OK_PARTIAL)
+UNSURE_DEG = 3.0  # standard deviation of up by gravity, beyond which the floor tells it better
 LEAST_KNOWN = 0.01  # of the pixels: with fewer confirmed depths there is no map
 
 
@@ -36,13 +37,14 @@ def occupancy_map(
 
     A voxel is free where a camera looks through all of it, and occupied where a confirmed surface is in it, which
     counts for more. `voxel` is its side in the result's unit; None: a 64th of the median depth. `up` (3,) is the
-    direction of up in the world, where it is known. `pause` is called several times a second, and may raise to abandon
-    the work. Raises NoMap, and ValueError for arguments that cannot be used.
+    direction of up in the world; None: gravity tells it, where the snapshot knows it. `pause` is called several times
+    a second, and may raise to abandon the work. Raises NoMap, and ValueError for arguments that cannot be used.
     """
     seen = _sights(snapshot)
     points = np.concatenate([sight.points for sight in seen]).astype(np.float64)
     unit = float(np.median(np.concatenate([sight.depth[sight.depth > 0] for sight in seen])))
-    frame = upright([camera.T_world_camera for camera in snapshot.cameras], points, up, unit)
+    told, how = _up(snapshot) if up is None else (up, "given")
+    frame = upright([camera.T_world_camera for camera in snapshot.cameras], points, told, unit, how)
     T = frame.T_world_map
     centres = np.stack([camera.T_world_camera[:3, 3] for camera in snapshot.cameras])
     layout = laid_out(_in_map(points, T), _in_map(centres, T), unit, snapshot.scale.metric, voxel)
@@ -53,6 +55,12 @@ def occupancy_map(
     ends = np.concatenate([blurred(sight) for sight in seen])
     states[surfaces(_in_map(ends, T), layout)] = State.OCCUPIED
     return OccupancyMap(states, layout.voxel, layout.origin, frame, snapshot.scale)
+
+
+def _up(snapshot: Snapshot) -> tuple[npt.NDArray[np.float64] | None, str]:
+    """By gravity, and how; none where nothing tells it, or it is too unsure to keep the floor level."""
+    up = snapshot.up
+    return (None, "") if up is None or up.sigma_deg > UNSURE_DEG else (np.array(up.direction), up.source)
 
 
 def _in_map(points: npt.NDArray[np.float64], T_world_map: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -28,16 +28,19 @@ class Upright:
         return "z = 0 is the floor" if self.on_floor else "no floor was found: z = 0 is the height of the first camera"
 
 
-def upright(Ts_world_camera: Sequence[Array], points: Array, given: Array | None, unit: float) -> Upright:
+def upright(
+    Ts_world_camera: Sequence[Array], points: Array, given: Array | None, unit: float, source: str = "given"
+) -> Upright:
     """The frame of a map of surface points (M, 3) that cameras (4, 4) saw from a median distance `unit`.
 
-    `given` (3,) is the direction of up in the world, if gravity or a tracker tells it. Else it is the normal of the
-    floor, and without one what keeps the cameras level. Raises ValueError where `given` is no direction.
+    `given` (3,) is the direction of up in the world, if gravity or a tracker tells it, as `source` says. Else it is
+    the normal of the floor, and without one what keeps the cameras level. Raises ValueError where `given` is no
+    direction.
     """
     Ts = np.stack(Ts_world_camera)
     guess, how = level(Ts)
     if given is not None:
-        guess, how = _unit(given), "given"
+        guess, how = _unit(given), source
     floor = find_floor(points, Ts[:, :3, 3], guess, unit, TILT if given is None else TILT_OF_GIVEN)
     if floor is not None and given is None:
         guess, how = floor.normal, f"the floor, a plane through {100 * floor.share:.0f} % of the surface that was seen"

@@ -27,6 +27,7 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
     stages = {stage: seconds for stage, seconds in snapshot.seconds.items() if stage != "total"}
     return {
         **snapshot.scale.record(),
+        "up": None if snapshot.up is None else asdict(snapshot.up),
         "verdict": {
             "code": verdict.code.value,
             "message": verdict.message,

@@ -13,6 +13,7 @@ from splatnode.capture.stamp import Stamp
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.scale import RELATIVE, Scale
+from splatnode.recon.result.up import Up
 from splatnode.recon.result.verdict import Verdict
 
 Array = npt.NDArray[np.float32]
@@ -81,6 +82,7 @@ class Snapshot:
     served_by: Mapping[str, str] = field(default_factory=dict)  # network or measure, by regularisation that was used
     evidence: Mapping[str, object] | None = None  # recon.verification.likelihood.record; None: nothing to verify
     scale: Scale = RELATIVE  # the unit of all lengths
+    up: Up | None = None  # in the world; None: no IMU tells it
     landmarks: Landmarks | None = None  # by which further photographs are placed; None: they were not gathered
     # By camera (h, w), one value for 2 x 2 pixels: z where a second photograph confirms it, else 0. Empty: not gathered
     depths: Mapping[str, npt.NDArray[np.float16]] = field(default_factory=dict)

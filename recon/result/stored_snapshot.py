@@ -24,6 +24,7 @@ from splatnode.recon.result.export.sources import SOURCES
 from splatnode.recon.result.export.stored import StoredResult, read_cameras, read_gaussians
 from splatnode.recon.result.landmarks_file import LANDMARKS, read_landmarks
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
+from splatnode.recon.result.up import Up
 from splatnode.recon.result.verdict import Code, Verdict
 
 log = logging.getLogger(__name__)
@@ -63,6 +64,7 @@ def read_result(place: Path) -> tuple[Snapshot, list[Path]]:
         seconds=report.seconds,
         final=True,
         scale=StoredResult(scene).scale(),
+        up=report.up,
     )
     return snapshot, reported + beside
 
@@ -86,12 +88,21 @@ class _Report(msgspec.Struct, frozen=True):
     iterations: Annotated[int, msgspec.Meta(ge=0, lt=1 << 31)] = 0
     seconds: dict[str, Annotated[float, msgspec.Meta(ge=0, le=1e9)]] = {}
     photographs: str | None = None
+    up: Up | None = None
 
     def texts(self) -> list[str]:
         """All that it says, which is shown."""
         verdict = self.verdict
         dropped = [text for frame in self.frames_dropped for text in (frame.name, frame.reason)]
-        return [verdict.message, verdict.advice, *verdict.frames, *dropped, *self.seconds, self.photographs or ""]
+        return [
+            verdict.message,
+            verdict.advice,
+            *verdict.frames,
+            *dropped,
+            *self.seconds,
+            self.photographs or "",
+            self.up.source if self.up else "",
+        ]
 
 
 def _report(path: Path) -> _Report | None:

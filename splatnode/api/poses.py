@@ -14,8 +14,12 @@ from splatnode.api.photographs import Images, names_of
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.given_pose import GivenPose, given_pose
+from splatnode.capture.gravity import SIGMA_DEG, Gravity
+from splatnode.capture.motion import Motion
 from splatnode.recon.metric.config import Config
 from splatnode.recon.metric.poses_file import named, poses_of, read_poses
+
+LEAST_STEP_SIGMA_M = 0.001  # standard deviation of a motion, however short it is
 
 Matrix: TypeAlias = "npt.NDArray[np.floating]"
 Poses: TypeAlias = "str | PathLike[str] | Mapping[str, Matrix] | Sequence[Matrix | None]"
@@ -39,6 +43,39 @@ def pose_of(pose: npt.ArrayLike | None, sigma: tuple[float, float] | None, confi
         return None
     usual = config.poses_sigma_m, config.poses_sigma_deg
     return given_pose(_matrix(pose), *(usual if sigma is None else _two(sigma, "pose_sigma")))
+
+
+def next_motion(
+    before: Motion | None, name: str, step: npt.ArrayLike | None, sigma: tuple[float, float] | None, config: Config
+) -> Motion:
+    """The motions up to photograph `name`: with one `step` more, T_previous_current (4, 4), metres.
+
+    Without a step, or a photograph before it, a chain begins with it. `sigma` None: as `config` has it.
+    Raises TypeError, ValueError.
+    """
+    if step is None and sigma is not None:
+        raise ValueError("motion_sigma says how unsure a motion is: give motion, too")
+    if step is None:
+        return Motion(name)
+    if before is None:
+        raise ValueError("motion is that since the photograph before: the first one has none")
+    moved = _matrix(step)
+    length = float(np.linalg.norm(moved[:3, 3]))
+    usual = max(config.motions_drift * length, LEAST_STEP_SIGMA_M), config.motions_sigma_deg
+    return before.then(moved, *(usual if sigma is None else _two(sigma, "motion_sigma")))
+
+
+def gravity_of(gravity: npt.ArrayLike | None, sigma_deg: float | None) -> Gravity | None:
+    """The direction of down in the camera's frame (3,). Raises TypeError, ValueError."""
+    if gravity is None:
+        if sigma_deg is not None:
+            raise ValueError("gravity_sigma says how unsure gravity is: give gravity, too")
+        return None
+    down = np.asarray(gravity, np.float64)
+    if down.shape != (3,):
+        raise TypeError(f"gravity must be a direction (3,) in the camera's frame, got shape {down.shape}")
+    x, y, z = down.tolist()
+    return Gravity((x, y, z), SIGMA_DEG if sigma_deg is None else float(sigma_deg))
 
 
 def poses_given(

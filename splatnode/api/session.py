@@ -9,11 +9,12 @@ from dataclasses import dataclass, replace
 import numpy.typing as npt
 
 from splatnode.api.photographs import Lens, Picture, frame, intrinsics_of, lenses, seen_through
-from splatnode.api.poses import pose_of
+from splatnode.api.poses import gravity_of, next_motion, pose_of
 from splatnode.api.reconstruction import Changes, check_count, configured
 from splatnode.api.result import Result, result_of
 from splatnode.api.scale import Scale, is_stereo
 from splatnode.capture.frame import Frame
+from splatnode.capture.motion import Motion
 from splatnode.capture.process.progress import Tell, told_to_nobody
 from splatnode.capture.quality import Limits
 from splatnode.capture.right_image import Baseline, RightImage, grey
@@ -75,6 +76,7 @@ class Session:
         self._work: IncrementalReconstruction | None = IncrementalReconstruction(self._config)
         self._frames: dict[str, Frame] = {}  # that were taken
         self._given: set[str] = set()
+        self._motion: Motion | None = None  # up to the photograph that was given last
         self._evidence = NOTHING  # of metres, in these frames
         self._snapshot: Snapshot | None = None
         self._lock = threading.RLock()
@@ -87,6 +89,10 @@ class Session:
         captured_at: Stamp | None = None,
         pose: npt.ArrayLike | None = None,
         pose_sigma: tuple[float, float] | None = None,
+        motion: npt.ArrayLike | None = None,
+        motion_sigma: tuple[float, float] | None = None,
+        gravity: npt.ArrayLike | None = None,
+        gravity_sigma: float | None = None,
         right: Picture | None = None,
         baseline_m: float | None = None,
     ) -> Update:
@@ -94,11 +100,16 @@ class Session:
 
         `pose` is where odometry or a tracker says that its camera was, T_world_camera (4, 4) in metres, all in one
         world, and `pose_sigma` how unsure that is, metres and degrees; default: what `config` says. Two poses or more
-        give the scene metres and their axes. `right` is what the right half of a stereo camera saw at that moment,
-        rectified, of the image's size, and `baseline_m` how far it stands from the left one, metres: such pairs give
-        the scene metres, too. Returns what became of the photograph once the scene has grown, which takes seconds
-        where it is taken, and milliseconds where it is not. Raises TypeError and ValueError where it is no image, its
-        pose or its right image is none, or a name comes again, and RuntimeError after `finish` or `close`.
+        give the scene metres and their axes. `motion` is how wheels or an IMU say that the camera has moved since the
+        photograph that was given before, whether that was taken or not: T_previous_current (4, 4), metres;
+        `motion_sigma`, metres and degrees, is of this motion alone. One or more give metres. `gravity` (3,) is the
+        direction of down in the camera's frame, `gravity_sigma` in degrees; it gives `Result.map` its up. `right` is
+        what the right half of a stereo camera saw at that moment, rectified, of the image's size, and `baseline_m` how
+        far it stands from the left one, metres: such pairs give the scene metres, too.
+
+        Returns what became of the photograph once the scene has grown, which takes seconds where it is taken, and
+        milliseconds where it is not. Raises TypeError and ValueError where it is no image, its pose, motion, gravity or
+        right image is none, or a name comes again, and RuntimeError after `finish` or `close`.
         """
         with self._lock, limits.at_most(self._threads):
             work = self._open()
@@ -107,7 +118,10 @@ class Session:
             if frame.name in self._given:
                 raise ValueError(f"name must be new for each photograph; {frame.name!r} was given before")
             given = pose_of(pose, pose_sigma, self._config.metric)
-            frame = replace(frame, given_pose=given, right=_right_of(right, baseline_m))
+            moved = next_motion(self._motion, frame.name, motion, motion_sigma, self._config.metric)
+            came = {"given_pose": given, "motion": moved, "gravity": gravity_of(gravity, gravity_sigma)}
+            frame = replace(frame, **came, right=_right_of(right, baseline_m))
+            self._motion = moved
             self._given.add(frame.name)
             decision = self._selector.decide(frame)
             if decision.take:

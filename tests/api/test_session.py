@@ -10,6 +10,8 @@ import pytest
 
 import splatnode
 from splatnode.capture.cameras import synthetic
+from splatnode.capture.diorama.odometry import Config as Odometry
+from splatnode.capture.diorama.odometry import odometry
 from tests.api.conftest import QUICK, SMALL
 from tests.support.synthetic import errors
 
@@ -151,3 +153,47 @@ def test_what_is_no_right_image_is_said(arrays):
             with pytest.raises(kind, match=why):
                 session.add(arrays[0], name="a.png", **bad)
         assert session.add(arrays[0], name="a.png").taken
+
+
+def test_motions_and_gravity_of_photographs_give_metres_and_up(arrays):
+    true = [T for T, _ in synthetic.scene_cameras(SMALL)]
+    measured = odometry([str(index) for index in range(len(true))], true, Odometry(), 7)
+    with splatnode.Session(config=QUICK, seed=0) as session:
+        for index, (image, (moved, gravity)) in enumerate(zip(arrays, measured, strict=True)):
+            more = {}
+            if index:
+                step = np.linalg.inv(measured[index - 1][0].matrix) @ moved.matrix
+                more = {"motion": step, "motion_sigma": (0.02, 2.0)}
+            session.add(image, gravity=gravity.down, **more)
+        result = session.finish()
+    assert result.metric and result.scale_interval is not None
+    first, last = result.cameras[0], result.cameras[-1]
+    apart = np.linalg.norm(true[-1][:3, 3] - true[0][:3, 3]) / np.linalg.norm(last.centre - first.centre)
+    assert abs(apart - 1) < 0.02 and result.scale_interval[0] <= apart <= result.scale_interval[1]
+    made = result.map()
+    true_up = first.T_world_camera[:3, :3] @ true[0][:3, :3].T @ [0.0, 0.0, 1.0]
+    assert made.upright.source == "gravity in 4 photographs" and made.T_world_map[:3, 2] @ true_up > np.cos(
+        np.radians(4)
+    )
+
+
+def test_motions_and_gravity_that_are_none_are_said(arrays):
+    step = np.eye(4)
+    with splatnode.Session(config=QUICK) as session:
+        for bad, kind, why in (
+            ({"motion": step}, ValueError, "the first one has none"),
+            ({"motion_sigma": (0.1, 1.0)}, ValueError, "give motion, too"),
+            ({"gravity": [0.0, 0, 0]}, ValueError, "gravity must be a direction"),
+            ({"gravity": np.eye(3)}, TypeError, r"a direction \(3,\) in the camera's frame, got shape \(3, 3\)"),
+            ({"gravity_sigma": 2.0}, ValueError, "give gravity, too"),
+        ):
+            with pytest.raises(kind, match=why):
+                session.add(arrays[0], name="a.png", **bad)
+        assert session.add(arrays[0], name="a.png").taken
+        for bad, kind, why in (
+            ({"motion": np.eye(3)}, TypeError, r"got shape \(3, 3\)"),
+            ({"motion": 2 * step}, ValueError, "T_previous_current must be a rigid motion"),
+            ({"motion": step, "motion_sigma": (0.0, 1.0)}, ValueError, "the sigmas of a step must be above 0"),
+        ):
+            with pytest.raises(kind, match=why):
+                session.add(arrays[1], name="b.png", **bad)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 import re
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 
+from splatnode.capture.cameras import synthetic
+from splatnode.capture.diorama.odometry import Config as Odometry
 from tests.conftest import ROOT
 
 PAGE = re.sub(r"\s+", " ", (ROOT / "docs" / "metres.md").read_text(encoding="utf-8"))
@@ -78,3 +81,18 @@ def test_the_bars_are_met():
     assert max(abs(row["error_percent"]) for row in chosen("stereo") if row["pairs"] > 1) < 0.5
     assert max(abs(row["error_percent"]) for row in poses) < 2.0
     assert all(row["without"] == pytest.approx(row["with"], abs=1e-5) for row in chosen("unharmed"))
+
+
+def test_the_program_for_wheels_gives_metres(capsys):
+    text = (ROOT / "docs" / "metres.md").read_text(encoding="utf-8")
+    (program,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    config = synthetic.Config(views=4, width=320, height=240, odometry=Odometry())
+    frames = list(synthetic.stream(config))
+    matrices = [frame.motion.matrix for frame in frames]
+    known = {
+        "photographs": [frame.image for frame in frames],
+        "motions": [np.linalg.inv(before) @ after for before, after in pairwise(matrices)],
+        "down": [frame.gravity.down for frame in frames],
+    }
+    exec(program, known)
+    assert re.search(r"stated one: \(0\.9\d+, 1\.0\d+\)", capsys.readouterr().out)

@@ -10,7 +10,9 @@ import yaml
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.given_pose import GivenPose
+from splatnode.capture.gravity import Gravity
 from splatnode.capture.messaging import commands, keyframe_messages, services, state, wire
+from splatnode.capture.motion import Motion
 from splatnode.capture.preview import PreviewHeader
 from splatnode.capture.status import CaptureStatus
 from splatnode.recon.daemon.control import Retract
@@ -130,7 +132,8 @@ def test_every_service_state_and_field_of_a_lens_is_told():
     both = [*offered, *(each.requests for each in offered if each.pattern is services.Pattern.STATE)]
     rows = re.findall(r"^\| `([\w.]+)` \| \w+ \| (\w+) \| \+(\d) \|", page, re.MULTILINE)
     assert {(each.name, each.pattern.name.lower(), str(each.tcp_port)) for each in both} == set(rows)
-    of_records = [*Intrinsics.__dataclass_fields__, *GivenPose.__dataclass_fields__]
+    records = (Intrinsics, GivenPose, Motion, Gravity)
+    of_records = [name for record in records for name in record.__dataclass_fields__]
     named = [f"`{each.value}`" for each in State] + [f"`{name}`" for name in of_records]
     assert not [name for name in named if name not in page]
     assert f"`SPLAT`, then one byte with the version ({wire.VERSION})" in page and all(

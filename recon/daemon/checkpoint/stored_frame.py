@@ -11,9 +11,12 @@ from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.given_pose import GivenPose
+from splatnode.capture.gravity import Gravity
+from splatnode.capture.left_out import or_left_out
 from splatnode.capture.messaging.frame_arrays import arrays_of, frame_in
 from splatnode.capture.messaging.message_file import read_message, write_message
 from splatnode.capture.messaging.wire import WireError, decode, encode
+from splatnode.capture.motion import Motion
 from splatnode.capture.right_image import Baseline
 from splatnode.capture.stamp import Stamp
 from splatnode.recon.daemon.checkpoint.ledger import LIMITS, VERSION, is_readable
@@ -31,8 +34,10 @@ class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     stamp_ns: int
     intrinsics: Intrinsics | None
     captured_at: Stamp | None = None
-    given_pose: GivenPose | UnsetType = UNSET  # left out where there is none, as in a message
-    baseline: Baseline | UnsetType = UNSET  # likewise
+    given_pose: GivenPose | UnsetType = UNSET  # left out where there is none, as in a message; and those below
+    motion: Motion | UnsetType = UNSET
+    gravity: Gravity | UnsetType = UNSET
+    baseline: Baseline | UnsetType = UNSET
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +53,10 @@ def file_name(number: int) -> str:
 
 def write_frame(path: Path, key: tuple[str, int], frame: Frame) -> None:
     """Whole or not at all; `key` is its session and sequence. Raises OSError."""
-    pose = UNSET if frame.given_pose is None else frame.given_pose
+    moved = or_left_out(frame.given_pose), or_left_out(frame.motion), or_left_out(frame.gravity)
     baseline = UNSET if frame.right is None else frame.right.baseline
     known = frame.name, frame.stamp_ns, frame.intrinsics, frame.captured_at
-    header = FrameRecord(VERSION, *key, *known, pose, baseline)
+    header = FrameRecord(VERSION, *key, *known, *moved, baseline)
     write_message(path, encode(header, arrays_of(frame)))
 
 

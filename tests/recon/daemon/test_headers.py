@@ -14,9 +14,11 @@ from msgspec import inspect
 from splatnode.capture import preview, status
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.given_pose import GivenPose
+from splatnode.capture.gravity import Gravity
 from splatnode.capture.messaging import commands, keyframe_messages
 from splatnode.capture.messaging.state import Want
 from splatnode.capture.messaging.wire import Header
+from splatnode.capture.motion import Motion
 from splatnode.capture.right_image import Baseline
 from splatnode.recon.daemon import control
 from splatnode.recon.daemon.status import ReconStatus
@@ -29,7 +31,8 @@ SCHEMAS = [
     preview.PreviewHeader, status.CaptureStatus, status.Heartbeat, commands.Seen, commands.Answer, control.Retract,
     Want, ReconStatus, SceneHeader, MapHeader,
 ]  # fmt: skip
-CHECKED_BY_THEMSELVES = (Intrinsics, GivenPose, Baseline)  # whose __post_init__ knows all their bounds
+# Their __post_init__ knows all their bounds.
+CHECKED_BY_THEMSELVES = (Intrinsics, GivenPose, Motion, Gravity, Baseline)
 
 
 def unbounded(kind: inspect.Type, where: str) -> Iterator[str]:

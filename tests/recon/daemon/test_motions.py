@@ -1,0 +1,63 @@
+"""Wheels and an IMU, live: keyframes that carry motions and gravity give the scene metres, and its map its up."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from msgspec.structs import replace as changed
+
+import splatnode
+from splatnode.capture import recording
+from splatnode.capture.cameras import synthetic
+from splatnode.capture.diorama.odometry import Config as Odometry
+from splatnode.capture.frame import Frame
+from splatnode.capture.recording import Recorder
+from splatnode.recon.daemon.free_space import Config as FreeSpace
+from tests.recon.daemon.test_daemon import config, finished, peer, running  # noqa: F401
+from tests.support.synthetic import SMALL, photographs
+
+MEASURED = synthetic.measured_motions(changed(SMALL, odometry=Odometry(drift=0.02, noise_deg=2.0)))
+TRUE = [T for T, _ in synthetic.scene_cameras(SMALL)]
+
+
+def frames_with_odometry(count: int = 4):
+    """Not each photograph is a keyframe: the second is missing."""
+    told = [replace(f, motion=m, gravity=g) for f, (m, g) in zip(photographs(), MEASURED, strict=False)]
+    return [told[0], *told[2 : count + 1]]
+
+
+def apart(first, last) -> float:
+    return float(np.linalg.norm(first[:3, 3] - last[:3, 3]))
+
+
+def test_keyframes_with_motions_give_metres_and_up_also_after_a_restart(config, peer):  # noqa: F811
+    frames = frames_with_odometry()
+    node = changed(config, map=FreeSpace(live=True))
+    with running(node), splatnode.connect(config.network.directory) as connection:
+        for frame in frames:
+            peer.server.offer(frame)
+        scene = peer.wait(finished(len(frames)), "a final scene").snapshot
+        early = next(heard.snapshot for heard in peer.heard if len(heard.snapshot.cameras) >= 2)
+        for shown in (early, scene):
+            assert shown.scale.metric and (shown.scale.source or "").startswith("motions between ")
+        found = connection.wait_for_map(60.0)
+        assert found.occupancy is not None and found.occupancy.upright.source == f"gravity in {len(frames)} photographs"
+        saved = splatnode.load(config.out / "scene-0001")
+        assert np.array_equal(saved.map().states, found.occupancy.states)
+    names = {camera.name: camera.T_world_camera for camera in scene.cameras}
+    ratio = apart(TRUE[0], TRUE[4]) / apart(names[frames[0].name], names[frames[-1].name])
+    low, high = scene.scale.interval_95
+    assert abs(ratio - 1) < 0.02 and low <= ratio <= high < 1.05
+    with running(config):
+        again = peer.wait(lambda heard: heard.snapshot.final, "the scene again").snapshot
+    assert again.scale == scene.scale
+
+
+def test_a_recording_keeps_motions_and_gravity(tmp_path):
+    frames = frames_with_odometry()
+    with Recorder(tmp_path / "walk") as recorder:
+        for frame in frames:
+            recorder.write(frame)
+    kept = [each for each in recording.read(tmp_path / "walk").frames() if isinstance(each, Frame)]
+    assert [(each.motion, each.gravity) for each in kept] == [(each.motion, each.gravity) for each in frames]
