@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 
+from splatnode.capture.masks import masked
 from splatnode.recon.evaluate.stability import corruptions
-from splatnode.recon.evaluate.stability.case import Case, accepted, either, refused, row
+from splatnode.recon.evaluate.stability.case import Case, accepted, either, frames, refused, row
 from splatnode.recon.evaluate.stability.corruptions import Image
 from splatnode.recon.evaluate.stability.places import Photo, Sampler
 from splatnode.recon.result.verdict import Code
@@ -93,6 +96,35 @@ def moving_object(sampler: Sampler) -> Case:
     return (either if share > 0.2 else accepted)(photos, note, *fitting)
 
 
+@row(18, "another thing in each frame")
+def passers_by(sampler: Sampler) -> Case:
+    """Cut-outs of other photographs, one a frame: nothing matches them."""
+    share = (0.05, 0.15, 0.3)[sampler.seed % 3]
+    photos = sampler.photos(5)
+    things = [sampler.photos(1, photos)[0].image for _ in photos]
+    covered = [photo for photo, _ in _with_things(sampler, photos, things, share)]
+    note, fitting = f"{share:.0%} covered", (Code.OK_PARTIAL, Code.MOVING_SCENE)
+    return (either if share > 0.2 else accepted)(covered, note, *fitting)
+
+
+@row(18, "wrong masks")
+def wrong_masks(sampler: Sampler) -> Case:
+    """A thing moves; the masks are those of the next frame, or are inverted: they leave nothing but the thing."""
+    photos = sampler.photos(5)
+    things = [sampler.photos(1, photos)[0].image] * len(photos)
+    covered = _with_things(sampler, photos, things, share=0.15)
+    free = [~thing for _, thing in covered]
+    inverted = sampler.seed % 2 == 1
+    masks = [~mask for mask in free] if inverted else [*free[1:], free[0]]
+    changed = [photo for photo, _ in covered]
+    hidden = tuple(masked(frame, mask) for frame, mask in zip(frames(changed), masks, strict=True))
+    fitting = Code.NO_PARALLAX, Code.PLANAR_ONLY, Code.NO_OVERLAP, Code.MOVING_SCENE, Code.LOW_TEXTURE, Code.AMBIGUOUS
+    if inverted:
+        return replace(refused(changed, "masks that leave only what moves", *fitting), source=partial(list, hidden))
+    case = either(changed, "each with the mask of the next", Code.MOVING_SCENE, Code.AMBIGUOUS)
+    return replace(case, source=partial(list, hidden))
+
+
 @row(18, "own body in view")
 def own_body(sampler: Sampler) -> Case:
     """The robot's bumper: the lowest rows of every frame are the same."""
@@ -125,18 +157,26 @@ def _changed(photos: Sequence[Photo], change: Callable[[Image], Image]) -> list[
 
 
 def _with_passer_by(sampler: Sampler, photos: Sequence[Photo], share: float) -> list[Photo]:
-    """An ellipse of another place's photograph, covering `share` of each frame, on a way of its own."""
-    rng = sampler.rng
+    """One ellipse of another place's photograph over all frames."""
     cutout = sampler.photos(1, photos)[0].image
+    return [photo for photo, _ in _with_things(sampler, photos, [cutout] * len(photos), share)]
+
+
+def _with_things(
+    sampler: Sampler, photos: Sequence[Photo], things: Sequence[Image], share: float
+) -> list[tuple[Photo, npt.NDArray[np.bool_]]]:
+    """The photographs, over each an ellipse of its thing, covering `share` of it, on a way of its own; where it is."""
+    rng = sampler.rng
     way = np.cumsum(rng.normal(scale=0.12, size=(len(photos), 2)), axis=0) + rng.uniform(0.3, 0.7, 2)
     result = []
-    for photo, (across, down) in zip(photos, np.clip(way, 0.2, 0.8), strict=True):
+    for photo, cutout, (across, down) in zip(photos, things, np.clip(way, 0.2, 0.8), strict=True):
         height, width = photo.image.shape[:2]
         side = np.sqrt(share * 4 / np.pi)  # of the frame's sides, so that the ellipse covers the share
         size = min(round(side * height), cutout.shape[0]), min(round(side * width), cutout.shape[1])
         left, top = round(across * width - size[1] / 2), round(down * height - size[0] / 2)
         patch = cutout[: size[0], : size[1]]
-        result.append(
-            replace(photo, image=corruptions.pasted(photo.image, patch, corruptions.ellipse(*size), left, top))
-        )
+        ellipse = corruptions.ellipse(*size)
+        covered = replace(photo, image=corruptions.pasted(photo.image, patch, ellipse, left, top))
+        black, white = np.zeros_like(photo.image), np.full((*size, 3), 255, np.uint8)
+        result.append((covered, corruptions.pasted(black, white, ellipse, left, top).max(2) > 0))
     return result
