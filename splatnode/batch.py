@@ -49,12 +49,12 @@ def reconstruct_dataset(
     Each row takes one core. Like all of Ray Data this is lazy: the work begins when the rows are read. What fails is a
     row with the verdict FAILED. Raises ModuleNotFoundError without ray.
     """
-    from splatnode.recon.batch import ray
-    from splatnode.recon.batch.child import Limits
+    from splatnode.recon.batch import cluster
     from splatnode.recon.batch.command import replay
     from splatnode.recon.batch.remote import Job
-    from splatnode.recon.batch.version import own_version
+    from splatnode.recon.jobs.child import Limits
+    from splatnode.recon.jobs.version import own_version
 
     where = str(results) if "://" in str(results) else str(Path(results).resolve())
     job = Job(partial(replay, tuple(options)), where, Limits(max_memory_mb, timeout_s), own_version())
-    return ds.map(partial(ray.run_row, job=job), num_cpus=1)
+    return ds.map(partial(cluster.run_row, job=job), num_cpus=1)

@@ -8,8 +8,8 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.process.printable import printable
-from splatnode.recon.batch.child import End
 from splatnode.recon.batch.sources import REPORT, Recording
+from splatnode.recon.jobs.child import End
 from splatnode.recon.result.export.limits import read_json_file
 
 FAILED = "FAILED"  # beside the codes of verdicts: there is no answer

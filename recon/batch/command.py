@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
 import sys
 import time
 from collections import Counter
@@ -18,8 +17,8 @@ from splatnode.capture.process.packages import remedy
 from splatnode.capture.process.printable import printable
 from splatnode.capture.process.progress import Step, Tell, telling, times, waiting
 from splatnode.capture.process.terminal import in_place, say, taken_away
+from splatnode.recon.batch import cluster
 from splatnode.recon.batch.answer import FAILED, Outcome
-from splatnode.recon.batch.child import Limits
 from splatnode.recon.batch.engine import Plan, Work, run_all
 from splatnode.recon.batch.keeping import remove_leftovers
 from splatnode.recon.batch.ledger import LEDGER, Ledger
@@ -28,8 +27,10 @@ from splatnode.recon.batch.remote import Job
 from splatnode.recon.batch.sources import Recording, recordings
 from splatnode.recon.batch.tables import CSV, PARQUET, write_csv, write_parquet
 from splatnode.recon.batch.verb import replay_options
-from splatnode.recon.batch.version import own_version
 from splatnode.recon.batch.write_back import write_back
+from splatnode.recon.jobs.child import Limits
+from splatnode.recon.jobs.cores import usable_cores
+from splatnode.recon.jobs.version import own_version
 from splatnode.recon.result.folder import result_folder
 
 Run = Callable[[Sequence[Recording]], Iterator[Outcome]]  # the outcomes as they come
@@ -96,14 +97,14 @@ def _here(args: argparse.Namespace, work: Work) -> Iterator[Run]:
 @contextlib.contextmanager
 def _on_ray(args: argparse.Namespace, work: Work) -> Iterator[Run]:
     """Raises NoCluster; ModuleNotFoundError without ray."""
-    from splatnode.recon.batch import ray  # takes a second, and is an extra
+    from splatnode.recon.jobs import ray  # takes a second, and is an extra
 
     results = args.results or str(args.out.resolve())
     job = Job(work, results, Limits(args.max_memory, args.timeout_s), own_version())
     try:
         with ray.joined(args.ray, None if args.ray else len(_cores(args.cores))):
             remove_leftovers(args.out)
-            yield lambda todo: ray.run_all(todo, job, args.cores)
+            yield lambda todo: cluster.run_all(todo, job, args.cores)
     finally:
         remove_leftovers(args.out)
 
@@ -150,10 +151,10 @@ def _write_tables(out: Path, found: Sequence[Recording], ledger: Ledger, tell: T
 
 def _cores(wanted: int | None) -> tuple[int, ...]:
     """Those that recordings are run on. Raises ValueError where there are fewer than are wanted."""
-    allowed = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1)
+    allowed = usable_cores()
     if wanted is not None and wanted > len(allowed):
         raise ValueError(f"--cores must be at most {len(allowed)}, which this process may use; got {wanted}")
-    return tuple(allowed)[:wanted]
+    return allowed[:wanted]
 
 
 def _check_new(out: Path, goes_on: bool) -> None:

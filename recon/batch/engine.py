@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from splatnode.recon.batch.answer import Outcome
-from splatnode.recon.batch.child import Child, Limits
 from splatnode.recon.batch.keeping import hidden, hidden_log, kept, remove_leftovers
 from splatnode.recon.batch.sources import Recording
-
-_POLL_S = 0.02
+from splatnode.recon.jobs.child import Child, Limits
+from splatnode.recon.jobs.engine import ends
 
 Work = Callable[[Recording, Path], Sequence[str]]  # the command that writes a recording's result into this new folder
 
@@ -26,12 +25,6 @@ class Plan:
     limits: Limits
 
 
-@dataclass(frozen=True, eq=False)
-class _Running:
-    recording: Recording
-    child: Child
-
-
 def run_all(todo: Iterable[Recording], work: Work, plan: Plan) -> Generator[Outcome, None, None]:
     """The outcomes as they come; a recording whose outcome is given has its result folder, if it has any.
 
@@ -39,27 +32,15 @@ def run_all(todo: Iterable[Recording], work: Work, plan: Plan) -> Generator[Outc
     next call removes.
     """
     remove_leftovers(plan.out)
-    waiting, running, free = iter(todo), [], list(plan.cores)
+    take, start = partial(next, iter(todo), None), partial(_started, work, plan.out)
+    running = ends(take, start, [(core,) for core in plan.cores], plan.limits)
     try:
-        while True:
-            while free and (recording := next(waiting, None)) is not None:
-                running.append(_started(recording, work, plan.out, free.pop(0)))
-            if not running:
-                return
-            ends = [(each, each.child.ended(plan.limits)) for each in running]
-            over = [(each, end) for each, end in ends if end is not None]
-            running = [each for each, end in ends if end is None]
-            for each, end in over:
-                free.append(each.child.core)
-                yield kept(each.recording, plan.out, each.recording.name, end)
-            if not over:
-                time.sleep(_POLL_S)
+        for recording, end in running:
+            yield kept(recording, plan.out, recording.name, end)
     finally:
-        for each in running:
-            each.child.stop()
+        running.close()
         remove_leftovers(plan.out)
 
 
-def _started(recording: Recording, work: Work, out: Path, core: int) -> _Running:
-    command = work(recording, hidden(out, recording.name))
-    return _Running(recording, Child(command, hidden_log(out, recording.name), core))
+def _started(work: Work, out: Path, recording: Recording, cores: Sequence[int]) -> Child:
+    return Child(work(recording, hidden(out, recording.name)), hidden_log(out, recording.name), cores)

@@ -8,8 +8,8 @@ import shutil
 from pathlib import Path
 
 from splatnode.recon.batch.answer import Outcome, outcome
-from splatnode.recon.batch.child import End
 from splatnode.recon.batch.sources import Recording
+from splatnode.recon.jobs.child import End
 
 LOG = "replay.log"  # in a result folder: what its process said; of one that failed NAME.log, beside the results
 PARTIAL = ".partial"  # the end of a hidden name, of what is being made

@@ -6,24 +6,20 @@ makes its result under a name of its own, and the last one counts, which is the 
 
 from __future__ import annotations
 
-import contextlib
-import fcntl
-import os
-import platform
 import shutil
 import tempfile
 import time
 import uuid
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from splatnode.recon.batch.answer import Outcome, without_answer
-from splatnode.recon.batch.child import Child, End, Limits
 from splatnode.recon.batch.engine import Work
 from splatnode.recon.batch.keeping import hidden, hidden_log, kept
 from splatnode.recon.batch.sources import REPORT, Recording
-from splatnode.recon.batch.version import own_version
+from splatnode.recon.jobs.child import NOT_RUN, Child, Limits
+from splatnode.recon.jobs.cores import free_core
+from splatnode.recon.jobs.version import other_version
 
 _POLL_S = 0.05
 _OF_STORE = "://"  # in the address of an object store
@@ -44,9 +40,8 @@ def run_recording(recording: Recording, job: Job) -> Outcome:
 
     What fails is an outcome. Raises OSError where the results cannot be written.
     """
-    if (version := own_version()) != job.version:
-        there = f"the worker on {platform.node()} has splatnode {version}, the batch was begun with {job.version}"
-        return without_answer(recording, End(None, "", 0.0, 0.0), f"{there}; install the same on all machines")
+    if (other := other_version(job.version)) is not None:
+        return without_answer(recording, NOT_RUN, other)
     if _OF_STORE not in job.results:
         return _run(recording, job, Path(job.results))
     with tempfile.TemporaryDirectory(prefix="splatnode-") as folder:
@@ -59,8 +54,8 @@ def _run(recording: Recording, job: Job, out: Path) -> Outcome:
     out.mkdir(parents=True, exist_ok=True)
     made_as = f"{recording.name}.{uuid.uuid4().hex[:12]}"
     try:
-        with _core() as core:
-            child = Child(job.work(recording, hidden(out, made_as)), hidden_log(out, made_as), core)
+        with free_core() as core:
+            child = Child(job.work(recording, hidden(out, made_as)), hidden_log(out, made_as), (core,))
             try:
                 while (end := child.ended(job.limits)) is None:
                     time.sleep(_POLL_S)
@@ -70,23 +65,6 @@ def _run(recording: Recording, job: Job, out: Path) -> Outcome:
     finally:
         shutil.rmtree(hidden(out, made_as), ignore_errors=True)
         hidden_log(out, made_as).unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def _core() -> Iterator[int]:
-    """A core that is free of recordings, of whatever worker of this user; where none is, the one with this turn."""
-    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else list(range(os.cpu_count() or 1))
-    folder = Path(tempfile.gettempdir(), f"splatnode-cores-{os.getuid()}")
-    folder.mkdir(mode=0o700, exist_ok=True)
-    for core in cores:
-        with (folder / str(core)).open("w") as lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                continue
-            yield core
-            return
-    yield cores[os.getpid() % len(cores)]
 
 
 def _upload(folder: Path, recording: Recording, results: str) -> None:

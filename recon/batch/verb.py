@@ -66,7 +66,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         help="at the end, write the cameras beside the LeRobot data sets and MCAP files that they are of",
     )
     parser.add_argument(
-        "--in-place", action="store_true", help="of a LeRobot data set, as columns of its own tables in meta/episodes"
+        "--in-place",
+        action="store_true",
+        help="into them: columns of a LeRobot data set's own tables in meta/episodes, topics of an MCAP file",
     )
     add_json(parser)
     _options_of_replay(parser)

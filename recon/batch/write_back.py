@@ -1,11 +1,13 @@
 """The cameras of a batch beside the data sets and logs that they are of, in the formats of these.
 
 Of a LeRobot data set it is one table, meta/splatnode_cameras.parquet, with a row for each camera of each episode, or
-columns of the same names in its own tables. Of an MCAP file it is another one beside it, NAME.splatnode.mcap.
+columns of the same names in its own tables. Of an MCAP file it is another one beside it, NAME.splatnode.mcap, or
+topics of its own.
 """
 
 from __future__ import annotations
 
+import shutil
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -39,7 +41,7 @@ class WrittenBack:
 def write_back(rows: Iterable[Outcome], out: Path, in_place: bool) -> Iterator[WrittenBack]:
     """Writes the cameras of `rows`, whose results lie in `out`; one after the other, what becomes of each file.
 
-    `in_place` adds columns to the tables of a data set; an MCAP file is never changed. Recordings of neither are left.
+    `in_place` adds columns to the tables of a data set, and topics to an MCAP file. Recordings of neither are left.
     """
     found: defaultdict[Path, list[tuple[str, Outcome]]] = defaultdict(list)
     for row in rows:
@@ -49,7 +51,7 @@ def write_back(rows: Iterable[Outcome], out: Path, in_place: bool) -> Iterator[W
     for file, parts in found.items():
         try:
             if file.suffix.lower() == film.MCAP:
-                yield WrittenBack(_beside_log(file, parts, out))
+                yield WrittenBack(_with_log(file, parts, out, in_place))
             else:
                 yield WrittenBack(_into_data_set(file, parts, out, in_place))
         except (OSError, ValueError, ModuleNotFoundError) as error:
@@ -97,7 +99,7 @@ def _seen(row: Outcome, out: Path, rate: float) -> dict[str, Any]:
     }
 
 
-def _beside_log(file: Path, parts: Sequence[tuple[str, Outcome]], out: Path) -> str:
+def _with_log(file: Path, parts: Sequence[tuple[str, Outcome]], out: Path, in_place: bool) -> str:
     """Raises OSError, UnusableLog, ModuleNotFoundError without mcap."""
     from splatnode.recon.batch import mcap
 
@@ -107,9 +109,15 @@ def _beside_log(file: Path, parts: Sequence[tuple[str, Outcome]], out: Path) -> 
         names = {kind: f"{topic}/splatnode/{kind}" for kind in ("pose", "calibration", "verdict")}
         schemas |= {names["pose"]: "PoseInFrame", names["calibration"]: "CameraCalibration", names["verdict"]: "Log"}
         told += _of_topic(file, topic, row, out, names)
+    told.sort(key=lambda each: each[1])
+    if in_place:
+        with replacing(file) as temporary:
+            mcap.write_with_messages(file, temporary, told, schemas)
+            shutil.copymode(file, temporary)
+        return f"{len(parts)} topics of {file} have cameras in topics of that file"
     target = file.with_name(file.stem + OWN_SUFFIX)
     with replacing(target) as temporary:
-        temporary.write_bytes(mcap.encoded(sorted(told, key=lambda each: each[1]), schemas))
+        temporary.write_bytes(mcap.encoded(told, schemas))
     return f"{len(parts)} topics of {file} have cameras in {target}"
 
 

@@ -9,6 +9,7 @@ import base64
 import io
 import json
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -70,6 +71,13 @@ def written(make_writer: Callable, messages: Sequence[Message], schemas: Mapping
     file = io.BytesIO()
     writer = make_writer(file)
     writer.start(library="splatnode")
+    add_messages(writer, messages, schemas)
+    writer.finish()
+    return file.getvalue()
+
+
+def add_messages(writer: Any, messages: Sequence[Message], schemas: Mapping[str, str]) -> None:
+    """Adds the messages to a Writer of mcap that was started; `schemas` names that of each topic."""
     channels = {}
     for topic in dict.fromkeys(topic for topic, _, _ in messages):
         name = schemas[topic]
@@ -78,8 +86,6 @@ def written(make_writer: Callable, messages: Sequence[Message], schemas: Mapping
         channels[topic] = writer.register_channel(topic, "json", known)
     for topic, ns, content in messages:
         writer.add_message(channels[topic], log_time=ns, publish_time=ns, data=json.dumps(content).encode())
-    writer.finish()
-    return file.getvalue()
 
 
 def calibration(camera: CameraEstimate, ns: int, frame: str) -> dict[str, object]:

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from splatnode.recon.batch.child import Limits
 from splatnode.recon.batch.engine import Plan, run_all
 from splatnode.recon.batch.keeping import LOG
 from splatnode.recon.batch.sources import Recording
+from splatnode.recon.jobs.child import Limits
 from tests.conftest import ROOT
 from tests.support.recordings import GOOD, REFUSED, simulated
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from splatnode.batch import reconstruct_dataset, recordings
-from splatnode.recon.batch.child import Limits
 from splatnode.recon.batch.command import EXIT_SOME_FAILED, run_batch
 from splatnode.recon.batch.remote import Job, run_recording
 from splatnode.recon.batch.sources import Recording
+from splatnode.recon.jobs.child import Limits
 from tests.support.recordings import GOOD, REFUSED, options, simulated
 from tests.support.synthetic import photographs
 
@@ -45,7 +45,7 @@ def test_a_dataset_gets_what_came_of_its_rows(tmp_path):
     for frame in photographs()[:2]:
         cv2.imwrite(str(folder / frame.name), frame.image[:, :, ::-1])
     (tmp_path / "in" / "film.mp4").write_bytes(b"no film")
-    with import_module("splatnode.recon.batch.ray").joined("", 1):
+    with import_module("splatnode.recon.jobs.ray").joined("", 1):
         rows = [{**row, "station": 7} for row in recordings([tmp_path / "in"])]
         done = reconstruct_dataset(ray.data.from_items(rows), tmp_path / "out", options=("--preset", "preview"))
         found = {row["name"]: row for row in done.take_all()}

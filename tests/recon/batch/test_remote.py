@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 
 from splatnode.recon.batch import command
-from splatnode.recon.batch.child import Limits
-from splatnode.recon.batch.remote import Job, _core, run_recording
+from splatnode.recon.batch.remote import Job, run_recording
 from splatnode.recon.batch.sources import Recording
-from splatnode.recon.batch.version import own_version
+from splatnode.recon.jobs.child import Limits
+from splatnode.recon.jobs.cores import free_core
+from splatnode.recon.jobs.version import own_version
 from tests.support.recordings import GOOD, REFUSED, options, simulated
 
 
@@ -72,9 +73,9 @@ def test_a_worker_with_another_splatnode_says_so(tmp_path):
 
 def test_each_recording_has_a_core_while_there_are_some():
     cores = os.sched_getaffinity(0)
-    with _core() as first, _core() as second:
+    with free_core() as first, free_core() as second:
         assert {first, second} <= cores and (first != second or len(cores) == 1)
-    with _core() as again:
+    with free_core() as again:
         assert again == first
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import errno
 import json
 from pathlib import Path
 from typing import Any
@@ -9,8 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from splatnode import command_line
+from splatnode.capture.image_file import encode_png
 from splatnode.capture.lerobot.data_set import parts
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.batch.command import EXIT_GOOD, EXIT_SOME_FAILED, run_batch
@@ -155,3 +159,68 @@ def test_an_episode_and_a_topic_are_reconstructed_and_written_back(tmp_path):
     with (tmp_path / "in" / "log.splatnode.mcap").open("rb") as stream:
         poses = [each for _, channel, each in make_reader(stream).iter_messages() if channel.topic.endswith("pose")]
     assert len(poses) == 3
+
+
+def everything(file: Path) -> list[tuple]:
+    """All messages as mcap's own reader has them, then attachments and metadata."""
+    with file.open("rb") as stream:
+        reader = make_reader(stream)
+        told = [
+            (channel.topic, channel.message_encoding, channel.metadata, schema and (schema.name, schema.data))
+            + (message.log_time, message.publish_time, message.sequence, message.data)
+            for schema, channel, message in reader.iter_messages(log_time_order=False)
+        ]
+        attached = [(each.name, each.data) for each in reader.iter_attachments()]
+        return [*told, *attached, *((each.name, each.metadata) for each in reader.iter_metadata())]
+
+
+def own(told: list[tuple]) -> list[tuple]:
+    return [each for each in told if "/splatnode/" in each[0]]
+
+
+def test_in_place_a_log_gets_topics_and_keeps_its_own(tmp_path):
+    file = tmp_path / "drive.mcap"
+    with file.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="robot", library="of somebody")
+        schema = writer.register_schema("foxglove.CompressedImage", "jsonschema", b"{}")
+        picture = {"format": "png", "data": base64.b64encode(encode_png(PICTURE)).decode()}
+        pictures = writer.register_channel("/a", "json", schema, {"lens": "wide"})
+        odometry = writer.register_channel("/odometry", "application/octet-stream", 0)
+        for index in range(3):
+            writer.add_message(odometry, index * 10, bytes([index, 255]), index * 10 + 1, sequence=7 + index)
+            writer.add_message(pictures, index * 10, json.dumps(picture).encode(), index * 10)
+        writer.add_attachment(1, 2, "map", "text/plain", b"where")
+        writer.add_metadata("robot", {"name": "r2"})
+        writer.finish()
+    file.chmod(0o640)
+    before = everything(file)
+    assert ran(tmp_path, file, in_place=True) == EXIT_GOOD
+    once = file.read_bytes()
+    assert ran(tmp_path, file, in_place=True, resume=True) == EXIT_GOOD
+    assert file.read_bytes() == once, "the second time they take the place of the first"
+    after = everything(file)
+    assert [each for each in after if each not in own(after)] == before and len(before) == 8
+    assert [each[0] for each in own(after)][:3] == [
+        f"/a/splatnode/{kind}" for kind in ("verdict", "pose", "calibration")
+    ]
+    assert file.stat().st_mode & 0o777 == 0o640
+    assert {path.name for path in tmp_path.iterdir() if path.suffix == ".mcap" or path.name[0] == "."} == {"drive.mcap"}
+
+
+def test_a_log_that_breaks_off_or_a_full_disk_leaves_it_as_it_is(tmp_path, drive, monkeypatch, capsys):
+    whole, found = drive.read_bytes(), recordings([drive], None)
+    broken = whole[: len(whole) // 2]
+    drive.write_bytes(broken)
+    in_place = options(tmp_path / "broken", write_back=True, in_place=True)
+    assert run_batch(in_place, found, placed(tmp_path), ["act"]) == EXIT_SOME_FAILED
+    assert drive.read_bytes() == broken and "were not written back: " in capsys.readouterr().out
+    drive.write_bytes(whole)
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("splatnode.recon.batch.mcap.add_messages", full)
+    assert ran(tmp_path, drive, in_place=True) == EXIT_SOME_FAILED
+    assert drive.read_bytes() == whole and "No space left" in capsys.readouterr().out
+    assert not list(tmp_path.glob(".*.partial"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import platform
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -24,3 +25,11 @@ def own_version() -> str:
     except metadata.PackageNotFoundError:
         version = "not installed"
     return f"{version} ({digest.hexdigest()[:_DIGITS]})"
+
+
+def other_version(begun_with: str) -> str | None:
+    """What to say where the splatnode of this machine is another one than work was begun with; None: it is the same."""
+    if (version := own_version()) == begun_with:
+        return None
+    there = f"the worker on {platform.node()} has splatnode {version}, the batch was begun with {begun_with}"
+    return f"{there}; install the same on all machines"

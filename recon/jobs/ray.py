@@ -1,7 +1,6 @@
-"""Many recordings on a Ray cluster, or on one that is begun here. Needs the extra ray.
+"""Functions of values on a Ray cluster, or on one that is begun here. Needs the extra ray.
 
-Ray places the work, and repeats what was lost with a worker or a machine; what a recording is and how it fails is as on
-one machine (`remote`). Workers send one row a recording; results go from them to the shared folder or store.
+Ray places the work, and repeats what was lost with a worker or a machine.
 """
 
 from __future__ import annotations
@@ -11,24 +10,31 @@ import logging
 import os
 import socket
 import sys
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, TypeVar
 
 from splatnode.capture.process.printable import printable
 from splatnode.capture.process.terminal import beneath
-from splatnode.recon.batch.answer import Outcome, without_answer
-from splatnode.recon.batch.child import End
-from splatnode.recon.batch.remote import Job, run_recording
-from splatnode.recon.batch.sources import Recording
 
 ray: Any = import_module("ray")  # by its name: where it is not installed, pyright takes this file for it
 _errors: Any = import_module("ray.exceptions")
 
-_REPEATS = 5  # of a recording whose worker or machine was lost
-_WAITING = 2  # recordings that are handed over, for each core of the cluster
+T = TypeVar("T")
+R = TypeVar("R")
+
+_REPEATS = 5  # of a call whose worker or machine was lost
+_WAITING = 2  # calls that are handed over, for each core of the cluster
 _WAIT_S = 1.0  # between looks at how many cores there are
 _ANSWER_S = 5.0  # in which a machine answers; Ray itself tries for two minutes
+
+
+@dataclass(frozen=True)
+class Lost:
+    """Of a call that gave nothing: why."""
+
+    reason: str
 
 
 class NoCluster(ConnectionError):
@@ -60,27 +66,30 @@ def joined(address: str, cores: int | None) -> Iterator[None]:
         ray.shutdown()
 
 
-def run_all(todo: Iterable[Recording], job: Job, most: int | None) -> Generator[Outcome, None, None]:
-    """The outcomes as they come, of at most `most` recordings at a time; None: of as many as the cluster has cores.
+def mapped(
+    take: Callable[[], T | None], function: Callable[[T], R], most: int | None, memory_mb: float | None
+) -> Generator[tuple[T, R | Lost], None, None]:
+    """What `take` gives, each with what `function` makes of it on one core of a worker, as they come.
 
-    A recording whose worker is lost is repeated elsewhere; after a few times it has failed.
+    At most `most` are under way at a time; None: as many as keep the cluster's cores busy. `take` gives None where
+    there is nothing to begin now: it is asked again after each end, and all is over when nothing runs any more. A call
+    whose worker is lost is repeated elsewhere; after a few times it is lost, too. `memory_mb` is what Ray sets aside
+    for each.
     """
-    run = _task(job)
-    waiting, running = iter(todo), {}
+    memory = {} if memory_mb is None else {"memory": memory_mb * 1e6}
+    run = ray.remote(_applied).options(num_cpus=1, max_retries=_REPEATS, **memory)
+    running: dict[Any, T] = {}
     while True:
-        while len(running) < _at_a_time(most) and (recording := next(waiting, None)) is not None:
-            running[run.remote(recording, job)] = recording
+        while len(running) < _at_a_time(most) and (item := take()) is not None:
+            running[run.remote(function, item)] = item
         if not running:
             return
         for reference in ray.wait(list(running), num_returns=1, timeout=_WAIT_S)[0]:
-            yield _outcome(reference, running.pop(reference))
+            yield running.pop(reference), _result(reference)
 
 
-def run_row(row: dict[str, Any], job: Job) -> dict[str, Any]:
-    """A row of a dataset, which has name and source, with what came of it, column by column."""
-    import msgspec
-
-    return {**row, **msgspec.structs.asdict(run_recording(Recording(row["name"], row["source"]), job))}
+def _applied(function: Callable[[T], R], item: T) -> R:
+    return function(item)
 
 
 def _check_answers(address: str) -> None:
@@ -90,24 +99,18 @@ def _check_answers(address: str) -> None:
         socket.create_connection((host, int(port)), _ANSWER_S).close()
 
 
-def _task(job: Job) -> Any:
-    memory = {} if job.limits.memory_mb is None else {"memory": job.limits.memory_mb * 1e6}
-    return ray.remote(run_recording).options(num_cpus=1, max_retries=_REPEATS, **memory)
-
-
 def _at_a_time(most: int | None) -> int:
-    """Machines may join and leave; until one is there, one recording waits for it."""
+    """Machines may join and leave; until one is there, one call waits for it."""
     return most or max(1, _WAITING * int(ray.cluster_resources().get("CPU", 0)))
 
 
-def _outcome(reference: Any, recording: Recording) -> Outcome:
+def _result(reference: Any) -> Any:
     try:
         return ray.get(reference)
-    except _errors.RayTaskError as error:  # what `run_recording` raised, or why it could not be run
-        reason = f"its worker could not do it: {_first_line(error.cause or error)}"
+    except _errors.RayTaskError as error:  # what the function raised, or why it could not be run
+        return Lost(f"its worker could not do it: {_first_line(error.cause or error)}")
     except _errors.RayError as error:
-        reason = f"its worker was lost {_REPEATS + 1} times: {_first_line(error)}"
-    return without_answer(recording, End(None, "", 0.0, 0.0), reason)
+        return Lost(f"its worker was lost {_REPEATS + 1} times: {_first_line(error)}")
 
 
 def _first_line(error: BaseException) -> str:

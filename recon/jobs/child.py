@@ -1,4 +1,4 @@
-"""The process of one recording: started on a core, watched, and ended where it takes too long or too much."""
+"""A process: started on cores of its own, watched, and ended where it takes too long or too much."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatnode.recon.batch import launch
-from splatnode.recon.batch.memory import tree_mb
+from splatnode.recon.jobs import launch
+from splatnode.recon.jobs.memory import tree_mb
 
 _LOOK_EVERY_S = 0.1  # at the memory
 _LARGEST_TAIL = 4096  # bytes of what it said that are looked through for a reason
@@ -22,7 +22,7 @@ _OURS = "splatnode: "  # before a sentence of the command line
 
 @dataclass(frozen=True)
 class Limits:
-    """Of one recording; None: none."""
+    """Of one process; None: none."""
 
     memory_mb: float | None = None  # 10^6 bytes of resident memory, with what its process has started
     timeout_s: float | None = None
@@ -38,21 +38,23 @@ class End:
     memory_mb: float  # the most that was seen, a look each tenth of a second
 
 
+NOT_RUN = End(None, "", 0.0, 0.0)  # of a process that was never begun
+
+
 class Child:
     """A running process."""
 
-    def __init__(self, command: Sequence[str], log: Path, core: int) -> None:
-        """Starts it; what it prints goes into `log`. Raises OSError."""
-        self.core = core
+    def __init__(self, command: Sequence[str], log: Path, cores: Sequence[int]) -> None:
+        """Starts it on `cores`; what it prints goes into `log`. Raises OSError."""
         self._log, self._began_s = log, time.monotonic()
         self._looked_s = self._memory_mb = 0.0
         with log.open("wb") as printed:
             self._process = subprocess.Popen(
-                [sys.executable, "-I", "-S", launch.__file__, str(os.getpid()), str(core), *command],
+                [sys.executable, "-I", "-S", launch.__file__, str(os.getpid()), ",".join(map(str, cores)), *command],
                 stdin=subprocess.DEVNULL,
                 stdout=printed,
                 stderr=subprocess.STDOUT,
-                start_new_session=True,  # who interrupts the driver must not make a recording fail
+                start_new_session=True,  # who interrupts the driver must not make it fail
             )
 
     def ended(self, limits: Limits) -> End | None:

@@ -1,0 +1,32 @@
+"""The cores that this process may use, and which of them is free of other work of this user."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+
+def usable_cores() -> tuple[int, ...]:
+    """Their numbers, rising."""
+    return tuple(sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1))
+
+
+@contextlib.contextmanager
+def free_core() -> Iterator[int]:
+    """A core that no other work is on, of whatever worker of this user; where none is, the one with this turn."""
+    cores = usable_cores()
+    folder = Path(tempfile.gettempdir(), f"splatnode-cores-{os.getuid()}")
+    folder.mkdir(mode=0o700, exist_ok=True)
+    for core in cores:
+        with (folder / str(core)).open("w") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            yield core
+            return
+    yield cores[os.getpid() % len(cores)]
