@@ -45,6 +45,7 @@ BENCHMARKS = {
         "calibrate",
         "occupancy",
         "metres",
+        "motions",
     ),
     "speed": ("rasterize", "stereo", "growth", "throughput"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),

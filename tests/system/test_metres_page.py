@@ -18,6 +18,9 @@ PAGE = re.sub(r"\s+", " ", (ROOT / "docs" / "metres.md").read_text(encoding="utf
 ROWS = json.loads((ROOT / "tests" / "bench" / "results" / "metres.json").read_text())["rows"]
 
 
+MOTIONS = json.loads((ROOT / "tests" / "bench" / "results" / "motions.json").read_text())["rows"]
+
+
 def chosen(what: str, **values: Any) -> list[dict[str, Any]]:
     return [row for row in ROWS if row["what"] == what and all(row.get(key) == value for key, value in values.items())]
 
@@ -42,7 +45,13 @@ def lines() -> list[str]:
         line(f"odometry, {odd}", chosen("poses", kind="way", wrong=None)),
         line(f"{whole}, and one pose wrong by 1 m", wrong("steps")),
         line(f"{odd}, and one pose wrong by 1 m", wrong("way")),
+        line("motions, each off by 2 % of its length", of_motions("motions")),
+        line("motions, and one of them wrong by 1 m", of_motions("slipped")),
     ]
+
+
+def of_motions(what: str) -> list[dict[str, Any]]:
+    return [row for row in MOTIONS if row["what"] == what]
 
 
 def wrong(kind: str) -> list[dict[str, Any]]:
@@ -60,11 +69,20 @@ def sentences() -> list[str]:
         kind: sum(len(set(row["left_out"]) - {row.get("wrong")}) for row in chosen("poses", kind=kind))
         for kind in ("steps", "way")
     }
+    slipped, gravity = of_motions("slipped"), of_motions("gravity")
+    both = [*of_motions("motions"), *slipped]
+    right = sum(row["wrong"] in row["left_out"] for row in slipped)
+    other = sum(len(set(row["left_out"]) - {row.get("wrong")}) for row in both)
+    off = [row["off_deg"] for row in gravity]
+    held = f"{100 * np.mean([row['held'] for row in gravity]):.1f} % of {len(gravity)} trials"
     places = len({row["seed"] for row in ROWS})
     return [
         f"{places} places of the built-in capture",
         f"A baseline that is 20 % off against a marker was refused in {refused} of {asked} trials",
         f"was named in {named['steps'][0]} of {named['steps'][1]} and {named['way'][0]} of {named['way'][1]} trials",
+        f"The motion that was wrong by a metre was named in {right} of {len(slipped)} trials",
+        f"left out {other} times in all {len(both)} trials",
+        f"{np.median(off):.1f} degrees in the median and by {max(off):.1f} at most, within what was told in {held}",
         f"other poses were left out {others['steps']} and {others['way']} times",
     ]
 
