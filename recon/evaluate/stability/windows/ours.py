@@ -18,6 +18,7 @@ from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.frames.screening import screen_all
 from splatnode.recon.ladder.ladder import climbed
 from splatnode.recon.matching.match import match
+from splatnode.recon.matching.moving import without_moving
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.preparation import load_prior, prepare
 
@@ -39,6 +40,7 @@ def answers(
             for frame in kept:
                 known[frame.name] = known.get(frame.name) or prepare(frame, config)
             graph, store = matched(store, [known[frame.name] for frame in kept], prior.matcher)
+            graph = without_moving(graph, prior.matcher)
             started = time.perf_counter()
             estimate = climbed(estimate_cameras(graph, rejected, config), rejected, config)
             seconds = time.perf_counter() - started
@@ -70,7 +72,8 @@ def _true_intrinsics(place: Place, name: str, width: int, height: int) -> Intrin
 def from_scratch(frames: Sequence[Frame], config: Config) -> Estimate:
     """Cameras and verdict of the frames, with nothing kept of other windows."""
     kept, _, rejected = screen_all(frames, config.screening)
-    graph = match([prepare(frame, config) for frame in kept], config.matching, load_prior(config).matcher)
+    matcher = load_prior(config).matcher
+    graph = without_moving(match([prepare(frame, config) for frame in kept], config.matching, matcher), matcher)
     return climbed(estimate_cameras(graph, rejected, config), rejected, config)
 
 
