@@ -2,7 +2,8 @@
 
 What stands still agrees on one geometry for each two photographs. What moves by itself, a person or a vehicle, gives
 matches that agree with each other and not with it. Of two such motions the one on the smaller patch of both
-photographs is the thing's. Walls repeat, too: a point counts as moving where two pairs of photographs say so of it.
+photographs is the thing's. Walls repeat, too: a point counts as moving where two pairs of photographs say so of it, and
+no two say that it stands still: a pattern that repeats stands still where photographs show the same part of the wall.
 """
 
 from __future__ import annotations
@@ -31,6 +32,9 @@ MIN_MATCHES = 40  # of one thing in two photographs: a plane among fewer may be 
 MOST_COMMON = 0.3  # share of a thing's matches that may fit the scene's motion, too
 SMALLER = 0.6  # the thing's patch over the scene's, in both photographs: beyond, nobody can tell which one moves
 VOTES = 2  # pairs of photographs that find a point on a thing
+RESTS = 2  # pairs of photographs in which a point stands still with the scene, so that it is of a wall that repeats
+FEW = 0.3  # share of the points that fit a motion, beside which all others make it the scene's
+MOST_AT_REST = 0.2  # share of a photograph's moving points: where more stand still, all of them do
 MIN_SHOWN = 3  # photographs that a thing must be found in, if there are so many
 ROUNDS = 3  # things of different motion that are looked for, one after the other
 KNOWN_SHARE = 0.5  # of a patch's points that are known to move, for the others of it to move, too
@@ -105,7 +109,7 @@ def moving_points(graph: ViewGraph) -> list[Mask]:
             if group.moves:
                 for side, index in enumerate(group.pair):
                     votes[index][group.matches[:, side]] += 1
-        new = _spread([own >= needed for own in votes], groups)
+        new = _not_at_rest(_spread([own >= needed for own in votes], groups), graph)
         if sum(own.sum() >= _MIN_POINTS for own in new) < min(MIN_SHOWN, len(new)):
             break
         moving = [before | own for before, own in zip(moving, new, strict=True)]
@@ -189,6 +193,20 @@ def _spread(moving: Sequence[Mask], groups: Sequence[_Group]) -> list[Mask]:
             for side, index in enumerate(group.pair):
                 moving[index][group.matches[:, side]] = True
         waiting = [group for group in waiting if group not in known]
+
+
+def _not_at_rest(moving: Sequence[Mask], graph: ViewGraph) -> list[Mask]:
+    """Without those of photographs in which they fit, in RESTS pairs each, the motion of many more points."""
+    rests = [np.zeros(len(own), int) for own in moving]
+    for pair, geometry in graph.pairs.items():
+        for side, index in enumerate(pair):
+            still = np.zeros(len(moving[index]), bool)
+            still[geometry.matches[:, side]] = True
+            own = still & moving[index]
+            if 0 < own.sum() < FEW * still.sum():
+                rests[index] += own
+    at_rest = [(known[own] >= RESTS).mean() if own.any() else 1.0 for own, known in zip(moving, rests, strict=True)]
+    return [own if share < MOST_AT_REST else np.zeros_like(own) for own, share in zip(moving, at_rest, strict=True)]
 
 
 def _patches(keyframe: Keyframe, moving: Mask) -> Mask:
