@@ -45,7 +45,9 @@ MARGIN_PX = 3  # around it, of the reduced photograph
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    enabled: bool = True  # leave out what verified views see through, where all photographs are at hand
+    # Leave out what verified views see through, where all photographs are at hand: something that passed through one of
+    # them. It also takes some surfaces that shine, or that stereo does not know, for such a thing
+    enabled: bool = False
 
 
 @dataclass(frozen=True, eq=False)
