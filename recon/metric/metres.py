@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.capture.right_image import Baseline
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.metric.config import Config
 from splatnode.recon.metric.distances import by_distance
@@ -74,21 +73,21 @@ def _said(snapshot: Snapshot, config: Config, evidence: Evidence) -> tuple[list[
         aligned = None if isinstance(found, str) else found
         said += [found] if isinstance(found, str) else [found.unit, *found.told]
     said += by_motions(views_of(snapshot), evidence.motions, config.motions_shared)
-    for baseline, pairs in _rigs(config, evidence).items():
-        stereo = baseline.metres, baseline.sigma_m
-        said.append(by_stereo(views_of(snapshot), snapshot.landmarks, pairs, *stereo))
+    for (baseline_m, sigma_m), pairs in _rigs(config, evidence).items():
+        said.append(by_stereo(views_of(snapshot), snapshot.landmarks, pairs, baseline_m, sigma_m))
     if config.network:
         said.append(_by_the_network(snapshot, config.network_sigma))
     return said, aligned
 
 
-def _rigs(config: Config, evidence: Evidence) -> dict[Baseline, list[Pair]]:
-    """The stereo pairs by how far apart their cameras are."""
-    usual = None if config.stereo_m is None else Baseline(config.stereo_m, config.stereo_sigma_m)
-    rigs: dict[Baseline, list[Pair]] = {} if usual is None else {usual: []}
+def _rigs(config: Config, evidence: Evidence) -> dict[tuple[float, float], list[Pair]]:
+    """The stereo pairs by how far apart their cameras are, and its standard deviation, metres."""
+    usual = None if config.stereo_m is None else (config.stereo_m, config.stereo_sigma_m)
+    rigs: dict[tuple[float, float], list[Pair]] = {} if usual is None else {usual: []}
     for pair in evidence.pairs:
-        if (baseline := pair.baseline or usual) is not None:
-            rigs.setdefault(baseline, []).append(pair)
+        own = usual if pair.baseline is None else (pair.baseline.metres, pair.baseline.sigma_m)
+        if own is not None:
+            rigs.setdefault(own, []).append(pair)
     return rigs
 
 

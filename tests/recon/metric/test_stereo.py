@@ -100,6 +100,12 @@ def test_a_scene_gets_metres_from_its_pairs():
     assert metric.scale.metric and "2 stereo pairs with 150 mm between the cameras" in (metric.scale.source or "")
 
 
+@pytest.mark.parametrize("sigma_m", [0.0003, 100.0])
+def test_a_baseline_that_is_configured_is_as_the_configuration_allows(sigma_m):
+    metric = in_metres(snapshot(), Config(stereo_m=150.0, stereo_sigma_m=sigma_m), Evidence(pairs=pairs()))
+    assert "150 m between the cameras" in (metric.scale.source or "")
+
+
 def shifted(down: int = 0, across: int = 0, swap: bool = False) -> list[Pair]:
     found = [replace(each, right=np.roll(each.right, (down, across), (0, 1))) for each in pairs()]
     return [replace(each, left=each.right, right=each.left) for each in found] if swap else found
