@@ -76,8 +76,7 @@ def begin_scene(estimate: Estimate, config: Config, all_at_hand: bool = True) ->
     masks = {keyframe.name: keyframe.mask for keyframe in keyframes}
     lenses = {keyframe.name: keyframe.lens for keyframe in keyframes}
     exposures = light.differing(pointmaps, images, config.light)
-    alike = {name: light.alike(images[name], exposure) for name, exposure in exposures.items()}
-    images |= alike
+    images = light.in_one_light(images, exposures)
     seen_through = _seen_through(pointmaps, images, masks, config) if all_at_hand else {}
     for name, hidden in seen_through.items():
         free, own = ~hidden, masks[name]

@@ -111,11 +111,16 @@ def photograph(config: Config, camera: Camera, noise_seed: int = 0) -> npt.NDArr
 
 
 def _right_image(config: Config, camera: Camera, index: int, baseline_m: float) -> RightImage:
-    """What a second camera sees, with the same axes and lens."""
+    seen = photograph(config, right_of(camera, baseline_m), _RIGHT_SEED + index)
+    return RightImage(grey(seen), Baseline(baseline_m))
+
+
+def right_of(camera: Camera, baseline_m: float) -> Camera:
+    """The right one of a stereo camera whose left one is `camera`: of the same axes and lens."""
     T_world_camera, K = camera
     beside = T_world_camera.copy()
     beside[:3, 3] += baseline_m * T_world_camera[:3, 0]
-    return RightImage(grey(photograph(config, (beside, K), _RIGHT_SEED + index)), Baseline(baseline_m))
+    return beside, K
 
 
 def depth(config: Config, index: int) -> npt.NDArray[np.float32]:

@@ -130,7 +130,7 @@ def to_message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
         given_pose=or_left_out(frame.given_pose),
         motion=or_left_out(frame.motion),
         gravity=or_left_out(frame.gravity),
-        baseline=UNSET if frame.right is None else frame.right.baseline,
+        baseline=or_left_out(frame.right and frame.right.baseline),
     )
     return encode(header, arrays_of(frame))
 

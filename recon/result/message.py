@@ -17,6 +17,7 @@ import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
 from splatnode.capture.frame import LARGEST_SIDE, DroppedFrame, Intrinsics
+from splatnode.capture.left_out import or_left_out, or_none
 from splatnode.capture.messaging.jpeg import from_jpeg, to_jpeg
 from splatnode.capture.messaging.values import Amount, Count, Finite, Name, Text
 from splatnode.capture.messaging.wire import Header, Message, WireError
@@ -212,7 +213,7 @@ def camera_record(camera: CameraEstimate) -> CameraRecord:
         height=camera.height,
         bounds=bounds_record(camera.bounds),
         captured_at=camera.captured_at,
-        lens=UNSET if camera.lens is None else camera.lens,
+        lens=or_left_out(camera.lens),
     )
 
 
@@ -226,7 +227,7 @@ def camera_from(record: CameraRecord) -> CameraEstimate:
         height=record.height,
         bounds=bounds_from(record.bounds),
         captured_at=record.captured_at,
-        lens=None if record.lens is UNSET else record.lens,
+        lens=or_none(record.lens),
     )
 
 

@@ -48,7 +48,7 @@ def grow(
     exposures = light.joining(seen, images, further, lit, lighting)
     begun = initialisation.initial_scene(
         seen,
-        images | {name: light.alike(images[name], exposure) for name, exposure in exposures.items()},
+        light.in_one_light(images, exposures),
         initialisation.Config(
             completion=config.completion,
             seeding=config.seeding,

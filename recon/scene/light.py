@@ -91,6 +91,11 @@ def exposed(image: Image, gains: Array) -> Exposure:
     return Exposure((red, green, blue), _saturated(image, gains))
 
 
+def in_one_light(images: Mapping[str, Image], exposures: Mapping[str, Exposure]) -> dict[str, Image]:
+    """The photographs, by name: those that have an exposure as gains of 1 would have them, the others as they are."""
+    return {name: alike(image, exposures[name]) if name in exposures else image for name, image in images.items()}
+
+
 def relit(image: Image, gains: Sequence[float] | None) -> tuple[Image, Exposure | None]:
     """The photograph `image` in the light of its scene, and the exposure taken out; as it is without gains."""
     if gains is None:

@@ -54,7 +54,7 @@ def file_name(number: int) -> str:
 def write_frame(path: Path, key: tuple[str, int], frame: Frame) -> None:
     """Whole or not at all; `key` is its session and sequence. Raises OSError."""
     moved = or_left_out(frame.given_pose), or_left_out(frame.motion), or_left_out(frame.gravity)
-    baseline = UNSET if frame.right is None else frame.right.baseline
+    baseline = or_left_out(frame.right and frame.right.baseline)
     known = frame.name, frame.stamp_ns, frame.intrinsics, frame.captured_at
     header = FrameRecord(VERSION, *key, *known, *moved, baseline)
     write_message(path, encode(header, arrays_of(frame)))
