@@ -6,6 +6,7 @@ import math
 import struct
 from collections.abc import Iterator, Mapping
 
+from splatnode.capture.exposure_settings import ExposureSettings, as_told
 from splatnode.capture.frame import Intrinsics
 
 IMAGE_WIDTH, IMAGE_LENGTH = 0x0100, 0x0101
@@ -14,6 +15,8 @@ FOCAL_LENGTH = 0x920A  # mm
 PIXEL_X_DIMENSION, PIXEL_Y_DIMENSION = 0xA002, 0xA003
 FOCAL_PLANE_X_RESOLUTION, FOCAL_PLANE_RESOLUTION_UNIT = 0xA20E, 0xA210
 FOCAL_LENGTH_35MM = 0xA405
+EXPOSURE_TIME, F_NUMBER = 0x829A, 0x829D  # seconds; focal length over aperture
+PHOTOGRAPHIC_SENSITIVITY = 0x8827  # ISO
 
 Tags = Mapping[int, tuple[float, ...]]
 
@@ -22,6 +25,7 @@ _ASPECT_TOLERANCE = 0.02  # relative; cameras round sides to whole blocks of pix
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 _MOST_VALUES = 16  # of a tag; texts, thumbnails and maker notes have more
 _ASCII, _LONGEST_TEXT = 2, 64  # TIFF type; characters
+_MOST_SENSITIVE = 65_535  # it has 16 bits: this value says that the sensitivity is beyond them (EXIF 2.32, 4.6.5)
 _FORMATS = {1: "B", 3: "H", 4: "I", 5: "II", 8: "h", 9: "i", 10: "ii"}  # TIFF type -> struct codes of one value
 # From a fisheye to a long telephoto lens; what lies outside is a wrong tag.
 _ORDERS = {b"II*\0": "<", b"MM\0*": ">"}  # byte order of struct, by how a TIFF structure begins
@@ -101,6 +105,14 @@ def exif_intrinsics(tags: Tags, width: int, height: int) -> Intrinsics | None:
     if focal is None or not _PLAUSIBLE_FOCAL[0] <= focal / longer <= _PLAUSIBLE_FOCAL[1]:
         return None
     return Intrinsics(width, height, fx=focal, fy=focal, cx=width / 2, cy=height / 2, source="exif")
+
+
+def exif_exposure(tags: Tags) -> ExposureSettings | None:
+    """How the photograph was exposed; None where the tags do not tell time and sensitivity."""
+    sensitivity = first(tags, PHOTOGRAPHIC_SENSITIVITY)
+    if sensitivity == _MOST_SENSITIVE:
+        return None
+    return as_told(first(tags, EXPOSURE_TIME), sensitivity, first(tags, F_NUMBER))
 
 
 def _focal_from_35mm(tags: Tags, width: int, height: int) -> float | None:

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.gravity import Gravity
 from splatnode.capture.motion import Motion
@@ -95,6 +96,7 @@ class Frame:
     motion: Motion | None = None  # of its camera since earlier frames, by wheels or an IMU; None: nobody knows
     gravity: Gravity | None = None  # in its camera's frame; None: nobody knows
     right: RightImage | None = field(default=None, repr=False)  # of a stereo camera, whose left image is `image`
+    exposure: ExposureSettings | None = None  # as its camera or its EXIF tells; None: nobody knows
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", printable(self.name, LONGEST_NAME))
@@ -162,10 +164,11 @@ def framed(
     motion: Motion | None = None,
     gravity: Gravity | None = None,
     right: RightImage | None = None,
+    exposure: ExposureSettings | None = None,
 ) -> Frame | DroppedFrame:
     """What a camera or a file gave as a Frame; left out, with the reason, where it keeps a Frame's bounds not."""
     try:
-        came = given_pose, motion, gravity, right
+        came = given_pose, motion, gravity, right, exposure
         return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at, mask, *came)
     except ValueError as error:
         return DroppedFrame(name, f"it cannot be used: {error}")
@@ -174,5 +177,5 @@ def framed(
 def renamed(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame | DroppedFrame:
     """The same image as another frame, which may be beyond a Frame's bounds."""
     known = frame.image, frame.intrinsics, frame.encoded, frame.captured_at, frame.mask
-    came = frame.given_pose, frame.motion, frame.gravity, frame.right
+    came = frame.given_pose, frame.motion, frame.gravity, frame.right, frame.exposure
     return framed(frame_id, name, stamp_ns, *known, *came)

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from splatnode.capture import exif, heif_file
 from splatnode.capture.exif_time import exif_time
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.image_header import UnusableImage, read_header
 from splatnode.capture.process.bounded_file import read_bounded
@@ -33,11 +34,12 @@ _FURTHER_FILE_BYTES = 64_000_000  # what a telephone puts behind a photograph: a
 
 
 class DecodedImage(NamedTuple):
-    """An image, and what its EXIF tells: of the camera, and when it was taken."""
+    """An image, and what its EXIF tells: of the camera, when it was taken, and how it was exposed."""
 
     image: npt.NDArray[np.uint8]  # (H, W, 3) RGB, upright
     intrinsics: Intrinsics | None
     captured_at: Stamp | None
+    exposure: ExposureSettings | None
 
 
 def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
@@ -56,8 +58,7 @@ def decode_photograph(data: bytes, max_pixels: int = MAX_PIXELS) -> DecodedImage
     if not heif_file.is_heif(data):
         return decode_image(data, max_pixels)
     image, tiff = heif_file.decode(data, max_pixels)
-    height, width = image.shape[:2]
-    return DecodedImage(image, exif.exif_intrinsics(exif.read_tags(tiff), width, height), exif_time(tiff))
+    return _with_exif(image, tiff)
 
 
 def check_whole(data: bytes) -> None:
@@ -69,7 +70,7 @@ def check_whole(data: bytes) -> None:
 
 
 def decode_image(data: bytes, max_pixels: int = MAX_PIXELS) -> DecodedImage:
-    """The image (H, W, 3) uint8 RGB, upright after its EXIF orientation, with the camera and time that its EXIF tells.
+    """The image (H, W, 3) uint8 RGB, upright after its EXIF orientation, with what its EXIF tells.
 
     Grey becomes RGB, 16 bits become the upper 8, and alpha is dropped: the colours beneath it are kept as stored, as
     COLMAP does. Of a file with several pages, the first. It takes at most BYTES_A_PIXEL of memory for each of
@@ -84,9 +85,14 @@ def decode_image(data: bytes, max_pixels: int = MAX_PIXELS) -> DecodedImage:
         if sorted((width, height)) != sorted((header.width, header.height)):
             stated = f"{header.width} x {header.height}"
             raise UnusableImage(f"damaged: it states {stated} pixels and is decoded to {width} x {height}")
-        intrinsics = exif.exif_intrinsics(exif.read_tags(header.exif), width, height)
-        rgb = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
-        return DecodedImage(rgb, intrinsics, exif_time(header.exif))
+        return _with_exif(cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False), header.exif)
+
+
+def _with_exif(image: npt.NDArray[np.uint8], tiff: bytes) -> DecodedImage:
+    """The image (H, W, 3) RGB with what its EXIF tells, whose bytes begin with a TIFF header."""
+    tags = exif.read_tags(tiff)
+    intrinsics = exif.exif_intrinsics(tags, image.shape[1], image.shape[0])
+    return DecodedImage(image, intrinsics, exif_time(tiff), exif.exif_exposure(tags))
 
 
 def _decode(data: bytes) -> npt.NDArray:

@@ -11,6 +11,7 @@ import msgspec
 
 from splatnode.capture.messaging.network import Network, runtime_directory
 from splatnode.capture.process.private import StrayFile, create_own, read_own
+from splatnode.capture.process.records import record_in
 
 Number = Annotated[int, msgspec.Meta(ge=0, lt=1 << 62)]
 
@@ -49,7 +50,7 @@ def end_run(network: Network, frames: int, keyframes: int) -> None:
 def last_run(network: Network) -> LastRun | None:
     """How capture ended on this machine; None where that is not known, or it was stopped. Raises NetworkError."""
     with contextlib.suppress(OSError, StrayFile, msgspec.MsgspecError):
-        return msgspec.json.decode(read_own(_path(network), _MOST_BYTES), type=LastRun)
+        return record_in(read_own(_path(network), _MOST_BYTES), LastRun)
     return None
 
 

@@ -17,6 +17,7 @@ from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.config_text import MAX_BYTES, ConfigError, parse_yaml
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import printable
+from splatnode.capture.process.records import record_of
 
 # What each of COLMAP's models holds, in its order. f is fx and fy.
 _COLMAP = {
@@ -76,7 +77,7 @@ def _of_ours(shown: str, content: Mapping[str, Any]) -> Intrinsics:
     told = {"source": "calibration", **told} if isinstance(told, dict) else told
     known = {field.name for field in dataclasses.fields(Intrinsics)}
     try:
-        lens = msgspec.convert(told, Intrinsics)
+        lens = record_of(told, Intrinsics)
     except msgspec.ValidationError as error:
         raise UnusableLens(f"{shown} must give {_READ}: {error}") from error
     if unknown := sorted(set(told) - known):

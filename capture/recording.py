@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.gravity import Gravity
@@ -30,6 +31,7 @@ from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.durable import sync_folder
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import LONGEST_NAME, is_printable, marked_name, printable
+from splatnode.capture.process.records import record_in
 from splatnode.capture.right_image import Baseline, RightImage, grey
 from splatnode.capture.stamp import Stamp
 
@@ -64,6 +66,7 @@ class _Line(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="frame"
     motion: Motion | UnsetType = UNSET
     gravity: Gravity | UnsetType = UNSET
     right: _Right | UnsetType = UNSET
+    exposure: ExposureSettings | UnsetType = UNSET
 
 
 class _DroppedLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="dropped"):
@@ -106,7 +109,7 @@ class Recorder:
         digest = _write(path, content)
         moved = or_left_out(item.given_pose), or_left_out(item.motion), or_left_out(item.gravity)
         right = UNSET if item.right is None else self._write_right(item.right)
-        known = path.name, digest, item.captured_at, *moved, right
+        known = path.name, digest, item.captured_at, *moved, right, or_left_out(item.exposure)
         self._append(_Line(item.name, item.stamp_ns, item.intrinsics, *known))
         self.frames += 1
         if self.frames % _SYNC_EVERY == 0:
@@ -189,7 +192,7 @@ class Recording:
             return DroppedFrame(line.name, f"cannot be read: {error.strerror}")
         known = image, line.intrinsics, content, line.captured_at
         moved = or_none(line.given_pose), or_none(line.motion), or_none(line.gravity)
-        return framed(frame_id, line.name, line.stamp_ns, *known, None, *moved, right)
+        return framed(frame_id, line.name, line.stamp_ns, *known, None, *moved, right, or_none(line.exposure))
 
     def _image(self, file: str, sha256: str, max_pixels: int) -> tuple[bytes, npt.NDArray[np.uint8]]:
         """The file, and its image (H, W, 3) RGB. Raises UnusableImage where it is not the recorded one, and OSError."""
@@ -223,7 +226,7 @@ def read(folder: Path) -> Recording:
     for number, text in enumerate(whole.splitlines(), start=1):
         where = f"{folder / INDEX}, line {number}"
         with foreign(RecordingError, where):
-            line = msgspec.json.decode(text, type=_Line | _DroppedLine)
+            line = record_in(text, _Line | _DroppedLine)
         for file in _files_of(line):
             if Path(file).name != file or not is_printable(file, LONGEST_NAME):
                 raise RecordingError(f"{where}: {printable(file, LONGEST_NAME)!r} is not a file of this folder")

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+
+from splatnode.capture.process.printable import printable
 
 LONGEST_M = 100.0  # between two cameras that see one thing
 SIGMA_M = 0.0003  # standard deviation of a baseline where nobody tells any
@@ -40,6 +43,23 @@ class RightImage:
     def __post_init__(self) -> None:
         if self.image.ndim != 2 or self.image.dtype != np.uint8:
             raise ValueError(f"a right image must be (H, W) uint8, got {self.image.shape} {self.image.dtype}")
+
+
+def partners(lefts: Sequence[str], rights: Sequence[str]) -> dict[str, str]:
+    """The name of the right photograph of each left one that has one: both have one name, whatever their suffixes.
+
+    Raises ValueError where none has a partner.
+    """
+    right_of = {_stem(name): name for name in rights}
+    found = {name: right_of[_stem(name)] for name in lefts if _stem(name) in right_of}
+    if not found:
+        first = printable(lefts[0] if lefts else "none", 100)
+        raise ValueError(f"no right photograph has the name of a left one, such as {first}; name both of a pair alike")
+    return found
+
+
+def _stem(name: str) -> str:
+    return name.rpartition(".")[0] or name
 
 
 def grey(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:

@@ -12,8 +12,9 @@ import os
 import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import IO
@@ -29,6 +30,7 @@ MAX_VIDEO_PIXELS = 36_000_000  # of a frame: 8192 x 4320
 BYTES_A_PIXEL = 80  # of memory at most for the decoder: its frames in flight, in colour, and what it refers to
 BASE_BYTES = 500_000_000  # further ones, whatever the size of a frame
 _MAX_THREADS = 8  # each has a frame of its own
+_LEAD = 10  # frames before a part of a video, whose times tell whether the way there was exact
 _AV1 = int.from_bytes(b"AV01", "little")  # OpenCV's number of the codec, which its wheels know and cannot decode
 _NEEDS_AV = 3  # exit code
 _START, _FRAME = struct.Struct("<d"), struct.Struct("<QII")  # frames a second; index, width, height
@@ -106,7 +108,7 @@ def main() -> None:
     span = Span(float(sys.argv[4]), float(sys.argv[5]))
     apart.limit_memory(BASE_BYTES + BYTES_A_PIXEL * max_pixels)
     threads = min(_MAX_THREADS, os.cpu_count() or 1)
-    video = cv2.VideoCapture(file, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, threads])
+    video = _opened(file, threads)
     if not video.isOpened():
         return
     is_av1 = round(video.get(cv2.CAP_PROP_FOURCC)) == _AV1
@@ -118,11 +120,22 @@ def main() -> None:
         video.release()
         _write_by_av(out, Path(file), every, max_pixels, span, threads)
     else:
-        _write_by_opencv(out, video, every, max_pixels, span)
+        _write_by_opencv(out, video, partial(_opened, file, threads), every, max_pixels, span)
 
 
-def _write_by_opencv(out: IO[bytes], video: cv2.VideoCapture, every: int, max_pixels: int, span: Span) -> None:
-    """All frames before the span are decoded, too: OpenCV's way to a frame is not exact."""
+def _opened(file: str, threads: int) -> cv2.VideoCapture:
+    return cv2.VideoCapture(file, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, threads])
+
+
+def _write_by_opencv(
+    out: IO[bytes],
+    video: cv2.VideoCapture,
+    again: Callable[[], cv2.VideoCapture],
+    every: int,
+    max_pixels: int,
+    span: Span,
+) -> None:
+    """`again` opens the video from its beginning."""
     rate = video.get(cv2.CAP_PROP_FPS)
     out.write(_START.pack(rate))
     width, height = (round(video.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
@@ -130,7 +143,9 @@ def _write_by_opencv(out: IO[bytes], video: cv2.VideoCapture, every: int, max_pi
         out.write(_FRAME.pack(0, width, height))
         return
     first, end = round(span.from_s * rate), math.inf if math.isinf(span.to_s) else round(span.to_s * rate)
-    index = 0
+    index = first if _sought(video, first, rate) else 0
+    if index < first:  # all frames before it are decoded, too
+        video = again()
     while index < end and video.grab():
         if index >= first and (index - first) % every == 0:
             found, image = video.retrieve()
@@ -138,6 +153,24 @@ def _write_by_opencv(out: IO[bytes], video: cv2.VideoCapture, every: int, max_pi
                 height, width = image.shape[:2]
                 out.write(_FRAME.pack(index, width, height) + image.tobytes())
         index += 1
+
+
+def _sought(video: cv2.VideoCapture, first: int, rate: float) -> bool:
+    """Whether the next frame is the `first` of a span without all that lies before; if not, the video is anywhere.
+
+    OpenCV promises no exact way to a frame. So it goes to one a little before, and from there on the times tell.
+    """
+    if first <= _LEAD or not video.set(cv2.CAP_PROP_POS_FRAMES, first - _LEAD):
+        return False
+    before = None
+    while video.grab():
+        place = round(video.get(cv2.CAP_PROP_POS_MSEC) / 1000.0 * rate)
+        if before is not None and place != before + 1:
+            return False
+        if place >= first - 1:
+            return place == first - 1
+        before = place
+    return False
 
 
 def _write_by_av(out: IO[bytes], file: Path, every: int, max_pixels: int, span: Span, threads: int) -> None:

@@ -18,24 +18,28 @@ from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.choosing import THINNED
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.lens_file import read_lens
+from splatnode.capture.poses_file import poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.progress import Step, Tell, telling
 from splatnode.capture.process.terminal import say
 from splatnode.recon import cost
 from splatnode.recon.config import Config, overlaid, preset
 from splatnode.recon.evaluate import methods
-from splatnode.recon.evaluate.bench import Entrants, Plan, Scoring, run_bench, run_line
+from splatnode.recon.evaluate.bench import Entrants, Plan, run_bench, run_line
 from splatnode.recon.evaluate.demo import largest_capture_bytes, write_held_out, write_photographs
 from splatnode.recon.evaluate.metrics import psnr
-from splatnode.recon.evaluate.protocol import INTERPOLATED_START, Networks, Run, Settings, evaluate, load_networks
-from splatnode.recon.evaluate.records import merged, read_bench
+from splatnode.recon.evaluate.one_run import Scoring
+from splatnode.recon.evaluate.perceptual import Networks, load_networks
+from splatnode.recon.evaluate.protocol import INTERPOLATED_START, Run, Settings, evaluate
+from splatnode.recon.evaluate.records import Bench, merged, read_bench
 from splatnode.recon.evaluate.report import redraw
 from splatnode.recon.evaluate.splits import Split
+from splatnode.recon.evaluate.timing import untimed
 from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.jobs.calls import engine as opened
 from splatnode.recon.mapping.command import replay_map
 from splatnode.recon.metric.arguments import metric_changes
 from splatnode.recon.metric.evidence import Evidence
-from splatnode.recon.metric.poses_file import poses_of, read_poses
 from splatnode.recon.metric.stereo_pairs import pairs_of, rights_in
 from splatnode.recon.offline import check_baseline, reconstructed, run, shown_to_nobody, with_looks
 from splatnode.recon.rasterize import device
@@ -167,27 +171,47 @@ def bench(args: argparse.Namespace) -> int:
     if args.redraw:
         found = merged([read_bench(path) for path in args.redraw])
     else:
-        chosen = methods.chosen(args.methods)
-        wanted = args.device or "cpu"
-        found = run_bench(
-            Plan(tuple(args.scenes), args.views, chosen, tuple(range(args.seeds)), args.checkpoints),
-            Entrants(partial(methods.by_name, device=wanted), methods.start_of),
-            args.out,
-            scoring=Scoring(
-                rasterizer(device.chosen(wanted)),
-                load_networks(args.weights_dir),
-                replace(INTERPOLATED_START if args.interpolated_start else Settings(), best_gain=args.best_gain),
-                args.by_region,
-            ),
-            command=shlex.join(["splatnode", *sys.argv[1:]]),
-            resume=args.resume,
-        )
+        found = _benched(args)
         for row in found.rows:
             if row.final:
                 say(run_line(row))
+        if why := untimed([row.others for row in found.rows if row.final]):
+            say(why)
     redraw(found, args.out)
     say(f"results: {args.out}/ (report.html, report.md, bench.json, bench.csv)")
     return EXIT_GOOD
+
+
+def _benched(args: argparse.Namespace) -> Bench:
+    wanted = args.device or "cpu"
+    on = device.chosen(wanted)
+    one_gpu = on.type != "cpu" and (args.ray is not None or (args.cores or 1) > 1)
+    plan = Plan(
+        tuple(args.scenes),
+        args.views,
+        methods.chosen(args.methods),
+        tuple(range(args.seeds)),
+        args.checkpoints,
+        args.timeout_s,
+        args.max_memory,
+        timed=not one_gpu,
+    )
+    scoring = Scoring(
+        rasterizer(on),
+        partial(load_networks, args.weights_dir and args.weights_dir.absolute()),
+        replace(INTERPOLATED_START if args.interpolated_start else Settings(), best_gain=args.best_gain),
+        args.by_region,
+    )
+    with opened(args.cores, args.ray) as engine:
+        return run_bench(
+            plan,
+            Entrants(partial(methods.by_name, device=wanted), methods.start_of),
+            args.out,
+            scoring=scoring,
+            command=shlex.join(["splatnode", *sys.argv[1:]]),
+            resume=args.resume,
+            engine=engine,
+        )
 
 
 def _known_of_metres(args: argparse.Namespace, given: Source) -> Evidence:

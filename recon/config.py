@@ -34,6 +34,7 @@ PREVIEW = refinement.Config(
     iterations=20,
     half_resolution_share=1.0,
     dssim=0.2,
+    first_opacity=None,
     dropout=dropout.Config(share=0.0),
     rates=refinement.CAUTIOUS,
     control=None,
@@ -43,14 +44,18 @@ PREVIEW = refinement.Config(
 class Ladder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What is tried before photographs are refused or left out for want of matches."""
 
-    seconds: Annotated[float, Meta(ge=0)] = 4.0  # in which further work begins, seconds; what has begun is finished
+    # Within which further work begins; what has begun is finished. A second of one core that does nothing else is about
+    # 1, but it is counted by what is done, not by a clock: the same photographs get the same work on any machine
+    work: Annotated[float, Meta(ge=0)] = 4.0
+    # Nothing further begins after so long, by the clock, for who cannot wait. None: no clock decides; in a node it is 4
+    most_s: Annotated[float, Meta(ge=0)] | None = None
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     size: Annotated[int, Meta(ge=64)] = 512  # longer side of the modelled images, pixels
     # Of the generators of random numbers: the same seed and photographs give the same scene
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
-    device: Device = "cpu"  # that Gaussians are refined on; cuda was never run by us
+    device: Device = "cpu"  # that Gaussians are refined on; cuda was run once by us, on an NVIDIA H200
     quick: bool = False  # the first answer stands, also where it is no: nothing that takes longer is tried
     # What gives depth, and matches that plain features miss
     prior: PriorChoice = PriorChoice("classical", classical.Config())

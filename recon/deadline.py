@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 
@@ -19,3 +20,8 @@ def pausing_until(deadline: float | None, pause: Callable[[], None] = lambda: No
             raise OutOfTime
 
     return ask
+
+
+def is_over(until: float) -> bool:
+    """Whether it is `until` or later, a time of `time.monotonic()`; of infinity, which is never, no clock is asked."""
+    return until < math.inf and time.monotonic() >= until

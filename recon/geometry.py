@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -15,6 +16,7 @@ Array = npt.NDArray[np.float64]
 ArrayOrTensor = TypeVar("ArrayOrTensor", Array, Tensor)
 
 MIN_DEPTH = 1e-9  # of a point that is projected; the scene's median depth is 1. Nearer points count as that near
+_STRONG = 0.1  # radial coefficient from which on undoing it takes more steps
 
 
 def to_camera(points: ArrayOrTensor, T_world_camera: ArrayOrTensor) -> ArrayOrTensor:
@@ -75,6 +77,34 @@ def quat_from_matrix(rotation: Tensor) -> Tensor:
     quat = torch.gather(outer, -2, row[..., None, None].expand(*row.shape, 1, 4))[..., 0, :]
     quat = quat / quat.norm(dim=-1, keepdim=True)
     return torch.where(quat[..., :1] < 0, -quat, quat)
+
+
+def matrices_from_quats(quats: Tensor) -> Tensor:
+    """(N, 3, 3) rotation matrices of quaternions (N, 4) wxyz of any length but zero, in as few operations as can be.
+
+    Each is a launch on a GPU. A matrix, times the squared length, is linear in the products of two components. To be
+    read are `rasterize.reference.rotations` and, without torch, `result.export.quaternions`.
+    """
+    products = (quats[:, :, None] * quats[:, None, :]).flatten(1)  # (N, 16)
+    rows, squared_lengths = (products @ _of_products(quats.dtype, quats.device)).split((9, 1), 1)
+    return (rows / squared_lengths).unflatten(1, (3, 3))
+
+
+@lru_cache(maxsize=8)
+def _of_products(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(16, 10): ww, wx, .. zz to the rows of the matrix and the squared length, of quaternions wxyz."""
+    w, x, y, z = range(4)
+    signs = [
+        {(w, w): 1, (x, x): 1, (y, y): -1, (z, z): -1}, {(x, y): 2, (w, z): -2}, {(x, z): 2, (w, y): 2},
+        {(x, y): 2, (w, z): 2}, {(w, w): 1, (x, x): -1, (y, y): 1, (z, z): -1}, {(y, z): 2, (w, x): -2},
+        {(x, z): 2, (w, y): -2}, {(y, z): 2, (w, x): 2}, {(w, w): 1, (x, x): -1, (y, y): -1, (z, z): 1},
+        {(w, w): 1, (x, x): 1, (y, y): 1, (z, z): 1},
+    ]  # fmt: skip
+    table = np.zeros((4, 4, 10))
+    for column, terms in enumerate(signs):
+        for (first, second), factor in terms.items():
+            table[first, second, column] = factor
+    return torch.from_numpy(table.reshape(16, 10)).to(device, dtype)
 
 
 def multiply_quats(a: Tensor, b: Tensor) -> Tensor:
@@ -162,3 +192,25 @@ def align_cameras(Ts_source: Array, Ts_target: Array) -> Similarity:
     scale = float((source_centred * target_centred).sum() / max((source_centred**2).sum(), 1e-18))
     scale = scale if scale > 1e-9 else 1.0
     return Similarity(scale, rotation, target.mean(0) - scale * source.mean(0))
+
+
+def distortion(squared_radii: Array, radials: Array) -> Array:
+    """(M,) by which a lens with radial coefficients (2,) or (M, 2) lengthens rays at depth 1 of squared lengths (M,).
+
+    It is 1 + k1 r^2 + k2 r^4, the first two terms of Brown's model ("Decentering distortion of lenses", 1966).
+    """
+    return 1.0 + (radials[..., 0] + radials[..., 1] * squared_radii) * squared_radii
+
+
+def without_distortion(rays: Array, radials: Array) -> Array:
+    """(M, 2) at depth 1 what a lens with radial coefficients (2,) or (M, 2) shows at `rays` (M, 2)."""
+    found = rays
+    for _ in range(undistort_iterations(radials)):
+        found = rays / distortion((found**2).sum(1), radials)[:, None]
+    return found
+
+
+def undistort_iterations(radials: Array) -> int:
+    """How many steps of its fixed-point iteration undo a distortion to a hundredth of a pixel."""
+    largest = float(np.abs(radials).max(initial=0.0))
+    return 0 if largest == 0 else 5 if largest < _STRONG else 20

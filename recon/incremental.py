@@ -20,6 +20,7 @@ from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.frames.screening import Rejected, Screened
 from splatnode.recon.ladder.ladder import climbed
 from splatnode.recon.matching.match import completed, matched_soon
+from splatnode.recon.matching.moving import without_moving
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.memory import Key, Memory
 from splatnode.recon.modelling import Shown, begin_scene, in_words, refined, shown, snapshot
@@ -125,8 +126,7 @@ class IncrementalReconstruction:
             self.clock = Clock()
         self.clock.lap("wait")
         rejected = self.screen(frame)
-        for each in rejected:
-            self.drop(DroppedFrame(each.name, each.reason))
+        self.dropped += [DroppedFrame(each.name, each.reason) for each in rejected]
         self.retract({each.name for each in rejected})
         self.clock.lap("poses")
         if frame.name in self._known.screened.summaries:
@@ -197,8 +197,8 @@ class IncrementalReconstruction:
             return estimate
         self.clock.lap("wait")
         self.complete(pause)
-        rejected = self._known.screened.rejected
-        estimate = estimate_cameras(self.graph, rejected, self.config, pause)
+        graph, rejected = without_moving(self.graph, self._prior.matcher, pause=pause), self._known.screened.rejected
+        estimate = estimate_cameras(graph, rejected, self.config, pause)
         self.clock.lap("poses")
         estimate = climbed(estimate, rejected, self.config, pause)
         self._remember(estimate)
@@ -246,7 +246,7 @@ class IncrementalReconstruction:
         estimate, scene = self.estimate_soon(pause), self.scene
         if scene is None or estimate.registration is None or not estimate.verdict.publishable:
             return False
-        beside = warping.beside(scene, estimate.registration, self.graph, estimate.verdict.provisional)
+        beside = warping.beside(scene, estimate.registration, estimate.graph, estimate.verdict.provisional)
         carried = warping.updated_pointmaps(self._known.pointmaps, beside.registration, beside.graph) if beside else {}
         moved = beside and warping.warped_scene(beside.scene, self._known.pointmaps, carried, MAX_CAMERA_SHIFT)
         if beside is None or moved is None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from splatnode.recon.estimation import Estimate
 
 REMEMBERED = 8  # estimates: a keyframe that is tried with each of several others, and taken back
+REMEMBERED_MASKED = 2  # estimates with things that move, whose photographs are copies without these
 REMEMBERED_REFUSED = 100  # sets of keyframes of which nothing came: they need not be tried again
 
 Key = tuple[tuple[str, ...], int]  # the keyframes' names, and how many frames were rejected beside them
@@ -27,8 +28,10 @@ class Memory:
 
     def remember(self, key: Key, estimate: Estimate) -> Memory:
         """With this estimate as the latest one."""
-        others = [(known, before) for known, before in self.recent if known != key]
-        memory = replace(self, recent=(*others, (key, estimate))[-REMEMBERED:])
+        recent = [*((known, before) for known, before in self.recent if known != key), (key, estimate)][-REMEMBERED:]
+        masked = [known for known, before in recent if any(keyframe.moving for keyframe in before.graph.keyframes)]
+        gone = masked[:-REMEMBERED_MASKED]
+        memory = replace(self, recent=tuple((known, before) for known, before in recent if known not in gone))
         if estimate.verdict.provisional:
             return memory
         names = frozenset(key[0])

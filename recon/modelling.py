@@ -30,6 +30,7 @@ from splatnode.recon.scene import denied, growth, light
 from splatnode.recon.scene.first_look import first_look
 from splatnode.recon.scene.initialisation import initial_scene
 from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene.told_light import told_logs
 
 COARSE = "Coarse so far: the matched points alone; depth and refinement follow."
 
@@ -75,7 +76,8 @@ def begin_scene(estimate: Estimate, config: Config, all_at_hand: bool = True) ->
     images = {keyframe.name: keyframe.image for keyframe in keyframes}
     masks = {keyframe.name: keyframe.mask for keyframe in keyframes}
     lenses = {keyframe.name: keyframe.lens for keyframe in keyframes}
-    exposures = light.differing(pointmaps, images, config.light)
+    told = told_logs(keyframe for keyframe in keyframes if keyframe.name in estimate.pointmaps)
+    exposures = light.differing(pointmaps, images, config.light, told)
     images = light.in_one_light(images, exposures)
     seen_through = _seen_through(pointmaps, images, masks, config) if all_at_hand else {}
     for name, hidden in seen_through.items():
@@ -166,8 +168,21 @@ def snapshot(
         depths=_confirmed(scene) if scene and final else {},
         masked=conclusion.masked,
         moving=_moving(conclusion, scene),
-        gains={view.name: view.exposure.gains for view in scene.views if view.exposure is not None} if scene else {},
+        gains=_gains(scene) if scene else {},
+        falloffs=_falloffs(scene) if scene else {},
     )
+
+
+def _falloffs(scene: Scene) -> dict[str, float]:
+    """By photograph whose lens's vignetting was taken out: its falloff."""
+    lit = {view.name: view.exposure for view in scene.views if view.exposure is not None}
+    return {name: exposure.falloff for name, exposure in lit.items() if exposure.falloff}
+
+
+def _gains(scene: Scene) -> dict[str, tuple[float, float, float]]:
+    """By photograph; none where all are as they were."""
+    found = {view.name: view.exposure.gains for view in scene.views if view.exposure is not None}
+    return found if any(gains != (1.0, 1.0, 1.0) for gains in found.values()) else {}
 
 
 def _moving(conclusion: Conclusion, scene: Scene | None) -> dict[str, float]:

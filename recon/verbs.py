@@ -81,7 +81,9 @@ def _audit_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="RECORDING",
-        help="folders in the order of time: a photograph a camera, of the camera's name, or a folder a camera",
+        help="in the order of time: a folder of photographs (one a camera, of the camera's name, or a folder a "
+        "camera), an MCAP file, a LeRobot data set (each episode), a video, a folder that holds such, or a text file "
+        "that names them, one a line",
     )
     _add_lens(parser)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write what was found into this file, too")

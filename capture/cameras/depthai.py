@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.exposure_settings import ExposureSettings, as_told
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.pace import FramesPerSecond
 from splatnode.capture.process.logs import event
@@ -163,12 +164,24 @@ def read(dai: ModuleType, source: Source, config: Config, hold: Callable[[], Non
 
 
 def to_frame(message: Any, frame_id: int) -> Frame | DroppedFrame:
-    """An ImgFrame as a Frame: its stamp is of the host's monotonic clock, synchronised by DepthAI."""
+    """An ImgFrame as a Frame: its stamp is of the host's monotonic clock, synchronised by DepthAI.
+
+    It has the exposure that the camera says it was taken with.
+    """
     stamp_ns = message.getTimestamp() // timedelta(microseconds=1) * 1000
     image = _rgb(message.getCvFrame())
     intrinsics = _intrinsics(message.getTransformation(), image.shape[1], image.shape[0])
     name = f"{stamp_ns / 1e9:.6f}"
-    return framed(frame_id, name, stamp_ns, image, intrinsics, captured_at=wall_clock(stamp_ns))
+    captured_at, exposure = wall_clock(stamp_ns), _exposure(message)
+    return framed(frame_id, name, stamp_ns, image, intrinsics, captured_at=captured_at, exposure=exposure)
+
+
+def _exposure(message: Any) -> ExposureSettings | None:
+    """None where the camera does not tell it, as DepthAI's own replay does not: its messages say 0."""
+    shutter, iso = message.getExposureTime(), message.getSensitivity()
+    if not isinstance(shutter, timedelta) or not isinstance(iso, int):
+        return None
+    return as_told(shutter.total_seconds(), iso)
 
 
 def to_pair(baseline: Baseline, group: Any, frame_id: int) -> Frame | DroppedFrame:

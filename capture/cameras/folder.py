@@ -6,13 +6,16 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 
 from splatnode.capture import heif_file, recording
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed, renamed
 from splatnode.capture.given_lens import same_aspect
+from splatnode.capture.given_pose import LARGEST_M, given_pose
+from splatnode.capture.given_pose import SIGMA_DEG as POSE_SIGMA_DEG
+from splatnode.capture.given_pose import SIGMA_M as POSE_SIGMA_M
 from splatnode.capture.image_file import (
     MAX_PIXELS,
     SUFFIXES,
@@ -24,7 +27,10 @@ from splatnode.capture.image_file import (
 from splatnode.capture.name_time import name_time
 from splatnode.capture.pace import FramesPerSecond, Pace, paced
 from splatnode.capture.process.printable import printable, printable_name
-from splatnode.capture.right_image import LONGEST_M, SIGMA_M, Baseline, RightImage, grey
+from splatnode.capture.right_image import LONGEST_M, SIGMA_M, Baseline, RightImage, grey, partners
+
+if TYPE_CHECKING:
+    from splatnode.capture.poses_file import Trajectory
 
 DEFAULT_STEP_NS = 100_000_000  # between two loops of a single photograph, which has no rate
 # Photographs that cannot be decoded here; they are reported as dropped.
@@ -46,6 +52,14 @@ class Right(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return Baseline(self.baseline_m, self.baseline_sigma_m)
 
 
+class Poses(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where the camera was, by odometry, a tracker or a drone's log, in metres; each photograph carries its pose."""
+
+    file: Path  # a TUM trajectory, nerfstudio's transforms.json, or the folder of a COLMAP model
+    sigma_m: Annotated[float, msgspec.Meta(gt=0, le=LARGEST_M)] = POSE_SIGMA_M  # of each position, metres
+    sigma_deg: Annotated[float, msgspec.Meta(gt=0, le=180)] = POSE_SIGMA_DEG  # of each orientation about each axis
+
+
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     folder: Path  # the folder with the photographs, or a recording of `splatnode record`
     names: tuple[str, ...] = ()  # the files to take, with or without suffix; none: all
@@ -58,6 +72,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     loops: Annotated[int, msgspec.Meta(ge=1)] = 1  # how many times all are shown, each time under other names
     # Of a stereo camera, whose left photographs lie in `folder`: what the right one saw, by which lengths are in metres
     right: Right | None = None
+    poses: Poses | None = None  # of the photographs; nothing: none are known
 
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
@@ -71,22 +86,33 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
             raise ValueError(
                 f"{str(config.folder)!r} is a recording, which has its right images in it: leave out right"
             )
+        if config.poses is not None:
+            raise ValueError(f"{str(config.folder)!r} is a recording, which has its poses in it: leave out poses")
         recorded = recording.read(config.folder)
         return paced(_looped(lambda: recorded.frames(config.names, config.max_pixels), config.loops), config.pace)
     paths = chosen_images(config.folder, config.names)  # before the first frame, so that mistakes show at once
-    partners = {} if config.right is None else _partners(config.right.folder, paths)
-    return paced(_looped(lambda: _frames(paths, partners, config), config.loops), config.pace)
+    rights = {} if config.right is None else _partners(config.right.folder, paths)
+    poses = None if config.poses is None else _known_poses(config.poses.file, paths)
+    return paced(_looped(lambda: _frames(paths, rights, poses, config), config.loops), config.pace)
 
 
 def _partners(folder: Path, lefts: list[Path]) -> dict[str, Path]:
-    """The right photographs by their names without suffix. Raises where no left one has a partner."""
-    partners = {path.stem: path for path in chosen_images(folder)}
-    if not any(path.stem in partners for path in lefts):
+    """The right photographs by the names of the left ones. Raises where no left one has a partner."""
+    rights = {path.name: path for path in chosen_images(folder)}
+    return {left: rights[right] for left, right in partners([path.name for path in lefts], list(rights)).items()}
+
+
+def _known_poses(file: Path, paths: list[Path]) -> Trajectory:
+    """What the file says. Raises ValueError where it names photographs, and none of these; OSError."""
+    from splatnode.capture.poses_file import read_poses  # brings what interpolates
+
+    poses = read_poses(file)
+    if poses.by_name and not any(poses.names(frame_name(path)) for path in paths):
         raise ValueError(
-            f"no photograph of {str(folder)!r} has the name of a left one, such as {frame_name(lefts[0])}; "
-            "name both of a pair alike"
+            f"{str(file)!r} has poses of photographs such as {printable(min(poses.by_name), 100)}, and none of those "
+            f"here, such as {frame_name(paths[0])}; give the poses of these photographs"
         )
-    return partners
+    return poses
 
 
 def _looped(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: int) -> Iterator[Frame | DroppedFrame]:
@@ -107,7 +133,9 @@ def _looped(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: int) -> I
         first_id, first_ns = first_id + last.frame_id + 1, first_ns + last.stamp_ns + step
 
 
-def _frames(paths: list[Path], partners: Mapping[str, Path], config: Config) -> Iterator[Frame | DroppedFrame]:
+def _frames(
+    paths: list[Path], rights: Mapping[str, Path], poses: Trajectory | None, config: Config
+) -> Iterator[Frame | DroppedFrame]:
     frame_id = 0
     for path in paths:
         if (unreadable := foreign_file(path)) is not None:
@@ -116,8 +144,8 @@ def _frames(paths: list[Path], partners: Mapping[str, Path], config: Config) -> 
         name = frame_name(path)
         try:
             data = read_image_file(path, config.max_pixels)
-            image, intrinsics, captured_at = decode_photograph(data, config.max_pixels)
-            right = _right_of(path, partners, config)
+            image, intrinsics, captured_at, exposure = decode_photograph(data, config.max_pixels)
+            right = _right_of(path, rights, config)
         except UnusableImage as error:
             yield DroppedFrame(name, str(error))
         except OSError as error:
@@ -127,15 +155,28 @@ def _frames(paths: list[Path], partners: Mapping[str, Path], config: Config) -> 
             if config.intrinsics is not None and same_aspect(config.intrinsics, width, height):
                 intrinsics = config.intrinsics.resized(width, height)
             stamp_ns = round(frame_id / config.frames_per_second * 1e9)
-            captured_at = captured_at or name_time(name)
-            item = framed(frame_id, name, stamp_ns, image, intrinsics, data, captured_at, right=right)
+            known = image, intrinsics, data, captured_at or name_time(name)
+            item = framed(frame_id, name, stamp_ns, *known, right=right, exposure=exposure)
             frame_id += isinstance(item, Frame)
-            yield item
+            yield _with_pose(item, poses, config.poses)
 
 
-def _right_of(path: Path, partners: Mapping[str, Path], config: Config) -> RightImage | None:
+def _with_pose(item: Frame | DroppedFrame, poses: Trajectory | None, given: Poses | None) -> Frame | DroppedFrame:
+    """With its pose, where it has one; left out, with the reason, where that cannot be sent."""
+    if isinstance(item, DroppedFrame) or poses is None or given is None:
+        return item
+    T_world_camera = poses.pose_of(item)
+    if T_world_camera is None:
+        return item
+    try:
+        return replace(item, given_pose=given_pose(T_world_camera, given.sigma_m, given.sigma_deg))
+    except ValueError as error:
+        return DroppedFrame(item.name, f"its pose cannot be used: {error}")
+
+
+def _right_of(path: Path, right_photographs: Mapping[str, Path], config: Config) -> RightImage | None:
     """What the right camera saw when the photograph was taken; None where that is not there. Raises as reading does."""
-    partner = partners.get(path.stem)
+    partner = right_photographs.get(path.name)
     if partner is None or config.right is None:
         return None
     seen = decode_photograph(read_image_file(partner, config.max_pixels), config.max_pixels)[0]

@@ -96,6 +96,11 @@ def held_out_cameras(config: Config) -> list[Camera]:
     return [_camera_on_path(config, index + 0.5) for index in range(config.views - 1)]
 
 
+def video_cameras(config: Config, between: int) -> list[Camera]:
+    """Cameras of a video on the same way: so many frames from each photograph of the stream to the next."""
+    return [_camera_on_path(config, number / between) for number in range((config.views - 1) * between + 1)]
+
+
 def photograph(config: Config, camera: Camera, noise_seed: int = 0) -> npt.NDArray[np.uint8]:
     """(H, W, 3) RGB as `camera` sees the place of `config`: antialiased, with sensor noise."""
     T_world_camera, K = camera

@@ -102,13 +102,13 @@ def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> 
 
 def _decoded(name: str, data: bytes, written_at: Stamp, config: Config, frame_id: int) -> Frame | DroppedFrame:
     try:
-        image, intrinsics, captured_at = decode_photograph(data, config.max_pixels)
+        image, intrinsics, captured_at, exposure = decode_photograph(data, config.max_pixels)
     except UnusableImage as error:
         return DroppedFrame(name, str(error))
     if config.intrinsics is not None:
         intrinsics = config.intrinsics.resized(image.shape[1], image.shape[0])
     captured_at = captured_at or name_time(name) or written_at
-    return framed(frame_id, name, time.monotonic_ns(), image, intrinsics, data, captured_at)
+    return framed(frame_id, name, time.monotonic_ns(), image, intrinsics, data, captured_at, exposure=exposure)
 
 
 def _listed(folder: Path) -> list[Path]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from types import ModuleType
 from typing import Any
 
 import msgspec
@@ -12,10 +14,12 @@ import msgspec
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import printable
+from splatnode.capture.process.records import record_in
 
 VERSION = "v3.0"
 INFO, EPISODES = Path("meta", "info.json"), Path("meta", "episodes")
 _MOST_BYTES = 10_000_000  # of info.json
+_NUMBER = "episode_index"  # the column
 _NAMED = "episode_"  # before an episode's number, in the name of a part
 
 
@@ -65,9 +69,9 @@ def is_data_set(folder: Path) -> bool:
 
 def read_info(folder: Path) -> Info:
     """Raises UnusableDataSet where it is of another version, or has no videos; OSError."""
-    shown = f"{printable(str(folder))!r}"
+    shown = _shown(folder)
     with foreign(UnusableDataSet, f"{shown}: {INFO}"):
-        info = msgspec.json.decode(read_bounded(folder / INFO, _MOST_BYTES, UnusableDataSet, shown), type=Info)
+        info = record_in(read_bounded(folder / INFO, _MOST_BYTES, UnusableDataSet, shown), Info)
     if info.codebase_version != VERSION:
         version = printable(info.codebase_version, 40)
         raise UnusableDataSet(
@@ -84,7 +88,13 @@ def read_info(folder: Path) -> Info:
 def parts(folder: Path) -> list[str]:
     """The names of all episodes' cameras, in order, for `film`. Raises as `read_info`, and without pyarrow."""
     cameras = read_info(folder).cameras
-    return [f"{_NAMED}{number:06d}/{key}" for number in sorted(_tables(folder, ())) for key in cameras]
+    numbers = sorted(set(_numbers(folder)))
+    return [f"{episode_name(number)}/{key}" for number in numbers for key in cameras]
+
+
+def episode_name(number: int) -> str:
+    """What `parts` calls an episode."""
+    return f"{_NAMED}{number:06d}"
 
 
 def film(folder: Path, part: str) -> Film:
@@ -94,12 +104,12 @@ def film(folder: Path, part: str) -> Film:
     """
     info = read_info(folder)
     number, key = episode_and_camera(folder, info, part)
-    shown = f"{printable(str(folder))!r}"
+    shown = _shown(folder)
     wanted = tuple(f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp"))
-    episodes = _tables(folder, wanted)
-    row = episodes.get(number)
+    with _reading(folder) as (tables, files):
+        row = tables.row(files, _NUMBER, number, wanted)
     if row is None:
-        raise UnusableDataSet(f"{shown} has no episode {number}; it has {len(episodes)} episodes")
+        raise UnusableDataSet(f"{shown} has no episode {number}; it has {len(set(_numbers(folder)))} episodes")
     chunk, file, from_s, to_s = (row.get(name) for name in wanted)
     if chunk is None or file is None or from_s is None or to_s is None or to_s <= from_s:
         raise UnusableDataSet(f"{shown}: episode {number} has no images of {printable(key)}")
@@ -114,25 +124,45 @@ def episode_and_camera(folder: Path, info: Info, part: str) -> tuple[int, str]:
     if not number.isascii() or not number.isdecimal() or key not in info.cameras:
         cameras = printable(", ".join(info.cameras))
         raise UnusableDataSet(
-            f"{printable(str(folder))!r}: behind the # must be an episode and a camera, as "
-            f"{_NAMED}000000/{info.cameras[0]}; got {printable(part, 100)!r}. The cameras are {cameras}"
+            f"{_shown(folder)}: behind the # must be an episode and a camera, as "
+            f"{episode_name(0)}/{info.cameras[0]}; got {printable(part, 100)!r}. The cameras are {cameras}"
         )
     return int(number), key
 
 
-def _tables(folder: Path, wanted: tuple[str, ...]) -> dict[int, Mapping[str, Any]]:
-    """The rows of meta/episodes by the episodes' numbers."""
-    from splatnode.capture.lerobot import pyarrow  # takes half a second, and is an extra
+def _numbers(folder: Path) -> list[int]:
+    """Of the episodes. Raises UnusableDataSet where there are none."""
+    with _reading(folder) as (tables, files):
+        numbers = [int(number) for number in tables.column(files, _NUMBER)]
+        if not numbers:
+            raise UnusableDataSet(
+                f"{_shown(folder)} must have a row for each episode in {EPISODES}/*/*.parquet; what is there has no "
+                "rows: record an episode first"
+            )
+    return numbers
 
-    shown = f"{printable(str(folder))!r}"
-    found: dict[int, Mapping[str, Any]] = {}
+
+@contextlib.contextmanager
+def _reading(folder: Path) -> Iterator[tuple[ModuleType, list[Path]]]:
+    """What reads tables, and the files of meta/episodes; what fails with these is told of them."""
+    shown = _shown(folder)
+    try:
+        from splatnode.capture.lerobot import pyarrow  # takes half a second, and is an extra
+    except ModuleNotFoundError as error:
+        said = f"{shown} is a LeRobot data set, and its tables are read with {error.name}, which is not installed"
+        raise ModuleNotFoundError(said, name=error.name) from error
+    files = sorted((folder / EPISODES).glob("*/*.parquet"))
+    if not files:
+        raise UnusableDataSet(
+            f"{shown} must have a row for each episode in {EPISODES}/*/*.parquet; there are no such files: copy or "
+            "download the whole data set, or record an episode first"
+        )
     with foreign(UnusableDataSet, f"{shown}: {EPISODES}"):
-        for file in sorted((folder / EPISODES).glob("*/*.parquet")):
-            for row in pyarrow.rows(file, ("episode_index", *wanted)):
-                found[int(row["episode_index"])] = row
-    if not found:
-        raise UnusableDataSet(f"{shown} has no episodes: there are no rows in {EPISODES}/*/*.parquet")
-    return found
+        yield pyarrow, files
+
+
+def _shown(folder: Path) -> str:
+    return f"{printable(str(folder))!r}"
 
 
 def _video(info: Info, key: str, chunk: int, file: int) -> PurePosixPath:

@@ -11,6 +11,7 @@ import msgspec
 
 from splatnode.capture.logged.message import Calibration, Layout, Picture, UnusableMessage
 from splatnode.capture.logged.protobuf import Fields
+from splatnode.capture.process.records import record_in
 
 _NS = 10**9
 _Message = TypeVar("_Message", bound=msgspec.Struct)
@@ -91,6 +92,6 @@ def _time_ns(stamp: Fields) -> int:
 
 def _decoded(data: bytes, kind: type[_Message]) -> _Message:
     try:
-        return msgspec.json.decode(data, type=kind)
+        return record_in(data, kind)
     except msgspec.DecodeError as error:
         raise UnusableMessage(f"the message must be JSON of Foxglove's schema: {error}") from error

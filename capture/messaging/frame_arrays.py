@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import UNSET, UnsetType
 
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.gravity import Gravity
@@ -37,6 +38,8 @@ class FrameFields(Protocol):
     def motion(self) -> Motion | UnsetType: ...
     @property
     def gravity(self) -> Gravity | UnsetType: ...
+    @property
+    def exposure(self) -> ExposureSettings | UnsetType: ...
     @property
     def baseline(self) -> Baseline | UnsetType: ...
 
@@ -69,6 +72,7 @@ def frame_in(header: FrameFields, frame_id: int, arrays: Sequence[npt.NDArray]) 
         given_pose=or_none(header.given_pose),
         motion=or_none(header.motion),
         gravity=or_none(header.gravity),
+        exposure=or_none(header.exposure),
         right=None if header.baseline is UNSET else RightImage(arrays[-1], header.baseline),
     )
 

@@ -13,6 +13,7 @@ import msgspec
 import zmq
 from msgspec import UNSET, UnsetType
 
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.gravity import Gravity
@@ -52,6 +53,7 @@ class FrameHeader(Header, frozen=True, forbid_unknown_fields=True, kw_only=True,
     given_pose: GivenPose | UnsetType = UNSET
     motion: Motion | UnsetType = UNSET
     gravity: Gravity | UnsetType = UNSET
+    exposure: ExposureSettings | UnsetType = UNSET
     baseline: Baseline | UnsetType = UNSET  # likewise; where it is there, the last array is the right image
 
 
@@ -130,6 +132,7 @@ def to_message(frame: Frame | DroppedFrame, numbering: Numbering) -> list[Part]:
         given_pose=or_left_out(frame.given_pose),
         motion=or_left_out(frame.motion),
         gravity=or_left_out(frame.gravity),
+        exposure=or_left_out(frame.exposure),
         baseline=or_left_out(frame.right and frame.right.baseline),
     )
     return encode(header, arrays_of(frame))

@@ -19,6 +19,7 @@ from splatnode.capture.process.durable import remove_leftovers, write_whole
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
 from splatnode.capture.process.private import StrayFile, own_files, private_folder, read_own
+from splatnode.capture.process.records import record_in
 
 log = logging.getLogger(__name__)
 
@@ -116,7 +117,7 @@ def _record(path: Path) -> SetAside:
     beside = path.with_suffix(".json")
     try:
         with foreign(ValueError, beside):
-            record = msgspec.json.decode(read_own(beside, _LARGEST_RECORD), type=SetAside)
+            record = record_in(read_own(beside, _LARGEST_RECORD), SetAside)
             check(record)
             return record
     except (OSError, ValueError):

@@ -24,6 +24,7 @@ import zmq
 
 from splatnode.capture.messaging.values import Sequential, SessionId, check
 from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.records import Decoder, decoder_of
 
 # Of the messages: 1 knew no answer to a keyframe that cannot be taken, 2 no time of capture, 3 no masks, 4 no fisheyes.
 VERSION = 5
@@ -145,8 +146,8 @@ def _envelope(head: memoryview, schema: Any) -> _Envelope[Any]:
 
 
 @functools.lru_cache(maxsize=64)
-def _decoder(schema: Any) -> msgspec.msgpack.Decoder:
-    return msgspec.msgpack.Decoder(_Envelope[schema])
+def _decoder(schema: Any) -> Decoder:
+    return decoder_of(_Envelope[schema])
 
 
 def _array(name: str, shape: list[int], buffer: memoryview, limits: Limits) -> npt.NDArray:

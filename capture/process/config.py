@@ -23,6 +23,7 @@ from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.config_text import MAX_BYTES, MAX_DEPTH, ConfigError, parse_yaml
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import printable
+from splatnode.capture.process.records import record_of
 
 T = TypeVar("T")
 
@@ -109,7 +110,7 @@ def typed(raw: Mapping[str, Any], schema: type[T], where: str = "") -> T:
     """`raw` as a `schema` (Struct or dataclass); `where` is the key under which it stands. Raises ConfigError."""
     with foreign(ConfigError, where):
         try:
-            return msgspec.convert(_checked(raw, schema, where), schema, dec_hook=_decode)
+            return record_of(_checked(raw, schema, where), schema, dec_hook=_decode)
         except msgspec.ValidationError as error:
             message, _, path = str(error).partition(" - at `$")
             key = _join(where, path.rstrip("`").lstrip("."))

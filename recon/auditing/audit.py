@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.process.progress import Step, Tell, told_to_nobody
-from splatnode.recon.auditing.history import Move, Period, moves, periods
+from splatnode.recon.auditing.history import Move, Period, extended, moves
 from splatnode.recon.auditing.sighting import NotSeen, Sighting, sight
 from splatnode.recon.auditing.stations import Recording
+from splatnode.recon.auditing.taken import taken
 from splatnode.recon.result.landmarks import Landmarks
 
 
@@ -20,6 +21,7 @@ class Audit:
     recordings: tuple[str, ...]  # their names, in the order given, which is that of time
     periods: Mapping[str, Sequence[Period]]  # of each camera that was placed at least once, by its name
     not_seen: Mapping[str, Mapping[int, NotSeen]]  # of each camera, where it was not placed
+    unreadable: Mapping[int, str]  # recordings of whose cameras nothing is known, and why
     moves: Sequence[Move]  # in their order
     unit: float  # the distance to the scene: the median depth of its points, in the unit of the result
     metric: bool  # lengths are metres
@@ -39,20 +41,22 @@ def audit(
 ) -> Audit:
     """Where each camera stood in each recording, in the world of the landmarks, and when it moved.
 
-    `given` is the cameras' lens; `fov_deg` their angle of view across the longer side, in degrees.
+    `given` is the cameras' lens; `fov_deg` their angle of view across the longer side, in degrees. What is in memory
+    grows with the moves, not with the recordings.
     """
-    seen: dict[str, dict[int, Sighting]] = {}
+    histories: dict[str, list[Period]] = {}
     not_seen: dict[str, dict[int, NotSeen]] = {}
-    total, done = sum(len(recording.photographs) for recording in recordings), 0
+    total, done = sum(len(recording.cameras) for recording in recordings), 0
     for number, recording in enumerate(recordings):
-        for camera, paths in recording.photographs.items():
+        for camera, pictures in recording.cameras.items():
             tell(Step("placing", done, total, "camera"))
-            found = sight(landmarks, paths, given, fov_deg)
+            found = sight(landmarks, taken(pictures, given), fov_deg)
             if isinstance(found, Sighting):
-                seen.setdefault(camera, {})[number] = found
+                histories[camera] = extended(histories.get(camera, ()), number, found)
             else:
                 not_seen.setdefault(camera, {})[number] = found
             done += 1
-    histories = {camera: periods(seen[camera]) for camera in sorted(seen)}
+    histories = {camera: histories[camera] for camera in sorted(histories)}
     names = tuple(recording.name for recording in recordings)
-    return Audit(names, histories, not_seen, moves(histories), landmarks.unit, landmarks.metric)
+    unreadable = {number: each.problem for number, each in enumerate(recordings) if each.problem}
+    return Audit(names, histories, not_seen, unreadable, moves(histories), landmarks.unit, landmarks.metric)

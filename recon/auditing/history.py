@@ -34,21 +34,18 @@ class Move:
     cameras: tuple[str, ...]
 
 
-def periods(sightings: Mapping[int, Sighting]) -> list[Period]:
-    """Of one camera, seen in recordings by number. Each is compared with the first of its period: drift adds up."""
-    found: list[Period] = []
-    for number in sorted(sightings):
-        sighting = sightings[number]
-        if not found:
-            found.append(Period((number,), sighting, None, None))
-            continue
-        last = found[-1]
-        since = motion(last.sighting.placed, sighting.placed)
-        if since.significant:
-            found.append(Period((number,), sighting, None, since))
-        else:
-            found[-1] = Period((*last.recordings, number), last.sighting, since, last.came_by)
-    return found
+def extended(history: Sequence[Period], number: int, sighting: Sighting) -> list[Period]:
+    """The periods of one camera, once it was seen in the recording `number`, too, which is later than theirs.
+
+    It is compared with the first recording of the last period: drift adds up.
+    """
+    if not history:
+        return [Period((number,), sighting, None, None)]
+    *earlier, last = history
+    since = motion(last.sighting.placed, sighting.placed)
+    if since.significant:
+        return [*earlier, last, Period((number,), sighting, None, since)]
+    return [*earlier, Period((*last.recordings, number), last.sighting, since, last.came_by)]
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,8 +34,9 @@ def picture(audit: Audit) -> bytes:
     for row, camera in enumerate(cameras):
         y = _TOP + row * _LINE
         parts.append(f'<text x="{_LEFT - 8}" y="{y + 18}" text-anchor="end">{_text(camera)}</text>')
-        for number, problem in audit.not_seen.get(camera, {}).items():
-            parts.append(_cell(number, y, _NOT_SEEN, f"{problem.code}: {problem.message}"))
+        not_seen = {number: f"{each.code}: {each.message}" for number, each in audit.not_seen.get(camera, {}).items()}
+        for number, told in {**audit.unreadable, **not_seen}.items():
+            parts.append(_cell(number, y, _NOT_SEEN, told))
         for index, period in enumerate(audit.periods.get(camera, ())):
             told = "where it stood first" if period.came_by is None else f"moved by {amount(audit, period.came_by)}"
             for number in period.recordings:

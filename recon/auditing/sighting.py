@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 
-from splatnode.capture.frame import DroppedFrame, Intrinsics
+from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.auditing.motion import motion
 from splatnode.recon.locating.locate import Placed, described, placed
-from splatnode.recon.locating.photographs import assumed_lens, photographs
+from splatnode.recon.locating.photographs import assumed_lens
 from splatnode.recon.result.landmarks import Landmarks
 
 MOVING = "MOVING"  # the code of a camera that did not stand still
@@ -34,15 +33,15 @@ class NotSeen:
 
 
 def sight(
-    landmarks: Landmarks, paths: Sequence[Path], given: Intrinsics | None = None, fov_deg: float | None = None
+    landmarks: Landmarks, frames: Iterable[Frame | DroppedFrame], fov_deg: float | None = None
 ) -> Sighting | NotSeen:
-    """Where the camera that took the photographs `paths` of one recording stood.
+    """Where the camera that took these photographs of one recording stood; there is at least one.
 
-    `given` is its lens; `fov_deg` its angle of view across the longer side, in degrees. Of several photographs all that
-    can be placed must be of one place.
+    `fov_deg` is its angle of view across the longer side, in degrees. Of several photographs all that can be placed
+    must be of one place.
     """
     first, problem = None, None
-    for frame in photographs(paths, given):
+    for frame in frames:
         if isinstance(frame, DroppedFrame):
             problem = problem or NotSeen(frame.name, UNREADABLE, frame.reason)
             continue
@@ -58,5 +57,5 @@ def sight(
             )
     if first is not None:
         return first
-    assert problem is not None  # a recording has at least one photograph of each camera
+    assert problem is not None  # there is at least one photograph
     return problem

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator
 
 from splatnode.recon.auditing.audit import Audit
 from splatnode.recon.auditing.history import Period
 from splatnode.recon.auditing.motion import Motion
+from splatnode.recon.auditing.sighting import NotSeen
+
+_MOST_LINES = 3  # of one camera for one reason; of more recordings the first is told, and how many there are
 
 
 def lines(audit: Audit) -> Iterator[str]:
@@ -25,9 +29,22 @@ def lines(audit: Audit) -> Iterator[str]:
     for camera, history in audit.periods.items():
         if len(history) == 1:
             yield f"{camera} {_stood(audit, history[0])}"
-    for camera, problems in sorted(audit.not_seen.items()):
-        for number, problem in sorted(problems.items()):
-            yield f"{camera} was not compared in {audit.recordings[number]}: {problem.code}: {problem.message}"
+    for camera in sorted(audit.not_seen):
+        yield from _not_compared(audit, camera)
+    for number, reason in audit.unreadable.items():
+        yield f"{audit.recordings[number]} was not compared: {reason}"
+
+
+def _not_compared(audit: Audit, camera: str) -> Iterator[str]:
+    by_code: defaultdict[str, list[tuple[int, NotSeen]]] = defaultdict(list)
+    for number, problem in sorted(audit.not_seen[camera].items()):
+        by_code[problem.code].append((number, problem))
+    for code, problems in by_code.items():
+        names = [audit.recordings[number] for number, _ in problems]
+        if len(problems) > _MOST_LINES:
+            names = [f"{len(names)} recordings, the first {names[0]}"]
+        for name, (_, problem) in zip(names, problems, strict=False):
+            yield f"{camera} was not compared in {name}: {code}: {problem.message}"
 
 
 def amount(audit: Audit, motion: Motion) -> str:
@@ -57,6 +74,9 @@ def values(audit: Audit) -> dict[str, object]:
         "scale": "metric" if audit.metric else "relative",
         "distance": audit.unit,
         "recordings": list(audit.recordings),
+        "not_read": [
+            {"recording": audit.recordings[number], "message": reason} for number, reason in audit.unreadable.items()
+        ],
         "moves": [
             {
                 "after": audit.recordings[move.after],

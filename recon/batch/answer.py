@@ -7,12 +7,15 @@ from pathlib import Path
 
 import msgspec
 
+from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY
 from splatnode.capture.process.printable import printable
+from splatnode.capture.process.records import record_in
 from splatnode.recon.batch.sources import REPORT, Recording
 from splatnode.recon.jobs.child import End
 from splatnode.recon.result.export.limits import read_json_file
 
 FAILED = "FAILED"  # beside the codes of verdicts: there is no answer
+_SHORT_OF_MEMORY = (SHORT_OF_MEMORY, "running low on memory")  # as a process says it, and as Ray does
 _WITH_ANSWER = (0, 65)  # exit codes of a command that has written its report: a scene, or why there is none
 
 
@@ -70,7 +73,7 @@ def outcome(recording: Recording, folder: Path, end: End) -> Outcome:
     if end.exit_code not in _WITH_ANSWER:
         return without_answer(recording, end, end.reason or f"ended with exit code {end.exit_code} and said nothing")
     try:
-        report = msgspec.json.decode(read_json_file(folder / REPORT), type=_Report)
+        report = record_in(read_json_file(folder / REPORT), _Report)
     except (OSError, ValueError) as error:  # a decoder's errors are ValueErrors
         return without_answer(recording, end, f"ended with exit code {end.exit_code}, but {REPORT}: {error}")
     claim = report.bounds
@@ -98,7 +101,7 @@ def without_answer(recording: Recording, end: End, reason: str) -> Outcome:
         name=recording.name,
         source=recording.source,
         verdict=FAILED,
-        message=printable(reason),
+        message=printable(_with_option(reason)),
         published=False,
         photographs=None,
         left_out=None,
@@ -112,3 +115,10 @@ def without_answer(recording: Recording, end: End, reason: str) -> Outcome:
         exit_code=end.exit_code,
         ended_at=round(time.time(), 3),
     )
+
+
+def _with_option(reason: str) -> str:
+    """The reason, with what a batch can do about it."""
+    if any(said in reason for said in _SHORT_OF_MEMORY):
+        return f"{reason}; in a batch fewer --cores, or --max-memory, leave more of it"
+    return reason

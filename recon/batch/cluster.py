@@ -31,6 +31,23 @@ def run_all(todo: Iterable[Recording], job: Job, most: int | None) -> Generator[
         yield without_answer(recording, NOT_RUN, found.reason) if isinstance(found, ray.Lost) else found
 
 
+def shortage(max_memory_mb: float | None) -> str | None:
+    """What to say where no machine of the cluster has so much memory for a recording; None: one has.
+
+    Ray, which must have been joined, would wait for such a machine without a word.
+    """
+    from splatnode.recon.jobs.ray import ray
+
+    resources = (node["Resources"] for node in ray.nodes() if node["Alive"])
+    most_mb = max((each.get("memory", 0.0) / 1e6 for each in resources if each.get("CPU")), default=0.0)
+    if max_memory_mb is None or not most_mb or max_memory_mb <= most_mb:
+        return None
+    return (
+        f"no machine of the cluster has the {max_memory_mb:g} MB that --max-memory sets aside for each recording, the "
+        f"largest has {most_mb:.0f} MB: give less"
+    )
+
+
 def run_row(row: dict[str, Any], job: Job) -> dict[str, Any]:
     """A row of a dataset, which has name and source, with what came of it, column by column."""
     return {**row, **msgspec.structs.asdict(run_recording(Recording(row["name"], row["source"]), job))}

@@ -29,7 +29,7 @@ from splatnode.recon.batch.tables import CSV, PARQUET, write_csv, write_parquet
 from splatnode.recon.batch.verb import replay_options
 from splatnode.recon.batch.write_back import write_back
 from splatnode.recon.jobs.child import Limits
-from splatnode.recon.jobs.cores import usable_cores
+from splatnode.recon.jobs.cores import chosen_cores
 from splatnode.recon.jobs.version import own_version
 from splatnode.recon.result.folder import result_folder
 
@@ -90,20 +90,24 @@ def run_batch(args: argparse.Namespace, found: list[Recording], work: Work, told
 
 @contextlib.contextmanager
 def _here(args: argparse.Namespace, work: Work) -> Iterator[Run]:
-    plan = Plan(args.out, _cores(args.cores), Limits(args.max_memory, args.timeout_s))
+    plan = Plan(args.out, chosen_cores(args.cores), Limits(args.max_memory, args.timeout_s))
     yield lambda todo: run_all(todo, work, plan)
 
 
 @contextlib.contextmanager
 def _on_ray(args: argparse.Namespace, work: Work) -> Iterator[Run]:
-    """Raises NoCluster; ModuleNotFoundError without ray."""
+    """Raises NoCluster; ValueError where a Ray of this machine has too little memory; ModuleNotFoundError."""
     from splatnode.recon.jobs import ray  # takes a second, and is an extra
 
     results = args.results or str(args.out.resolve())
     job = Job(work, results, Limits(args.max_memory, args.timeout_s), own_version())
     try:
-        with ray.joined(args.ray, None if args.ray else len(_cores(args.cores))):
+        with ray.joined(args.ray, None if args.ray else len(chosen_cores(args.cores))):
             remove_leftovers(args.out)
+            if (why := cluster.shortage(args.max_memory)) is not None and not args.ray:
+                raise ValueError(why)
+            if why is not None and not args.json:
+                say(f"{why}, or recordings wait until one that has joins", error=True)
             yield lambda todo: cluster.run_all(todo, job, args.cores)
     finally:
         remove_leftovers(args.out)
@@ -147,14 +151,6 @@ def _write_tables(out: Path, found: Sequence[Recording], ledger: Ledger, tell: T
         tell(f"no {PARQUET}: {error.name} is not installed. {remedy(error.name or '')}")
     write_page(out / PAGE, ledger.rows(ended), counts)
     return counts
-
-
-def _cores(wanted: int | None) -> tuple[int, ...]:
-    """Those that recordings are run on. Raises ValueError where there are fewer than are wanted."""
-    allowed = usable_cores()
-    if wanted is not None and wanted > len(allowed):
-        raise ValueError(f"--cores must be at most {len(allowed)}, which this process may use; got {wanted}")
-    return allowed[:wanted]
 
 
 def _check_new(out: Path, goes_on: bool) -> None:

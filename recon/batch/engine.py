@@ -43,4 +43,4 @@ def run_all(todo: Iterable[Recording], work: Work, plan: Plan) -> Generator[Outc
 
 
 def _started(work: Work, out: Path, recording: Recording, cores: Sequence[int]) -> Child:
-    return Child(work(recording, hidden(out, recording.name)), hidden_log(out, recording.name), cores)
+    return Child.started(work(recording, hidden(out, recording.name)), hidden_log(out, recording.name), cores)

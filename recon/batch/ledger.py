@@ -18,6 +18,7 @@ import msgspec
 
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.printable import printable
+from splatnode.capture.process.records import record_of
 from splatnode.recon.batch.answer import Outcome
 from splatnode.recon.batch.sources import Recording
 
@@ -101,7 +102,7 @@ class Ledger:
 
     def _check(self, first: bytes, command: list[str]) -> None:
         try:
-            header = msgspec.convert(json.loads(first), Header)
+            header = record_of(json.loads(first), Header)
         except ValueError as error:
             raise OtherBatch(f"{self.path} is not the ledger of a batch ({error}); give another --out") from error
         if header.batch != _FORMAT:
@@ -132,4 +133,4 @@ def _key(of: Recording | Outcome) -> Key:
 
 
 def _outcome(line: bytes) -> Outcome:
-    return msgspec.convert(json.loads(line), Outcome)
+    return record_of(json.loads(line), Outcome)

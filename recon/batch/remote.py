@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-import time
 import uuid
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,11 +16,10 @@ from splatnode.recon.batch.answer import Outcome, without_answer
 from splatnode.recon.batch.engine import Work
 from splatnode.recon.batch.keeping import hidden, hidden_log, kept
 from splatnode.recon.batch.sources import REPORT, Recording
-from splatnode.recon.jobs.child import NOT_RUN, Child, Limits
+from splatnode.recon.jobs.child import NOT_RUN, Child, Limits, finished
 from splatnode.recon.jobs.cores import free_core
 from splatnode.recon.jobs.version import other_version
 
-_POLL_S = 0.05
 _OF_STORE = "://"  # in the address of an object store
 
 
@@ -55,12 +53,8 @@ def _run(recording: Recording, job: Job, out: Path) -> Outcome:
     made_as = f"{recording.name}.{uuid.uuid4().hex[:12]}"
     try:
         with free_core() as core:
-            child = Child(job.work(recording, hidden(out, made_as)), hidden_log(out, made_as), (core,))
-            try:
-                while (end := child.ended(job.limits)) is None:
-                    time.sleep(_POLL_S)
-            finally:
-                child.stop()
+            child = Child.started(job.work(recording, hidden(out, made_as)), hidden_log(out, made_as), (core,))
+            end = finished(child, job.limits)
         return kept(recording, out, made_as, end)
     finally:
         shutil.rmtree(hidden(out, made_as), ignore_errors=True)

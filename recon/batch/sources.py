@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,14 +59,14 @@ def recordings(sources: Sequence[Path], out: Path | None, own_names: frozenset[s
     ]
 
 
-def _found(source: Path, out: Path | None) -> Iterator[tuple[Path, str]]:
-    """Paths of recordings, each with what it is called."""
+def _found(source: Path, out: Path | None, lists: tuple[Path, ...] = ()) -> Iterator[tuple[Path, str]]:
+    """Paths of recordings, each with what it is called; `lists` led to this source."""
     if source.is_dir():
         for path in _walked(source, out, set()):
             yield from _parts(path, _label(path, source))
     elif source.suffix.lower() == LIST and source.is_file():
-        for path in _listed(source):
-            yield from _found(path, out)
+        for path in listed(source, lists):
+            yield from _found(path, out, (*lists, source.resolve()))
     else:
         yield from _parts(source, _label(source))
 
@@ -77,7 +77,7 @@ def _parts(path: Path, label: str) -> Iterator[tuple[Path, str]]:
     So is a file or a data set that cannot be read: its recording says why.
     """
     try:
-        names = _names(path)
+        names = parts(path)
     except (ValueError, OSError, ModuleNotFoundError):
         names = []
     for name in names:
@@ -86,14 +86,23 @@ def _parts(path: Path, label: str) -> Iterator[tuple[Path, str]]:
         yield path, label
 
 
-def _names(path: Path) -> list[str]:
+def parts(path: Path) -> list[str]:
+    """What recordings an MCAP file or a data set holds, as `film` names them; none of anything else.
+
+    Raises ValueError, OSError and ModuleNotFoundError where it cannot be read.
+    """
     if path.suffix.lower() == film.MCAP and path.is_file():
         return [topic.name for topic in mcap.image_topics(path)]
     return data_set.parts(path) if data_set.is_data_set(path) else []
 
 
-def _listed(path: Path) -> Iterator[Path]:
-    """The paths that a list names, which are relative to its own folder; empty lines and those of a # say nothing."""
+def listed(path: Path, lists: Collection[Path]) -> Iterator[Path]:
+    """The paths that a list names, which are relative to its own folder; empty lines and those of a # say nothing.
+
+    Raises ValueError where it is one of the resolved `lists`, which led to it.
+    """
+    if path.resolve() in lists:
+        raise ValueError(f"the list {printable_name(str(path))!r} leads to itself; take it out of what it names")
     for line in path.read_bytes().splitlines():
         name = os.fsdecode(line.strip())
         if name and not name.startswith("#"):

@@ -16,6 +16,7 @@ from splatnode.recon.batch.answer import Outcome
 
 CSV, PARQUET = "batch.csv", "batch.parquet"
 COLUMNS = Outcome.__struct_fields__
+BEING_WRITTEN = ".partial"  # the end of the hidden name under which a file is written; a killed process leaves it
 
 
 def write_csv(path: Path, rows: Iterable[Outcome]) -> None:
@@ -43,7 +44,7 @@ def shown(row: Outcome) -> Outcome:
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """A file that takes the place of `path` at the end, and is on the disk then; else it is removed."""
-    temporary = path.with_name(f".{path.name}.partial")
+    temporary = path.with_name(f".{path.name}{BEING_WRITTEN}")
     try:
         yield temporary
         with temporary.open("rb") as file:

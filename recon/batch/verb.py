@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from splatnode.capture.process.arguments import add_json, megabytes, positive, seconds
+from splatnode.capture.process.arguments import add_json, positive, seconds
 from splatnode.capture.process.verb import Verb, lazily
+from splatnode.recon.jobs.arguments import add_max_memory, add_ray
 from splatnode.recon.replay_verb import add_choice, add_way
 
 
@@ -43,17 +44,9 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--cores", type=positive, metavar="N", help="recordings at a time, each on one core (default: all cores)"
     )
-    parser.add_argument(
-        "--max-memory", type=megabytes, metavar="MB", help="end a recording that takes more, in 10^6 bytes"
-    )
+    add_max_memory(parser, "a recording")
     parser.add_argument("--timeout-s", type=seconds, metavar="S", help="end a recording that takes longer")
-    parser.add_argument(
-        "--ray",
-        nargs="?",
-        const="",
-        metavar="ADDRESS",
-        help="on the Ray cluster at this address, such as 10.0.0.1:6379 or auto; without one, on a Ray of this machine",
-    )
+    add_ray(parser)
     parser.add_argument(
         "--results",
         metavar="WHERE",

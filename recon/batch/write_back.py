@@ -7,6 +7,7 @@ topics of its own.
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -17,9 +18,11 @@ from typing import Any
 from splatnode.capture import film
 from splatnode.capture.lerobot import data_set
 from splatnode.capture.logged.mcap import messages
+from splatnode.capture.process.folders import LOCK
+from splatnode.capture.process.lock import Held, exclusive
 from splatnode.recon.batch.answer import Outcome
 from splatnode.recon.batch.sources import OWN_SUFFIX
-from splatnode.recon.batch.tables import replacing
+from splatnode.recon.batch.tables import BEING_WRITTEN, replacing
 from splatnode.recon.result.export import read_cameras
 from splatnode.recon.result.export.foxglove import Message, calibration, pose, time
 from splatnode.recon.result.snapshot import CameraEstimate
@@ -41,7 +44,8 @@ class WrittenBack:
 def write_back(rows: Iterable[Outcome], out: Path, in_place: bool) -> Iterator[WrittenBack]:
     """Writes the cameras of `rows`, whose results lie in `out`; one after the other, what becomes of each file.
 
-    `in_place` adds columns to the tables of a data set, and topics to an MCAP file. Recordings of neither are left.
+    `in_place` adds columns to the tables of a data set, and topics to an MCAP file. Recordings of neither are left. A
+    process that is killed leaves each file as it was or whole, and hidden files, which the next call removes.
     """
     found: defaultdict[Path, list[tuple[str, Outcome]]] = defaultdict(list)
     for row in rows:
@@ -49,13 +53,34 @@ def write_back(rows: Iterable[Outcome], out: Path, in_place: bool) -> Iterator[W
         if part and not row.failed:
             found[file].append((part, row))
     for file, parts in found.items():
+        write = _with_log if file.suffix.lower() == film.MCAP else _into_data_set
         try:
-            if file.suffix.lower() == film.MCAP:
-                yield WrittenBack(_with_log(file, parts, out, in_place))
-            else:
-                yield WrittenBack(_into_data_set(file, parts, out, in_place))
+            with _alone(file):
+                sentence = write(file, parts, out, in_place)
+        except Held as error:
+            why = f"{error}, which writes there; run this again with --resume when it has ended"
+            yield WrittenBack(f"the cameras of {file} were not written back: {why}", failed=True)
         except (OSError, ValueError, ModuleNotFoundError) as error:
             yield WrittenBack(f"the cameras of {file} were not written back: {error}", failed=True)
+        else:
+            yield WrittenBack(sentence)
+
+
+@contextlib.contextmanager
+def _alone(file: Path) -> Iterator[None]:
+    """One process at a time writes a log or a data set; what a killed one has left is removed. Raises Held, OSError."""
+    if file.is_dir():
+        lock, begun = file / "meta" / LOCK, (file / "meta").rglob(f".*{BEING_WRITTEN}")
+    else:
+        lock = file.with_name(f".{file.name}{LOCK}")
+        begun = (file.with_name(f".{name}{BEING_WRITTEN}") for name in (file.name, file.stem + OWN_SUFFIX))
+    with exclusive(lock):
+        try:
+            for leftover in begun:
+                leftover.unlink(missing_ok=True)
+            yield
+        finally:
+            lock.unlink(missing_ok=True)
 
 
 def _into_data_set(folder: Path, parts: Sequence[tuple[str, Outcome]], out: Path, in_place: bool) -> str:

@@ -59,7 +59,7 @@ struct State {
         : rotations(b.rotations, b.rotations + 9 * b.num_cameras),
           translations(b.translations, b.translations + 3 * b.num_cameras),
           log_focals(b.log_focals, b.log_focals + b.num_lenses),
-          radials(b.radials, b.radials + b.num_lenses),
+          radials(b.radials, b.radials + 2 * b.num_lenses),
           shifts(b.shifts, b.shifts + 2 * b.num_lenses),
           points(b.points, b.points + 3 * size_t(b.num_points)) {}
 
@@ -90,9 +90,10 @@ void move(const Bundle& bundle, const System& system, const std::vector<double>&
     for (int g = 0; g < bundle.num_lenses; ++g) {
         const double* of_lens = &step[kPose * bundle.num_cameras + kLens * g];
         bundle.log_focals[g] += std::clamp(of_lens[0], -0.5, 0.5);
-        bundle.radials[g] += std::clamp(of_lens[1], -0.2, 0.2);
-        bundle.shifts[2 * g] += of_lens[2];
-        bundle.shifts[2 * g + 1] += of_lens[3];
+        for (int k = 0; k < 2; ++k) {
+            bundle.radials[2 * g + k] += std::clamp(of_lens[1 + k], -0.2, 0.2);
+            bundle.shifts[2 * g + k] += of_lens[3 + k];
+        }
     }
 }
 
@@ -132,7 +133,7 @@ CORE_API double core_bundle_adjust(const Bundle* bundle, int max_iterations, dou
     return cost;
 }
 
-// The normal matrix of all poses and lenses with the points eliminated, (6 C + 4 G, 6 C + 4 G), without damping.
+// The normal matrix of all poses and lenses with the points eliminated, (6 C + 5 G, 6 C + 5 G), without damping.
 CORE_API void core_bundle_information(const Bundle* bundle, double* matrix) {
     System system(*bundle);
     assemble(*bundle, 0.0, system);

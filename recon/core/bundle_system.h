@@ -37,7 +37,7 @@ struct System {
     int size;                      // parameters
     std::vector<double> matrix;    // (size, size), lower triangle
     std::vector<double> gradient;  // (size,)
-    std::vector<double> spread;    // (O, 10, 3): (J_camera^T w J_point) (J_point^T w J_point)^-1
+    std::vector<double> spread;    // (O, 11, 3): (J_camera^T w J_point) (J_point^T w J_point)^-1
     std::vector<double> shift;     // (P, 3): (J_point^T w J_point)^-1 J_point^T w residual
     std::vector<Sums> sums;        // of each chunk
 
@@ -50,7 +50,7 @@ struct System {
           sums(kChunks) {}
 };
 
-// Where the k-th of an observation's ten parameters is among all.
+// Where the k-th of an observation's eleven parameters is among all.
 inline int parameter(const Bundle& bundle, int camera, int k) {
     return k < kPose ? kPose * camera + k
                      : kPose * bundle.num_cameras + kLens * bundle.lens_of_camera[camera] + k - kPose;

@@ -9,7 +9,7 @@
 // As splatnode.recon.registration.epipolar.Pose: the second camera's pose in the first one's frame, and both lenses.
 struct EpipolarPose {
     double rotation[9], translation[3];
-    double focals[2], radials[2], shifts[4];
+    double focals[2], radials[4], shifts[4];
     double min_parallax;  // the sine of the angle between two rays from which on their order along each other is told
     int32_t undistort_iterations;
 };
@@ -23,7 +23,8 @@ inline void normalise(const EpipolarPose& pose, int camera, const double* pixel,
     const double y = (pixel[1] - pose.shifts[2 * camera + 1]) / pose.focals[camera];
     ray[0] = x, ray[1] = y, ray[2] = 1;
     for (int i = 0; i < pose.undistort_iterations; ++i) {
-        const double by = 1 + pose.radials[camera] * (ray[0] * ray[0] + ray[1] * ray[1]);
+        const double squared = ray[0] * ray[0] + ray[1] * ray[1];
+        const double by = 1 + (pose.radials[2 * camera] + pose.radials[2 * camera + 1] * squared) * squared;
         ray[0] = x / by, ray[1] = y / by;
     }
 }

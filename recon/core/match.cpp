@@ -1,8 +1,5 @@
 // The two nearest of 8-bit descriptors and the way back, fused with the products: no matrix of distances is kept.
 //
-// A descriptor is 128 bytes below 128 (one factor of _mm256_maddubs is signed) of norm at most 181, so that the dot
-// product of any two, and each part of it, is below 2^15 (Cauchy and Schwarz): products may be summed in 16-bit lanes,
-// exactly and alike on every instruction set.
 // A register holds four bytes of each of several descriptors of the second set ("panel"); four bytes of one descriptor
 // of the first set are broadcast to all its lanes.
 #include <algorithm>
@@ -10,59 +7,16 @@
 #include <cstring>
 #include <vector>
 
-#include "simd.h"
+#include "descriptors.h"
 #include "threads.h"
 
 namespace core {
 namespace {
 
-constexpr int kSize = 128;           // bytes of a descriptor
-constexpr int kSteps = kSize / 4;    // registers of a panel
-constexpr int kRows = 4;             // descriptors of the first set whose sums are held in registers
-constexpr int kPanels = 2;           // panels of the second set with them
+constexpr int kSteps = kSize / 4;  // registers of a panel
+constexpr int kRows = 4;           // descriptors of the first set whose sums are held in registers
+constexpr int kPanels = 2;         // panels of the second set with them
 constexpr int kRowsPerTask = 48;
-constexpr int kOffset = 16320;       // above half the largest squared norm: keeps scores positive
-
-// NEON multiplies bytes into 16-bit lanes of two registers or, since Armv8.2, adds four products into a 32-bit lane.
-#if defined(__ARM_FEATURE_DOTPROD)
-typedef IntVec Sums;
-#elif defined(__aarch64__)
-struct Sums {
-    uint16x8_t low, high;
-};
-#else
-typedef int16_t Sums __attribute__((vector_size(4 * CORE_LANES)));
-#endif
-
-// sums += the products of bytes, added in pairs or fours, or not yet.
-inline Sums multiply_add(Sums sums, IntVec a, IntVec b) {
-#if CORE_LANES == 16 && defined(__AVX512BW__)
-    return sums + (Sums)_mm512_maddubs_epi16((__m512i)a, (__m512i)b);
-#elif CORE_LANES == 8
-    return sums + (Sums)_mm256_maddubs_epi16((__m256i)a, (__m256i)b);
-#elif defined(__ARM_FEATURE_DOTPROD)
-    return (Sums)vdotq_u32((uint32x4_t)sums, (uint8x16_t)a, (uint8x16_t)b);
-#elif defined(__aarch64__)
-    const uint8x16_t x = (uint8x16_t)a, y = (uint8x16_t)b;
-    return {vmlal_u8(sums.low, vget_low_u8(x), vget_low_u8(y)), vmlal_high_u8(sums.high, x, y)};
-#else
-    const Sums low = (Sums)(a & 0x00ff00ff) * (Sums)(b & 0x00ff00ff);
-    const Sums high = (Sums)(((BitVec)a >> 8) & 0x00ff00ffu) * (Sums)(((BitVec)b >> 8) & 0x00ff00ffu);
-    return sums + low + high;
-#endif
-}
-
-// One dot product a lane. Each part of a sum is at least 0, and together they fit 16 bits.
-inline IntVec dot_products(Sums sums) {
-#if defined(__ARM_FEATURE_DOTPROD)
-    return sums;
-#elif defined(__aarch64__)
-    return (IntVec)vpaddq_u32(vpaddlq_u16(sums.low), vpaddlq_u16(sums.high));
-#else
-    const BitVec both = (BitVec)sums;
-    return (IntVec)((both & 0xffffu) + (both >> 16));
-#endif
-}
 
 inline IntVec larger(IntVec a, IntVec b) { return a > b ? a : b; }
 inline IntVec smaller(IntVec a, IntVec b) { return a < b ? a : b; }
@@ -84,18 +38,12 @@ struct Panels {
         aligned = to;
         for (int i = 0; i < count; ++i) {
             const uint8_t* from = descriptors + size_t(i) * kSize;
-            int32_t squared = 0;
-            for (int k = 0; k < kSize; ++k) squared += from[k] * from[k];
-            offset[i] = kOffset - squared / 2;
+            offset[i] = kOffset - half_norm(from);
             int32_t* panel = to + size_t(i / kLanes) * kSteps * kLanes + i % kLanes;
             for (int step = 0; step < kSteps; ++step) std::memcpy(panel + step * kLanes, from + 4 * step, 4);
         }
     }
 };
-
-// A score and the index that has it in one number, so that the larger is the better and, of equals, the earlier.
-inline int32_t index_of(int32_t packed) { return 0xffff - (packed & 0xffff); }
-inline int32_t score_of(int32_t packed) { return packed >> 16; }
 
 struct Result {
     int32_t *nearest, *score, *second_score, *back;
@@ -166,11 +114,7 @@ CORE_API void core_match(const uint8_t* first, int num1, const uint8_t* second, 
                          int32_t* score, int32_t* second_score, int32_t* back) {
     const Panels panels(second, num2);
     std::vector<int32_t> half_norms(num1);
-    for (int i = 0; i < num1; ++i) {
-        int32_t squared = 0;
-        for (int k = 0; k < kSize; ++k) squared += first[size_t(i) * kSize + k] * first[size_t(i) * kSize + k];
-        half_norms[i] = squared / 2;
-    }
+    for (int i = 0; i < num1; ++i) half_norms[i] = half_norm(first + size_t(i) * kSize);
     const Result result = {nearest, score, second_score, back};
     std::vector<std::vector<IntVec>> column_best(num_threads(), std::vector<IntVec>(panels.num_panels, IntVec{}));
     run_ranges(num1, kRowsPerTask, [&](int begin, int end, int thread) {

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.memory import resident_mb
+from splatnode.capture.process.records import record_in
 from splatnode.recon.daemon.atlas.links import Cameras, Kind, Link, carried, link
 from splatnode.recon.daemon.atlas.pose_graph import Pose, optimised
 from splatnode.recon.daemon.status import PlaceStatus
@@ -136,7 +137,7 @@ class Places:
         self._path, self._index = out / FILE, _Index(checkpoint)
         try:
             with foreign(SceneFileError):
-                found = msgspec.json.decode(read_json_file(self._path), type=_Index)
+                found = record_in(read_json_file(self._path), _Index)
             if found.checkpoint == checkpoint:
                 self._index = found
         except FileNotFoundError:

@@ -28,6 +28,7 @@ log = logging.getLogger(__name__)
 
 IDLE_S = 0.5  # between looks at whether to stop
 FIRST_WAIT_S, LONGEST_WAIT_S = 5.0, 300.0  # after a step for which the memory did not suffice; doubled each time
+LADDER_S = 4.0  # in which more matches may be looked for, also on a slow machine: keyframes wait meanwhile
 TRIED_AGAIN = f"{SHORT_OF_MEMORY}. What failed is tried again"
 
 
@@ -41,7 +42,9 @@ class Worker:
         stopping: threading.Event,
     ) -> None:
         limit = min(config.max_gaussians, config.reconstruction.max_gaussians or config.max_gaussians)
-        self._recipe = msgspec.structs.replace(config.reconstruction, max_gaussians=limit, budget_s=None)
+        asked = config.reconstruction.ladder
+        ladder = asked if asked.most_s is not None else msgspec.structs.replace(asked, most_s=LADDER_S)
+        self._recipe = msgspec.structs.replace(config.reconstruction, max_gaussians=limit, budget_s=None, ladder=ladder)
         self._config, self._store, self._inbox, self._stopping = config, store, inbox, stopping
         self._output = Output(config, store, publish, self._complain)
         self.place = PresentPlace(config, self._recipe, store, self._output, self._pause)

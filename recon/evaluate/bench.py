@@ -1,37 +1,34 @@
-"""The benchmark: every method on every scene, each run in a process of its own."""
+"""The benchmark: every method on every scene, each run in a process of its own, some at a time."""
 
 from __future__ import annotations
 
 import itertools
 import logging
+import os
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
 import msgspec
 
-from splatnode.capture.frame import Frame
+from splatnode.capture.process.records import record_of
 from splatnode.recon.config import Config
-from splatnode.recon.evaluate.appearance import Rasterize
-from splatnode.recon.evaluate.process import call_alone, run_alone
-from splatnode.recon.evaluate.protocol import STAGES, Networks, Poses, Row, Run, Settings, evaluate, ignore_render
+from splatnode.recon.evaluate.kept import Kept
+from splatnode.recon.evaluate.one_run import Done, Job, Reconstruct, Scoring, done, failed_row, seen, timed_start
+from splatnode.recon.evaluate.protocol import Row
 from splatnode.recon.evaluate.records import Bench, bench_files, read_bench, run_of, this_machine
-from splatnode.recon.evaluate.regions import Counts
-from splatnode.recon.evaluate.renders import Renders
 from splatnode.recon.evaluate.report import report_files
-from splatnode.recon.evaluate.shown import Surface, shown_counts, surfaces
+from splatnode.recon.evaluate.schedule import Need, Planned, ended
 from splatnode.recon.evaluate.splits import Split, load_split
-from splatnode.recon.evaluate.start import Start, find_start
+from splatnode.recon.evaluate.timing import check_same_cores, had_alone
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.jobs.call import Answer, Work
+from splatnode.recon.jobs.calls import Engine, one_at_a_time, work_folder
+from splatnode.recon.jobs.child import Limits
 from splatnode.recon.result.export.staged import write_files
-from splatnode.recon.result.snapshot import Snapshot
-
-# Photographs, a method's name, a seed and what it may start from; it is sent to another process.
-Reconstruct = Callable[[Sequence[Frame], str, int, Start | None], Iterator[Snapshot]]
-
-_SHOWN = 3  # test views of each run whose renders are kept
+from splatnode.recon.result.folder import result_folder
 
 logger = logging.getLogger(__name__)
 
@@ -45,7 +42,9 @@ class Plan:
     methods: tuple[str, ...]
     seeds: tuple[int, ...] = (0,)
     checkpoints: tuple[int, ...] = ()
-    timeout_s: float = 3600.0  # of one run
+    timeout_s: float = 3600.0  # of one run with its scores, from the start of its process on
+    max_memory_mb: float | None = None  # of one run
+    timed: bool = True  # False: runs share what nobody watches, such as a GPU, so that their seconds say nothing
 
 
 @dataclass(frozen=True)
@@ -56,16 +55,6 @@ class Entrants:
     start_of: Callable[[str], Config | None]
 
 
-@dataclass(frozen=True)
-class Scoring:
-    """How the snapshots of a run are scored."""
-
-    rasterize: Rasterize
-    networks: Networks
-    settings: Settings
-    by_region: bool = False  # also of what two training photographs show, one, or none (shown.py)
-
-
 def run_bench(
     plan: Plan,
     entrants: Entrants,
@@ -74,141 +63,132 @@ def run_bench(
     scoring: Scoring,
     command: str,
     resume: bool = False,
+    engine: Engine | None = None,
 ) -> Bench:
     """Runs the plan and returns all that `out_dir` then holds; with `resume`, runs that it holds are not run again.
 
-    bench.json, bench.csv and the reports are rewritten after every run, so an interrupted benchmark keeps what it has
-    measured. Cameras and points that several methods start from are found once for each set of photographs and seed;
-    their seconds count in each method's total.
-    A run that fails, or exceeds the time, becomes a row with the verdict "FAILED" and the reason. Raises ValueError or
-    FileNotFoundError for a scene or split that is not there, before anything is run.
+    `engine` says where runs are made and how many at a time; None: here, one at a time, on all cores. What came to an
+    end is on the disk at once, in a journal beside bench.json, which is rewritten every few seconds, with bench.csv and
+    the reports. Cameras and points that several methods start from are found once for each set of photographs and seed;
+    their seconds count in each method's total. A run that fails, or exceeds its time or memory, becomes a row with the
+    verdict "FAILED" and the reason. Seconds are those of runs that had their cores alone. Raises ValueError or
+    FileNotFoundError for a scene or split that is not there, or for an `out_dir` that holds runs that were scored
+    otherwise or had another number of cores, before anything is run.
     """
-    sets = [
-        (scene, load_split(folder, list(scene.cameras), views))
-        for scene, folder, views in ((load_scene(f), f, v) for f, v in itertools.product(plan.scenes, plan.views))
-    ]
+    engine = engine or one_at_a_time()
+    sets = _sets(plan)
     known = read_bench(out_dir / "bench.json") if resume and (out_dir / "bench.json").exists() else None
-    if known is not None and known.settings != scoring.settings:
-        raise ValueError(f"{out_dir} holds views that were scored with {known.settings}: resume into another folder")
-    if known is not None and command not in known.command:
-        command = f"{known.command}; {command}"
-    bench = Bench(() if known is None else known.rows, scoring.settings, this_machine(), command)
-    finished, started = bench.done(), time.monotonic()
-    seen = _Seen(scoring.settings.longer_side)
-    jobs = [
-        (scene, split, seed, [m for m in plan.methods if (scene.name, len(split.train), m, seed) not in finished])
-        for (scene, split), seed in itertools.product(sets, plan.seeds)
+    if known is not None:
+        _check_resumable(known, scoring, engine, out_dir)
+        command = known.command if command in known.command else f"{known.command}; {command}"
+    before = Bench(() if known is None else known.rows, scoring.settings, this_machine(), command)
+    present, found = before.done(), dict[_Key, list[Row]]()
+    with result_folder(out_dir), work_folder(out_dir) as folder:
+        write_files(out_dir, bench_files(before))  # how the runs of the journal are scored
+        if not resume:
+            (out_dir / _JOURNAL).unlink(missing_ok=True)
+        with Kept(out_dir / _JOURNAL, lambda: _write(out_dir, _with(before, found, sets, plan))) as kept:
+            for rows in (record_of(record, list[Row]) for record in kept.left()):
+                if run_of(rows[-1]) not in present:
+                    found[run_of(rows[-1])] = rows
+            todo = _todo(plan, entrants, sets, scoring, present | found.keys())
+            runs = ended(todo, engine, Limits(plan.max_memory_mb, plan.timeout_s), folder)
+            for rows in _told(_rows(runs, out_dir), len(todo)):
+                found[run_of(rows[-1])] = rows
+                kept.add([asdict(row) for row in rows])
+    return _with(before, found, sets, plan)
+
+
+_Key = tuple[str, int, str, int]  # of records.run_of
+_Set = tuple[EvaluationScene, Split]
+_JOURNAL = "bench.jsonl"
+
+
+def _sets(plan: Plan) -> list[_Set]:
+    """Scenes with absolute paths: other machines see them, too, not this process's folder."""
+    folders = [Path(os.path.abspath(folder)) for folder in plan.scenes]
+    scenes = [(load_scene(folder), folder) for folder in folders]
+    return [
+        (scene, load_split(folder, list(scene.cameras), views))
+        for (scene, folder), views in itertools.product(scenes, plan.views)
     ]
-    total, number = sum(len(methods) for *_, methods in jobs), 0
-    for scene, split, seed, methods in (job for job in jobs if job[-1]):
-        starts = _Starts(entrants.start_of, scene.frames(split.train), seed, plan.timeout_s)
-        shown = seen.counts(scene, split) if scoring.by_region else {}
-        for method in methods:
-            number += 1
-            rows = _run(plan, entrants.reconstruct, starts, scene, split, method, out_dir, scoring, shown)
-            bench = msgspec.structs.replace(bench, rows=(*bench.rows, *rows))
-            write_files(out_dir, bench_files(bench) | report_files(bench, out_dir))
-            left = (time.monotonic() - started) / number * (total - number)
-            logger.info("bench %d/%d, about %.0f min left: %s", number, total, left / 60, run_line(rows[-1]))
-    return bench
 
 
-class _Starts:
-    """What the methods start from on one set of photographs, found when the first of them asks for it."""
-
-    def __init__(
-        self, start_of: Callable[[str], Config | None], frames: Sequence[Frame], seed: int, timeout_s: float
-    ) -> None:
-        self.frames, self.seed = frames, seed
-        self._start_of, self._timeout_s = start_of, timeout_s
-        self._found: list[tuple[Config, Start]] = []
-
-    def of(self, method: str) -> Start | None:
-        """Raises RuntimeError where it cannot be found."""
-        wanted = self._start_of(method)
-        if wanted is None:
-            return None
-        for config, start in self._found:
-            if config == wanted:
-                return start
-        seeded = msgspec.structs.replace(wanted, seed=self.seed)
-        start = call_alone(partial(find_start, self.frames, seeded), self._timeout_s)
-        self._found.append((wanted, start))
-        return start
+def _check_resumable(known: Bench, scoring: Scoring, engine: Engine, out_dir: Path) -> None:
+    if known.settings != scoring.settings:
+        raise ValueError(f"{out_dir} holds views that were scored with {known.settings}: resume into another folder")
+    before = known.machine.get("threads")  # which each run had, before a row said so itself
+    cores = [row.cores or before for row in known.rows if row.seconds.get("total") is not None]
+    check_same_cores([each for each in cores if each], engine.cores_each, out_dir)
 
 
-class _Seen:
-    """What the photographs of a scene see, by its true cameras, found once for all its sets of photographs."""
-
-    def __init__(self, longer_side: int) -> None:
-        self._longer_side = longer_side
-        self._scene, self._surfaces = "", dict[str, Surface]()
-
-    def counts(self, scene: EvaluationScene, split: Split) -> dict[str, Counts]:
-        """By test view, how many training photographs show each pixel."""
-        if scene.name != self._scene:
-            self._scene, self._surfaces = scene.name, surfaces(scene, self._longer_side)
-        training = [self._surfaces[name] for name in split.train if name in self._surfaces]
-        return {n: shown_counts(self._surfaces[n], training) for n in split.test if n in self._surfaces}
-
-
-def _run(
-    plan: Plan,
-    reconstruct: Reconstruct,
-    starts: _Starts,
-    scene: EvaluationScene,
-    split: Split,
-    method: str,
-    out_dir: Path,
-    scoring: Scoring,
-    seen: Mapping[str, Counts],
-) -> list[Row]:
-    """The rows of one run: its checkpoints and its end, or its failure."""
-    seed, views = starts.seed, len(split.train)
-    try:
-        start = starts.of(method)
-    except RuntimeError as error:
-        return [_failed_row(scene, views, method, seed, str(error))]
-    work = partial(reconstruct, starts.frames, method, seed, start)
-    outcome = run_alone(work, plan.checkpoints, plan.timeout_s, 0.0 if start is None else start.seconds)
-    kept = Renders(out_dir, scene.name, views, method, seed, split.test[:: max(1, len(split.test) // _SHOWN)][:_SHOWN])
-    poses: Poses = {}
-    rows: list[Row] = []
-    for moment in reversed(outcome.snapshots):  # the end first: from its test poses the search goes on for the others
-        peaks = [peak for peak in (moment.peak_rss_mb, start and start.peak_rss_mb) if peak is not None]
-        run = Run(method, seed, moment.checkpoint, moment.seconds, max(peaks, default=None))
-        shown, networks = kept.keep, scoring.networks
-        if moment.checkpoint is not None:
-            shown, networks = ignore_render, networks.quickest
-        row = evaluate(
-            moment.snapshot,
-            scene,
-            split,
-            run,
-            rasterize=scoring.rasterize,
-            networks=networks,
-            settings=scoring.settings,
-            show=shown,
-            found=poses,
-            shown=seen,
-        )
-        rows.insert(0, row)
-    return rows if outcome.error is None else [*rows, _failed_row(scene, views, method, seed, outcome.error)]
+def _todo(plan: Plan, entrants: Entrants, sets: Sequence[_Set], scoring: Scoring, finished: set[_Key]) -> list[Planned]:
+    """The runs that are missing, in their order, with what they need."""
+    todo = []
+    for (scene, split), seed, method in itertools.product(sets, plan.seeds, plan.methods):
+        if (scene.name, len(split.train), method, seed) in finished:
+            continue
+        reconstruct, timed = entrants.reconstruct, plan.timed
+        job = Job(scene, split, method, seed, plan.checkpoints, reconstruct, scoring, timed)
+        start = _start(entrants.start_of(method), scene, split, seed)
+        shown = _seen(scene, sets, scoring) if scoring.by_region else None
+        work = partial(_work, job, start is not None)
+        todo.append(Planned(job, tuple(need for need in (start, shown) if need is not None), work))
+    return todo
 
 
-def _failed_row(scene: EvaluationScene, views: int, method: str, seed: int, error: str) -> Row:
-    return Row(
-        scene=scene.name,
-        views=views,
-        method=method,
-        seed=seed,
-        checkpoint=None,
-        final=True,
-        seconds={**dict.fromkeys(STAGES), "total": None},
-        peak_rss_mb=None,
-        verdict="FAILED",
-        error=error,
-    )
+def _work(job: Job, with_start: bool, *needed: bytes) -> Work:
+    """The call of a run; first of what it needs comes the start, where it has one."""
+    start, *rest = needed if with_start else (None, *needed)
+    return partial(done, job, start, rest[0] if rest else None)
+
+
+def _start(config: Config | None, scene: EvaluationScene, split: Split, seed: int) -> Need | None:
+    if config is None:
+        return None
+    key = scene.name, len(split.train), seed, repr(config)
+    return Need(key, partial(timed_start, scene, split, msgspec.structs.replace(config, seed=seed)))
+
+
+def _seen(scene: EvaluationScene, sets: Sequence[_Set], scoring: Scoring) -> Need:
+    splits = [split for other, split in sets if other.name == scene.name]
+    return Need(scene.name, partial(seen, scene, splits, scoring.settings.longer_side))
+
+
+def _rows(runs: Iterable[tuple[Planned, Answer]], out_dir: Path) -> Iterator[list[Row]]:
+    """The rows of each run, as they come; its renders are written."""
+    for run, answer in runs:
+        made = _made(run.about, answer)
+        if made.renders:
+            write_files(out_dir, made.renders)
+        yield made.rows
+
+
+def _made(job: Job, answer: Answer) -> Done:
+    return Done([failed_row(job, answer.reason)], {}) if answer.pickled is None else answer.value()
+
+
+def _told(runs: Iterator[list[Row]], total: int) -> Iterator[list[Row]]:
+    started = time.monotonic()
+    for number, rows in enumerate(runs, start=1):
+        yield rows
+        left = (time.monotonic() - started) / number * (total - number)
+        logger.info("bench %d/%d, about %.0f min left: %s", number, total, left / 60, run_line(rows[-1]))
+
+
+def _with(before: Bench, found: dict[_Key, list[Row]], sets: Sequence[_Set], plan: Plan) -> Bench:
+    """With the rows that were found since, in the order of the plan, whichever came to its end first."""
+    order = [
+        (scene.name, len(split.train), method, seed)
+        for (scene, split), seed, method in itertools.product(sets, plan.seeds, plan.methods)
+    ]
+    planned = set(order)
+    listed = [*(key for key in found if key not in planned), *(key for key in order if key in found)]
+    return msgspec.structs.replace(before, rows=(*before.rows, *(row for key in listed for row in found[key])))
+
+
+def _write(out_dir: Path, bench: Bench) -> None:
+    write_files(out_dir, bench_files(bench) | report_files(bench, out_dir))
 
 
 def run_line(row: Row) -> str:
@@ -217,4 +197,6 @@ def run_line(row: Row) -> str:
     score = "not scored" if row.psnr is None else f"{row.psnr:.2f} dB, {row.ssim:.3f} SSIM"
     seconds = row.seconds.get("total")
     took = "" if seconds is None else f", {seconds:.1f} s"
+    if not had_alone(row.others):
+        took = f", seconds not reported: others took {row.others:.0%} of its cores"
     return f"{scene} {views} views, {method}, seed {seed}: {row.verdict}, {score}{took}"

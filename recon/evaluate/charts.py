@@ -45,14 +45,15 @@ _LPIPS_ALEX = Quality("LPIPS Alex", lambda point: point.lpips_alex, False)
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """speed_accuracy.png and parsimony.png, and ablation.png where parts were measured; none where nothing was scored.
 
-    Methods that were made for the ablation are drawn there alone; fields, which have no Gaussians, not in the second.
+    What has no seconds is left out of the first, fields, which have no Gaussians, of the second. Methods that were made
+    for the ablation are drawn there alone.
     """
     files = {}
     measured = [
         p for p in method_means(shared([row for row in rows if not is_variant(row.method)])) if p.psnr is not None
     ]
-    if measured:
-        files["speed_accuracy.png"] = png(speed_accuracy(measured))
+    if timed := [p for p in measured if p.seconds]:
+        files["speed_accuracy.png"] = png(speed_accuracy(timed))
     if sized := [p for p in measured if p.num_gaussians]:
         files["parsimony.png"] = png(parsimony(sized))
     scored = [row for row in rows if row.final and row.psnr is not None]

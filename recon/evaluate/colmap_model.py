@@ -10,11 +10,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatnode.capture.colmap_images import binary_images, content_lines, text_images
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import printable
 from splatnode.recon.evaluate.json_file import MAX_BYTES, EvaluationFileError
-from splatnode.recon.result.colmap_images import binary_images, content_lines, text_images
 
 _PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}  # parameters of each
 _NUMBERS = {0: "SIMPLE_PINHOLE", 1: "PINHOLE"}

@@ -9,6 +9,7 @@ import msgspec
 
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.records import record_in
 
 T = TypeVar("T")
 
@@ -26,6 +27,6 @@ def read_json(path: Path, kind: type[T], expected: str) -> T:
     """
     with foreign(EvaluationFileError, str(path)):
         try:
-            return msgspec.json.decode(read_bounded(path, MAX_BYTES, EvaluationFileError, str(path)), type=kind)
+            return record_in(read_bounded(path, MAX_BYTES, EvaluationFileError, str(path)), kind)
         except msgspec.MsgspecError as error:
             raise EvaluationFileError(f"{path} must be {expected}: {error}") from error

@@ -26,7 +26,8 @@ from splatnode.recon.rasterize.device import Device
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import pixelwise
 
-CHECKPOINTS = (50, 150, 500)  # iterations at which a configuration shows its scene, besides its end
+# Iterations at which a configuration shows its scene, besides its end; none so early that it would begin otherwise
+CHECKPOINTS = (refinement.MIN_SOFT, 150, 500)
 
 # InstantSplat's released settings (2025): a Gaussian a pixel, nothing added or taken away; colours, scales and turns
 # ten times as fast as in 3DGS; steps that do not fall, but for the poses', which fall to a hundredth.

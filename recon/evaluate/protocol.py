@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -15,8 +14,9 @@ from torch import Tensor
 from splatnode.recon.evaluate.appearance import Appearance, Rasterize, appearance_of
 from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
 from splatnode.recon.evaluate.metrics import best_gains, psnr, ssim
+from splatnode.recon.evaluate.perceptual import Networks
 from splatnode.recon.evaluate.regions import UNKNOWN, Counts, ErrorMaps, RegionScore, error_maps, region_scores
-from splatnode.recon.evaluate.same_lens import of_one_lens, seen_by
+from splatnode.recon.evaluate.same_lens import mean_intrinsics, of_one_lens, seen_by
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.start_pose import between_neighbours
 from splatnode.recon.evaluate.test_pose import find_test_pose
@@ -24,8 +24,8 @@ from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.frames import border
 from splatnode.recon.frames.keyframe import modelled_image, modelled_mask
 from splatnode.recon.geometry import align_cameras
-from splatnode.recon.networks.lpips import Lpips, load_lpips
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
+from splatnode.recon.scene.vignetting import light_at
 
 STAGES = ("poses", "points", "optimise")
 _FIRST_RATE, _CONTINUED_RATE = 3e-3, 5e-4  # learning rates of the test-pose search, in radians and parts of the depth
@@ -79,7 +79,10 @@ class Row:
     centre_error_pct: float | None = None
     focal_error_pct: float | None = None
     ate_instantsplat: float | None = None
-    seconds: Mapping[str, float | None]
+    seconds: Mapping[str, float | None]  # None: not measured, or others had a part of its cores
+    cores: int | None = None  # that it could use while it was timed
+    processor: str | None = None
+    others: float | None = None  # the share of the cores' time that others took meanwhile
     peak_rss_mb: float | None
     num_gaussians: int | None = None
     num_cameras: int | None = None  # of the training views, those with an estimated pose
@@ -89,29 +92,12 @@ class Row:
     error: str | None = None  # why it did
 
 
-@dataclass(frozen=True, eq=False)
-class Networks:
-    """The perceptual metrics for which there are weights."""
-
-    alex: Lpips | None
-    vgg: Lpips | None
-
-    @property
-    def quickest(self) -> Networks:
-        """Without VGG, which takes twenty times as long as AlexNet, where the other serves."""
-        return self if self.alex is None else Networks(self.alex, None)
-
-
 Show = Callable[[str, Tensor, Tensor], None]  # name of a test view, photograph, render; both (H, W, 3) in [0, 1]
 Poses = MutableMapping[str, npt.NDArray[np.float64]]  # T_world_camera (4, 4) by the name of a test view
 
 
 def ignore_render(name: str, truth: Tensor, image: Tensor) -> None:
     """For a caller that wants no renders."""
-
-
-def load_networks(weights_dir: Path | None = None) -> Networks:
-    return Networks(load_lpips("alex", weights_dir), load_lpips("vgg", weights_dir))
 
 
 def evaluate(
@@ -143,7 +129,9 @@ def evaluate(
     found = {} if found is None else found
     cameras = of_one_lens(snapshot.cameras)
     counts = {} if shown is None or (cameras and cameras[0].lens) else shown  # they are of the photographs as they are
-    views = _score_test_views(appearance, cameras, estimated, scene, split, networks, settings, show, found, counts)
+    falloff = snapshot.falloffs.get(cameras[0].name, 0.0) if cameras else 0.0
+    seen = appearance, cameras, estimated, falloff
+    views = _score_test_views(*seen, scene, split, networks, settings, show, found, counts)
     return Row(
         scene=scene.name,
         views=len(split.train),
@@ -186,6 +174,7 @@ def _score_test_views(
     appearance: Appearance | None,
     cameras: Sequence[CameraEstimate],
     estimated: Sequence[CameraEstimate],
+    falloff: float,
     scene: EvaluationScene,
     split: Split,
     networks: Networks,
@@ -201,14 +190,12 @@ def _score_test_views(
     can be scored with fewer than two of them. Photographs are compared where they show the scene: a black rim that
     undistortion left is cut off, for the search too, and what a mask hides counts as well rendered in SSIM and LPIPS,
     and not at all in PSNR and in the scores by region. A distortion that was taken out of the training photographs is
-    taken out of these, too.
+    taken out of these, too. Where their vignetting was taken out, renders get it.
     """
     if appearance is None or len(estimated) < 2:
         return []
-    true_to_estimated = align_cameras(
-        np.stack([scene.cameras[camera.name].T_world_camera for camera in estimated]),
-        np.stack([camera.T_world_camera for camera in estimated]),
-    )
+    true = [scene.cameras[camera.name].T_world_camera for camera in estimated]
+    true_to_estimated = align_cameras(np.stack(true), np.stack([camera.T_world_camera for camera in estimated]))
     names = [name for name in split.test if name in scene.cameras]
     given = [seen_by(cameras[0].lens, *scene.masked_image(name)) for name in names]
     photographs = [modelled_image(image, settings.longer_side) for image, _ in given]
@@ -219,6 +206,7 @@ def _score_test_views(
         whole_K = mean_intrinsics(cameras, photograph.shape[1], photograph.shape[0])
         rows, columns = border.valid_rectangle(shown)
         truth = whole[rows, columns]
+        light = torch.from_numpy(light_at(falloff, photograph.shape[1], photograph.shape[0]))[..., None]
         K = whole_K - np.array([[0.0, 0.0, columns.start], [0.0, 0.0, rows.start], [0.0, 0.0, 0.0]])
         if name in found:
             start, steps, levels, rate = found[name], settings.continued_steps, 1, _CONTINUED_RATE
@@ -228,14 +216,14 @@ def _score_test_views(
                 start = between_neighbours(name, list(scene.paths), {c.name: c.T_world_camera for c in estimated})
             steps, levels, rate = settings.alignment_steps, settings.alignment_levels, _FIRST_RATE
         used = torch.from_numpy(modelled_mask(mask, *photograph.shape[:2]))
-        target = truth
+        target = (truth / light[rows, columns]).clamp(0.0, 1.0)
         if settings.best_gain:
             begun = appearance.render(start, K, truth.shape[1], truth.shape[0])
-            target = (truth / best_gains(truth, begun, used[rows, columns])).clamp(0.0, 1.0)
+            target = (target / best_gains(target, begun, used[rows, columns])).clamp(0.0, 1.0)
         aligned = find_test_pose(appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate)
         T_world_camera = aligned.T_world_camera
         found.setdefault(name, T_world_camera)
-        with_rim = appearance.render(T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
+        with_rim = light * appearance.render(T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
         if settings.best_gain:
             gains = best_gains(truth, with_rim[rows, columns], used[rows, columns])
             with_rim = (with_rim * gains).clamp(0.0, 1.0)
@@ -267,16 +255,6 @@ def _view_score(
         lpips_vgg=networks.vgg(image, truth) if networks.vgg else None,
         maps=maps,
     )
-
-
-def mean_intrinsics(cameras: Sequence[CameraEstimate], width: int, height: int) -> npt.NDArray[np.float64]:
-    """(3, 3) K for an image `width` x `height`: mean focal lengths and principal point, relative to the image sizes."""
-    longer = np.array([max(camera.width, camera.height) for camera in cameras])
-    Ks = np.stack([camera.K for camera in cameras])
-    fx, fy = (float((Ks[:, i, i] / longer).mean()) * max(width, height) for i in (0, 1))
-    cx = float((Ks[:, 0, 2] / [camera.width for camera in cameras]).mean()) * width
-    cy = float((Ks[:, 1, 2] / [camera.height for camera in cameras]).mean()) * height
-    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 def _camera_errors(estimated: Sequence[CameraEstimate], scene: EvaluationScene) -> CameraErrors:

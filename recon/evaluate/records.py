@@ -6,7 +6,6 @@ import csv
 import dataclasses
 import io
 import os
-import platform
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import msgspec
 
 from splatnode.recon.evaluate.json_file import read_json
 from splatnode.recon.evaluate.protocol import Row, Settings
+from splatnode.recon.evaluate.timing import processor
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.report import versions
 
@@ -69,7 +69,7 @@ def bench_files(bench: Bench) -> dict[str, bytes]:
 def this_machine() -> dict[str, Any]:
     """What the seconds were measured on."""
     affinity = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"processor": _processor(), "threads": affinity, **versions()}
+    return {"processor": processor(), "threads": affinity, **versions()}
 
 
 def _csv(records: Sequence[Mapping[str, Any]]) -> bytes:
@@ -90,13 +90,3 @@ def _csv(records: Sequence[Mapping[str, Any]]) -> bytes:
     writer.writeheader()
     writer.writerows(flat)
     return text.getvalue().encode()
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        pass
-    return platform.processor() or platform.machine()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
@@ -10,7 +10,6 @@ import numpy as np
 from torch import Tensor
 
 from splatnode.recon.evaluate.protocol import Row
-from splatnode.recon.result.export.staged import write_files
 
 FOLDER = "renders"
 PHOTOGRAPH = "photograph.jpg"
@@ -19,20 +18,21 @@ _QUALITY = 90
 
 @dataclass(frozen=True)
 class Renders:
-    """Of one run. The test views in `shown` are kept."""
+    """Of one run. The test views in `shown` are kept as files, by their paths in the folder of the benchmark."""
 
-    out_dir: Path
     scene: str
     views: int
     method: str
     seed: int
     shown: tuple[str, ...]
+    files: dict[str, bytes] = field(default_factory=dict)
 
     def keep(self, name: str, truth: Tensor, image: Tensor) -> None:
         """A `recon.evaluate.protocol.Show`."""
         if name in self.shown:
-            folder = self.out_dir / FOLDER / f"{self.scene}-{self.views}" / Path(name).stem
-            write_files(folder, {PHOTOGRAPH: _jpeg(truth), f"{self.method}-{self.seed}.jpg": _jpeg(image)})
+            folder = f"{FOLDER}/{self.scene}-{self.views}/{Path(name).stem}"
+            self.files[f"{folder}/{PHOTOGRAPH}"] = _jpeg(truth)
+            self.files[f"{folder}/{self.method}-{self.seed}.jpg"] = _jpeg(image)
 
 
 def kept(out_dir: Path, row: Row) -> dict[str, Path]:

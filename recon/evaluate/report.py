@@ -63,7 +63,8 @@ def _introduction(bench: Bench) -> str:
         f"{settings.longer_side} px, without the black rim that undistortion left (`with rim`: PSNR of the whole "
         f"photograph){_GAINS[settings.best_gain]}. "
         "Seconds are wall time of the reconstruction alone, with the cameras and points that methods of "
-        "one prior share. Means are over the runs that every method was put to and, of these, the method's that "
+        "one prior share; of runs that did not have their cores alone, or had other cores than the rest, there are "
+        "none. Means are over the runs that every method was put to and, of these, the method's that "
         "published a scene; `±`: standard deviation "
         "between seeds; `–`: not measured."
     )

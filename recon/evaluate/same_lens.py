@@ -30,3 +30,13 @@ def seen_by(lens: Intrinsics | None, image: Image, mask: Mask) -> tuple[Image, M
         return image, mask
     frame = undistorted(Frame(0, "photograph", 0, image, lens, mask=mask))
     return frame.image, mask if frame.mask is None else frame.mask
+
+
+def mean_intrinsics(cameras: Sequence[CameraEstimate], width: int, height: int) -> npt.NDArray[np.float64]:
+    """(3, 3) K for an image `width` x `height`: mean focal lengths and principal point, relative to the image sizes."""
+    longer = np.array([max(camera.width, camera.height) for camera in cameras])
+    Ks = np.stack([camera.K for camera in cameras])
+    fx, fy = (float((Ks[:, i, i] / longer).mean()) * max(width, height) for i in (0, 1))
+    cx = float((Ks[:, 0, 2] / [camera.width for camera in cameras]).mean()) * width
+    cy = float((Ks[:, 1, 2] / [camera.height for camera in cameras]).mean()) * height
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

@@ -71,6 +71,11 @@ def _row_at(run: Sequence[Row], moment: float) -> Row:
     return min(beyond, key=_moment) if beyond else max(run, key=_moment)
 
 
+def _alike(rows: Sequence[Row]) -> bool:
+    """Whether all ran on processors of one kind, on as many cores each: else a mean of their seconds says nothing."""
+    return len({(row.processor, row.cores) for row in rows}) <= 1
+
+
 def _method_mean(views: int, method: str, checkpoint: int | None, rows: Sequence[Row]) -> MethodMean:
     """Seconds, Gaussians and bytes are those of the published runs, like the quality that they bought."""
     solved = [row for row in rows if row.psnr is not None]
@@ -87,7 +92,7 @@ def _method_mean(views: int, method: str, checkpoint: int | None, rows: Sequence
         checkpoint,
         runs=len(rows),
         solved=len(solved),
-        seconds=over_all([row.seconds.get("total") for row in solved]),
+        seconds=over_all([row.seconds.get("total") for row in solved]) if _alike(solved) else None,
         scene_megabytes=None if scene_bytes is None else scene_bytes / 1e6,
         **{name: over_all([getattr(row, name) for row in solved]) for name in (*names, *poses)},
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from splatnode.capture.process.arguments import counts, names, positive, seconds
 from splatnode.capture.process.verb import Verb, lazily
+from splatnode.recon.jobs.arguments import add_max_memory, add_ray
 from splatnode.recon.shared_arguments import add_device
 
 
@@ -37,6 +38,7 @@ def _bench_arguments(parser: argparse.ArgumentParser) -> None:
         "--by-region", action="store_true", help="score also what two training photographs show, one, or none"
     )
     parser.add_argument("--seeds", type=positive, default=1, metavar="N", help="runs of each, with seeds 0 to N-1")
+    _add_engine(parser, "runs", "a run", 3600.0)
     add_device(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
     parser.add_argument("--resume", action="store_true", help="go on: runs that --out holds are not run again")
@@ -64,8 +66,7 @@ def _stability_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--given-lens", action="store_true", help="windows of a calibrated camera: splatnode is told the true lens"
     )
-    parser.add_argument("--jobs", type=positive, default=1, metavar="N", help="trials at a time (default: 1)")
-    parser.add_argument("--timeout-s", type=seconds, default=120.0, metavar="S", help="of one trial (default: 120)")
+    _add_engine(parser, "trials", "a trial", 120.0)
     parser.add_argument(
         "--windows", action="store_true", help="instead of the matrix: windows of 3, 6 and 12 consecutive photographs"
     )
@@ -78,6 +79,25 @@ def _stability_arguments(parser: argparse.ArgumentParser) -> None:
         help="time each window from its photographs on, too, with nothing kept of others",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="trials that it holds are not run again")
+
+
+def _add_engine(parser: argparse.ArgumentParser, several: str, one: str, timeout_s: float) -> None:
+    """Where and how many at a time, and what ends `one` of `several`."""
+    parser.add_argument(
+        "--cores",
+        type=positive,
+        metavar="N",
+        help=f"{several} at a time, each on one core (default: one at a time, on all cores)",
+    )
+    add_ray(parser)
+    add_max_memory(parser, one)
+    parser.add_argument(
+        "--timeout-s",
+        type=seconds,
+        default=timeout_s,
+        metavar="S",
+        help=f"end {one} that takes longer (default: {timeout_s:g})",
+    )
 
 
 BENCH = Verb(

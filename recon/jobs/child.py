@@ -11,11 +11,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol
 
 from splatnode.recon.jobs import launch
 from splatnode.recon.jobs.memory import tree_mb
 
 _LOOK_EVERY_S = 0.1  # at the memory
+_POLL_S = 0.02
 _LARGEST_TAIL = 4096  # bytes of what it said that are looked through for a reason
 _OURS = "splatnode: "  # before a sentence of the command line
 
@@ -41,21 +43,41 @@ class End:
 NOT_RUN = End(None, "", 0.0, 0.0)  # of a process that was never begun
 
 
+class Process(Protocol):
+    """What a child needs of a process, which leads a group of its own. `Popen` is one."""
+
+    @property
+    def pid(self) -> int: ...
+
+    def poll(self) -> int | None:
+        """Its exit code, below 0 the number of the signal that ended it; None while it runs."""
+        ...
+
+    def wait(self) -> object:
+        """Returns when it has ended."""
+        ...
+
+
 class Child:
     """A running process."""
 
-    def __init__(self, command: Sequence[str], log: Path, cores: Sequence[int]) -> None:
-        """Starts it on `cores`; what it prints goes into `log`. Raises OSError."""
-        self._log, self._began_s = log, time.monotonic()
+    def __init__(self, process: Process, log: Path) -> None:
+        """`log` is where it prints."""
+        self._process, self._log, self._began_s = process, log, time.monotonic()
         self._looked_s = self._memory_mb = 0.0
+
+    @classmethod
+    def started(cls, command: Sequence[str], log: Path, cores: Sequence[int]) -> Child:
+        """Starts it on `cores`; what it prints goes into `log`. Raises OSError."""
         with log.open("wb") as printed:
-            self._process = subprocess.Popen(
-                [sys.executable, "-I", "-S", launch.__file__, str(os.getpid()), ",".join(map(str, cores)), *command],
+            process = subprocess.Popen(
+                launched(command, cores),
                 stdin=subprocess.DEVNULL,
                 stdout=printed,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,  # who interrupts the driver must not make it fail
             )
+        return cls(process, log)
 
     def ended(self, limits: Limits) -> End | None:
         """How it ended; None while it runs. It is killed here where it exceeds `limits`."""
@@ -83,6 +105,22 @@ class Child:
 
     def _end(self, exit_code: int | None, reason: str) -> End:
         return End(exit_code, reason, time.monotonic() - self._began_s, self._memory_mb)
+
+
+def launched(command: Sequence[str], cores: Sequence[int]) -> list[str]:
+    """The command that runs `command` on `cores` until this process ends: see `launch`."""
+    told = [launch.__file__, str(os.getpid()), ",".join(map(str, cores))]
+    return [sys.executable, "-I", "-S", *told, *command]
+
+
+def finished(child: Child, limits: Limits) -> End:
+    """Waits for its end. It is ended where this is interrupted."""
+    try:
+        while (end := child.ended(limits)) is None:
+            time.sleep(_POLL_S)
+        return end
+    finally:
+        child.stop()
 
 
 def _killed(number: int) -> str:

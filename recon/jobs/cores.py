@@ -15,6 +15,14 @@ def usable_cores() -> tuple[int, ...]:
     return tuple(sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else range(os.cpu_count() or 1))
 
 
+def chosen_cores(wanted: int | None) -> tuple[int, ...]:
+    """The first `wanted` of them; None: all. Raises ValueError where there are fewer."""
+    allowed = usable_cores()
+    if wanted is not None and wanted > len(allowed):
+        raise ValueError(f"--cores must be at most {len(allowed)}, which this process may use; got {wanted}")
+    return allowed[:wanted]
+
+
 @contextlib.contextmanager
 def free_core() -> Iterator[int]:
     """A core that no other work is on, of whatever worker of this user; where none is, the one with this turn."""

@@ -31,5 +31,5 @@ def other_version(begun_with: str) -> str | None:
     """What to say where the splatnode of this machine is another one than work was begun with; None: it is the same."""
     if (version := own_version()) == begun_with:
         return None
-    there = f"the worker on {platform.node()} has splatnode {version}, the batch was begun with {begun_with}"
+    there = f"the worker on {platform.node()} has splatnode {version}, the work was begun with {begun_with}"
     return f"{there}; install the same on all machines"

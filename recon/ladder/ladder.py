@@ -1,7 +1,9 @@
 """The ladder before the no: what costs more is tried before photographs are refused for want of matches.
 
-The first estimate is the first rung. While it lacks cameras for some keyframes, and the seconds last, further rungs
+The first estimate is the first rung. While it lacks cameras for some keyframes, and there is work left, further rungs
 find more to estimate from, and cameras are estimated again. An answer is never made worse: the better one is kept.
+How much is tried depends on the photographs alone: work is counted by what is done, and no clock decides unless
+somebody asked for a deadline.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 from splatnode.recon.config import Config
+from splatnode.recon.deadline import is_over
 from splatnode.recon.estimation import Estimate, estimate_cameras
 from splatnode.recon.frames.screening import Rejected
 from splatnode.recon.ladder import learned, tilts
@@ -23,7 +26,8 @@ from splatnode.recon.result.verdict import Code
 
 log = logging.getLogger(__name__)
 
-RUNGS = (learned.RUNG, tilts.RUNG)  # what wins most for its seconds comes first
+RUNGS = (learned.RUNG, tilts.RUNG)  # what wins most for its work comes first
+CAMERAS = 0.2  # work of estimating the cameras again, for each keyframe
 LACKING_MATCHES = (Code.NO_OVERLAP, Code.SPLIT, Code.OK_PARTIAL, Code.AMBIGUOUS)
 # Of the others, what more cameras may mend, where some keyframes have none: few leave much open.
 UNCERTAIN = (Code.OK_ROUGH, Code.TOO_ROUGH, Code.FOCAL_SUSPECT, Code.PLANAR_ONLY, Code.BASELINE_TOO_SMALL)
@@ -39,7 +43,7 @@ def climbed(
 ) -> Estimate:
     """The best of `estimate` and what the `rungs` lead to; a refusal then says what was tried.
 
-    With `config.quick` it is `estimate`. `config.ladder.seconds` bounds the work that is added: they are looked at
+    With `config.quick` it is `estimate`. `config.ladder` bounds the work that is added: what it comes to is looked at
     between pairs and before each rung, as is `until`, a time of `time.monotonic()`. A pair and an estimate that have
     begun are finished. Where that does not help, photographs in doubt are left out. `pause` may raise.
     """
@@ -47,7 +51,7 @@ def climbed(
         return estimate
     if _lacks_matches(estimate):
         estimate = _with_more(estimate, rejected, config, pause, rungs, until)
-    return estimate if time.monotonic() >= until else without_the_doubtful(estimate, rejected, config, pause)
+    return estimate if is_over(until) else without_the_doubtful(estimate, rejected, config, pause)
 
 
 def _with_more(
@@ -58,25 +62,27 @@ def _with_more(
     rungs: Sequence[Rung],
     until: float,
 ) -> Estimate:
-    means, until = Means(estimate.graph, config), min(until, time.monotonic() + config.ladder.seconds)
+    means, most_s = Means(estimate.graph, config), config.ladder.most_s
+    until = until if most_s is None else min(until, time.monotonic() + most_s)
     tried: list[str] = []
     not_tried: list[str] = []
     for rung in rungs:
         doubtful = doubtful_keyframes(estimate)
-        if not doubtful or time.monotonic() >= until:
+        if not doubtful or _ends(means, until):
             break
         obstacle = rung.obstacle()
         if obstacle:
             not_tried.append(f"{rung.name} ({obstacle})")
             continue
-        began, before = time.monotonic(), means
+        before = means
         means = _last(rung.climb(before, doubtful), before, until, pause)
         if means is before:
             continue
         other = estimate_cameras(means.graph, rejected, means.config, pause)
+        means = means.after(CAMERAS * len(means.graph.keyframes))
         estimate = better(estimate, other)
         gained = "more photographs found their place" if estimate is other else "nothing gained"
-        log.info("looked for more matches: %s: %s in %.1f s", rung.name, gained, time.monotonic() - began)
+        log.info("looked for more matches: %s: %s by %.1f of work", rung.name, gained, means.work - before.work)
         tried.append(rung.name)
     return _telling(estimate, {"Also tried": tried, "Not tried": not_tried})
 
@@ -87,13 +93,18 @@ def _lacks_matches(estimate: Estimate) -> bool:
 
 
 def _last(climb: Iterator[Means], means: Means, until: float, pause: Callable[[], None]) -> Means:
-    """The means after the last piece of work that ends before `until`, a time of `time.monotonic()`, or just after."""
+    """The means after the last piece of work that begins before the climb ends."""
     for further in climb:
         means = further
         pause()
-        if time.monotonic() >= until:
+        if _ends(means, until):
             break
     return means
+
+
+def _ends(means: Means, until: float) -> bool:
+    """Whether nothing further begins, for these means or from `until` on, a time of `time.monotonic()`."""
+    return means.work >= means.config.ladder.work or is_over(until)
 
 
 def doubtful_keyframes(estimate: Estimate) -> frozenset[str]:

@@ -9,13 +9,14 @@ from splatnode.recon.ladder.rung import Means, Rung, with_matches
 from splatnode.recon.learned_parts import LearnedPart, obstacle
 from splatnode.recon.priors import xfeat
 
+PAIR = 0.48  # work, with its share of finding the photographs' points: the networks take pictures of one size only
 _PART = LearnedPart("xfeat", "matches of wide baselines", xfeat.WEIGHTS, xfeat.PACKAGE)
 
 
 def _climb(means: Means, doubtful: Collection[str]) -> Iterator[Means]:
     if means.config.prior.kind != "classical":  # another prior has been asked for matches
         return iter(())
-    return with_matches(means, doubtful, tilts=(), matcher=xfeat.load(xfeat.Config()).matcher)
+    return with_matches(means, doubtful, lambda graph, pair: PAIR, matcher=xfeat.load(xfeat.Config()).matcher)
 
 
 RUNG = Rung("learned matches", _climb, partial(obstacle, _PART))

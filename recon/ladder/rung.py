@@ -16,11 +16,18 @@ class Means:
 
     graph: ViewGraph
     config: Config
+    work: float = 0.0  # that went into them, as `config.ladder.work` counts it
+
+    def after(self, work: float) -> Means:
+        """The same, after so much further work."""
+        return replace(self, work=self.work + work)
 
 
 # The means after each further piece of work, given those so far and the names of the keyframes in doubt; none
 # where this rung has nothing to add.
 Climb = Callable[[Means, Collection[str]], Iterator[Means]]
+# The work of matching a pair of the view graph further, by what there is to do: never by a clock.
+Work = Callable[[ViewGraph, Pair], float]
 
 
 @dataclass(frozen=True)
@@ -33,11 +40,12 @@ class Rung:
 
 
 def with_matches(
-    means: Means, doubtful: Collection[str], tilts: tuple[float, ...], matcher: Matcher | None
+    means: Means, doubtful: Collection[str], work: Work, tilts: tuple[float, ...] = (), matcher: Matcher | None = None
 ) -> Iterator[Means]:
     """After each weak pair of a doubtful keyframe has got further matches, the most promising pairs first."""
     for pair in weak_pairs(means.graph, doubtful):
-        means = replace(means, graph=matched_further(means.graph, pair, tilts, matcher).chosen())
+        cost = work(means.graph, pair)
+        means = replace(means, graph=matched_further(means.graph, pair, tilts, matcher).chosen()).after(cost)
         yield means
 
 

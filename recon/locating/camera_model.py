@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
-from splatnode.recon.registration.cross_product import cross_matrix
+from splatnode.recon.geometry import distortion
+from splatnode.recon.geometry import without_distortion as straight
 
 Array = npt.NDArray[np.float64]
 
-NUM_PARAMETERS = 10  # a small turn (3) and move (3) of the world in the camera, log focal, radial, shift (2)
+NUM_PARAMETERS = 10  # a small turn (3) and move (3) of the world in the camera, log focal, first radial, shift (2)
 POSE = 6  # of them, the pose's
+PINHOLE = 0.0, 0.0  # its radial coefficients
 _MIN_DEPTH = 1e-9
-_UNDISTORT_ITERATIONS = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,16 +24,16 @@ class Lens:
     """A lens with what is known of it: standard deviations; 0 where a number is certain."""
 
     focal: float  # pixels
-    radial: float  # first radial coefficient, as recon/registration/bundle.py has it
+    radial: tuple[float, float]  # radial coefficients, as recon/registration/bundle.py has them; the second is held
     shift: Array  # (2,) of the principal point, pixels
     log_focal_sigma: float
-    radial_sigma: float
+    radial_sigma: float  # of the first
     shift_sigma: float  # pixels
 
     @property
     def values(self) -> Array:
         """(4,) as parameters."""
-        return np.array([np.log(self.focal), self.radial, *self.shift])
+        return np.array([np.log(self.focal), self.radial[0], *self.shift])
 
     @property
     def sigmas(self) -> Array:
@@ -52,12 +53,12 @@ class CameraModel:
         """With the parameters changed by `step` (NUM_PARAMETERS,)."""
         lens = self.lens
         return CameraModel(
-            Rotation.from_rotvec(step[:3]).as_matrix() @ self.rotation,
+            np.asarray(cv2.Rodrigues(step[:3])[0]) @ self.rotation,
             self.translation + step[3:POSE],
             replace(
                 lens,
                 focal=lens.focal * float(np.exp(step[6])),
-                radial=lens.radial + step[7],
+                radial=(lens.radial[0] + float(step[7]), lens.radial[1]),
                 shift=lens.shift + step[8:],
             ),
         )
@@ -78,38 +79,35 @@ class CameraModel:
         """Pixels (M, 2) of world points (M, 3), relative to the nominal principal point, and depths (M,)."""
         in_camera = points @ self.rotation.T + self.translation
         rays = in_camera[:, :2] / _safe(in_camera[:, 2])[:, None]
-        distortion = 1.0 + self.lens.radial * (rays**2).sum(1)
-        return self.lens.focal * distortion[:, None] * rays + self.lens.shift, in_camera[:, 2]
+        bent = distortion((rays**2).sum(1), np.array(self.lens.radial))
+        return self.lens.focal * bent[:, None] * rays + self.lens.shift, in_camera[:, 2]
 
     def derivatives(self, points: Array) -> tuple[Array, Array]:
         """Of the pixels of points (M, 3): (M, 2, NUM_PARAMETERS) by the parameters, (M, 2, 3) by the points."""
-        turned = points @ self.rotation.T
-        in_camera = turned + self.translation
-        depth = _safe(in_camera[:, 2])
-        rays = in_camera[:, :2] / depth[:, None]
-        focal, radial, squared = self.lens.focal, self.lens.radial, (rays**2).sum(1)
-        distortion = (1.0 + radial * squared)[:, None]
-        by_ray = focal * (distortion[..., None] * np.eye(2) + 2.0 * radial * rays[:, :, None] * rays[:, None, :])
-        ray_by_camera = np.zeros((len(points), 2, 3))
-        ray_by_camera[:, 0, 0] = ray_by_camera[:, 1, 1] = 1.0 / depth
-        ray_by_camera[:, :, 2] = -rays / depth[:, None]
-        by_camera = by_ray @ ray_by_camera
-        by_parameters = np.zeros((len(points), 2, NUM_PARAMETERS))
-        by_parameters[:, :, :3] = -by_camera @ cross_matrix(turned)
-        by_parameters[:, :, 3:POSE] = by_camera
-        by_parameters[:, :, 6] = focal * distortion * rays
-        by_parameters[:, :, 7] = focal * squared[:, None] * rays
-        by_parameters[:, 0, 8] = by_parameters[:, 1, 9] = 1.0
-        return by_parameters, by_camera @ self.rotation
+        # A row of memory is a derivative of all points: so NumPy's loops are long ones.
+        turned = np.ascontiguousarray((points @ self.rotation.T).T)
+        z = _safe(turned[2] + self.translation[2])
+        x, y = (turned[0] + self.translation[0]) / z, (turned[1] + self.translation[1]) / z
+        focal, (first, second), squared = self.lens.focal, self.lens.radial, x * x + y * y
+        scaled = focal * distortion(squared, np.array(self.lens.radial))
+        twice = 2.0 * focal * (first + 2.0 * second * squared)
+        # By the ray (x, y), which is the point over its depth; then by the point in the camera.
+        xx, xy, yy = scaled + twice * x * x, twice * x * y, scaled + twice * y * y
+        by_camera = np.stack([[xx, xy, -(xx * x + xy * y)], [xy, yy, -(xy * x + yy * y)]]) / z  # (2, 3, M)
+        by_parameters = np.zeros((2, NUM_PARAMETERS, len(points)))
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # turned x by_camera
+            by_parameters[:, i] = turned[j] * by_camera[:, k] - turned[k] * by_camera[:, j]
+        by_parameters[:, 3:POSE] = by_camera
+        by_parameters[:, 6] = scaled * x, scaled * y
+        by_parameters[:, 7] = focal * squared * x, focal * squared * y
+        by_parameters[0, 8] = by_parameters[1, 9] = 1.0
+        return by_parameters.transpose(2, 0, 1), (self.rotation.T @ by_camera).transpose(2, 0, 1)
 
 
 def without_distortion(pixels: Array, lens: Lens) -> Array:
     """(M, 2) where a pinhole of the same focal length would see what `lens` sees at `pixels` (M, 2)."""
     distorted = (pixels - lens.shift) / lens.focal
-    rays = distorted
-    for _ in range(_UNDISTORT_ITERATIONS if lens.radial else 0):
-        rays = distorted / (1.0 + lens.radial * (rays**2).sum(1))[:, None]
-    return lens.focal * rays
+    return lens.focal * straight(distorted, np.array(lens.radial))
 
 
 def _safe(depth: Array) -> Array:

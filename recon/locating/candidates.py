@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Intrinsics
-from splatnode.recon.locating.camera_model import Lens
+from splatnode.recon.locating.camera_model import PINHOLE, Lens
 from splatnode.recon.result.landmarks import KnownLenses
 
 Array = npt.NDArray[np.float64]
@@ -24,7 +24,7 @@ _TOLD_APART = 0.002  # log focals of a result's lenses that are tried one by one
 
 def given(intrinsics: Intrinsics) -> Lens | None:
     """The lens of a photograph without distortion that came with trusted intrinsics; None where they are not."""
-    return Lens(intrinsics.fx, 0.0, np.zeros(2), 0.0, 0.0, 0.0) if intrinsics.source != "exif" else None
+    return Lens(intrinsics.fx, PINHOLE, np.zeros(2), 0.0, 0.0, 0.0) if intrinsics.source != "exif" else None
 
 
 def own(lenses: KnownLenses, width: int, height: int, intrinsics: Intrinsics | None) -> list[Lens]:
@@ -41,19 +41,32 @@ def own(lenses: KnownLenses, width: int, height: int, intrinsics: Intrinsics | N
             continue
         moved = shift * side if upright else np.zeros(2)
         sigmas = _SAME_LENS_SIGMA, _SAME_RADIAL_SIGMA, _SHIFT_SIGMA * side
-        found.append(Lens(float(focal) * side, float(radial), moved, *sigmas))
+        found.append(Lens(float(focal) * side, (float(radial[0]), float(radial[1])), moved, *sigmas))
     return found
+
+
+def continued(focal: float, log_sigma: float, shift: Array, lenses: KnownLenses, width: int, height: int) -> Lens:
+    """That of the photograph before, of the same camera and size: `focal` and `shift` in pixels, as it was found.
+
+    `log_sigma` is how well the logarithm of the focal length is known. Its radial coefficients are those of
+    the result's lens nearest to it, if that took pictures of this shape.
+    """
+    side = max(width, height)
+    alike = own(lenses, width, height, Intrinsics(width, height, focal, focal, width / 2, height / 2, source="exif"))
+    nearest = min(alike, key=lambda lens: abs(np.log(lens.focal / focal)), default=None)
+    radial, sigma = (PINHOLE, _RADIAL_SIGMA) if nearest is None else (nearest.radial, _SAME_RADIAL_SIGMA)
+    return Lens(focal, radial, shift, max(log_sigma, _SAME_LENS_SIGMA), sigma, _SHIFT_SIGMA * side)
 
 
 def nominal(intrinsics: Intrinsics, side: int) -> Lens:
     """The lens that EXIF tells, which is right to a few per cent."""
-    return Lens(intrinsics.fx, 0.0, np.zeros(2), _EXIF_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side)
+    return Lens(intrinsics.fx, PINHOLE, np.zeros(2), _EXIF_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side)
 
 
 def any_lens(side: int) -> list[Lens]:
     """Focal lengths from wide to long, each with what lies between it and the next."""
     return [
-        Lens(float(focal) * side, 0.0, np.zeros(2), _FREE_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side)
+        Lens(float(focal) * side, PINHOLE, np.zeros(2), _FREE_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side)
         for focal in _FOCALS
     ]
 

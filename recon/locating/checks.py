@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import msgspec
 import numpy as np
@@ -32,11 +32,28 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     max_centre_percent: float = 10.0  # likewise
 
 
+Check = Callable[[Case, Config], NotLocated | None]
+
+
 def refused(case: Case, config: Config) -> NotLocated | None:
     """The first check that refuses, or None."""
+    return _first(case, config, _CHECKS)
+
+
+def refused_as_chance(case: Case, config: Config) -> NotLocated | None:
+    """The same of the checks whether the camera was found at all, which matches with all that is in view answer."""
+    return _first(case, config, _WHETHER_FOUND)
+
+
+def refused_as_wrong(case: Case, config: Config) -> NotLocated | None:
+    """The same of the other ones."""
+    return _first(case, config, [check for check in _CHECKS if check not in _WHETHER_FOUND])
+
+
+def _first(case: Case, config: Config, checks: Sequence[Check]) -> NotLocated | None:
     if case.posed is None:
         return nothing_found(case)
-    return next((found for check in _CHECKS if (found := check(case, config)) is not None), None)
+    return next((found for check in checks if (found := check(case, config)) is not None), None)
 
 
 def nothing_found(case: Case) -> NotLocated:
@@ -155,7 +172,6 @@ def _halves_disagree(case: Case, config: Config) -> NotLocated | None:
     )
 
 
-Check = Callable[[Case, Config], NotLocated | None]
 _CHECKS: tuple[Check, ...] = (
     _by_chance,
     _with_an_impossible_lens,
@@ -163,3 +179,4 @@ _CHECKS: tuple[Check, ...] = (
     _as_well_elsewhere,
     _halves_disagree,
 )
+_WHETHER_FOUND: tuple[Check, ...] = (_by_chance, _as_well_elsewhere)

@@ -17,7 +17,7 @@ from splatnode.recon.result.landmarks import Landmarks
 Array = npt.NDArray[np.float64]
 
 _BALL_95 = 2.7955  # radius that holds 95 % of a normal distribution with sigma 1 in three dimensions
-_NORMAL_95 = 1.96  # and in one
+NORMAL_95 = 1.96  # and in one
 _MOST_LOG_FOCAL = math.log(10.0)  # who knows the focal length no better knows nothing
 
 
@@ -32,7 +32,7 @@ def claimed(posed: Posed, known: Correspondences, landmarks: Landmarks) -> tuple
     move = np.sqrt(shares @ landmarks.centre_bounds**2) / _BALL_95
     covariance = pose_covariance(posed.fit.camera, posed.fit.covariance) + np.diag([move**2] * 3 + [turn**2] * 3)
     centre = length_95(covariance[:3, :3])
-    focal = _NORMAL_95 * math.sqrt(max(posed.fit.covariance[6, 6], 0.0))
+    focal = NORMAL_95 * math.sqrt(max(posed.fit.covariance[6, 6], 0.0))
     claim = Claim(
         rotation_deg=math.degrees(length_95(covariance[3:, 3:])),
         centre=centre,

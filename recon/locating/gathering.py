@@ -64,7 +64,7 @@ def _triangulated(graph: ViewGraph, registration: Registration) -> tuple[bundle.
     """All points on which matches and cameras agree, and the keyframes' features relative to the principal points."""
     count = len(graph.keyframes)
     rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
-    log_focals, radials, principals = np.zeros(count), np.zeros(count), np.zeros((count, 2))
+    log_focals, radials, principals = np.zeros(count), np.zeros((count, 2)), np.zeros((count, 2))
     for camera in registration.cameras:
         rotations[camera.index] = camera.T_world_camera[:3, :3].T
         translations[camera.index] = -rotations[camera.index] @ camera.T_world_camera[:3, 3]

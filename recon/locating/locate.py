@@ -17,10 +17,11 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.frames.keyframe import Features, longer_side, principal_point
 from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.locating import candidates, checks, claims, posing
-from splatnode.recon.locating.camera_model import CameraModel
+from splatnode.recon.locating.camera_model import CameraModel, Lens
 from splatnode.recon.locating.case import Case, Judged
 from splatnode.recon.locating.correspondences import Correspondences, correspondences
 from splatnode.recon.locating.outcome import Located, NotLocated
+from splatnode.recon.locating.refinement import Fit, refined
 from splatnode.recon.matching import features, nearest_neighbours
 from splatnode.recon.result.landmarks import Landmarks
 
@@ -93,10 +94,13 @@ def placed(landmarks: Landmarks, photograph: Photograph, config: Config = Config
     frame = photograph.frame
     known = correspondences(photograph.features, principal_point(frame), landmarks, config.neighbours)
     case = _case(known, frame, landmarks, config)
-    refusal = checks.refused(case, config.checks)
-    if refusal is not None or case.posed is None:
-        return refusal or checks.nothing_found(case)
-    claim, covariance = claims.claimed(case.posed, known, landmarks)
+    return checks.refused(case, config.checks) or claimed(case, frame, landmarks, config)
+
+
+def claimed(case: Case, frame: Frame, landmarks: Landmarks, config: Config) -> Placed | NotLocated:
+    """The camera of the photograph `frame` that no check refuses, with what is claimed of it."""
+    assert case.posed is not None  # a check refuses it
+    claim, covariance = claims.claimed(case.posed, case.known, landmarks)
     refusal = checks.too_rough(claim, config.checks)
     if refusal is not None:
         return refusal
@@ -117,30 +121,38 @@ def _case(known: Correspondences, frame: Frame, landmarks: Landmarks, config: Co
     best = judged.case(None)
     for lens in candidates.own(landmarks.lenses, frame.width, frame.height, given):
         found = judged.case(judged.posed(lens))
-        if found.log10_nfa < best.log10_nfa and _as_uncropped(found, judged, side) is found:
+        if found.log10_nfa < best.log10_nfa and as_uncropped(found, judged, side) is found:
             best = found
     if best.log10_nfa < _AMPLE_NFA:
         return best
     others = candidates.any_lens(side) if given is None else [candidates.nominal(given, side)]
     found = judged.case(judged.posed(*others))
-    return min(best, _as_uncropped(found, judged, side), key=lambda each: each.log10_nfa)
+    return min(best, as_uncropped(found, judged, side), key=lambda each: each.log10_nfa)
 
 
-def _as_uncropped(found: Case, judged: Judged, side: int) -> Case:
+def as_uncropped(found: Case, judged: Judged, side: int) -> Case:
     """The case as it is; or, where its lens does not stay what it is once it is free, with a free lens.
 
     Such a picture is of another lens, or a part of what its camera saw.
     """
     if found.posed is None:
         return found
-    prior = found.posed.prior
     again = judged.settled(found.posed.fit.camera, candidates.cropped(found.posed.fit.camera.lens, side))
-    if again is None:
-        return found
-    free, sigmas = again.fit.camera.lens, _SAME_LENS_SIGMAS * np.sqrt(np.diag(again.fit.covariance)[6:])
+    return found if again is None or _same_lens(found.posed.prior, again.fit, side) else judged.case(again)
+
+
+def of_its_lens(case: Case, side: int) -> bool:
+    """Whether the lens stays what it was taken for once it is free, by what agrees with the camera."""
+    assert case.posed is not None
+    camera, by = case.posed.fit.camera, case.by
+    free = refined(camera, candidates.cropped(camera.lens, side), case.agreeing, by.noise_px)
+    return _same_lens(case.posed.prior, free, side)
+
+
+def _same_lens(prior: Lens, fit: Fit, side: int) -> bool:
+    free, sigmas = fit.camera.lens, _SAME_LENS_SIGMAS * np.sqrt(np.diag(fit.covariance)[6:])
     of_focal = abs(math.log(free.focal / prior.focal)) / max(
         _SAME_LENS_LOG, _SAME_LENS_SIGMAS * prior.log_focal_sigma, sigmas[0]
     )
     of_shift = np.abs(free.shift - prior.shift) / np.maximum(_SAME_LENS_SHIFT * side, sigmas[2:])
-    same = max(of_focal, *of_shift) < 1.0
-    return found if same else judged.case(again)
+    return bool(max(of_focal, *of_shift) < 1.0)

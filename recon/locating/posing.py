@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from splatnode.recon import poselib
 from splatnode.recon.locating.camera_model import CameraModel, Lens, without_distortion
-from splatnode.recon.locating.correspondences import Correspondences
+from splatnode.recon.locating.correspondences import LEAST_COSINE, Correspondences
 from splatnode.recon.locating.refinement import Fit, refined
 from splatnode.recon.registration import epipolar
 
@@ -19,15 +19,15 @@ Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 _SAMPLE = 3  # correspondences that define a pose
-_ITERATIONS, _ITERATIONS_OF_MANY = 10_000, 3_000  # of RANSAC: they do for 9 and 13 % inliers; where lenses are tried
-_LEAST_COSINE = 0.5  # between two directions from which a feature looks alike: 60 degrees are beyond SIFT's reach
+_ITERATIONS_OF_MANY = 3_000  # of RANSAC, where lenses are tried: they do for 13 % inliers
 _MIN_LENGTH = 1e-12
-_ROUNDS = 4  # of inliers and refinement; they have settled by then
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     search_px: float = 6.0  # reprojection error of an inlier while the lens is not exact, pixels at REFERENCE_SIDE
     max_error_px: float = 3.0  # of an inlier in the end
+    iterations: int = 10_000  # of RANSAC, at most: they do for 9 % inliers
+    rounds: int = 4  # of inliers and refinement; they have settled by then
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ def posed(
 
     `scale` is pixels of the photograph for one at REFERENCE_SIDE; `noise_px` is of an observation, in its pixels.
     """
-    most = _ITERATIONS if len(lenses) == 1 else _ITERATIONS_OF_MANY
+    most = config.iterations if len(lenses) == 1 else min(config.iterations, _ITERATIONS_OF_MANY)
     found = [(camera, lens) for lens in lenses if (camera := searched(known, lens, scale, config, most)) is not None]
     if not found:
         return None
@@ -56,7 +56,7 @@ def posed(
 
 
 def searched(
-    known: Correspondences, lens: Lens, scale: float, config: Config, most_iterations: int = _ITERATIONS
+    known: Correspondences, lens: Lens, scale: float, config: Config, most_iterations: int | None = None
 ) -> CameraModel | None:
     """The camera by random samples, with the lens as it is given; None where there are too few correspondences."""
     if len(known) <= _SAMPLE:
@@ -68,7 +68,7 @@ def searched(
         {
             "max_reproj_error": config.search_px * scale,
             "min_iterations": 500,
-            "max_iterations": most_iterations,
+            "max_iterations": most_iterations or config.iterations,
             "seed": 0,
         },
     )
@@ -82,7 +82,7 @@ def settled(
 ) -> Posed | None:
     """The camera refined by its inliers, which are found again, until both have settled."""
     fit, agreeing = None, np.zeros(len(known), bool)
-    for limit_px in np.linspace(config.search_px, config.max_error_px, _ROUNDS):
+    for limit_px in np.linspace(config.search_px, config.max_error_px, config.rounds):
         agreeing = agreement(camera, known, limit_px * scale)
         if agreeing.sum() <= _SAMPLE:
             return None
@@ -101,7 +101,7 @@ def agreement(camera: CameraModel, known: Correspondences, limit_px: float) -> F
     errors = camera.errors(known.points, known.pixels)
     along = known.points - camera.T_world_camera[:3, 3]
     cosine = (along * known.seen_along).sum(1) / np.maximum(np.linalg.norm(along, axis=1), _MIN_LENGTH)
-    agreeing = (errors < limit_px) & (cosine > _LEAST_COSINE)
+    agreeing = (errors < limit_px) & (cosine > LEAST_COSINE)
     for kind in (known.feature_of, known.landmark_of):
         order = np.lexsort((errors, ~agreeing, kind))
         first = np.ones(len(order), bool)

@@ -19,7 +19,7 @@ Array = npt.NDArray[np.float64]
 CORRELATED = 30.0
 _ROBUST = 3.0  # scale of the Cauchy loss, in standard deviations
 _STEPS = 12  # Gauss-Newton converges in a few
-_CONVERGED = 1e-8  # largest change of a parameter over its standard deviation, squared
+_CONVERGED = 1e-6  # largest change of a parameter over its standard deviation, squared
 _RAYLEIGH_MEDIAN = 1.1774  # median length of a 2D error whose components have sigma 1: sqrt(2 log 2)
 _FIXED = 1e-9  # stands for a sigma of 0
 
@@ -42,13 +42,15 @@ def refined(camera: CameraModel, prior: Lens, known: Correspondences, noise_px: 
     information_of_prior = 1.0 / np.maximum(prior.sigmas, _FIXED) ** 2
     spread = 1.0
     covariance = np.full((NUM_PARAMETERS, NUM_PARAMETERS), np.nan)
+    covariances = np.ascontiguousarray(known.covariances.transpose(1, 2, 0))
     for _ in range(_STEPS):
-        rows, residuals = _whitened(camera, known, noise_px)
-        lengths = np.linalg.norm(residuals, axis=1)
-        spread = max(float(np.median(lengths)) / _RAYLEIGH_MEDIAN, 1.0)
+        rows, residuals = _whitened(camera, known, covariances, noise_px)
+        lengths = np.hypot(*residuals)
+        spread = max(_median(lengths) / _RAYLEIGH_MEDIAN, 1.0)
         weights = 1.0 / (1.0 + (lengths / (_ROBUST * spread)) ** 2) / spread**2
-        information = np.einsum("m,mij,mik->jk", weights, rows, rows)
-        gradient = np.einsum("m,mij,mi->j", weights, rows, residuals)
+        across, down = weights * rows
+        information = across @ rows[0].T + down @ rows[1].T
+        gradient = across @ residuals[0] + down @ residuals[1]
         # The prior is one observation, and so are CORRELATED correspondences.
         lens = slice(POSE, NUM_PARAMETERS)
         information[lens, lens] += CORRELATED * np.diag(information_of_prior)
@@ -65,13 +67,31 @@ def refined(camera: CameraModel, prior: Lens, known: Correspondences, noise_px: 
     return Fit(camera, covariance, spread)
 
 
-def _whitened(camera: CameraModel, known: Correspondences, noise_px: float) -> tuple[Array, Array]:
-    """Derivatives (M, 2, NUM_PARAMETERS) and residuals (M, 2), observed less predicted, in standard deviations."""
-    by_parameters, by_point = camera.derivatives(known.points)
-    predicted, _ = camera.project(known.points)
-    covariances = by_point @ known.covariances @ by_point.transpose(0, 2, 1) + noise_px**2 * np.eye(2)
-    whiten = np.linalg.inv(np.linalg.cholesky(covariances))
-    return whiten @ by_parameters, (whiten @ (known.pixels - predicted)[..., None])[..., 0]
+def _whitened(
+    camera: CameraModel,
+    known: Correspondences,
+    covariances: Array,  # (3, 3, M) of the points
+    noise_px: float,
+) -> tuple[Array, Array]:
+    """Derivatives (2, NUM_PARAMETERS, M) and residuals (2, M), observed less predicted, in standard deviations."""
+    by_parameters, by_point = (each.transpose(1, 2, 0) for each in camera.derivatives(known.points))
+    residuals = (known.pixels - camera.project(known.points)[0]).T
+    # The Cholesky factor of each pixel's covariance (2, 2).
+    of_first, of_second = ((covariances * each[:, None]).sum(0) for each in by_point)
+    top = np.sqrt((of_first * by_point[0]).sum(0) + noise_px**2)
+    aside = (of_first * by_point[1]).sum(0) / top
+    bottom = np.sqrt((of_second * by_point[1]).sum(0) + noise_px**2 - aside**2)
+    rows, errors = np.empty_like(by_parameters), np.empty((2, len(known)))
+    for whitened, given in ((rows, by_parameters), (errors, residuals)):
+        whitened[0] = given[0] / top
+        whitened[1] = (given[1] - aside * whitened[0]) / bottom
+    return rows, errors
+
+
+def _median(values: Array) -> float:
+    """As NumPy's of (M,), in a fraction of its time for few."""
+    middle = (len(values) - 1) // 2, len(values) // 2
+    return float(np.partition(values, middle)[list(middle)].mean())
 
 
 def _inverse(information: Array) -> Array | None:

@@ -12,11 +12,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.process.progress import Step, telling, times
+from splatnode.capture.process.records import record_in
 from splatnode.capture.process.terminal import in_place, progress, say
 from splatnode.recon.config import Config
 from splatnode.recon.mapping.scenes import (
@@ -106,7 +105,7 @@ def _kept(source: Recording, out: Path) -> Iterator[Frame | DroppedFrame]:
 
 
 def _report(source: Recording, out: Path, reports: Reports, seconds: float) -> dict[str, object]:
-    places = msgspec.json.decode(read_json_file(out / FILE))["places"]
+    places = record_in(read_json_file(out / FILE), dict[str, Any])["places"]
     why = {each["name"]: each["reason"] for place in places for each in place["frames_dropped"]}
     why |= {name: f"{place['scene_id']}: {place['message']}" for place in places for name in place["frames_used"]}
     placed = {camera.name for name in reports for camera in read_cameras(out / name / "cameras.json")}

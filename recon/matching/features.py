@@ -87,11 +87,22 @@ def add_tilted(features: Features, image: Image, tilts: Sequence[float], config:
     return features
 
 
+def searched_pixels(image: Image, config: Config) -> float:
+    """In how many pixels the features of `image` (H, W, 3) are looked for."""
+    return image.shape[0] * image.shape[1] * _scale(image, config) ** 2
+
+
+def _scale(image: Image, config: Config) -> float:
+    """By which `image` is enlarged or shrunk before its features are looked for."""
+    longer = max(image.shape[:2])
+    return float(np.clip(1.0, config.min_longer_side / longer, config.max_longer_side / longer))
+
+
 def _detect(image: Image, tilt: float, config: Config) -> tuple[Array, npt.NDArray[np.uint8]]:
     """Points (M, 2) in pixels of `image`, the strongest first, and their descriptors (M, 128)."""
     grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     height, width = grey.shape
-    scale = float(np.clip(1.0, config.min_longer_side / max(grey.shape), config.max_longer_side / max(grey.shape)))
+    scale = _scale(image, config)
     size = max(1, round(width * scale / max(tilt, 1.0))), max(1, round(height * scale * min(tilt, 1.0)))
     if tilt != 1.0:
         blur = _TILT_BLUR * float(np.sqrt(max(tilt, 1.0 / tilt) ** 2 - 1))

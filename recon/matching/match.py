@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Protocol
@@ -12,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.progress import Step, Tell, told_to_nobody
+from splatnode.recon.deadline import is_over
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching import features, pair_matching
 from splatnode.recon.matching.candidates import to_glance_at
@@ -95,7 +95,7 @@ def completed(graph: ViewGraph, matcher: Matcher | None, until: float = math.inf
     to_tilt = graph.to_tilt()
     weak = [pair for pair in graph.plain if pair in to_tilt and pair not in graph.tilted]
     for further in _all_matched_further(graph, weak, graph.config.tilting.tilts, matcher):
-        if time.monotonic() >= until:
+        if is_over(until):
             break
         yield (graph := further)
     yield graph.chosen()

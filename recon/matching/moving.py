@@ -9,7 +9,7 @@ no two say that it stands still: a pattern that repeats stands still where photo
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -20,7 +20,7 @@ from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.masks import masked
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side, modelled_image, principal_point
 from splatnode.recon.matching import features, two_view
-from splatnode.recon.matching.match import Matcher, match
+from splatnode.recon.matching.match import Matcher, completed
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.workers import each
 
@@ -56,21 +56,29 @@ class _Group:
     moves: bool  # whether it is the smaller patch beyond doubt
 
 
-def without_moving(graph: ViewGraph, matcher: Matcher | None, until: float = math.inf) -> ViewGraph:
+def without_moving(
+    graph: ViewGraph, matcher: Matcher | None, until: float = math.inf, pause: Callable[[], None] = lambda: None
+) -> ViewGraph:
     """The complete view graph without what moved between the photographs: matched again where there is such a thing.
 
-    Such a keyframe has a mask over it, and its share in `moving`. `until` as for `match.completed`.
+    Such a keyframe has a mask over it, and its share in `moving`. `until` as for `match.completed`; `pause` is called
+    between parts of the work and may raise.
     """
+    pause()
     masks = moving_masks(graph)
-    if not masks:
-        return graph
-    keyframes = [_without(keyframe, masks.get(keyframe.name)) for keyframe in graph.keyframes]
-    return match(keyframes, graph.config, matcher, until=until)
+    shown = [keyframe for keyframe in graph.keyframes if keyframe.name in masks]
+    hidden = [_without(keyframe, masks[keyframe.name]) for keyframe in shown]
+    changed = [after for before, after in zip(shown, hidden, strict=True) if after is not before]
+    pause()
+    for further in completed(graph.with_changed(changed), matcher, until) if changed else ():
+        graph = further
+        pause()
+    return graph
 
 
-def _without(keyframe: Keyframe, mask: Mask | None) -> Keyframe:
+def _without(keyframe: Keyframe, mask: Mask) -> Keyframe:
     """The keyframe without what the mask (H, W) hides; itself where hardly anything would remain."""
-    frame = keyframe.frame if mask is None else masked(keyframe.frame, mask)
+    frame = masked(keyframe.frame, mask)
     if isinstance(frame, DroppedFrame) or frame is keyframe.frame or frame.mask is None:
         return keyframe
     before = 1.0 if keyframe.frame.mask is None else float(keyframe.frame.mask.mean())

@@ -89,6 +89,19 @@ class ViewGraph:
             glanced=remaining(self.glanced),
         )
 
+    def with_changed(self, keyframes: Collection[Keyframe]) -> ViewGraph:
+        """With these in place of those of the same names; all pairs of theirs are pending."""
+        names, by_name = self.names, {keyframe.name: keyframe for keyframe in keyframes}
+        changed = {index for index, name in enumerate(names) if name in by_name}
+        rest = self.without_pairs_of(by_name)
+        pairs = itertools.combinations(range(len(names)), 2)
+        return replace(
+            rest,
+            keyframes=tuple(by_name.get(keyframe.name, keyframe) for keyframe in self.keyframes),
+            pending=rest.pending.union(pair for pair in pairs if not changed.isdisjoint(pair)),
+            codes={name: code for name, code in self.codes.items() if name not in by_name},
+        )
+
     def joined(self, other: ViewGraph) -> ViewGraph:
         """The view graph of the keyframes of both, by frame id, with the pairs that either has matched.
 

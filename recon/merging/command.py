@@ -13,6 +13,7 @@ from splatnode.capture.process.terminal import say
 from splatnode.recon.merging.merge import Merged, merged
 from splatnode.recon.merging.submap import Submap, Submaps, load_submaps
 from splatnode.recon.result.coarser import Level, levels
+from splatnode.recon.result.depth_file import DEPTHS, encode_depths
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.formats.ply import encode_ply, most_in_ply
 from splatnode.recon.result.export.prepare import take, viewer_safe
@@ -26,6 +27,8 @@ from splatnode.recon.result.report import build_report, peak_rss_mb
 from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.size import result_bytes
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.stored_snapshot import read_up
+from splatnode.recon.result.up import Up
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.result.whole import Whole, WholeMap, read_whole
 from splatnode.recon.scene.background import SHELL
@@ -72,7 +75,7 @@ def write_map(whole: Whole, of: WholeMap, found: Submaps, folder: Path, most: in
     given = sum(len(each.gaussians) for each in found.used)
     with result_folder(folder, round((1 + _LEVELS_BYTES) * result_bytes(given if most is None else min(given, most)))):
         one = merged(found.used, most)
-        snapshot = _snapshot(one, found, _scale(whole, of))
+        snapshot = _snapshot(one, found, *_scale_and_up(whole, of))
         coarse = levels(one.gaussians)
         report = _report(snapshot, one, found, coarse, given)
         write_result(snapshot, folder, report, preview=contact_sheet(snapshot), further=_further(snapshot, one, coarse))
@@ -86,20 +89,23 @@ def most(args: argparse.Namespace, submaps: Sequence[Submap]) -> int | None:
     return min((limit for limit in (args.max_gaussians, by_size) if limit is not None), default=None)
 
 
-def _scale(whole: Whole, of: WholeMap) -> Scale:
-    """The unit of the scene that the map is named after."""
+def _scale_and_up(whole: Whole, of: WholeMap) -> tuple[Scale, Up | None]:
+    """Those of the scene that the map is named after, whose world and unit it has."""
     place = whole.places.get(of.name)
-    return Scale() if place is None or place.folder is None else StoredResult.at(place.folder).scale()
+    if place is None or place.folder is None:
+        return Scale(), None
+    return StoredResult.at(place.folder).scale(), read_up(place.folder)
 
 
-def _snapshot(one: Merged, found: Submaps, scale: Scale) -> Snapshot:
+def _snapshot(one: Merged, found: Submaps, scale: Scale, up: Up | None) -> Snapshot:
     rough = [each.verdict for each in found.used if each.verdict != Code.OK.value]
     names = ", ".join(each.scene_id for each in found.used)
     message = f"One scene of {len(found.used)}: {names}."
     if rough:
         message += f" {len(rough)} of them known less well: {', '.join(sorted(set(rough)))}."
     verdict = Verdict(Code.OK_ROUGH if rough else Code.OK, message, "", publishable=True)
-    return Snapshot(0, verdict, one.cameras, one.gaussians, {}, (), 0, dict(one.seconds), final=True, scale=scale)
+    seconds = dict(one.seconds)
+    return Snapshot(0, verdict, one.cameras, one.gaussians, {}, (), 0, seconds, final=True, scale=scale, up=up)
 
 
 def _report(snapshot: Snapshot, one: Merged, found: Submaps, coarse: Sequence[Level], given: int) -> dict[str, object]:
@@ -114,13 +120,16 @@ def _report(snapshot: Snapshot, one: Merged, found: Submaps, coarse: Sequence[Le
 
 
 def _further(snapshot: Snapshot, one: Merged, coarse: Sequence[Level]) -> dict[str, bytes]:
-    """levels/1.ply and so on, levels.json, which tells from how far away each suffices, and each submap's piece."""
+    """levels/1.ply and so on, levels.json (from how far away each suffices), each submap's piece, and depth.npz."""
     parts = {f"levels/{number}.ply": viewer_safe(each.gaussians) for number, each in enumerate(coarse, 1)}
     source = one.gaussians.source_frame
     numbers = {each.scene_id: number for number, each in enumerate(one.shares)} | {SHELL_PIECE: SHELL}
     parts |= {piece_name(each): take(one.gaussians, source == number) for each, number in numbers.items()}
     levels_file = json_bytes(snapshot.scale.record() | levels_record(coarse, snapshot.cameras))
-    return {name: encode_ply(part, snapshot.scale) for name, part in parts.items()} | {LEVELS_FILE: levels_file}
+    depths = {DEPTHS: encode_depths(one.depths)} if one.depths else {}
+    return (
+        {name: encode_ply(part, snapshot.scale) for name, part in parts.items()} | {LEVELS_FILE: levels_file} | depths
+    )
 
 
 def _tell(report: dict[str, object], folder: Path) -> None:

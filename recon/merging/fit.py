@@ -58,7 +58,11 @@ def fitted(
     if most is not None:
         begun = _with_few_shells(begun, [_camera(view) for view in views], most, seed)
     config = refinement.Config(
-        iterations=passes * len(views), checkpoints=(), control=ControlChoice("prune", prune.Config()), rates=_rates()
+        iterations=passes * len(views),
+        checkpoints=(),
+        first_opacity=None,
+        control=ControlChoice("prune", prune.Config()),
+        rates=_rates(),
     )
     *_, scene = refinement.refine(Scene(tuple(views), begun), config, seed=seed, max_gaussians=most)
     found = iter(scene.views)

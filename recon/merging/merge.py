@@ -51,6 +51,7 @@ class Merged:
     cameras: tuple[CameraEstimate, ...]  # without bounds: those of a submap do not hold across a map
     shares: tuple[Share, ...]
     shell: int  # Gaussians of the far shells among those that are kept
+    depths: Mapping[str, npt.NDArray[np.float16]]  # confirmed z by camera, of the submap that the camera is of
     seconds: Mapping[str, float]
 
 
@@ -80,7 +81,8 @@ def merged(submaps: Sequence[Submap], most: int | None = None) -> Merged:
     larger = smaller.inverse()
     gaussians = viewer_safe(larger.gaussians(together))
     seconds = {"seams": seamed - began, "fit": time.perf_counter() - seamed}
-    return Merged(gaussians, _once(cameras, larger), shares, int((source == SHELL).sum()), seconds)
+    shell = int((source == SHELL).sum())
+    return Merged(gaussians, _once(cameras, larger), shares, shell, _depths(submaps), seconds)
 
 
 def _of_submap(submap: Submap, number: int, mask: npt.NDArray[np.bool_]) -> GaussianArrays:
@@ -112,3 +114,12 @@ def _once(cameras: Sequence[Sequence[CameraEstimate]], placement: Placement) -> 
     for camera in (camera for each in cameras for camera in each):
         found.setdefault(camera.name, replace(placement.camera(camera), bounds=None))
     return tuple(sorted(found.values(), key=lambda camera: camera.frame_id))
+
+
+def _depths(submaps: Sequence[Submap]) -> dict[str, npt.NDArray[np.float16]]:
+    """Those of each photograph's first submap, which its camera is of."""
+    first: dict[str, Submap] = {}
+    for each in submaps:
+        for camera in each.cameras:
+            first.setdefault(camera.name, each)
+    return {name: each.depths[name] for name, each in first.items() if name in each.depths}

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.result.depth_file import read_depths
 from splatnode.recon.result.export import SceneFileError
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.placement import Placement
 from splatnode.recon.result.shell import far_shell
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
+from splatnode.recon.result.verdict import SURE
 from splatnode.recon.result.whole import ScenePlace, Whole, WholeMap
 
 
@@ -24,6 +28,8 @@ class Submap:
     gaussians: GaussianArrays
     cameras: tuple[CameraEstimate, ...]
     shell: npt.NDArray[np.bool_]  # (N,) which of the Gaussians are its far shell
+    # Confirmed z by camera, as of a Snapshot; none of a scene that is known too roughly for a map of free space
+    depths: Mapping[str, npt.NDArray[np.float16]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +62,13 @@ def submap(
     gaussians: GaussianArrays,
     cameras: tuple[CameraEstimate, ...],
     placement: Placement,
+    depths: Mapping[str, npt.NDArray[np.float16]] = MappingProxyType({}),
 ) -> Submap:
     """The scene, given in its own world, where `placement` puts it."""
     shell = far_shell(gaussians, cameras)
     moved = tuple(placement.camera(camera) for camera in cameras)
-    return Submap(scene_id, verdict, placement.gaussians(gaussians), moved, shell)
+    farther = {name: (placement.scale * depth.astype(np.float32)).astype(np.float16) for name, depth in depths.items()}
+    return Submap(scene_id, verdict, placement.gaussians(gaussians), moved, shell, farther)
 
 
 def _why_not(place: ScenePlace) -> str:
@@ -77,6 +85,8 @@ def _load(place: ScenePlace, placement: Placement) -> Submap:
     assert place.folder is not None  # `_why_not` has seen to it
     result = StoredResult.at(place.folder)
     try:
-        return submap(place.scene_id, place.verdict, result.gaussians(), result.cameras(), placement)
+        sure = place.verdict in {code.value for code in SURE}
+        depths = read_depths(place.folder) if sure else {}
+        return submap(place.scene_id, place.verdict, result.gaussians(), result.cameras(), placement, depths)
     except SceneFileError as error:
         raise SceneFileError(f"{place.folder}: {error}") from error

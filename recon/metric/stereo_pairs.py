@@ -11,8 +11,7 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, reduced
-from splatnode.capture.process.printable import printable
-from splatnode.capture.right_image import Baseline, grey
+from splatnode.capture.right_image import Baseline, grey, partners
 from splatnode.recon.frames.undistort import undistorted
 
 Grey = npt.NDArray[np.uint8]  # (H, W)
@@ -35,12 +34,9 @@ def pairs_of(frames: Sequence[Frame | DroppedFrame], rights: Iterable[Frame | Dr
 
     Raises ValueError where none has a partner, or a partner is of another size.
     """
-    lefts = {_stem(each.name): each for each in frames if isinstance(each, Frame)}
-    found = [_pair(lefts[_stem(right.name)], right) for right in rights if _is_of(right, lefts)]
-    if not found:
-        first = printable(next(iter(lefts), "none"), 100)
-        raise ValueError(f"no right photograph has the name of a left one, such as {first}; name both of a pair alike")
-    return tuple(found)
+    lefts = {each.name: each for each in frames if isinstance(each, Frame)}
+    seen = {each.name: each for each in rights if isinstance(each, Frame)}
+    return tuple(_pair(lefts[left], seen[right]) for left, right in partners(list(lefts), list(seen)).items())
 
 
 def pair_with(frame: Frame) -> Pair | None:
@@ -54,26 +50,16 @@ def pair_with(frame: Frame) -> Pair | None:
 
 def rights_in(path: Path, frames: Sequence[Frame | DroppedFrame]) -> Iterator[Frame | DroppedFrame]:
     """The photographs in the folder that are partners of the frames. Raises FileNotFoundError, ValueError."""
-    wanted = {_stem(each.name) for each in frames}
-    names = tuple(name for name in folder.names_in(path) if _stem(name) in wanted)
-    return folder.stream(folder.Config(folder=path, names=names)) if names else iter(())
+    names = partners([each.name for each in frames], folder.names_in(path)).values()
+    return folder.stream(folder.Config(folder=path, names=tuple(names)))
 
 
-def _stem(name: str) -> str:
-    return name.rpartition(".")[0] or name
-
-
-def _is_of(right: Frame | DroppedFrame, lefts: dict[str, Frame]) -> bool:
-    return isinstance(right, Frame) and _stem(right.name) in lefts
-
-
-def _pair(left: Frame, right: Frame | DroppedFrame) -> Pair:
+def _pair(left: Frame, right: Frame) -> Pair:
     """A right camera has the lens of the left one: that is what rectifying means."""
-    if not isinstance(right, Frame) or (right.width, right.height) != (left.width, left.height):
-        size = f"{right.width} x {right.height}" if isinstance(right, Frame) else "no size"
+    if (right.width, right.height) != (left.width, left.height):
         raise ValueError(
             f"both photographs of a pair must have one size: {left.name} has {left.width} x {left.height} pixels, "
-            f"its partner {size}"
+            f"its partner {right.width} x {right.height}"
         )
     partner = undistorted(replace(right, intrinsics=left.intrinsics))
     return Pair(left.name, _compared(undistorted(left).image), _compared(partner.image))

@@ -10,12 +10,12 @@ from itertools import combinations
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.geometry import distortion, without_distortion
 from splatnode.recon.metric.measurement import TWO_SIDED_95
+from splatnode.recon.registration.straightened import radial_of
 from splatnode.recon.result.snapshot import Snapshot
 
 Array = npt.NDArray[np.float64]
-
-_UNDISTORT_ITERATIONS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +24,7 @@ class View:
 
     T_world_camera: Array  # (4, 4)
     focal: float
-    radial: float  # first radial coefficient, as recon/registration/bundle.py has it
+    radial: Array  # (2,) radial coefficients, as recon/registration/bundle.py has them
     shift: Array  # (2,) of the principal point from the middle of the picture
     bound: float  # 95 % bound of the centre's error, in the scene's unit; 0 where none is known
 
@@ -36,17 +36,14 @@ class View:
         """(M, 2) at depth 1 of pixels (M, 2) in a picture of this size."""
         side = max(width, height)
         distorted = ((pixels - np.array([width, height]) / 2.0) / side - self.shift) / self.focal
-        rays = distorted
-        for _ in range(_UNDISTORT_ITERATIONS if self.radial else 0):
-            rays = distorted / (1.0 + self.radial * (rays**2).sum(1))[:, None]
-        return rays
+        return without_distortion(distorted, self.radial)
 
     def pixels(self, points: Array, width: int, height: int) -> Array:
         """(M, 2) in a picture of this size of world points (M, 3); not a number behind the camera."""
         in_camera = (points - self.centre) @ self.T_world_camera[:3, :3]
         depth = np.where(in_camera[:, 2] > 0, in_camera[:, 2], np.nan)
         rays = in_camera[:, :2] / depth[:, None]
-        distorted = self.focal * (1.0 + self.radial * (rays**2).sum(1))[:, None] * rays + self.shift
+        distorted = self.focal * distortion((rays**2).sum(1), self.radial)[:, None] * rays + self.shift
         return max(width, height) * distorted + np.array([width, height]) / 2.0
 
 
@@ -58,7 +55,7 @@ def views_of(snapshot: Snapshot) -> Mapping[str, View]:
         side, size = max(camera.width, camera.height), np.array([camera.width, camera.height])
         K = camera.K_photographed
         shift = (K[:2, 2] - size / 2.0) / side
-        radial = 0.0 if camera.lens is None else camera.lens.distortion[0]
+        radial = np.array(radial_of(camera.lens))
         found[camera.name] = View(camera.T_world_camera, float(K[0, 0]) / side, radial, shift, bounds[camera.name])
     landmarks = snapshot.landmarks
     if landmarks is None:
@@ -66,7 +63,7 @@ def views_of(snapshot: Snapshot) -> Mapping[str, View]:
     lenses = landmarks.lenses
     for index, name in enumerate(landmarks.names):
         if name in found:
-            lens = float(lenses.focals[index]), float(lenses.radials[index]), lenses.shifts[index]
+            lens = float(lenses.focals[index]), lenses.radials[index], lenses.shifts[index]
             found[name] = View(landmarks.Ts_world_camera[index], *lens, bounds[name])
     return found
 

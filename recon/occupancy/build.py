@@ -14,9 +14,8 @@ from splatnode.recon.occupancy.sight import Sight, sights
 from splatnode.recon.occupancy.surfaces import blurred, surfaces
 from splatnode.recon.occupancy.upright import upright
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.verdict import Code
+from splatnode.recon.result.verdict import SURE
 
-SURE = (Code.OK, Code.OK_PARTIAL)
 UNSURE_DEG = 3.0  # standard deviation of up by gravity, beyond which the floor tells it better
 LEAST_KNOWN = 0.01  # of the pixels: with fewer confirmed depths there is no map
 
@@ -72,7 +71,7 @@ def _sights(snapshot: Snapshot) -> list[Sight]:
     verdict = snapshot.verdict
     if not verdict.publishable:
         raise NoMap(f"there is no map of a scene that was refused: {verdict.code.value}. {verdict.message}")
-    if verdict.code not in SURE:
+    if verdict.code not in SURE and not snapshot.scenes:  # a merged one has depths of its sure scenes alone
         raise NoMap(
             f"the verdict is {verdict.code.value}: the scene can be looked at, but a map of it could call free what is "
             f"solid. {verdict.advice or 'Take more photographs'}"
@@ -80,8 +79,8 @@ def _sights(snapshot: Snapshot) -> list[Sight]:
     if not snapshot.depths:
         raise NoMap(
             "it is not known which depths two photographs confirm: the result has no depth.npz. An earlier splatnode "
-            "made it, or it is a merged map, a scene file, or not final. Reconstruct the photographs again, or give "
-            "the folder of one scene"
+            "made it, or it is a scene file, or not final, or merged of scenes that are all known roughly. Reconstruct "
+            "the photographs again"
         )
     seen = sights(snapshot.cameras, snapshot.depths)
     known = sum(int((sight.depth > 0).sum()) for sight in seen)

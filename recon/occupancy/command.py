@@ -21,7 +21,7 @@ FOLDER = "occupancy"  # in the result's, where no other is given
 
 def map_result(args: argparse.Namespace) -> int:
     """Says what is known and how up was found; raises NoMap, with the exit code of a refusal, where there is no map."""
-    snapshot = _read(args.result)
+    snapshot = read_to_map(args.result)
     with waiting("looking through the place"):
         made = occupancy_map(snapshot, args.voxel, None if args.up is None else np.array(args.up))
         written = made.save(args.out or args.result / FOLDER, args.band)
@@ -36,8 +36,8 @@ def map_result(args: argparse.Namespace) -> int:
     return 0
 
 
-def _read(folder: Path) -> Snapshot:
-    """Raises FileNotFoundError, ValueError."""
+def read_to_map(folder: Path) -> Snapshot:
+    """The result in `folder` with its confirmed depths. Raises FileNotFoundError, ValueError."""
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is no folder; give one that splatnode replay --out wrote")
     if is_whole(folder):

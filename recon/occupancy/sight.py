@@ -12,6 +12,7 @@ import numpy.typing as npt
 from splatnode.recon.result.snapshot import CameraEstimate
 
 Float32 = npt.NDArray[np.float32]
+UNBOUNDED = 0.01  # of a depth: what a camera may be off whose bounds nobody tells, as of one of a merged scene
 DEPTH_ERROR = 0.02  # of a depth: as much confirmed depths may differ from each other (recon/priors/confirmed.py)
 
 
@@ -48,7 +49,6 @@ def _sight(camera: CameraEstimate, depth: npt.NDArray[np.float16]) -> Sight:
             f"{camera.width} x {camera.height} pixels: depth.npz is not of these cameras"
         )
     K = np.diag([1 / reduction, 1 / reduction, 1.0]) @ camera.K
-    error = DEPTH_ERROR
-    if camera.bounds is not None:
-        error += camera.bounds.centre_percent / 100.0 + math.radians(camera.bounds.rotation_deg)
-    return Sight(camera.T_world_camera, K, depth.astype(np.float32), error)
+    bounds = camera.bounds
+    off = UNBOUNDED if bounds is None else bounds.centre_percent / 100.0 + math.radians(bounds.rotation_deg)
+    return Sight(camera.T_world_camera, K, depth.astype(np.float32), DEPTH_ERROR + off)

@@ -5,12 +5,15 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from splatnode.recon.core import library
 from splatnode.recon.rasterize import dispatch
+
+_EACH: Any = torch  # has functions of many tensors at once; its pages list them, though their names begin with _
 
 
 class Adam:
@@ -57,9 +60,7 @@ class Adam:
         if all(dispatch.by_core(group.param) for group in moving.values()):
             self._step_natively(moving, gradients, factors)
             return
-        for name, group in moving.items():
-            size = self._step_size(name, group)
-            _step_by_torch(group, gradients[name], size, factors.get(name), self.betas, self.eps)
+        self._step_by_torch(moving, gradients, factors)
 
     def _step_size(self, name: str, group: _Group) -> float:
         return self.lrs[name] / (1 - self.betas[0] ** group.steps)
@@ -79,6 +80,23 @@ class Adam:
         library().core_adam(native, len(moving), *map(ctypes.c_double, (*self.betas, self.eps)))
         for group in moving.values():
             torch.autograd.graph.increment_version(group.param)
+
+    def _step_by_torch(
+        self, moving: Mapping[str, _Group], gradients: Mapping[str, Tensor], factors: Mapping[str, Tensor]
+    ) -> None:
+        """What the core does, on any device: a launch for each step of the calculation, of all parameters at once."""
+        given, groups = list(gradients.values()), list(moving.values())
+        firsts, seconds = [group.first for group in groups], [group.second for group in groups]
+        _EACH._foreach_lerp_(firsts, given, 1 - self.betas[0])
+        _EACH._foreach_mul_(seconds, self.betas[1])
+        _EACH._foreach_addcmul_(seconds, given, given, 1 - self.betas[1])
+        roots = [(1 - self.betas[1] ** group.steps) ** 0.5 for group in groups]  # of the correction of the second
+        spreads = _EACH._foreach_sqrt(seconds)
+        _EACH._foreach_add_(spreads, [self.eps * root for root in roots])
+        sizes = [-self._step_size(name, group) for name, group in moving.items()]
+        sizes = [size * root for size, root in zip(sizes, roots, strict=True)]
+        moves = [_by_row(first, factors.get(name)) for name, first in zip(moving, firsts, strict=True)]
+        _EACH._foreach_addcdiv_([group.param for group in groups], moves, spreads, sizes)
 
     def follow(self, params: Mapping[str, Tensor], origin: Tensor) -> None:
         """Goes on with `params`, of M rows each, in place of the old ones.
@@ -147,22 +165,8 @@ class _NativeGroup(ctypes.Structure):
     ]
 
 
-def _step_by_torch(
-    group: _Group,
-    gradient: Tensor,
-    step_size: float,
-    row_factors: Tensor | None,
-    betas: tuple[float, float],
-    eps: float,
-) -> None:
-    """What the core does, for a parameter on any device."""
-    group.first.lerp_(gradient, 1 - betas[0])
-    group.second.lerp_(gradient**2, 1 - betas[1])
-    root_correction = (1 - betas[1] ** group.steps) ** -0.5
-    direction = group.first / (group.second.sqrt() * root_correction + eps)
-    if row_factors is not None:
-        direction *= _beside(row_factors.to(direction), direction)
-    group.param.add_(direction, alpha=-step_size)
+def _by_row(values: Tensor, factors: Tensor | None) -> Tensor:
+    return values if factors is None else values * _beside(factors.to(values), values)
 
 
 def _beside(rows: Tensor, values: Tensor) -> Tensor:

@@ -51,7 +51,9 @@ class Dropout:
         """
         if self._config.share == 0 or progress >= self._config.until:
             return opacities
-        drawn = torch.rand(len(opacities), generator=self._generator).to(opacities) >= self._probabilities
+        # Drawn on the processor. Memory that a GPU reads by itself lets the copy wait for nothing.
+        drawn = torch.rand(len(opacities), generator=self._generator, pin_memory=opacities.is_cuda)
+        drawn = drawn.to(opacities, non_blocking=True) >= self._probabilities
         return (opacities * (drawn * self._raised)).clamp(max=MAX_OPACITY)
 
 

@@ -8,14 +8,16 @@ efficiently in learning", 1998) under Adam. A step is a share of the Gaussian's 
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from splatnode.recon.core import library
+from splatnode.recon.geometry import matrices_from_quats
 from splatnode.recon.optimize.adam import Adam
 from splatnode.recon.rasterize import dispatch
-from splatnode.recon.rasterize.reference import rotations
 from splatnode.recon.scene.gaussians import Gaussians
 
 LARGEST_EXTENT = 0.2  # standard deviation that counts at most, in median depths: the far shell's are many times that
@@ -31,11 +33,11 @@ class Shifts:
     def step(self, gaussians: Gaussians, rate: float) -> None:
         """Moves `gaussians.means`, which must have their gradient, by about `rate` standard deviations."""
         assert gaussians.means.grad is not None
-        offsets = self._adam.params["offsets"]
-        offsets.grad = along_axes(gaussians.means.grad, gaussians)
+        offsets, turned = self._adam.params["offsets"], turning(gaussians)
+        offsets.grad = turned(gaussians.means.grad, to_world=False)
         self._adam.lrs = {"offsets": rate}
         self._adam.step()
-        gaussians.means.add_(in_world(offsets, gaussians))
+        gaussians.means.add_(turned(offsets, to_world=True))
         offsets.zero_()
 
     def follow(self, gaussians: Gaussians, origin: Tensor) -> None:
@@ -45,18 +47,23 @@ class Shifts:
 
 def along_axes(gradients: Tensor, gaussians: Gaussians) -> Tensor:
     """(N, 3) the derivatives by offsets along the axes, of derivatives by positions `gradients` (N, 3)."""
-    return _turned(gradients, gaussians, to_world=False)
+    return turning(gaussians)(gradients, to_world=False)
 
 
 def in_world(offsets: Tensor, gaussians: Gaussians) -> Tensor:
     """(N, 3) the shifts in the world, of `offsets` (N, 3) along the axes in standard deviations."""
-    return _turned(offsets, gaussians, to_world=True)
+    return turning(gaussians)(offsets, to_world=True)
 
 
-def _turned(vectors: Tensor, gaussians: Gaussians, to_world: bool) -> Tensor:
+def turning(gaussians: Gaussians) -> Callable[..., Tensor]:
+    """A function of vectors (N, 3) and of `to_world`, by which vectors along the axes of `gaussians` turn into it."""
     quats, log_scales = gaussians.quats.detach(), gaussians.log_scales.detach()
-    if not dispatch.by_core(vectors):
-        return turned_by_torch(vectors, quats, log_scales, to_world)
+    if dispatch.by_core(quats):
+        return partial(_turned_by_core, quats, log_scales)
+    return partial(turned_by_torch, axes_by_torch(quats, log_scales))
+
+
+def _turned_by_core(quats: Tensor, log_scales: Tensor, vectors: Tensor, to_world: bool) -> Tensor:
     given = [tensor.to(torch.float32).contiguous() for tensor in (quats, log_scales, vectors.detach())]
     result = torch.empty_like(given[2])
     addresses = [ctypes.c_void_p(tensor.data_ptr()) for tensor in given]
@@ -65,10 +72,15 @@ def _turned(vectors: Tensor, gaussians: Gaussians, to_world: bool) -> Tensor:
     return result.to(vectors.dtype)
 
 
-def turned_by_torch(vectors: Tensor, quats: Tensor, log_scales: Tensor, to_world: bool) -> Tensor:
+def axes_by_torch(quats: Tensor, log_scales: Tensor) -> Tensor:
+    """(N, 3, 3) the axes in columns, as long as their standard deviations count."""
+    return matrices_from_quats(quats) * log_scales.exp().clamp_max(LARGEST_EXTENT)[:, None, :]
+
+
+def turned_by_torch(axes: Tensor, vectors: Tensor, to_world: bool) -> Tensor:
     """What the core does, on any device."""
-    axes = rotations(quats) * log_scales.exp().clamp_max(LARGEST_EXTENT)[:, None, :]  # (N, 3, 3), in columns
-    return torch.einsum("nij,nj->ni" if to_world else "nji,nj->ni", axes, vectors)
+    beside = vectors[:, None, :] if to_world else vectors[:, :, None]
+    return (axes * beside).sum(2 if to_world else 1)
 
 
 def _zeros(gaussians: Gaussians) -> Tensor:

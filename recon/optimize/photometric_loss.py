@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.core import library
-from splatnode.recon.optimize import photometric_reference
+from splatnode.recon.optimize import photometric_by_torch
 from splatnode.recon.rasterize import dispatch
 
 
@@ -17,8 +17,7 @@ class PhotometricLoss:
     """(1 - w) * mean |rgb - target| + w * mean (1 - SSIM), w = `ssim_weight`: the loss of 3DGS.
 
     SSIM has the 11 x 11 Gaussian window of sigma 1.5 and zeros beyond the border. Value and gradient are computed
-    together in the compiled core, in float32. On another device than the processor,
-    which is the target's, the reference computes both.
+    together, in float32: in the compiled core, or by torch where the target is on another device than the processor.
     """
 
     def __init__(
@@ -41,7 +40,9 @@ class PhotometricLoss:
         self.target = _planar(target.detach())
         if not bool(torch.isfinite(self.target).all()):
             raise ValueError("target must be finite")
+        self._on_device: photometric_by_torch.Weights | None = None  # where torch computes
         if not dispatch.by_core(self.target):
+            self._on_device = photometric_by_torch.weights_of(self.target, ssim_weight, self._weights)
             return
         pixels = float(target.shape[0] * target.shape[1])
         self._total_weight = pixels if self._weights is None else float(self._weights.sum(dtype=torch.float64))
@@ -54,8 +55,6 @@ class PhotometricLoss:
             raise ValueError(
                 f"rgb must be ({height}, {width}, 3) floats as the target, got {tuple(rgb.shape)} {rgb.dtype}"
             )
-        if not dispatch.by_core(self.target):
-            return photometric_reference.photometric_loss(rgb, self.target, self.ssim_weight, self._weights)
         return _Photometric.apply(rgb, self)
 
     def _computed_moments(self) -> tuple[Tensor, Tensor]:
@@ -65,7 +64,17 @@ class PhotometricLoss:
         library().core_photometric_moments(_address(self.target), width, height, _address(mean), _address(variance))
         return mean, variance
 
-    def evaluate(self, planar: Tensor, gradient: Tensor | None) -> float:
+    def evaluate(self, rgb: Tensor, differentiate: bool) -> tuple[Tensor, Tensor | None]:
+        """The loss of `rgb` (H, W, 3), scalar, and its gradient (3, H, W) where it is asked for."""
+        if self._on_device is not None:
+            image = rgb.to(torch.float32).permute(2, 0, 1)
+            value, gradient = photometric_by_torch.evaluated(image, self.target, self._on_device, differentiate)
+            return value.to(rgb.dtype), gradient
+        planar = _planar(rgb)
+        gradient = torch.empty_like(planar) if differentiate else None
+        return rgb.new_tensor(self._evaluate_by_core(planar, gradient)), gradient
+
+    def _evaluate_by_core(self, planar: Tensor, gradient: Tensor | None) -> float:
         """The loss of a planar (3, H, W) image; fills `gradient`, of the same shape, where given."""
         _, height, width = self.target.shape
         mean, variance = self._moments or self._computed_moments()
@@ -81,17 +90,18 @@ class PhotometricLoss:
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rgb: Tensor, loss: PhotometricLoss) -> Tensor:
-        planar = _planar(rgb)
-        gradient = torch.empty_like(planar) if ctx.needs_input_grad[0] else None
-        value = loss.evaluate(planar, gradient)
-        ctx.gradient, ctx.dtype = gradient, rgb.dtype
-        return rgb.new_tensor(value)
+        value, ctx.gradient = loss.evaluate(rgb, ctx.needs_input_grad[0])
+        ctx.dtype = rgb.dtype
+        return value
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, upstream: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
-        factor = float(upstream)
-        gradient = ctx.gradient if factor == 1 else ctx.gradient * factor
+        if upstream.device.type != "cpu":  # whose value would have to be waited for
+            gradient = ctx.gradient * upstream
+        else:
+            factor = float(upstream)
+            gradient = ctx.gradient if factor == 1 else ctx.gradient * factor
         return gradient.permute(1, 2, 0).to(ctx.dtype), None
 
 

@@ -1,4 +1,4 @@
-"""What the photometric loss is, in PyTorch: the core equals it, and it serves on other devices than the processor."""
+"""What the photometric loss is, in PyTorch: the core equals it, and so does what serves on other devices."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-_WINDOW, _SIGMA = 11, 1.5
-_C1, _C2 = 0.01**2, 0.03**2
+WINDOW, _SIGMA = 11, 1.5  # pixels
+C1, C2 = 0.01**2, 0.03**2
 
 
 def photometric_loss(
@@ -38,16 +38,21 @@ def ssim(image: Tensor, target: Tensor) -> Tensor:
     mean, target_mean, squared, target_squared, product = _blurred(products)
     variance, target_variance = squared - mean**2, target_squared - target_mean**2
     covariance = product - mean * target_mean
-    return ((2 * mean * target_mean + _C1) * (2 * covariance + _C2)) / (
-        (mean**2 + target_mean**2 + _C1) * (variance + target_variance + _C2)
+    return ((2 * mean * target_mean + C1) * (2 * covariance + C2)) / (
+        (mean**2 + target_mean**2 + C1) * (variance + target_variance + C2)
     )
 
 
 def _blurred(images: Tensor) -> Tensor:
     """(M, 3, H, W) under the normalised Gaussian window, which is separable, with zeros beyond the border."""
-    offsets = torch.arange(_WINDOW, dtype=images.dtype, device=images.device) - _WINDOW // 2
-    window = torch.exp(-(offsets**2) / (2 * _SIGMA**2))
-    window = window / window.sum()
+    weights = window(images.dtype, images.device)
     planes = images.flatten(0, 1)[:, None]
-    rows = functional.conv2d(planes, window.view(1, 1, 1, -1), padding=(0, _WINDOW // 2))
-    return functional.conv2d(rows, window.view(1, 1, -1, 1), padding=(_WINDOW // 2, 0)).view_as(images)
+    rows = functional.conv2d(planes, weights.view(1, 1, 1, -1), padding=(0, WINDOW // 2))
+    return functional.conv2d(rows, weights.view(1, 1, -1, 1), padding=(WINDOW // 2, 0)).view_as(images)
+
+
+def window(dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(11,) the weights of neighbours in a row, which is also those in a column."""
+    offsets = torch.arange(WINDOW, dtype=dtype, device=device) - WINDOW // 2
+    weights = torch.exp(-(offsets**2) / (2 * _SIGMA**2))
+    return weights / weights.sum()

@@ -25,13 +25,15 @@ from splatnode.recon.optimize.torch_threads import single_torch_thread
 from splatnode.recon.optimize.training_image import TrainingImage, training_image
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.rasterize.render import Render
-from splatnode.recon.scene.gaussians import Gaussians
+from splatnode.recon.result.sources import SHELL
+from splatnode.recon.scene.gaussians import Gaussians, logit
 from splatnode.recon.scene.scene import Scene, fitted_pixels
 
 Share = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(ge=0, le=1)]
 PARAMETERS = ("means", "quats", "log_scales", "logit_opacities", "sh")  # of Gaussians, that are optimised
 _SCALES = {False: 1.0, True: 0.5}  # of the photographs' resolution, by whether it is halved
+MIN_SOFT = 100  # iterations, at the end or a checkpoint, below which a refinement begins with opacities as seeded
 _KEPT_PIXELS = 5_000_000  # of all views: of more, what the loss needs of a photograph is computed at each step
 _PROCESSOR = torch.device("cpu")  # where the cameras are, whatever the Gaussians are on
 _POSE_BETAS = (0.9, 0.99)  # of Adam for the cameras: each gets one gradient in as many steps as there are views
@@ -65,6 +67,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     checkpoints: tuple[int, ...] = (150,)  # iterations after which the scene is shown, besides the last one
     half_resolution_share: Share = 0.0  # share of the iterations, at the start, on images of half the size
     dssim: Share = 0.4  # weight of D-SSIM in the photometric loss; that of L1 is 1 minus it
+    # Largest opacity of what photographs seeded, as the refinement of a begun scene starts: soft Gaussians settle more
+    # freely, in a hundred steps and more, so they are left as seeded where a time limit may end it. null: as seeded
+    first_opacity: Annotated[float, Meta(gt=0, lt=1)] | None = 0.1
     dropout: dropout.Config = dropout.Config()
     refine_poses: bool = True  # whether cameras are refined together with the Gaussians
     rates: Rates = Rates()
@@ -91,7 +96,7 @@ def refine(
     that random numbers are drawn on the processor: they are the same everywhere.
     """
     with single_torch_thread():
-        fit = _Fit(scene, config, seed, max_gaussians)
+        fit = _Fit(scene if deadline else _soft(scene, config), config, seed, max_gaussians)
     order = np.random.default_rng(seed)
     started = time.monotonic()
     queue: list[int] = []
@@ -108,7 +113,21 @@ def refine(
         gone_on(iteration + 1)
         if iteration + 1 in config.checkpoints and iteration + 1 < config.iterations:
             yield fit.scene()
-    yield replace(fit.scene(), losses=tuple(fit.losses))
+    yield replace(fit.scene(), losses=fit.losses())
+
+
+def _soft(scene: Scene, config: Config) -> Scene:
+    """A begun scene with its first opacities, if there are steps enough for them to grow before it is looked at."""
+    if scene.iterations or config.first_opacity is None or min((config.iterations, *config.checkpoints)) < MIN_SOFT:
+        return scene
+    return replace(scene, gaussians=softened(scene.gaussians, config.first_opacity))
+
+
+def softened(gaussians: Gaussians, most: float) -> Gaussians:
+    """With opacities of at most `most`, but for the far shell's."""
+    logits = gaussians.logit_opacities
+    soft = torch.where(gaussians.source_frame == SHELL, logits, logits.clamp_max(logit(most)))
+    return replace(gaussians, logit_opacities=soft)
 
 
 class _Fit:
@@ -143,27 +162,28 @@ class _Fit:
         }
         self._regularisation = _regularisation(scene, config.regularise, seed)
         self._iterations = scene.iterations
-        self.losses: list[float] = []  # photometric, of each step
+        self._losses: list[Tensor] = []  # photometric, of each step
 
     def step(self, index: int, progress: float) -> None:
         """One iteration on view `index`; `progress` in [0, 1] sets resolution and step sizes."""
         half = progress < self._config.half_resolution_share
         image = self._images[half][index]
         refine_pose = self._config.refine_poses and index > 0
-        T_world_camera = self._Ts_world_camera[index].requires_grad_(refine_pose)
+        on_device = self._Ts_world_camera[index].to(self._gaussians.means.device, non_blocking=True)
+        T_world_camera = on_device.requires_grad_(refine_pose)
         channels = self._regularisation.channels(progress) if self._regularisation else ("rgb",)
         opacities = self._dropout(self._gaussians.opacities, progress)
         camera = Camera(T_world_camera, image.K, image.width, image.height)
         render = render_gaussians(self._gaussians, camera, channels, opacities=opacities)
         assert render.rgb is not None  # it was asked for
         loss = image.loss(render.rgb)
-        self.losses.append(float(loss.detach()))
+        self._losses.append(loss.detach())
         if self._regularisation is not None:
             loss = loss + self._further_losses(self._regularisation, index, render, progress).to(loss)
         loss.backward()
         self._move_gaussians(progress)
         if refine_pose and T_world_camera.grad is not None:
-            gradient = twist_gradient(T_world_camera.detach(), T_world_camera.grad)
+            gradient = twist_gradient(self._Ts_world_camera[index].detach(), T_world_camera.grad.to(_PROCESSOR))
             self._move_camera(index, gradient, self._config.rates.final_pose**progress)
         self._iterations += 1
         self._control_density(index, self._images[half], progress)
@@ -219,6 +239,10 @@ class _Fit:
         direction, self._pose_moments[index] = adam_direction(gradient, self._pose_moments[index], _POSE_BETAS)
         T_world_camera = self._Ts_world_camera[index].detach()
         self._Ts_world_camera[index] = T_world_camera @ exp_se3(-decay * self._pose_rates * direction)
+
+    def losses(self) -> tuple[float, ...]:
+        """The photometric one of each step."""
+        return tuple(torch.stack(self._losses).tolist()) if self._losses else ()
 
     def scene(self) -> Scene:
         """What has been learnt so far."""

@@ -38,6 +38,7 @@ class _Exposed:
     loss: PhotometricLoss
     target: Tensor  # (height, width, 3) the photograph
     told: Tensor  # (height, width, 3) bool: False where it is saturated, or does not show the scene
+    prior: Tensor  # (3,) as much as _PRIOR of the photograph, squared
 
     def __call__(self, rgb: Tensor) -> Tensor:
         rgb = rgb * self._gains(rgb.detach())
@@ -45,9 +46,9 @@ class _Exposed:
 
     def _gains(self, rgb: Tensor) -> Tensor:
         """(3,) in closed form."""
-        seen, known = rgb * self.told, self.target * self.told
-        prior = _PRIOR * (known * known).sum((0, 1))
-        return ((seen * known).sum((0, 1)) + prior) / ((seen * seen).sum((0, 1)) + prior).clamp_min(1e-12)
+        seen = rgb * self.told
+        known = (seen * self.target).sum((0, 1)) + self.prior
+        return known / ((seen * seen).sum((0, 1)) + self.prior).clamp_min(1e-12)
 
 
 def training_image(
@@ -81,7 +82,9 @@ def training_image(
     if view.exposure.saturated is not None:
         share = cv2.resize(view.exposure.saturated.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         told = told & torch.from_numpy(share == 0).to(device)
-    return TrainingImage(K, width, height, _Exposed(loss, target, told))
+    known = target * told
+    prior = _PRIOR * (known * known).sum((0, 1))
+    return TrainingImage(K, width, height, _Exposed(loss, target, told, prior))
 
 
 def scaled(K: Tensor, width: int, height: int, scale: float) -> tuple[Tensor, int, int]:

@@ -29,7 +29,8 @@ def check_input(
 ) -> None:
     """Raises ValueError for the first shape, dtype, device or number that a rasteriser cannot take.
 
-    Values of the Gaussians are not looked at: that takes time, and back-ends do it on the way.
+    Values of the Gaussians are not looked at: that takes time, and back-ends do it on the way. Nor are those of a
+    camera that is not on the processor, which would have to wait for them.
     """
     gaussians = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
     for name, tensor in {**gaussians, "T_world_camera": T_world_camera, "K": K}.items():
@@ -62,10 +63,13 @@ def check_input(
         raise ValueError(f"channels must be some of {CHANNELS}, got {channels!r}")
     if not 0 < near < float("inf"):
         raise ValueError(f"near must be positive, got {near}")
-    _check_camera(T_world_camera.detach(), K.detach())
+    if T_world_camera.device.type == "cpu":
+        _check_pose(T_world_camera.detach())
+    if K.device.type == "cpu":
+        _check_intrinsics(K.detach())
 
 
-def _check_camera(T_world_camera: Tensor, K: Tensor) -> None:
+def _check_pose(T_world_camera: Tensor) -> None:
     T = T_world_camera.tolist()
     if not all(math.isfinite(value) for row in T for value in row):
         raise ValueError(f"T_world_camera must be finite, got {T}")
@@ -74,6 +78,9 @@ def _check_camera(T_world_camera: Tensor, K: Tensor) -> None:
     )
     if drift > 1e-2 or max(abs(value - last) for value, last in zip(T[3], (0, 0, 0, 1), strict=True)) > 1e-6:
         raise ValueError(f"T_world_camera must be a rigid transform (its rotation is off by {drift:.2g}), got {T}")
+
+
+def _check_intrinsics(K: Tensor) -> None:
     matrix = K.tolist()
     if not all(math.isfinite(value) for row in matrix for value in row) or matrix[0][0] <= 0 or matrix[1][1] <= 0:
         raise ValueError(f"K must be finite with positive focal lengths, got {matrix}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -26,10 +27,10 @@ def rasterize(means: Tensor, *further: Any, **options: Any) -> Render:
 
 
 def rasterizer(device: torch.device) -> Callable[..., Render]:
-    """A `rasterize` that computes on `device` and takes and gives tensors on the processor."""
+    """A `rasterize` that computes on `device` and takes and gives tensors on the processor. It can be pickled."""
+    return rasterize if device.type == "cpu" else partial(_rasterize_on, device)
 
-    def rasterize_there(means: Tensor, *further: Any, **options: Any) -> Render:
-        tensors = (each.to(device) if isinstance(each, Tensor) else each for each in further)
-        return rasterize(means.to(device), *tensors, **options).on(torch.device("cpu"))
 
-    return rasterize_there if device.type != "cpu" else rasterize
+def _rasterize_on(device: torch.device, means: Tensor, *further: Any, **options: Any) -> Render:
+    tensors = (each.to(device) if isinstance(each, Tensor) else each for each in further)
+    return rasterize(means.to(device), *tensors, **options).on(torch.device("cpu"))

@@ -15,16 +15,17 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.core import library, pointer
+from splatnode.recon.geometry import distortion, without_distortion
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
 _RAYLEIGH_MEDIAN = 1.1774  # median length of a 2D error whose components have sigma 1: sqrt(2 log 2)
 _MIN_NOISE_PX = 0.05  # at REFERENCE_SIDE: no observation is believed to be better
-_POSE, _LENS = 6, 4  # parameters of a pose (rotation vector, translation) and of a lens (log focal, radial, shift x, y)
+# Parameters of a pose (rotation vector, translation) and of a lens (log focal, two radial coefficients, shift x, y)
+_POSE, _LENS = 6, 5
 _MIN_DEPTH = 1e-9  # in the problem's unit of length, in place of 0
 _BEHIND_PX = 1e3  # the error that the robust cost counts for a point behind its camera
-UNDISTORT_ITERATIONS = 5  # of the fixed-point iteration; radial coefficients are small
 _MIN_CURVATURE = 1e-30  # in place of 0 for a parameter on which no observation depends
 _MIN_EIGENVALUE = 1e-14  # of the information at unit curvature: what is flatter is rounding
 
@@ -37,7 +38,7 @@ class Problem:
     translations: Array  # (C, 3) world to camera
     lens_of_camera: Index  # (C,)
     log_focals: Array  # (G,) log of the focal length in pixels
-    radials: Array  # (G,) first radial coefficient: distorted = undistorted * (1 + k r^2)
+    radials: Array  # (G, 2) radial coefficients: distorted = undistorted * (1 + k1 r^2 + k2 r^4)
     shifts: Array  # (G, 2) of the principal point, pixels
     points: Array  # (P, 3) world
     camera_of: Index  # (O,)
@@ -58,7 +59,7 @@ class LensPrior:
 
     log_focals: Array  # (G,)
     sigmas: Array  # (G,) of log focal
-    radial_sigmas: Array  # (G,) around zero
+    radial_sigmas: Array  # (G, 2) around zero
     shift_sigmas: Array  # (G,) pixels around the nominal principal point
 
 
@@ -72,8 +73,8 @@ def without_points(
 
 def focal_prior(log_focals: Array, sigmas: Array) -> LensPrior:
     """A prior under which only focal lengths (G,) are free, within `sigmas` (G,)."""
-    fixed = np.zeros(len(log_focals))
-    return LensPrior(log_focals, sigmas, fixed, fixed)
+    count = len(log_focals)
+    return LensPrior(log_focals, sigmas, np.zeros((count, 2)), np.zeros(count))
 
 
 def with_pose(problem: Problem, camera: int, rotation: Array, translation: Array) -> Problem:
@@ -96,19 +97,16 @@ def project(problem: Problem) -> tuple[Array, Array]:
         + problem.translations[camera]
     )
     normalised = in_camera[:, :2] / _safe_depth(in_camera[:, 2:])
-    distortion = 1.0 + problem.radials[lens] * (normalised**2).sum(1)
+    bent = distortion((normalised**2).sum(1), problem.radials[lens])
     focal = np.exp(problem.log_focals[lens])
-    return normalised * (focal * distortion)[:, None] + problem.shifts[lens], in_camera[:, 2]
+    return normalised * (focal * bent)[:, None] + problem.shifts[lens], in_camera[:, 2]
 
 
 def normalise(problem: Problem, camera: Index, pixels: Array) -> Array:
     """(M, 2) coordinates at depth 1, without distortion, of `pixels` (M, 2) of the cameras `camera` (M,)."""
     lens = problem.lens_of_camera[camera]
     distorted = (pixels - problem.shifts[lens]) / np.exp(problem.log_focals[lens])[:, None]
-    result = distorted
-    for _ in range(UNDISTORT_ITERATIONS if np.any(problem.radials) else 0):
-        result = distorted / (1.0 + problem.radials[lens] * (result**2).sum(1))[:, None]
-    return result
+    return without_distortion(distorted, problem.radials[lens])
 
 
 def reprojection_errors(problem: Problem) -> Array:
@@ -170,7 +168,7 @@ def covariance(problem: Problem, prior: LensPrior, config: Config, fixed_camera:
     library().core_bundle_information(ctypes.byref(native), pointer(information))
     free = np.ones(len(information), bool)
     free[_POSE * fixed_camera : _POSE * (fixed_camera + 1)] = False
-    of_lens = np.stack([prior.sigmas, prior.radial_sigmas, prior.shift_sigmas, prior.shift_sigmas], 1)
+    of_lens = np.column_stack([prior.sigmas, prior.radial_sigmas, prior.shift_sigmas, prior.shift_sigmas])
     free[_POSE * count :] = of_lens.ravel() > 0
     observed = np.bincount(problem.camera_of, minlength=count) > 0
     free[: _POSE * count] &= np.repeat(observed, _POSE)
@@ -200,7 +198,7 @@ def _gauge_free_inverse(information: Array, free_direction: Array) -> Array:
 
 
 def _scale_direction(problem: Problem, fixed_camera: int) -> Array:
-    """(6 C + 4 G,) change of the parameters when the scene is scaled about the fixed camera, which no error sees."""
+    """(6 C + 5 G,) change of the parameters when the scene is scaled about the fixed camera, which no error sees."""
     fixed_centre = -problem.rotations[fixed_camera].T @ problem.translations[fixed_camera]
     poses = np.zeros((len(problem.rotations), _POSE))
     poses[:, 3:] = problem.translations + problem.rotations @ fixed_centre

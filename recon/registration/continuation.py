@@ -67,7 +67,7 @@ def _known_cameras(
     """A map of the known cameras without points, in the pixels of their lenses; only focal lengths are free."""
     count, num_lenses = len(keyframes), len(known)
     rotations, translations = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3))
-    log_focals, radials, shifts = np.zeros(num_lenses), np.zeros(num_lenses), np.zeros((num_lenses, 2))
+    log_focals, radials, shifts = np.zeros(num_lenses), np.zeros((num_lenses, 2)), np.zeros((num_lenses, 2))
     for camera in start:
         index, lens = camera.index, grouping.lens_of[camera.index]
         rotations[index] = camera.T_world_camera[:3, :3].T

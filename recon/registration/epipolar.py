@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from splatnode.recon import poselib
 from splatnode.recon.core import library, pointer
+from splatnode.recon.geometry import undistort_iterations
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import bundle
 
@@ -47,10 +48,10 @@ def sampson_errors(estimate: bundle.Problem, views: tuple[int, int], pair: TwoVi
         tuple(rotation.ravel()),
         tuple(estimate.translations[second] - rotation @ estimate.translations[first]),
         tuple(focals),
-        tuple(radials),
+        tuple(radials.ravel()),
         tuple(estimate.shifts[lenses].ravel()),
         _MIN_PARALLAX_PX / focals.max(),
-        bundle.UNDISTORT_ITERATIONS if radials.any() else 0,
+        undistort_iterations(radials),
     )
     points1, points2 = (np.ascontiguousarray(points, np.float64) for points in (pair.points1, pair.points2))
     errors = np.empty(len(points1))
@@ -66,7 +67,7 @@ class _Pose(ctypes.Structure):
         ("rotation", ctypes.c_double * 9),
         ("translation", ctypes.c_double * 3),
         ("focals", ctypes.c_double * 2),
-        ("radials", ctypes.c_double * 2),
+        ("radials", ctypes.c_double * 4),
         ("shifts", ctypes.c_double * 4),
         ("min_parallax", ctypes.c_double),
         ("undistort_iterations", ctypes.c_int32),

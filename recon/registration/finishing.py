@@ -9,11 +9,14 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.geometry import distortion
 from splatnode.recon.registration import bundle, incremental, subpixel, triangulation
+from splatnode.recon.registration.lenses import CORNER, LEAST_SHIFT
 from splatnode.recon.registration.mapping_problem import MappingProblem, PartialMap
 from splatnode.recon.registration.patch_image import PatchImage
 
 Array = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 _ROBUST_PER_MEDIAN = 3.0  # scale of the robust loss over the median error
 _TOLERANCES = (3.0, 2.0, 1.0)  # of observations, in one adjustment after the other: multiples of `max_error_px`
@@ -54,33 +57,45 @@ def finish(
     `images`, one a view, give subpixel observations; where there are none, the features' positions are kept.
     """
     partial = replace(partial, prior=_free_lenses(problem, partial.prior, config))
-    loss = _loss(problem, partial.estimate, config)
     for tolerance in _TOLERANCES:
-        partial = incremental.adjust(problem, partial, problem.final_tracks, loss, tolerance, config.triangulation)
-        partial = _held_by_evidence(partial, config)
+        partial = _settled(problem, partial, tolerance, config)
         if len(partial.estimate.points) < config.min_points:
             return None
-        loss = _loss(problem, partial.estimate, config)
+    bending = _bending(problem, partial.estimate)
+    if bending.any():
+        partial = _settled(problem, _with_second_radial(partial, bending), _TOLERANCES[-1], config)
+        if len(partial.estimate.points) < config.min_points:
+            return None
     if images:
         refined = subpixel.refine(partial.estimate, partial.registered, images, config.subpixel)
         if len(refined.points) >= config.min_points and _all_observed(refined, partial.registered):
             partial = replace(partial, estimate=refined)
             for _ in range(_REFINED_ADJUSTMENTS):
                 partial = _held_by_evidence(_adjust_and_filter(problem, partial, config), config)
-            loss = _loss(problem, partial.estimate, config)
-    errors = _errors(problem, partial.estimate)
+    loss, errors = _loss(problem, partial.estimate, config), _errors(problem, partial.estimate)
     return Finished(partial, loss, float(np.sqrt(np.mean(errors**2))))
+
+
+def _settled(problem: MappingProblem, partial: PartialMap, tolerance: float, config: Config) -> PartialMap:
+    """The map after an adjustment to the final tracks, its lenses held by what it found of them."""
+    loss = _loss(problem, partial.estimate, config)
+    adjusted = incremental.adjust(problem, partial, problem.final_tracks, loss, tolerance, config.triangulation)
+    return _held_by_evidence(adjusted, config)
 
 
 def _free_lenses(problem: MappingProblem, prior: bundle.LensPrior, config: Config) -> bundle.LensPrior:
     """The prior with distortion and principal point free for all lenses that are not calibrated."""
     unknown = prior.sigmas > 0
-    longer_side = np.array(
-        [max(view.longer_side for view in problem.views if view.lens == g) for g in range(len(problem.lenses))]
-    )
+    radial_sigmas = np.column_stack([_WIDEST_RADIAL * unknown, np.zeros(len(unknown))])
     return replace(
-        prior, radial_sigmas=_WIDEST_RADIAL * unknown, shift_sigmas=config.shift_sigma * longer_side * unknown
+        prior, radial_sigmas=radial_sigmas, shift_sigmas=config.shift_sigma * _longer_sides(problem) * unknown
     )
+
+
+def _longer_sides(problem: MappingProblem) -> Array:
+    """(G,) of each lens' largest picture, pixels."""
+    lenses = range(len(problem.lenses))
+    return np.array([max(view.longer_side for view in problem.views if view.lens == g) for g in lenses], np.float64)
 
 
 def _held_by_evidence(partial: PartialMap, config: Config) -> PartialMap:
@@ -91,6 +106,20 @@ def _held_by_evidence(partial: PartialMap, config: Config) -> PartialMap:
     """
     found = np.maximum(np.abs(partial.estimate.radials), config.radial_sigma)
     sigmas = np.where(partial.prior.radial_sigmas > 0, found, 0.0)
+    return replace(partial, prior=replace(partial.prior, radial_sigmas=sigmas))
+
+
+def _bending(problem: MappingProblem, estimate: bundle.Problem) -> Flags:
+    """(G,) the lenses whose distortion moves the corners of their pictures by more than LEAST_SHIFT."""
+    focals = np.exp(estimate.log_focals) / _longer_sides(problem)
+    corners = CORNER / focals
+    return np.abs(distortion(corners**2, estimate.radials) - 1.0) * corners * focals > LEAST_SHIFT
+
+
+def _with_second_radial(partial: PartialMap, lenses: Flags) -> PartialMap:
+    """The map with the second coefficient free of those of the `lenses` (G,) whose first one is."""
+    sigmas = partial.prior.radial_sigmas.copy()
+    sigmas[lenses & (sigmas[:, 0] > 0), 1] = _WIDEST_RADIAL
     return replace(partial, prior=replace(partial.prior, radial_sigmas=sigmas))
 
 

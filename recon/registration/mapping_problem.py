@@ -33,7 +33,7 @@ class Lens:
 
     focals: tuple[float, ...]  # candidates in pixels, the most likely first
     sigma: float  # of log focal around the candidate; 0: it is calibrated
-    radial: float = 0.0  # first radial coefficient
+    radial: tuple[float, float] = (0.0, 0.0)  # radial coefficients
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,7 @@ class RegisteredCamera:
     lens: int  # cameras with the same number share a lens, relative to their longer side
     focal: float  # pixels
     principal: Array  # (2,) pixels
-    radial: float  # first radial distortion coefficient
+    radial: Array  # (2,) coefficients of r^2 and r^4 in the lens' distortion, as bundle.py has them
     rotation_sigma_deg: float  # after the best similarity; infinite where nothing is known
     centre_sigma_rel: float  # over the spread of the centres, after the best similarity; infinite likewise
     # (3, 3) of the centre, after the best similarity, in the frame and the squared unit of the world; NaN likewise
@@ -163,7 +163,7 @@ def in_first_camera(found: mapper.Map, keyframes: Sequence[Keyframe], scales: Se
                 lens=int(lens),
                 focal=float(np.exp(estimate.log_focals[lens])) / scales[i],
                 principal=principal_point(keyframes[i].frame) + estimate.shifts[lens] / scales[i],
-                radial=float(estimate.radials[lens]),
+                radial=estimate.radials[lens].copy(),
                 rotation_sigma_deg=float(rotation_sigmas[position]),
                 centre_sigma_rel=float(centre_sigmas[position]),
                 centre_covariance=covariances[position],

@@ -1,7 +1,7 @@
 """Photographs without the distortion that registration estimated, for all that comes after the poses.
 
 Stereo, seeding, refinement and what is published are those of a pinhole. The poses, their verification and the
-landmarks keep the photographs as they were taken, of which the radial coefficient is.
+landmarks keep the photographs as they were taken, of which the radial coefficients are.
 """
 
 from __future__ import annotations
@@ -18,16 +18,15 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import opencv
 from splatnode.recon.frames.keyframe import Features, Keyframe, modelled_image, modelled_mask
 from splatnode.recon.frames.undistort import undistorted
+from splatnode.recon.geometry import distortion
 from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.registration.lenses import LEAST_SHIFT
 from splatnode.recon.registration.register import RegisteredCamera, Registration
 
 log = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 
-# By which the distortion moves the farthest corner, over the longer side: 8 pixels of 512. What is estimated below is
-# as much the errors of few points as the lens: held-out PSNR fell by .3 to .4 dB at 1 to 4 pixels, and rose from 13 on
-LEAST_SHIFT = 0.016
 _DETAIL = 2  # times the modelled size: what is straightened, so that resampling twice costs no sharpness
 
 
@@ -70,7 +69,7 @@ def with_lenses(registration: Registration, graph: ViewGraph, known: Mapping[str
             frame = graph.keyframes[camera.index].frame
             own = lens.resized(frame.width, frame.height)
             principal = np.array([own.cx, own.cy])
-            camera = replace(camera, focal=own.fx, principal=principal, radial=own.distortion[0])
+            camera = replace(camera, focal=own.fx, principal=principal, radial=np.array(radial_of(own)))
         cameras.append(camera)
     return replace(registration, cameras=tuple(cameras))
 
@@ -103,12 +102,22 @@ def corner_shift(lens: Intrinsics | None) -> float:
         return 0.0
     across = max(lens.cx, lens.width - lens.cx) / lens.fx
     down = max(lens.cy, lens.height - lens.cy) / lens.fy
-    return float(lens.distortion[0] * np.hypot(across, down) ** 3 * lens.fx / max(lens.width, lens.height))
+    corner = np.hypot(across, down)
+    moved = distortion(corner**2, np.array(radial_of(lens))) - 1.0
+    return float(moved * corner * lens.fx / max(lens.width, lens.height))
+
+
+def radial_of(lens: Intrinsics | None) -> tuple[float, float]:
+    """The radial coefficients of a lens that registration estimated; without one, those of a pinhole."""
+    if lens is None or not lens.distortion:
+        return 0.0, 0.0
+    first, second, *_ = (*lens.distortion, 0.0)
+    return first, second
 
 
 def _estimated(camera: RegisteredCamera, frame: Frame) -> Intrinsics:
     cx, cy = (float(value) for value in camera.principal)
-    radial = (float(camera.radial), 0.0, 0.0, 0.0) if camera.radial else ()
+    radial = (*camera.radial.tolist(), 0.0, 0.0) if camera.radial.any() else ()
     focal = float(camera.focal)
     return Intrinsics(frame.width, frame.height, focal, focal, cx, cy, "estimated", radial)
 
@@ -126,7 +135,7 @@ def _seen_by(keyframes: list[Keyframe], registration: Registration) -> Registrat
         pixels[own] = straight_pixels(pixels[own], keyframe.lens, pinhole)
         inside[own] = np.all((pixels[own] >= 0) & (pixels[own] < (pinhole.width, pinhole.height)), axis=1)
         principal = np.array([pinhole.cx, pinhole.cy])
-        cameras.append(replace(camera, focal=pinhole.fx, principal=principal, radial=0.0))
+        cameras.append(replace(camera, focal=pinhole.fx, principal=principal, radial=np.zeros(2)))
     return replace(
         registration,
         cameras=tuple(cameras),

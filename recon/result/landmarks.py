@@ -20,7 +20,7 @@ class KnownLenses:
     """The lenses of C cameras. Lengths in the picture count over its longer side."""
 
     focals: Array  # (C,)
-    radials: Array  # (C,) first radial coefficient, as recon/registration/bundle.py has it
+    radials: Array  # (C, 2) radial coefficients, as recon/registration/bundle.py has them
     shifts: Array  # (C, 2) of the principal point from the middle of the picture
     shapes: Array  # (C,) height over width
 
@@ -42,16 +42,6 @@ class Landmarks:
     noise_px: float  # standard deviation of an observation's error, pixels at REFERENCE_SIDE
     unit: float = 1.0  # the median depth of the scene's points: metres where the result is metric
     metric: bool = False  # lengths are metres
-
-    def seen_by(self, photographs: Index) -> Landmarks:
-        """With the descriptors of these photographs alone; everything keeps its number."""
-        own = np.isin(self.photograph_of, photographs)
-        return replace(
-            self,
-            descriptors=self.descriptors[own],
-            point_of=self.point_of[own],
-            photograph_of=self.photograph_of[own],
-        )
 
     def moved(self, scale: float, rotation: Array, translation: Array, *, metric: bool = False) -> Landmarks:
         """The same in the world to which x -> scale * rotation @ x + translation leads.

@@ -62,6 +62,7 @@ def decode_landmarks(data: bytes, name: str = LANDMARKS) -> Landmarks:
     with foreign(SceneFileError, name):
         with opened(data, MOST_BYTES, name, "landmarks") as arrays:
             found = {key: arrays[key] for key in _SHAPES}
+        found["lenses"] = _with_second_radial(found["lenses"])
         _check(found, name)
         return _decoded(found)
 
@@ -74,10 +75,15 @@ _SHAPES: dict[str, tuple[str, str, tuple[int, ...]]] = {  # kind, what its first
     "photograph_of": ("u", "D", ()),
     "names": ("S", "C", ()),
     "Ts_world_camera": ("f", "C", (4, 4)),
-    "lenses": ("f", "C", (5,)),
+    "lenses": ("f", "C", (6,)),
     "bounds": ("f", "C", (2,)),
     "scale": ("f", "three", ()),
 }
+
+
+def _with_second_radial(lenses: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """(C, 6) of a file from before lenses had a second radial coefficient, which has (C, 5)."""
+    return np.insert(lenses, 2, 0.0, axis=1) if lenses.ndim == 2 and lenses.shape[1] == 5 else lenses
 
 
 def _check(found: dict[str, npt.NDArray[Any]], name: str) -> None:
@@ -98,7 +104,7 @@ def _check(found: dict[str, npt.NDArray[Any]], name: str) -> None:
         problem = camera_problem(T_world_camera, np.diag([lens[0], lens[0], 1.0]), 1, 1)
         if problem:
             raise SceneFileError(f"{name}: {problem}")
-    if (found["lenses"][:, [0, 4]] <= 0).any() or (found["scale"][:2] <= 0).any() or (found["bounds"] < 0).any():
+    if (found["lenses"][:, [0, 5]] <= 0).any() or (found["scale"][:2] <= 0).any() or (found["bounds"] < 0).any():
         raise SceneFileError(f"{name}: focal lengths, shapes, bounds and units must be positive")
 
 
@@ -118,7 +124,7 @@ def _decoded(found: dict[str, npt.NDArray[Any]]) -> Landmarks:
         found["photograph_of"].astype(np.int64),
         tuple(printable(name.decode(), LONGEST_NAME) for name in found["names"].tolist()),
         found["Ts_world_camera"],
-        KnownLenses(lenses[:, 0], lenses[:, 1], lenses[:, 2:4], lenses[:, 4]),
+        KnownLenses(lenses[:, 0], lenses[:, 1:3], lenses[:, 3:5], lenses[:, 5]),
         bounds[:, 0],
         bounds[:, 1],
         noise_px,

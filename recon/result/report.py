@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from dataclasses import asdict
 from importlib import metadata
@@ -52,6 +53,7 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
         "masked": {name: round(share, 4) for name, share in snapshot.masked.items()},
         "moving": {name: round(share, 4) for name, share in snapshot.moving.items()},
         "gains": {name: [round(gain, 4) for gain in gains] for name, gains in snapshot.gains.items()},
+        "vignetting": {name: round(1.0 - math.exp(-falloff), 4) for name, falloff in snapshot.falloffs.items()},
         "seed": seed,
         "preset": preset,
         "versions": versions(),

@@ -89,3 +89,5 @@ class Snapshot:
     masked: Mapping[str, float] = field(default_factory=dict)  # share that a mask hides, by photograph that has one
     moving: Mapping[str, float] = field(default_factory=dict)  # share left out because it moved, by photograph
     gains: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # taken out of photographs: red, green, blue
+    falloffs: Mapping[str, float] = field(default_factory=dict)  # of lenses that dim their corners, by photograph
+    scenes: tuple[str, ...] = ()  # that it was merged of, by scene_id, where it was read from a result

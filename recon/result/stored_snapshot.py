@@ -18,6 +18,7 @@ from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.image_file import UnusableImage, decode_photograph, read_image_file
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import is_printable
+from splatnode.capture.process.records import record_in
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.sources import SOURCES
@@ -65,6 +66,7 @@ def read_result(place: Path) -> tuple[Snapshot, list[Path]]:
         final=True,
         scale=StoredResult(scene).scale(),
         up=report.up,
+        scenes=tuple(each.scene for each in report.scenes),
     )
     return snapshot, reported + beside
 
@@ -80,6 +82,12 @@ def _gaussians(scene: Path) -> GaussianArrays:
     return read_gaussians(scene)
 
 
+class _Scene(msgspec.Struct, frozen=True):
+    """One of the scenes that were merged."""
+
+    scene: str
+
+
 class _Report(msgspec.Struct, frozen=True):
     """What is shown of report.json."""
 
@@ -89,6 +97,7 @@ class _Report(msgspec.Struct, frozen=True):
     seconds: dict[str, Annotated[float, msgspec.Meta(ge=0, le=1e9)]] = {}
     photographs: str | None = None
     up: Up | None = None
+    scenes: tuple[_Scene, ...] = ()
 
     def texts(self) -> list[str]:
         """All that it says, which is shown."""
@@ -100,9 +109,16 @@ class _Report(msgspec.Struct, frozen=True):
             *verdict.frames,
             *dropped,
             *self.seconds,
+            *(each.scene for each in self.scenes),
             self.photographs or "",
             self.up.source if self.up else "",
         ]
+
+
+def read_up(folder: Path) -> Up | None:
+    """Where up is in the world of the result in `folder`, if its report tells. Raises SceneFileError, OSError."""
+    report = _report(folder / "report.json")
+    return None if report is None else report.up
 
 
 def _report(path: Path) -> _Report | None:
@@ -111,7 +127,7 @@ def _report(path: Path) -> _Report | None:
         return None
     with foreign(SceneFileError, str(path)):
         try:
-            report = msgspec.json.decode(read_json_file(path), type=_Report)
+            report = record_in(read_json_file(path), _Report)
         except msgspec.MsgspecError as error:
             raise SceneFileError(f"{path} is not a report of splatnode, or is damaged: {error}") from error
         if not all(is_printable(text, _LONGEST_SENTENCE) for text in report.texts()):

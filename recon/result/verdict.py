@@ -34,6 +34,9 @@ class Code(enum.Enum):
     BUDGET_HIT = "BUDGET_HIT"
 
 
+SURE = (Code.OK, Code.OK_PARTIAL)  # the scene is known well enough to measure in it, and to map what is free
+
+
 @dataclass(frozen=True)
 class Verdict:
     """What can be said of photographs, whether there is a scene of them or not."""

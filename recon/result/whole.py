@@ -17,6 +17,7 @@ import numpy as np
 
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, is_printable
+from splatnode.capture.process.records import record_in
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.placement import IDENTITY, Placement
@@ -89,7 +90,7 @@ def read_whole(folder: Path) -> Whole:
     data = read_json_file(path)
     with foreign(SceneFileError, str(path)):
         try:
-            found = msgspec.json.decode(data, type=_File)
+            found = record_in(data, _File)
         except msgspec.MsgspecError as error:
             raise SceneFileError(f"{path} is not a places.json of splatnode, or is damaged: {error}") from error
         places = {place.scene_id: _place(place, folder, path) for place in found.places}

@@ -15,6 +15,7 @@ from splatnode.recon.result.sources import frame_of
 from splatnode.recon.scene import initialisation, light
 from splatnode.recon.scene.gaussians import concatenate
 from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene.told_light import told_logs
 
 NUM_NEIGHBOURS = 3  # views beside a further one that tell what of it is known, hidden or empty: each costs time
 
@@ -44,8 +45,10 @@ def grow(
     images = {view.name: view.image for view in scene.views} | {
         name: graph.keyframes[index].image for name, index in further.items()
     }
-    lit = any(view.exposure is not None for view in scene.views)
-    exposures = light.joining(seen, images, further, lit, lighting)
+    lit = {view.name: view.exposure for view in scene.views if view.exposure is not None}
+    falloffs = {name: _falloff(scene, pointmaps[name]) for name in further}
+    told = told_logs(graph.keyframes[index] for index in sorted(shown))
+    exposures = light.joining(seen, images, falloffs, lit, lighting, told)
     begun = initialisation.initial_scene(
         seen,
         light.in_one_light(images, exposures),
@@ -79,6 +82,14 @@ def without_views(scene: Scene, names: Collection[str]) -> Scene:
         ),
         gaussians=kept.transformed(1.0, T_camera_world[:3, :3], T_camera_world[:3, 3]),
     )
+
+
+def _falloff(scene: Scene, pointmap: Pointmap) -> float:
+    """That of the lens of a further photograph: as of the view whose lens is most like it."""
+    focal_lengths = [view.K[0, 0].item() / max(view.width, view.height) for view in scene.views]
+    own = pointmap.K[0, 0] / max(pointmap.depth.shape)
+    nearest = min(zip(focal_lengths, scene.views, strict=True), key=lambda lens: abs(lens[0] - own))[1]
+    return nearest.exposure.falloff if nearest.exposure else 0.0
 
 
 def _neighbours(graph: ViewGraph, index: int, registered: Collection[int]) -> list[int]:

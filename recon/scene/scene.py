@@ -24,7 +24,8 @@ from splatnode.recon.scene.gaussians import Gaussians
 class Exposure:
     """How a photograph differs from its image in a scene of one light."""
 
-    gains: tuple[float, float, float]  # red, green, blue: of the photograph over the image
+    gains: tuple[float, float, float]  # red, green, blue: of the photograph over the image, in its middle
+    falloff: float  # the light at its corners is exp(-falloff) of that in its middle
     saturated: npt.NDArray[np.bool_] | None  # (h, w, 3), True: what it shows is at least so bright; None: nowhere
 
 

@@ -51,7 +51,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     depth_weight: float = 1.0  # a relative difference of depth counts as this many times a difference of colour
     noise: float = 0.01  # standard deviation of colours in [0, 1] that is not worth a Gaussian
     footprint: float = 1.2  # standard deviations of a new Gaussian across, over its piece's
-    thickness: float = 0.15  # its standard deviation along the normal, over the smaller one across
+    thickness: float = 1.0  # its standard deviation along the normal, over the smaller one across
     opacity: float = 0.5  # of a new Gaussian
 
 

@@ -86,7 +86,8 @@ def with_photographs(scene: Scene, graph: ViewGraph) -> Scene | None:
         if keyframe is None or abs(corner_shift(keyframe.lens) - corner_shift(view.lens)) > MAX_LENS_SHIFT:
             return None
         if keyframe.lens is not None:
-            image, exposure = light.relit(keyframe.image, view.exposure and view.exposure.gains)
+            lit = view.exposure
+            image, exposure = light.relit(keyframe.image, lit and lit.gains, lit.falloff if lit else 0.0)
             view = replace(view, image=image, exposure=exposure, mask=keyframe.mask, lens=keyframe.lens)
         views.append(view)
     return replace(scene, views=tuple(views))

@@ -18,6 +18,7 @@ from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.fitted import FITTED
 from splatnode.recon.verification.models import Fitted
 from splatnode.recon.verification.odds_check import odds
+from splatnode.recon.verification.strong_lens import bends_strongly
 from splatnode.recon.verification.undetermined import undetermined
 
 __all__ = ["Config", "decide", "refuse_before_registration"]
@@ -33,6 +34,7 @@ LIMITS = (  # each asks one piece of the evidence, and decides by itself
 CHECKS = (  # what is surer about the reason comes first; those after the first may take all numbers for finite
     undetermined,
     *LIMITS,
+    bends_strongly,
     odds,
     causes.unknown,
     checks.required,

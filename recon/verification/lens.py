@@ -10,10 +10,10 @@ import numpy as np
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import focal
+from splatnode.recon.registration.lenses import CORNER
 from splatnode.recon.verification import refit
 
 FREE_RADIAL = 0.3  # sigma of the first radial coefficient where it is free
-CORNER = 0.6  # distance of a corner from the middle, over the longer side: that of a picture of 3 x 2
 STEPS = (0.0, 0.35, -0.35)  # of log focal, from which it is set free: a wrong one can be a local minimum
 
 
@@ -39,13 +39,14 @@ class Distortion:
 def distortion(fit: refit.Fit) -> Distortion:
     held = refit.adjusted(fit)
     num_lenses = len(held.prior.sigmas)
-    free = refit.adjusted(replace(held, prior=replace(held.prior, radial_sigmas=np.full(num_lenses, FREE_RADIAL))))
+    first = np.tile([FREE_RADIAL, 0.0], (num_lenses, 1))
+    free = refit.adjusted(replace(held, prior=replace(held.prior, radial_sigmas=first)))
     corner = (
         CORNER
         * REFERENCE_SIDE
         * np.array([held.scale[held.problem.lens_of_camera == g].max() for g in range(num_lenses)])
     )
-    further = (free.problem.radials - held.problem.radials) * (corner / np.exp(free.problem.log_focals)) ** 2
+    further = (free.problem.radials - held.problem.radials)[:, 0] * (corner / np.exp(free.problem.log_focals)) ** 2
     return Distortion(float(np.abs(further).max()), float(free.cost / max(held.cost, refit.MIN_COST)))
 
 

@@ -57,7 +57,20 @@ def _wrong_poses(case: Case, against: str) -> Verdict:
         return refuse(refusals.UNCONFIRMED, (weakest.name,), name=weakest.name, points=weakest.confirmed)
     if against in ("rotation_bound", "travel_bound"):
         return why_wide(case)
-    weakest = min(cameras, key=lambda camera: camera.inlier_ratio)
+    return _contradictions(case, against)
+
+
+def _contradictions(case: Case, against: str) -> Verdict:
+    """Photographs, pairs of them, or two parts do not fit together. It is about the photograph that fits least."""
+    weakest = min(case.evidence.cameras, key=lambda camera: camera.inlier_ratio)
+    if against == "directions":
+        return refuse(refusals.DISAGREEING, (weakest.name,), degrees=case.evidence.cycles.direction_deg)
+    if against in ("link_points", "link_inlier_ratio"):
+        link, inliers = case.evidence.weakest_link, 100 * case.evidence.weakest_link.inlier_ratio
+        count, points = len(link.smaller_part), link.shared_points
+        return refuse(refusals.WEAKLY_JOINED, (weakest.name,), count=count, points=points, inliers=inliers)
+    if against == "camera_inlier_ratio":
+        return refuse(refusals.CONTRADICTED, (weakest.name,), name=weakest.name, inliers=100 * weakest.inlier_ratio)
     return refuse(refusals.CONTRADICTING, (weakest.name,), inliers=100 * case.evidence.inlier_ratio)
 
 

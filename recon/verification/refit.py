@@ -73,7 +73,7 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
     lenses, lens_of_camera = np.unique([camera.lens for camera in cameras], return_inverse=True)
     longer_sides = np.array([sides[lens_of_camera == lens].max() for lens in range(len(lenses))])
     enlarged = longer_sides[lens_of_camera] / sides
-    focals, radials, sigmas = np.zeros(len(lenses)), np.zeros(len(lenses)), np.zeros(len(lenses))
+    focals, radials, sigmas = np.zeros(len(lenses)), np.zeros((len(lenses), 2)), np.zeros(len(lenses))
     told = np.full(len(lenses), np.nan)
     for camera, lens, by in zip(cameras, lens_of_camera, enlarged, strict=True):
         given = keyframes[camera.index].frame.intrinsics

@@ -106,6 +106,23 @@ CONTRADICTING = Refusal(
     "The photographs contradict each other: only {inliers:.0f} % of their matches fit together.",
     "Add photographs between those named; look out for repeated or mirrored structures and moving things.",
 )
+CONTRADICTED = Refusal(
+    Code.AMBIGUOUS,
+    "{name} contradicts the others: only {inliers:.0f} % of its matches fit with them.",
+    "Leave it out, or add a photograph beside it; look out for repeated or mirrored structures and moving things.",
+)
+DISAGREEING = Refusal(
+    Code.AMBIGUOUS,
+    "Pairs of photographs disagree by {degrees:.0f} degrees, in the median, with the poses of all of them about the "
+    "direction in which the camera moved.",
+    "Add photographs from further to the side; if the lens bends lines, calibrate the camera.",
+)
+WEAKLY_JOINED = Refusal(
+    Code.AMBIGUOUS,
+    "The photographs fall into two parts that only {points} points join, and {inliers:.0f} % of the matches between "
+    "them fit. The smaller part has {count} of them.",
+    "Add photographs between the two parts, and beside the one named.",
+)
 SMALL_PART = Refusal(
     Code.AMBIGUOUS,
     "What {name} shares with the others fills only {percent:.0f} % of its picture: too little to tell where it stands.",

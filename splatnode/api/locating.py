@@ -4,21 +4,54 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
 
 from splatnode.api.photographs import Lens, Picture, photographs, with_lens
 from splatnode.capture.frame import Frame
+from splatnode.capture.given_pose import rigid_problem
 from splatnode.capture.process.progress import told_to_nobody
+from splatnode.recon.locating.follow import follow
 from splatnode.recon.locating.locate import locate
 from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.result.landmarks import Landmarks
 
+Near: TypeAlias = "Located | NotLocated | npt.ArrayLike | None"
 
-def localised(landmarks: Landmarks, image: str | PathLike[str] | Picture, lens: Lens | None) -> Located | NotLocated:
+
+def localised(
+    landmarks: Landmarks, image: str | PathLike[str] | Picture, lens: Lens | None, near: Near
+) -> Located | NotLocated:
     """The camera of one photograph, a file or a picture. Raises TypeError, ValueError, FileNotFoundError."""
     if isinstance(image, (str, PathLike)) and not Path(image).is_file():
         raise FileNotFoundError(f"no photograph {str(image)!r}; give a file, or a picture")
+    expected = _expected(near)
     given = with_lens(photographs([image], None, False, told_to_nobody), lens).frames
     (frame, *_) = given
     if not isinstance(frame, Frame):
         raise ValueError(f"image {frame.name} cannot be read: {frame.reason}")
-    return locate(landmarks, frame.image, frame.intrinsics)
+    if expected is None:
+        return locate(landmarks, frame.image, frame.intrinsics)
+    return follow(landmarks, frame.image, expected, frame.intrinsics)
+
+
+def _expected(near: Near) -> Located | npt.NDArray[np.float64] | None:
+    """What is known of where the photograph was taken; None: nothing."""
+    if near is None or isinstance(near, NotLocated):
+        return None
+    if isinstance(near, Located):
+        return near
+    try:
+        T_world_camera = np.asarray(near, np.float64)
+    except (TypeError, ValueError):
+        raise TypeError(_WHAT_NEAR_IS.format(type(near).__name__)) from None
+    if T_world_camera.shape != (4, 4):
+        raise TypeError(_WHAT_NEAR_IS.format(f"shape {T_world_camera.shape}"))
+    if problem := rigid_problem(T_world_camera.ravel().tolist()):
+        raise ValueError(f"near must be {problem}")
+    return T_world_camera
+
+
+_WHAT_NEAR_IS = "near must be what localise returned, or T_world_camera (4, 4), got {}"

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.cameras.folder import SUFFIXES, frame_name
-from splatnode.capture.exif import exif_intrinsics, read_tags
+from splatnode.capture.exif import exif_exposure, exif_intrinsics, read_tags
 from splatnode.capture.exif_time import exif_time
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.given_lens import check_fits, seen_through
@@ -60,12 +60,13 @@ def names_of(images: Images) -> list[str]:
 
 
 def frame(picture: Picture, frame_id: int, name: str, stamp_ns: int, captured_at: Stamp | None = None) -> Frame:
-    """A picture as a frame, with what its EXIF tells of lens and time. Raises TypeError, ValueError."""
+    """A picture as a frame, with what its EXIF tells of lens, time and exposure. Raises TypeError, ValueError."""
     try:
         image, tiff = pixels(picture), _tiff(picture)
         height, width = image.shape[:2]
-        intrinsics = exif_intrinsics(read_tags(tiff), width, height)
-        return Frame(frame_id, name, stamp_ns, image, intrinsics, captured_at=captured_at or exif_time(tiff))
+        tags, taken_at = read_tags(tiff), captured_at or exif_time(tiff)
+        intrinsics, exposure = exif_intrinsics(tags, width, height), exif_exposure(tags)
+        return Frame(frame_id, name, stamp_ns, image, intrinsics, captured_at=taken_at, exposure=exposure)
     except (TypeError, ValueError) as error:
         raise type(error)(f"image {name}: {error}") from error
 

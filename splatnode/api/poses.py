@@ -16,8 +16,8 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.given_pose import GivenPose, given_pose
 from splatnode.capture.gravity import SIGMA_DEG, Gravity
 from splatnode.capture.motion import Motion
+from splatnode.capture.poses_file import named, poses_of, read_poses
 from splatnode.recon.metric.config import Config
-from splatnode.recon.metric.poses_file import named, poses_of, read_poses
 
 LEAST_STEP_SIGMA_M = 0.001  # standard deviation of a motion, however short it is
 

@@ -108,13 +108,21 @@ class Result:
             raise ValueError(f"there is no scene to render: {self.verdict.code.value}. Ask verdict.publishable first")
         return view(self._snapshot.gaussians, T_world_camera, K, size, threads)
 
-    def localise(self, image: str | PathLike[str] | Picture, *, intrinsics: Lens | None = None) -> Located | NotLocated:
+    def localise(
+        self,
+        image: str | PathLike[str] | Picture,
+        *,
+        intrinsics: Lens | None = None,
+        near: Located | NotLocated | npt.ArrayLike | None = None,
+    ) -> Located | NotLocated:
         """Where a further photograph was taken, or why that cannot be said: a refusal is a value.
 
         `image` is a file or a picture, of any camera; `intrinsics` is its lens, if that is known: `Intrinsics`, or K
-        (3, 3) in its pixels. `Located` has `T_world_camera`, `K`, `covariance`, and `claim`: how wrong it may be, with
-        95 %. `NotLocated` has `code`, `message` and `advice`. Raises ValueError where there is no scene to look in,
-        TypeError for other types, and FileNotFoundError.
+        (3, 3) in its pixels. `near` is what was found of a photograph that the same camera took shortly before, or
+        T_world_camera (4, 4) about where this one was taken: there it is found faster. Where it is not there, or
+        nothing was found before, it is looked for everywhere. `Located` has `T_world_camera`, `K`, `covariance`, and
+        `claim`: how wrong it may be, with 95 %. `NotLocated` has `code`, `message` and `advice`. Raises ValueError
+        where there is no scene to look in, TypeError for other types, and FileNotFoundError.
         """
         from splatnode.api.locating import localised  # brings what matches photographs
 
@@ -124,7 +132,7 @@ class Result:
             if not self.verdict.publishable:
                 why = f"there is none: {self.verdict.code.value}. Ask verdict.publishable first"
             raise ValueError(f"no scene to look for a photograph in: {why}")
-        return localised(landmarks, image, intrinsics)
+        return localised(landmarks, image, intrinsics, near)
 
     def map(self, *, voxel: float | None = None, up: npt.ArrayLike | None = None) -> OccupancyMap:
         """Which space is free, occupied, or not seen, by depths that two photographs confirm and by nothing else.

@@ -43,6 +43,35 @@ def test_a_known_lens_is_taken(result, between):
     assert isinstance(found, splatnode.Located) and found.K[0, 0] == pytest.approx(K[0, 0], rel=0.02)
 
 
+def test_near_to_where_it_was_taken_it_is_placed_without_looking_everywhere(result, between, monkeypatch):
+    found = result.localise(between)
+    monkeypatch.setattr("splatnode.recon.locating.follow.locate", None)
+    for near in (found, found.T_world_camera, result.cameras[1].T_world_camera.tolist()):
+        again = result.localise(between, near=near)
+        assert isinstance(again, splatnode.Located)
+        assert np.allclose(again.T_world_camera, found.T_world_camera, atol=0.01)
+
+
+def test_where_nothing_was_found_before_it_is_looked_for_everywhere(result, between):
+    found, before = result.localise(between), result.localise(np.zeros((240, 320, 3), np.uint8))
+    assert isinstance(before, splatnode.NotLocated)
+    assert np.array_equal(result.localise(between, near=before).T_world_camera, found.T_world_camera)
+
+
+@pytest.mark.parametrize(
+    ("near", "error", "said"),
+    [
+        ("behind", TypeError, r"near must be what localise returned, or T_world_camera \(4, 4\), got str"),
+        (np.eye(3), TypeError, r"got shape \(3, 3\)"),
+        (2.0 * np.eye(4), ValueError, "near must be a rigid motion"),
+        (np.full((4, 4), np.nan), ValueError, "near must be a matrix of 16 finite numbers"),
+    ],
+)
+def test_what_is_no_place_is_told(result, between, near, error, said):
+    with pytest.raises(error, match=said):
+        result.localise(between, near=near)
+
+
 def test_noise_is_refused(result):
     noise = np.random.default_rng(0).integers(0, 256, (240, 320, 3), np.uint8)
     found = result.localise(noise)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from splatnode.api.photographs import frame, pixels
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.image_file import decode_image
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (24, 32, 4)).astype(np.uint8)
@@ -54,13 +55,14 @@ def test_a_deep_pil_image_keeps_its_upper_bits():
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_a_pil_image_is_upright_and_tells_its_lens_and_time(orientation):
-    image = pytest.importorskip("PIL.Image")
+def test_a_pil_image_is_upright_and_tells_its_lens_time_and_exposure(orientation):
+    image, rational = pytest.importorskip("PIL.Image"), pytest.importorskip("PIL.TiffImagePlugin")
     smooth = cv2.resize(PICTURE[:3, :4, :3], (320, 240), interpolation=cv2.INTER_CUBIC)
     written, file = image.fromarray(smooth), io.BytesIO()
     exif = written.getexif()
     exif[0x0112] = orientation
-    exif.get_ifd(0x8769).update({0x9003: "2024:05:06 10:00:07", 0xA405: 28})
+    exposed = {0x829A: rational.IFDRational(1, 125), 0x8827: 400}
+    exif.get_ifd(0x8769).update({0x9003: "2024:05:06 10:00:07", 0xA405: 28} | exposed)
     written.save(file, "jpeg", exif=exif, quality=95)
     made = frame(image.open(file), 0, "a.jpg", 0)
     expected = decode_image(file.getvalue())
@@ -68,3 +70,4 @@ def test_a_pil_image_is_upright_and_tells_its_lens_and_time(orientation):
     assert np.abs(made.image.astype(int) - expected.image).mean() < 1.0
     assert made.intrinsics == expected.intrinsics is not None
     assert made.captured_at == expected.captured_at is not None
+    assert made.exposure == expected.exposure == ExposureSettings(0.008, 400.0)

@@ -41,13 +41,17 @@ BENCHMARKS = {
         "movers",
         "fisheyes",
         "light",
+        "told_light",
+        "vignetting",
         "bent",
+        "unknown_lenses",
         "calibrate",
         "occupancy",
+        "walk_occupancy",
         "metres",
         "motions",
     ),
-    "speed": ("rasterize", "stereo", "growth", "throughput"),
+    "speed": ("rasterize", "stereo", "growth", "throughput", "campaign"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),
 }
 MODULES = {name: f"tests.bench.{folder}.{name}" for folder, names in BENCHMARKS.items() for name in names}

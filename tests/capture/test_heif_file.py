@@ -16,6 +16,7 @@ import pytest
 
 from splatnode.capture import heif_file, image_file
 from splatnode.capture.cameras import folder, watched
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import UnusableImage, check_whole, decode_image, decode_photograph
 from splatnode.capture.pi_heif import BASE_BYTES, BYTES_A_PIXEL
@@ -24,6 +25,7 @@ from tests.conftest import ROOT
 from tests.support.crafted.bounded import MARGIN
 
 Image = pytest.importorskip("PIL.Image", reason="needs Pillow")
+TiffImagePlugin = pytest.importorskip("PIL.TiffImagePlugin", reason="needs Pillow")
 pytest.importorskip("pi_heif", reason="needs pi_heif")
 
 PHOTOGRAPHS = ROOT / "tests" / "support" / "photographs"
@@ -42,6 +44,7 @@ def as_avif(orientation: int, pixels: np.ndarray | None = None) -> bytes:
     exif[0x0112] = orientation
     part = exif.get_ifd(0x8769)
     part[0x9003], part[0xA405] = "2024:05:06 10:00:07", 28
+    part[0x829A], part[0x8827] = TiffImagePlugin.IFDRational(1, 125), 400
     fields = np.zeros((60, 80, 3), np.uint8)
     fields[:30, :40], fields[:30, 40:], fields[30:, :40], fields[30:, 40:] = RED, GREEN, BLUE, YELLOW
     written = io.BytesIO()
@@ -51,7 +54,8 @@ def as_avif(orientation: int, pixels: np.ndarray | None = None) -> bytes:
 
 @pytest.mark.parametrize("data", [TURNED, as_avif(6)], ids=["heic", "avif"])
 def test_what_the_file_and_its_exif_both_turn_is_turned_once(data):
-    image, intrinsics, captured_at = decode_photograph(data)
+    image, intrinsics, captured_at, exposure = decode_photograph(data)
+    assert exposure == (None if data is TURNED else ExposureSettings(0.008, 400.0))
     assert image.shape == (80, 60, 3) and image.dtype == np.uint8
     np.testing.assert_allclose(corners(image), [BLUE, RED, YELLOW, GREEN], atol=12)
     assert captured_at == TAKEN

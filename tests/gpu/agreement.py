@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
@@ -50,37 +51,44 @@ def figures(
     device: torch.device, iterations: int = 60, computing: Computing = contextlib.nullcontext
 ) -> Iterator[Figure]:
     """All parts of a refinement one by one, then a refinement of so many iterations."""
-    for antialias in (False, True):
-        yield from _rasterizer(device, antialias, computing)
+    for antialias, known in itertools.product((False, True), repeat=2):
+        yield from _rasterizer(device, antialias, known, computing)
     yield from _loss(device, computing)
     yield _adam(device, computing)
     yield from _refinement(device, iterations, computing)
 
 
-def _rasterizer(device: torch.device, antialias: bool, computing: Computing) -> Iterator[Figure]:
-    """The largest difference of a pixel, and of each gradient relative to its norm, over three random views."""
-    words = "antialiased " if antialias else ""
+def _rasterizer(device: torch.device, antialias: bool, known: bool, computing: Computing) -> Iterator[Figure]:
+    """The largest difference of a pixel, and of each gradient relative to its norm, over three random views.
+
+    As a refinement renders, intrinsics are `known`, so that they have no gradient, and colours have one term.
+    """
+    words = ("antialiased " if antialias else "") + ("known intrinsics, plain colours, " if known else "")
+    names = NAMES[:-1] if known else NAMES
     largest: dict[str, float] = {}
     for seed in range(3):
-        expected = _rendered(moderate(seed), torch.device("cpu"), torch.float64, reference.rasterize, antialias)
+        case = moderate(seed)
+        case = replace(case, sh=case.sh[:, :1]) if known else case
+        expected = _rendered(case, torch.device("cpu"), torch.float64, reference.rasterize, antialias, known)
         with computing():
-            actual = _rendered(moderate(seed), device, torch.float32, dispatch.rasterize, antialias)
+            actual = _rendered(case, device, torch.float32, dispatch.rasterize, antialias, known)
         pixels = max(float((a - e).abs().max()) for a, e in zip(actual[0], expected[0], strict=True))
         errors = [relative_error(a, e) for a, e in zip(actual[1], expected[1], strict=True)]
-        for name, value in (("a pixel", pixels), *zip((f"gradient of {name}" for name in NAMES), errors, strict=True)):
+        for name, value in (("a pixel", pixels), *zip((f"gradient of {name}" for name in names), errors, strict=False)):
             largest[name] = max(largest.get(name, 0.0), value)
     for name, value in largest.items():
         yield Figure(f"{words}render: {name}", value, 2e-3 if name == "a pixel" else 1e-2)
 
 
 def _rendered(
-    case: Case, device: torch.device, dtype: torch.dtype, rasterize: Callable, antialias: bool
+    case: Case, device: torch.device, dtype: torch.dtype, rasterize: Callable, antialias: bool, known: bool
 ) -> tuple[list[Tensor], list[Tensor]]:
     """Images and gradients of the sum of their squares, on the processor in float64.
 
     Depth counts as far as there is something: where alpha is next to nothing, rounding decides which splats it is of.
     """
     leaves = [tensor.detach().to(device).requires_grad_() for tensor in case.tensors(dtype)]
+    leaves[-1].requires_grad_(not known)
     whole = rasterize(*leaves, WIDTH, HEIGHT, antialias=antialias)
     shown = [*images(replace(whole, depth=None)), whole.depth * whole.alpha]
     torch.stack([(image**2).mean() for image in shown]).sum().backward()

@@ -35,6 +35,11 @@ def test_a_file_changes_a_control_or_leaves_it_out():
     assert overlaid(preset("fast"), {"optimize": {"control": None}}).optimize.control is None
 
 
+def test_seconds_of_the_ladder_are_no_option_any_more():
+    with pytest.raises(ConfigError, match=r"ladder\.seconds: unknown key; allowed here: work, most_s"):
+        overlaid(Config(), {"ladder": {"seconds": 60.0}})
+
+
 @pytest.mark.parametrize(
     "changes",
     [

@@ -14,6 +14,7 @@ from splatnode.recon.geometry import (
     Similarity,
     align_cameras,
     exp_se3,
+    matrices_from_quats,
     multiply_quats,
     project,
     quat_from_matrix,
@@ -120,6 +121,12 @@ def test_quaternions_of_many_matrices_at_once():
 @given(quats, quats)
 def test_the_product_of_quaternions_is_the_product_of_rotations(a, b):
     torch.testing.assert_close(matrix(multiply_quats(a, b)), matrix(a) @ matrix(b), rtol=0, atol=1e-12)
+
+
+def test_matrices_of_many_quaternions_of_any_length():
+    many = torch.from_numpy(np.random.default_rng(0).normal(size=(50, 4)) * np.geomspace(1e-3, 1e3, 50)[:, None])
+    torch.testing.assert_close(matrices_from_quats(many), matrix(many), rtol=0, atol=1e-12)
+    assert matrices_from_quats(torch.zeros(0, 4)).shape == (0, 3, 3)
 
 
 def test_hamiltons_rule():

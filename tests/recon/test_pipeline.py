@@ -17,7 +17,7 @@ from splatnode.recon.config import PREVIEW, Config
 from splatnode.recon.evaluate.appearance import Splats
 from splatnode.recon.evaluate.camera_errors import camera_errors
 from splatnode.recon.evaluate.metrics import psnr
-from splatnode.recon.evaluate.protocol import mean_intrinsics
+from splatnode.recon.evaluate.same_lens import mean_intrinsics
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.incremental import IncrementalReconstruction

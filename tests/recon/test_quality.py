@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from splatnode.recon.config import overlaid, preset
-from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate
+from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
 from splatnode.recon.evaluate.splits import load_split
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.pipeline import reconstruct

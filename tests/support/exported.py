@@ -77,7 +77,7 @@ def make_landmarks() -> Landmarks:
         photograph_of=np.array([0, 1, 0, 1, 0, 1, 1, 0, 1]),
         names=("a.jpg", "ü b.jpg"),
         Ts_world_camera=np.tile(np.eye(4), (2, 1, 1)),
-        lenses=KnownLenses(np.full(2, 0.8), np.full(2, 0.01), np.full((2, 2), 0.001), np.full(2, 0.75)),
+        lenses=KnownLenses(np.full(2, 0.8), np.full((2, 2), 0.01), np.full((2, 2), 0.001), np.full(2, 0.75)),
         rotation_bounds=np.array([0.3, 0.5]),
         centre_bounds=np.array([0.01, 0.02]),
         noise_px=0.4,

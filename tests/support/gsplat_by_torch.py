@@ -28,6 +28,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(gsplat, "check_input", lambda *given: check(*given[:-1], "cpu"))
     monkeypatch.setattr(wrapper, "_FullyFusedProjection", types.SimpleNamespace(apply=_project))
     monkeypatch.setattr(wrapper, "_FullyFusedProjectionPacked", types.SimpleNamespace(apply=_project_packed))
+    monkeypatch.setattr(wrapper, "_SphericalHarmonics", types.SimpleNamespace(apply=_harmonics))
     monkeypatch.setattr(wrapper, "_RasterizeToPixels", types.SimpleNamespace(apply=_rasterize))
     monkeypatch.setattr(wrapper, "_make_lazy_cuda_func", _KERNELS.__getitem__)
     rays = types.ModuleType("nerfacc")
@@ -51,7 +52,15 @@ def _project(
     else:
         full = covars[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))
     project = _implementation()._fully_fused_projection
-    return project(means, full, viewmats, Ks, width, height, eps2d, near, far, compensate, model)
+    radii, centres, depths, conics, compensations = project(
+        means, full, viewmats, Ks, width, height, eps2d, near, far, compensate, model
+    )
+    seen = (opacities if compensations is None else opacities * compensations) >= _ALPHA_MIN
+    drawn = (radii > 0).all(-1) & seen
+    # The kernel leaves whatever was there where it draws nothing, but for compensations, and gives no gradient.
+    centres, conics = (torch.where(drawn[..., None], each, torch.nan) for each in (centres, conics))
+    compensations = None if compensations is None else torch.where(drawn, compensations, 0)
+    return radii * drawn[..., None], centres, torch.where(drawn, depths, torch.nan), conics, compensations
 
 
 def _project_packed(means, covars, quats, scales, viewmats, Ks, width, height, eps2d, near, far, clip, sparse, *rest):
@@ -63,10 +72,19 @@ def _project_packed(means, covars, quats, scales, viewmats, Ks, width, height, e
     return torch.zeros_like(cameras), cameras, gaussians, *rows
 
 
+def _harmonics(degree, directions, coefficients, masks):
+    """Where the mask is False the kernel leaves whatever was there, and gives no gradient."""
+    found = _implementation()._spherical_harmonics(degree, directions[masks], coefficients[masks])
+    return torch.full_like(directions, torch.nan).index_put((masks,), found)
+
+
 def _rasterize(means2d, conics, colors, opacities, backgrounds, masks, width, height, tile, offsets, ids, absgrad):
     assert masks is None and not absgrad
     if means2d.dim() == 2:  # packed, of one camera
         means2d, conics, colors, opacities = means2d[None], conics[None], colors[None], opacities[None]
+    if not len(ids):  # an image of nothing, which the kernels differentiate, too
+        nothing = 0 * torch.stack([each.nan_to_num().sum() for each in (means2d, conics, colors, opacities)]).sum()
+        return nothing.expand(1, height, width, colors.shape[-1]), nothing.expand(1, height, width, 1)
     rasterize = _implementation()._rasterize_to_pixels
     return rasterize(means2d, conics, colors, opacities, width, height, tile, offsets, ids, backgrounds)
 

@@ -42,6 +42,14 @@ def photograph(index: int) -> tuple[np.ndarray, Camera]:
     return synthetic.photograph(PLACE, camera, 100 + index), camera
 
 
+def turned(camera: Camera, degrees: float) -> Camera:
+    """The camera once it has turned to its right where it stands."""
+    T, K = camera
+    turn, angle = np.eye(4), np.radians(degrees)
+    turn[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    return T @ turn, K
+
+
 def errors(found: Located, camera: Camera) -> tuple[float, float]:
     """Degrees, and percent of the distance to the scene."""
     place = known_place()

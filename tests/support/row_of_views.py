@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from collections.abc import Mapping
+from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
 
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import Frame
 from splatnode.recon.frames.keyframe import Features, Keyframe
 from splatnode.recon.geometry import Similarity
@@ -28,12 +30,12 @@ def camera(index: int) -> np.ndarray:
     return T_world_camera
 
 
-def graph_of(count: int) -> ViewGraph:
-    """Views in a row; the nearer two are, the more matches they have."""
+def graph_of(count: int, exposures: Mapping[int, ExposureSettings] = MappingProxyType({})) -> ViewGraph:
+    """Views in a row; the nearer two are, the more matches they have. `exposures` is what their cameras tell."""
     noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH + 16 * count, 3)).astype(np.uint8)
     images = [np.ascontiguousarray(noise[:, index : index + WIDTH]) for index in range(count)]
     keyframes = [
-        Keyframe(Frame(index, f"{index:02d}.png", 0, image, None), image, NO_FEATURES)
+        Keyframe(Frame(index, f"{index:02d}.png", 0, image, None, exposure=exposures.get(index)), image, NO_FEATURES)
         for index, image in enumerate(images)
     ]
     pairs = [(i, j) for i in range(count) for j in range(i + 1, count)]
@@ -46,7 +48,9 @@ def registration_of(count: int, world: Similarity | None = None) -> Registration
     principal = np.array([WIDTH / 2, HEIGHT / 2])
     return Registration(
         cameras=tuple(
-            RegisteredCamera(i, world.camera(camera(i)), 0, 1.1 * WIDTH, principal, 0.0, 0.1, 0.01, 1e-4 * np.eye(3))
+            RegisteredCamera(
+                i, world.camera(camera(i)), 0, 1.1 * WIDTH, principal, np.zeros(2), 0.1, 0.01, 1e-4 * np.eye(3)
+            )
             for i in range(count)
         ),
         points=np.array([[0.0, 0.0, 2.0]]) * world.scale @ world.rotation.T + world.translation,

@@ -68,7 +68,7 @@ def registration(indices: tuple[int, ...]) -> Registration:
         T_world_camera = np.eye(4)
         T_world_camera[0, 3] = 0.2 * index
         principal, still = np.array([32.0, 24.0]), np.zeros((3, 3))
-        cameras.append(RegisteredCamera(index, T_world_camera, 0, 64.0, principal, 0.0, 0.05, 0.005, still))
+        cameras.append(RegisteredCamera(index, T_world_camera, 0, 64.0, principal, np.zeros(2), 0.05, 0.005, still))
     return Registration(
         cameras=tuple(cameras),
         points=np.zeros((0, 3)),

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from splatnode.recon.result.depth_file import DEPTHS, encode_depths
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.prepare import SH_C0
 from splatnode.recon.result.placement import IDENTITY, Placement
@@ -92,11 +93,16 @@ def walk(step: float = STEP) -> tuple[WalkScene, WalkScene]:
     )
 
 
-def write_walk(out: Path, *, poses: bool = True, further: tuple[dict, ...] = (), step: float = STEP) -> Path:
-    """The folder that a node would have written, with `further` places that have no scene."""
+def write_walk(
+    out: Path, *, poses: bool = True, further: tuple[dict, ...] = (), step: float = STEP, second: Code = Code.OK
+) -> Path:
+    """The folder that a node would have written, with `further` places that have no scene.
+
+    `second` is the verdict on the second scene.
+    """
     out.mkdir(exist_ok=True)
     scenes = walk(step)
-    places = [_written(out, each) for each in scenes]
+    places = [_written(out, each, code) for each, code in zip(scenes, (Code.OK, second), strict=True)]
     link = {"scene": "scene-0001", "other": "scene-0002", "shared": ["2.png", "3.png"], **record(SECOND)}
     index = {"checkpoint": "0" * 32, "places": [*places, *further], "links": [link]}
     if poses:
@@ -121,12 +127,20 @@ def place(scene_id: str, **values: object) -> dict:
     return {"scene_id": scene_id, **nothing, **none, **values}
 
 
-def _written(out: Path, scene: WalkScene) -> dict:
-    verdict = Verdict(Code.OK, "All photographs were placed.", "", publishable=True)
+def depths_of(scene: WalkScene) -> dict[str, np.ndarray]:
+    """How far away the wall is in each photograph, in the scene's own unit: a value for 2 x 2 pixels."""
+    distances = {each.name: 1.0 - scene.placement.camera(each).T_world_camera[2, 3] for each in scene.cameras}
+    size = HEIGHT // 2, WIDTH // 2
+    return {name: np.full(size, far / scene.placement.scale, np.float16) for name, far in distances.items()}
+
+
+def _written(out: Path, scene: WalkScene, code: Code) -> dict:
+    verdict = Verdict(code, "All photographs were placed.", "", publishable=True)
     snapshot = Snapshot(0, verdict, scene.cameras, scene.gaussians, {}, (), 1, final=True)
-    write_result(snapshot, out / scene.scene_id, build_report(snapshot, seed=0, preset="fast", peak_rss_mb=None))
+    report = build_report(snapshot, seed=0, preset="fast", peak_rss_mb=None)
+    write_result(snapshot, out / scene.scene_id, report, further={DEPTHS: encode_depths(depths_of(scene))})
     names = [each.name for each in scene.cameras]
-    good = {"folder": scene.scene_id, "verdict": "OK", "message": "", "publishable": True, "frames_used": names}
+    good = {"folder": scene.scene_id, "verdict": code.value, "message": "", "publishable": True, "frames_used": names}
     return place(scene.scene_id, **good, num_gaussians=len(scene.gaussians))
 
 

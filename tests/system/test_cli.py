@@ -67,6 +67,7 @@ def test_help_loads_nothing_but_the_verbs_and_what_stops_them():
         "splatnode.command_line",
         "splatnode.recon.batch.verb",
         "splatnode.recon.evaluate.verbs",
+        "splatnode.recon.jobs.arguments",
         "splatnode.recon.metric.arguments",
         "splatnode.recon.replay_verb",
         "splatnode.recon.shared_arguments",

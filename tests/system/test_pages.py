@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.gravity import Gravity
@@ -132,7 +133,7 @@ def test_every_service_state_and_field_of_a_lens_is_told():
     both = [*offered, *(each.requests for each in offered if each.pattern is services.Pattern.STATE)]
     rows = re.findall(r"^\| `([\w.]+)` \| \w+ \| (\w+) \| \+(\d) \|", page, re.MULTILINE)
     assert {(each.name, each.pattern.name.lower(), str(each.tcp_port)) for each in both} == set(rows)
-    records = (Intrinsics, GivenPose, Motion, Gravity)
+    records = (Intrinsics, GivenPose, Motion, Gravity, ExposureSettings)
     of_records = [name for record in records for name in record.__dataclass_fields__]
     named = [f"`{each.value}`" for each in State] + [f"`{name}`" for name in of_records]
     assert not [name for name in named if name not in page]

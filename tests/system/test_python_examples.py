@@ -38,6 +38,7 @@ PRINTED = {
     "Metres, and a known lens": r"True 294(\.0)?\n",
     "A view from where no camera was": r"[1-9][\d.]* \d\d% of it two photographs have seen\n",
     "Where a further photograph was taken": r"(?s)\[.*\] 0\.\d+ 0\.\d+\nrefused: NOT_FOUND: .*\n",
+    "Where a camera that moves is now": r"(placed at .*\n){10}",
     "A refusal is a value": r"TOO_FEW_VIEWS 1 usable photograph: .*\n0 0\n",
     "A camera's loop": r"(?s)0000\.png first view.* OK 3\n.*All \d photographs were placed\. True\n",
     "A running node": r"kitchen OK 2\nthe live camera: .*\nfree space: the node has said nothing of a map",

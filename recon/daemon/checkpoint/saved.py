@@ -42,6 +42,7 @@ class SceneRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     final: bool
     lenses: list[Intrinsics | None] = []  # estimated, of each view; empty: of none
     gains: list[tuple[float, float, float] | None] = []  # of each view's photograph over its image; empty: of none
+    falloffs: list[float] = []  # of each view's lens; empty: none dims its corners
 
 
 def graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
@@ -82,7 +83,8 @@ def scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDAr
     gaussians = [getattr(scene.gaussians, field.name) for field in fields(Gaussians)]
     lenses = [view.lens for view in scene.views]
     gains = [view.exposure and view.exposure.gains for view in scene.views]
-    header = SceneRecord(views, scene.iterations, final, lenses, gains)
+    falloffs = [view.exposure.falloff if view.exposure else 0.0 for view in scene.views]
+    header = SceneRecord(views, scene.iterations, final, lenses, gains, falloffs)
     return header, [tensor.numpy() for tensor in (*cameras, *gaussians)]
 
 
@@ -96,17 +98,24 @@ def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe])
     Ts_world_camera, Ks, *gaussians = (torch.from_numpy(np.array(array)) for array in message.arrays)
     lenses = header.lenses or [None] * len(header.views)
     gains = header.gains or [None] * len(header.views)
+    falloffs = header.falloffs or [0.0] * len(header.views)
     views = tuple(
         _view(keyframes[name] if lens is None else straight(keyframes[name], lens), own, T_world_camera, K)
-        for name, lens, own, T_world_camera, K in zip(header.views, lenses, gains, Ts_world_camera, Ks, strict=True)
+        for name, lens, own, T_world_camera, K in zip(
+            header.views, lenses, zip(gains, falloffs, strict=True), Ts_world_camera, Ks, strict=True
+        )
     )
     return Scene(views, Gaussians(*gaussians), header.iterations)
 
 
 def _view(
-    keyframe: Keyframe, gains: tuple[float, float, float] | None, T_world_camera: torch.Tensor, K: torch.Tensor
+    keyframe: Keyframe,
+    told: tuple[tuple[float, float, float] | None, float],
+    T_world_camera: torch.Tensor,
+    K: torch.Tensor,
 ) -> TrainingView:
-    image, exposure = light.relit(keyframe.image, gains)
+    """`told`: the photograph's gains, and its lens's falloff."""
+    image, exposure = light.relit(keyframe.image, *told)
     shown = keyframe.name, keyframe.frame.frame_id, image
     return TrainingView(*shown, T_world_camera, K, mask=keyframe.mask, exposure=exposure, lens=keyframe.lens)
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import fields
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import fields, replace
 from typing import Any
 
 import msgspec
@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.messaging.wire import Message
+from splatnode.capture.process.records import record_of
 from splatnode.recon.daemon.checkpoint.saved import Numbers, put_together, taken_apart
 from splatnode.recon.estimation import Estimate
 from splatnode.recon.frames.keyframe import Keyframe
@@ -56,7 +57,7 @@ def estimate_message(estimate: Estimate, proven: Collection[str]) -> tuple[Estim
         names=estimate.graph.names,
         proven=sorted(proven),
         verdict=estimate.verdict,
-        evidence=msgspec.convert(msgspec.to_builtins(evidence, enc_hook=lambda number: number.item()), Evidence),
+        evidence=record_of(msgspec.to_builtins(evidence, enc_hook=lambda number: number.item()), Evidence),
         cameras=[numbers for numbers, _ in cameras],
         inlier_ratios=[(int(i), int(j), float(ratio)) for (i, j), ratio in registration.inlier_ratios.items()],
         numbers={name: float(value) for name, value in kept.items() if isinstance(value, (int, float))},
@@ -68,7 +69,7 @@ def estimate_message(estimate: Estimate, proven: Collection[str]) -> tuple[Estim
 def estimate_from(message: Message[EstimateRecord], graph: ViewGraph) -> Estimate:
     """What `estimate_message` was given, of the same keyframes. Raises ValueError where another version wrote it."""
     header, arrays = message.header, iter(message.arrays)
-    cameras = tuple(put_together(RegisteredCamera, numbers, arrays) for numbers in header.cameras)
+    cameras = tuple(_camera(numbers, arrays) for numbers in header.cameras)
     inlier_ratios = {(i, j): ratio for i, j, ratio in header.inlier_ratios}
     content: dict[str, Any] = {"cameras": cameras, "inlier_ratios": inlier_ratios, **header.numbers}
     try:
@@ -76,6 +77,14 @@ def estimate_from(message: Message[EstimateRecord], graph: ViewGraph) -> Estimat
     except TypeError as error:
         raise ValueError("an estimate of another version") from error
     return Estimate(graph, registration, header.evidence, header.verdict)
+
+
+def _camera(numbers: Numbers, arrays: Iterator[npt.NDArray]) -> RegisteredCamera:
+    """Of version 6 and before, too, whose lenses had one radial coefficient, a number."""
+    camera = put_together(RegisteredCamera, numbers, arrays)
+    if "radial" not in numbers:
+        return camera
+    return replace(camera, radial=np.array([numbers["radial"], 0.0], np.float64))
 
 
 def pointmaps_message(pointmaps: Mapping[str, Pointmap]) -> tuple[PointmapsRecord, list[npt.NDArray]]:

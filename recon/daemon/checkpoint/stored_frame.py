@@ -9,6 +9,7 @@ from pathlib import Path
 import msgspec
 from msgspec import UNSET, UnsetType
 
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.gravity import Gravity
@@ -37,6 +38,7 @@ class FrameRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     given_pose: GivenPose | UnsetType = UNSET  # left out where there is none, as in a message; and those below
     motion: Motion | UnsetType = UNSET
     gravity: Gravity | UnsetType = UNSET
+    exposure: ExposureSettings | UnsetType = UNSET
     baseline: Baseline | UnsetType = UNSET
 
 
@@ -56,7 +58,7 @@ def write_frame(path: Path, key: tuple[str, int], frame: Frame) -> None:
     moved = or_left_out(frame.given_pose), or_left_out(frame.motion), or_left_out(frame.gravity)
     baseline = or_left_out(frame.right and frame.right.baseline)
     known = frame.name, frame.stamp_ns, frame.intrinsics, frame.captured_at
-    header = FrameRecord(VERSION, *key, *known, *moved, baseline)
+    header = FrameRecord(VERSION, *key, *known, *moved, or_left_out(frame.exposure), baseline)
     write_message(path, encode(header, arrays_of(frame)))
 
 

@@ -5,11 +5,13 @@ Everything is at its defaults, except that frames of one size share a camera, as
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import MappingProxyType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +22,26 @@ from splatnode.capture.frame import Frame, Intrinsics
 
 Array = npt.NDArray[np.float64]
 Mapper = Callable[[Path, int], Mapping[int, pycolmap.Reconstruction]]
+Pair = tuple[str, str]  # of images, by their names
+
+
+@dataclass(frozen=True, eq=False)
+class Described:
+    """The features of an image."""
+
+    keypoints: npt.NDArray[np.float32]
+    descriptors: Any  # pycolmap.FeatureDescriptors, which older releases do not have
+
+
+@dataclass(frozen=True, eq=False)
+class Matched:
+    """The matches of two images, and what they agree on."""
+
+    matches: npt.NDArray[np.uint32]
+    geometry: pycolmap.TwoViewGeometry
+
+
+NOTHING_KNOWN: Mapping[str, Described] = MappingProxyType({})
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +95,13 @@ def image_names(frames: Sequence[Frame]) -> dict[str, Frame]:
     return {f"{frame.width}x{frame.height}/{number:04d}.png": frame for number, frame in enumerate(frames)}
 
 
-def extract_features(folder: Path, named: Mapping[str, Frame], seed: int) -> None:
-    """Writes the images of the frames to `folder`/images, and their features to `folder`/database.db."""
+def extract_features(
+    folder: Path, named: Mapping[str, Frame], seed: int, known: Mapping[str, Described] = NOTHING_KNOWN
+) -> None:
+    """Writes the images of the frames to `folder`/images, and their features to `folder`/database.db.
+
+    Features that are `known`, by the image's name, are not sought again.
+    """
     pycolmap.logging.minloglevel = pycolmap.logging.ERROR.value  # it reports every step
     pycolmap.set_random_seed(seed)
     groups: dict[str, list[str]] = {}
@@ -85,56 +112,73 @@ def extract_features(folder: Path, named: Mapping[str, Frame], seed: int) -> Non
         groups.setdefault(name.split("/")[0], []).append(name)
     for members in groups.values():
         options = pycolmap.ImageReaderOptions()
-        known = named[members[0]].intrinsics
-        if known is not None:
+        lens = named[members[0]].intrinsics
+        if lens is not None:
             options.camera_model = "SIMPLE_RADIAL"
-            options.camera_params = f"{known.fx},{known.cx},{known.cy},0"
-        pycolmap.extract_features(
-            folder / "database.db",
-            folder / "images",
-            image_names=members,
-            camera_mode=pycolmap.CameraMode.PER_FOLDER,
-            reader_options=options,
-            device=pycolmap.Device.cpu,
-        )
+            options.camera_params = f"{lens.fx},{lens.cx},{lens.cy},0"
+        images = {"database_path": folder / "database.db", "image_path": folder / "images", "image_names": members}
+        one_camera = pycolmap.CameraMode.PER_FOLDER
+        if known:
+            pycolmap.Database.open(folder / "database.db").close()  # it must be there
+            pycolmap.import_images(**images, camera_mode=one_camera, options=options)
+            _write_features(folder, {name: known[name] for name in members if name in known})
+        pycolmap.extract_features(**images, camera_mode=one_camera, reader_options=options, device=pycolmap.Device.cpu)
 
 
-def match_pairs(folder: Path, pairs: Iterable[tuple[str, str]]) -> None:
-    """Matches these pairs of the images whose features `folder`/database.db holds."""
-    options = pycolmap.ImportedPairingOptions()
-    options.match_list_path = folder / "pairs.txt"
-    (folder / "pairs.txt").write_text("".join(f"{first} {second}\n" for first, second in pairs))
-    pycolmap.match_image_pairs(folder / "database.db", pairing_options=options, device=pycolmap.Device.cpu)
+def match_pairs(folder: Path, pairs: Sequence[Pair], seed: int, known: Mapping[Pair, Matched]) -> None:
+    """Matches these pairs of the images whose features `folder`/database.db holds, but for those that are `known`.
 
-
-def part(folder: Path, names: Collection[str], into: Path) -> None:
-    """Makes the folder `into` with a database of the images called `names` alone, as that in `folder` has them.
-
-    Global mapping calibrates its whole database: it takes one that holds nothing else.
+    What comes of a pair depends on no other one.
     """
-    into.mkdir(parents=True)
-    (into / "images").symlink_to(folder / "images")
-    whole = pycolmap.Database.open(folder / "database.db")
-    chosen = pycolmap.Database.open(into / "database.db")
-    images = [image for image in whole.read_all_images() if image.name in names]
-    cameras, frames = {image.camera_id for image in images}, {image.frame_id for image in images}
-    for camera_id in sorted(cameras):
-        chosen.write_camera(whole.read_camera(camera_id), use_camera_id=True)
-    for rig in whole.read_all_rigs():
-        if rig.ref_sensor_id.id in cameras:  # each camera is a rig of its own
-            chosen.write_rig(rig, use_rig_id=True)
-    for frame_id in sorted(frames):
-        chosen.write_frame(whole.read_frame(frame_id), use_frame_id=True)
-    for image in images:
-        chosen.write_image(image, use_image_id=True)
-        chosen.write_keypoints(image.image_id, whole.read_keypoints(image.image_id))
-    for first, second in itertools.combinations(sorted(image.image_id for image in images), 2):
-        if whole.exists_matches(first, second):
-            chosen.write_matches(first, second, whole.read_matches(first, second))
-        if whole.exists_two_view_geometry(first, second):
-            chosen.write_two_view_geometry(first, second, whole.read_two_view_geometry(first, second))
-    chosen.close()
-    whole.close()
+    with _opened(folder) as (database, ids):
+        for (first, second), found in known.items():
+            database.write_matches(ids[first], ids[second], found.matches)
+            database.write_two_view_geometry(ids[first], ids[second], found.geometry)
+    pairing, verifying = pycolmap.ImportedPairingOptions(), pycolmap.TwoViewGeometryOptions()
+    pairing.match_list_path = folder / "pairs.txt"
+    verifying.ransac.random_seed = seed
+    pairing.match_list_path.write_text(
+        "".join(f"{first} {second}\n" for first, second in pairs if (first, second) not in known)
+    )
+    pycolmap.match_image_pairs(
+        folder / "database.db", pairing_options=pairing, verification_options=verifying, device=pycolmap.Device.cpu
+    )
+
+
+def features(folder: Path, names: Collection[str]) -> dict[str, Described]:
+    """What `folder`/database.db holds of these images."""
+    with _opened(folder) as (database, ids):
+        return {
+            name: Described(database.read_keypoints(ids[name]), database.read_descriptors(ids[name])) for name in names
+        }
+
+
+def matches(folder: Path, pairs: Collection[Pair]) -> dict[Pair, Matched]:
+    """What `folder`/database.db holds of these pairs of images."""
+    with _opened(folder) as (database, ids):
+        return {
+            (first, second): Matched(
+                database.read_matches(ids[first], ids[second]), database.read_two_view_geometry(ids[first], ids[second])
+            )
+            for first, second in pairs
+        }
+
+
+def _write_features(folder: Path, known: Mapping[str, Described]) -> None:
+    with _opened(folder) as (database, ids):
+        for name, found in known.items():
+            database.write_keypoints(ids[name], found.keypoints)
+            database.write_descriptors(ids[name], found.descriptors)
+
+
+@contextlib.contextmanager
+def _opened(folder: Path) -> Iterator[tuple[pycolmap.Database, dict[str, int]]]:
+    """The database of a folder, and the numbers of its images by their names."""
+    database = pycolmap.Database.open(folder / "database.db")
+    try:
+        yield database, {image.name: image.image_id for image in database.read_all_images()}
+    finally:
+        database.close()
 
 
 def largest_model(folder: Path, named: Mapping[str, Frame], seed: int, mapping: Mapper) -> Model | None:

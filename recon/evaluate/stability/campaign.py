@@ -1,22 +1,29 @@
-"""All trials of a plan, one after the other or some at a time; what is on the disk already is not run again."""
+"""All trials of a plan, some at a time; what is on the disk already is not run again."""
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 import msgspec
 
 from splatnode.recon.evaluate.json_file import read_json
+from splatnode.recon.evaluate.kept import Kept
 from splatnode.recon.evaluate.records import this_machine
-from splatnode.recon.evaluate.stability.case import Row
+from splatnode.recon.evaluate.stability.case import Case, Row
 from splatnode.recon.evaluate.stability.places import Places, Sampler
 from splatnode.recon.evaluate.stability.summary import report
-from splatnode.recon.evaluate.stability.trial import Trial, run_trial
+from splatnode.recon.evaluate.stability.trial import FAILED, Trial, judged, reconstructed
+from splatnode.recon.evaluate.timing import check_same_cores
+from splatnode.recon.jobs.call import packed
+from splatnode.recon.jobs.calls import Engine, Task, work_folder
+from splatnode.recon.jobs.child import Limits
 from splatnode.recon.result.export.staged import json_bytes, write_file
+from splatnode.recon.result.folder import result_folder
 
 logger = logging.getLogger(__name__)
 
@@ -28,37 +35,56 @@ class Plan:
     rows: tuple[Row, ...]
     seeds: tuple[int, ...]
     methods: tuple[str, ...]
-    jobs: int = 1  # trials at a time; more than 1 makes the seconds longer
-    timeout_s: float = 120.0  # of one trial
+    timeout_s: float = 120.0  # of one trial, from the start of its process on
+    max_memory_mb: float | None = None  # of one trial
 
 
-def run_campaign(plan: Plan, places: Places, out: Path, command: str) -> list[dict]:
-    """Runs what is missing in `out`/stability.json and returns all its trials; the file is rewritten after each.
+@dataclass(frozen=True, eq=False)
+class _About:
+    """A trial that is under way; its case is without photographs."""
 
-    Raises ValueError where the file is of other scenes: rates over both would mean nothing.
+    row: int
+    name: str
+    seed: int
+    method: str
+    case: Case
+
+
+def run_campaign(plan: Plan, places: Places, out: Path, command: str, engine: Engine) -> list[dict]:
+    """Runs what is missing in `out`/stability.json and returns all its trials.
+
+    What came to an end is on the disk at once, in a journal beside the file, which is rewritten every few seconds.
+    Raises ValueError where the file is of other scenes, or of trials with another number of cores: rates and seconds
+    over both would mean nothing.
     """
     path = out / "stability.json"
     scenes = [place.name for kind in (places.walked, places.forward, places.turned) for place in kind]
-    trials = _resumed(path, scenes)
-    present = {_key(trial) for trial in trials}
-    todo = [job for job in _jobs(plan) if (job[0].number, job[0].name, *job[1:]) not in present]
-    for trial in _results(plan, places, todo):
-        trials.append(asdict(trial))
-        ordered = sorted(trials, key=lambda t: (plan_order(plan, t["method"]), *_key(t)))
-        content = {
-            "trials": ordered,
-            **report(ordered),
-            "scenes": scenes,
-            "machine": this_machine(),
-            "command": command,
-        }
-        write_file(path, json_bytes(content))
-        seconds = "no answer" if trial.seconds is None else f"{trial.seconds:.1f} s"
-        logger.info(
-            f"stability {len(trials)}/{len(present) + len(todo)}: row {trial.row} {trial.name}, seed {trial.seed}, "
-            f"{trial.method}: {trial.verdict}, {trial.outcome}, {seconds}"
-        )
+    trials = _resumed(path, scenes, engine.cores_each)
+    whole = partial(_write, path, plan, trials, {"scenes": scenes, "machine": this_machine(), "command": command})
+    with result_folder(out), work_folder(out) as folder:
+        if not path.exists():
+            whole()  # which scenes the journal is of
+        with Kept(out / "stability.jsonl", whole) as kept:
+            known = set(map(_key, trials))
+            trials += [trial for trial in kept.left() if _key(trial) not in known]
+            present = set(map(_key, trials))
+            todo = [job for job in _jobs(plan) if (job[0].number, job[0].name, *job[1:]) not in present]
+            for trial in _results(plan, places, todo, engine, folder):
+                trials.append(asdict(trial))
+                kept.add(trials[-1])
+                logger.info(f"stability {len(trials)}/{len(present) + len(todo)}: {_line(trial)}")
     return trials
+
+
+def _write(path: Path, plan: Plan, trials: Sequence[Mapping], circumstances: Mapping) -> None:
+    ordered = sorted(trials, key=lambda t: (plan_order(plan, t["method"]), *_key(t)))
+    write_file(path, json_bytes({"trials": ordered, **report(ordered), **circumstances}))
+
+
+def _line(trial: Trial) -> str:
+    took = "not timed" if trial.seconds is None else f"{trial.seconds:.1f} s"
+    answered = f"{trial.verdict}, {trial.outcome}, {'no answer' if trial.verdict == FAILED else took}"
+    return f"row {trial.row} {trial.name}, seed {trial.seed}, {trial.method}: {answered}"
 
 
 def plan_order(plan: Plan, method: str) -> int:
@@ -71,34 +97,30 @@ def _jobs(plan: Plan) -> list[tuple[Row, int, str]]:
     return [(row, seed, method) for seed in plan.seeds for row in plan.rows for method in plan.methods]
 
 
-def _results(plan: Plan, places: Places, todo: Sequence[tuple[Row, int, str]]) -> Iterator[Trial]:
-    """Trials as they are done; at most `plan.jobs` sets of photographs are in memory."""
-    waiting = iter(todo)
-    with ThreadPoolExecutor(plan.jobs) as pool:
-        running: set[Future[Trial]] = set()
-        while True:
-            for row, seed, method in waiting:
-                running.add(pool.submit(_run, row, seed, method, places, plan.timeout_s))
-                if len(running) >= plan.jobs:
-                    break
-            if not running:
-                return
-            done, running = wait(running, return_when=FIRST_COMPLETED)
-            for future in done:
-                yield future.result()
+def _results(
+    plan: Plan, places: Places, todo: Sequence[tuple[Row, int, str]], engine: Engine, folder: Path
+) -> Iterator[Trial]:
+    """Trials as they are done."""
+    tasks = (_task(places, *job) for job in todo)
+    limits = Limits(plan.max_memory_mb, plan.timeout_s)
+    for about, answer in engine.answers(partial(next, tasks, None), limits, folder):
+        yield judged(about.case, about.row, about.name, about.seed, about.method, answer)
 
 
-def _run(row: Row, seed: int, method: str, places: Places, timeout_s: float) -> Trial:
+def _task(places: Places, row: Row, seed: int, method: str) -> Task:
+    """The photographs go to the process, and the truth stays here."""
     case = row.make(Sampler(places, row.name, seed))
-    return run_trial(case, row.number, row.name, seed, method, timeout_s)
+    call = packed(partial(reconstructed, dataclasses.replace(case, worlds=()), method))
+    return Task(_About(row.number, row.name, seed, method, dataclasses.replace(case, source=list, probe=None)), call)
 
 
 class _Trials(msgspec.Struct, frozen=True):
     scenes: list[str]
     trials: list[dict]
+    machine: dict
 
 
-def _resumed(path: Path, scenes: Sequence[str]) -> list[dict]:
+def _resumed(path: Path, scenes: Sequence[str], cores_each: int) -> list[dict]:
     if not path.exists():
         return []
     content = read_json(path, _Trials, "the stability.json of a campaign")
@@ -107,6 +129,9 @@ def _resumed(path: Path, scenes: Sequence[str]) -> list[dict]:
             f"{path} is of the scenes {', '.join(content.scenes)}, now there are {', '.join(scenes)}; "
             "give another folder with --out DIR, or the same scenes"
         )
+    before = content.machine.get("threads")  # on which each trial ran, before a trial said so itself
+    known = [trial.get("cores") or before for trial in content.trials if trial.get("seconds") is not None]
+    check_same_cores([cores for cores in known if cores], cores_each, path)
     return content.trials
 
 

@@ -14,6 +14,8 @@ from splatnode.recon.evaluate.stability.methods import by_name
 from splatnode.recon.evaluate.stability.places import load_places
 from splatnode.recon.evaluate.stability.summary import Rate, summarise
 from splatnode.recon.evaluate.stability.windows.command import windows
+from splatnode.recon.evaluate.timing import untimed
+from splatnode.recon.jobs.calls import engine as opened
 
 logger = logging.getLogger(__name__)
 
@@ -26,13 +28,14 @@ def stability(args: argparse.Namespace) -> int:
         rows=chosen(args.rows),
         seeds=tuple(range(args.seeds)),
         methods=args.methods or ("splatnode",),
-        jobs=args.jobs,
         timeout_s=args.timeout_s,
+        max_memory_mb=args.max_memory,
     )
     for method in plan.methods:
         by_name(method)
     command = shlex.join(["splatnode", *sys.argv[1:]])
-    trials = run_campaign(plan, load_places(args.scenes, args.out), args.out, command)
+    with opened(args.cores, args.ray) as engine:
+        trials = run_campaign(plan, load_places(args.scenes, args.out), args.out, command, engine)
     try:
         from splatnode.recon.evaluate.stability import chart
     except ImportError:
@@ -50,6 +53,8 @@ def stability(args: argparse.Namespace) -> int:
             f"{method}: {summary.trials} trials, false accepts {_rate_text(summary.false_accept)}, "
             f"false refusals {_rate_text(summary.false_refuse)}, other codes {_rate_text(summary.other_code)}"
         )
+    if why := untimed([trial.get("others") for trial in trials]):
+        say(why)
     say(f"results: {args.out}/ (stability.json, stability.png)")
     return 0
 

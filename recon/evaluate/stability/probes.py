@@ -11,7 +11,8 @@ import numpy as np
 from splatnode.capture.frame import Frame
 from splatnode.recon.config import Config
 from splatnode.recon.evaluate.camera_errors import camera_errors
-from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate
+from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.stability.case import Measured, Probe, frames
 from splatnode.recon.evaluate.stability.methods import splatnode

@@ -1,23 +1,20 @@
-"""One trial: a case and a method in a process of its own, so that a crash, a hang or its memory are its own."""
+"""One trial: a case and a method, answered in a process of its own and compared with the truth where it is known."""
 
 from __future__ import annotations
 
-import dataclasses
-import multiprocessing
-import os
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
-from multiprocessing.context import ForkServerContext
 
 from splatnode.recon.clock import Clock
-from splatnode.recon.evaluate.process import call_alone
 from splatnode.recon.evaluate.stability.case import Case, Measured
 from splatnode.recon.evaluate.stability.claim import ROUGH, CameraError
 from splatnode.recon.evaluate.stability.methods import by_name
 from splatnode.recon.evaluate.stability.outcome import Outcome, compare, outcome
 from splatnode.recon.evaluate.stability.own_cameras import cameras_of, registered
+from splatnode.recon.evaluate.timing import Timing, timing
+from splatnode.recon.jobs import call
+from splatnode.recon.jobs.alone import now
 from splatnode.recon.pipeline import estimate_frames
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.result.snapshot import CameraEstimate
@@ -41,7 +38,10 @@ class Trial:
     published: bool
     right: bool  # the answer as a whole: see outcome.Outcome
     outcome: str
-    seconds: float | None = None  # wall time from the first frame to the last snapshot
+    seconds: float | None = None  # wall time from the first frame to the last snapshot; None also: not alone
+    cores: int | None = None  # that it could use
+    processor: str | None = None
+    others: float | None = None  # the share of the cores' time that others took meanwhile; None also: nobody can tell
     processor_seconds: float | None = None
     peak_rss_mb: float | None = None
     num_cameras: int = 0  # that were published
@@ -57,21 +57,22 @@ class Trial:
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """What the other process leaves."""
+class Reconstructed:
+    """What the other process returns."""
 
     verdict: Verdict
     cameras: tuple[CameraEstimate, ...]  # those published; of splatnode's refusals, those that were registered
     evidence: Mapping[str, object] | None
     num_gaussians: int
     seconds: float
+    timed_on: Timing
     processor_seconds: float
     peak_rss_mb: float | None
     measured: Measured | None
 
 
-def run_trial(case: Case, row: int, name: str, seed: int, method: str, timeout_s: float) -> Trial:
-    answer = _answer(case, method, timeout_s)
+def judged(case: Case, row: int, name: str, seed: int, method: str, answer: call.Answer) -> Trial:
+    """The trial of a case that `reconstructed` was called for; its photographs are not looked at."""
     head = {
         "row": row,
         "name": name,
@@ -81,11 +82,12 @@ def run_trial(case: Case, row: int, name: str, seed: int, method: str, timeout_s
         "demand": case.demand.value,
         "expected": tuple(sorted(code.value for code in case.codes)),
     }
-    if isinstance(answer, str):
-        failed = Outcome.FAILED
-        return Trial(**head, verdict=FAILED, published=False, right=failed.right, outcome=failed.value, message=answer)
-    verdict = answer.verdict
-    score = compare(answer.cameras, case.worlds, rough=verdict.code.value == ROUGH)
+    if answer.pickled is None:
+        failed, why = Outcome.FAILED, answer.reason
+        return Trial(**head, verdict=FAILED, published=False, right=failed.right, outcome=failed.value, message=why)
+    made: Reconstructed = answer.value()
+    verdict = made.verdict
+    score = compare(made.cameras, case.worlds, rough=verdict.code.value == ROUGH)
     found = outcome(case.demand, verdict.publishable, score.right, verdict.code in case.codes)
     return Trial(
         **head,
@@ -93,57 +95,44 @@ def run_trial(case: Case, row: int, name: str, seed: int, method: str, timeout_s
         published=verdict.publishable,
         right=found.right,
         outcome=found.value,
-        seconds=answer.seconds,
-        processor_seconds=answer.processor_seconds,
-        peak_rss_mb=answer.peak_rss_mb,
-        num_cameras=len(answer.cameras) if verdict.publishable else 0,
-        num_gaussians=answer.num_gaussians,
+        seconds=made.seconds if made.timed_on.alone else None,
+        cores=made.timed_on.cores,
+        processor=made.timed_on.processor,
+        others=made.timed_on.others,
+        processor_seconds=made.processor_seconds,
+        peak_rss_mb=made.peak_rss_mb,
+        num_cameras=len(made.cameras) if verdict.publishable else 0,
+        num_gaussians=made.num_gaussians,
         rotation_error_deg=score.rotation_error_deg if verdict.publishable else None,
         centre_error_pct=score.centre_error_pct if verdict.publishable else None,
-        measured=answer.measured.values if answer.measured else None,
-        held=answer.measured.held if answer.measured else None,
+        measured=made.measured.values if made.measured else None,
+        held=made.measured.held if made.measured else None,
         errors=score.errors,
-        registered_right=score.exact if answer.cameras else None,
-        evidence=answer.evidence,
+        registered_right=score.exact if made.cameras else None,
+        evidence=made.evidence,
         message=verdict.message,
     )
 
 
-def _answer(case: Case, method: str, timeout_s: float) -> Answer | str:
-    """The answer, or why there is none."""
-    job = dataclasses.replace(case, worlds=())  # the truth stays here
-    try:
-        return call_alone(partial(_work, job, method), timeout_s, _context())
-    except RuntimeError as error:
-        return str(error)
-
-
-def _context() -> ForkServerContext:
-    """Processes that find everything imported: half of a short trial would be the import of torch."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__])
-    return context
-
-
-def _work(case: Case, method: str) -> Answer:
-    """The other process, in a session of its own: who interrupts a campaign must not make a trial fail."""
-    os.setsid()
+def reconstructed(case: Case, method: str) -> Reconstructed:
+    """What a method makes of the photographs; `case` comes without the truth. It is called in a process of its own."""
     reconstruct = by_name(method, case.stream)
-    started, worked = time.perf_counter(), time.process_time()
+    since, started, worked = now(), time.perf_counter(), time.process_time()
     snapshot = reconstruct(case.source(), case.config)
     seconds, processor_seconds = time.perf_counter() - started, time.process_time() - worked
-    peak = peak_rss_mb()
+    timed_on, peak = timing(since), peak_rss_mb()
     probe = case.probe if snapshot.verdict.publishable and method == "splatnode" else None
     cameras, evidence = snapshot.cameras, snapshot.evidence
     if method == "splatnode" and not snapshot.verdict.publishable:
         estimate = registered(estimate_frames(case.source(), case.config, Clock())[0], case.config)
         cameras, evidence = cameras_of(estimate), estimate.evidence_record
-    return Answer(
+    return Reconstructed(
         verdict=snapshot.verdict,
         cameras=cameras,
         evidence=evidence,
         num_gaussians=len(snapshot.gaussians),
         seconds=seconds,
+        timed_on=timed_on,
         processor_seconds=processor_seconds,
         peak_rss_mb=peak,
         measured=probe(snapshot, case.config) if probe is not None else None,

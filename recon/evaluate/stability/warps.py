@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from splatnode.recon.evaluate.stability.places import Image, Photo
 from splatnode.recon.evaluate.truth import TrueCamera
+from splatnode.recon.geometry import distortion
 
 Array = npt.NDArray[np.float64]
 
@@ -112,18 +113,19 @@ def cropped(photo: Photo, share: float, left: float, top: float) -> Photo:
     return replace(photo, image=image, camera=_camera(camera, K, image.shape))
 
 
-def distorted(photo: Photo, k1: float) -> Photo:
-    """As a lens with the radial coefficient `k1` shows it; enlarged just enough that nothing is missing."""
+def distorted(photo: Photo, k1: float, k2: float = 0.0) -> Photo:
+    """As a lens with these radial coefficients shows it; enlarged just enough that nothing is missing."""
     camera = _known(photo)
     height, width = photo.image.shape[:2]
     corner = np.hypot(camera.K[0, 2] / camera.K[0, 0], camera.K[1, 2] / camera.K[1, 1])
-    K = np.diag([*[max(1.0, 1.0 / (1.0 + k1 * corner**2))] * 2, 1.0]) @ camera.K
+    radials = np.array([k1, k2])
+    K = np.diag([*[max(1.0, 1.0 / float(distortion(corner**2, radials)))] * 2, 1.0]) @ camera.K
     K[:2, 2] = camera.K[:2, 2]
     across, down = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     seen = np.stack([(across - K[0, 2]) / K[0, 0], (down - K[1, 2]) / K[1, 1]], -1)
     true = seen.copy()
-    for _ in range(20):  # seen = true (1 + k1 |true|^2), by fixed point
-        true = seen / (1.0 + k1 * (true**2).sum(-1, keepdims=True))
+    for _ in range(20):  # a fixed point
+        true = seen / distortion((true**2).sum(-1), radials)[..., None]
     source = (true * [camera.K[0, 0], camera.K[1, 1]] + camera.K[:2, 2] - 0.5).astype(np.float32)
     image = cv2.remap(photo.image, source[..., 0], source[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
     return replace(photo, image=image.astype(np.uint8), camera=_camera(camera, K, image.shape))

@@ -102,7 +102,7 @@ def changes_without(gaussians: Gaussians, cameras: Sequence[Camera], probes: int
         assert rgb is not None  # it was asked for
         visible = torch.from_numpy(visibility(rgb.detach().cpu().numpy(), scale)).to(rgb.device)
         for _ in range(probes):
-            signs = (torch.randint(0, 2, rgb.shape, generator=generator) * 2.0 - 1.0).to(rgb.device)
+            signs = torch.randint(0, 2, rgb.shape, generator=generator).to(rgb.device) * 2.0 - 1.0
             # Of a sum: of an image and weights torch would first load its symbolic shapes, for half a second.
             (gradient,) = torch.autograd.grad((signs * visible[..., None] * rgb).sum(), opacities, retain_graph=True)
             total += (gradient * opacities.detach() / scale) ** 2

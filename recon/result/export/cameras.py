@@ -16,6 +16,7 @@ import numpy as np
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import LONGEST_TEXT, is_printable, printable
+from splatnode.capture.process.records import record_in
 from splatnode.capture.stamp import LARGEST_NS, Clock, Stamp
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.camera_check import MAX_COORDINATE, camera_problem
@@ -134,7 +135,7 @@ def _parsed(data: bytes, name: str) -> _File:
     if len(data) > MAX_JSON_BYTES:
         raise SceneFileError(f"{name} has {len(data)} bytes; at most {MAX_JSON_BYTES} are read")
     try:
-        parsed = msgspec.json.decode(data, type=_File)
+        parsed = record_in(data, _File)
     except msgspec.MsgspecError as error:
         raise SceneFileError(f"{name} is not a cameras.json of splatnode, or is damaged: {error}") from error
     if not is_printable(parsed.scale_source or ""):

@@ -12,6 +12,7 @@ import msgspec
 
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import is_printable
+from splatnode.capture.process.records import record_in
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.formats.colmap import encode_colmap
@@ -120,7 +121,7 @@ class _Manifest(msgspec.Struct, frozen=True):
 def _read_manifest(out_dir: Path) -> dict[str, str]:
     """sha256 by file of the result that is there; empty where there is none that can be read."""
     with contextlib.suppress(OSError, SceneFileError), foreign(SceneFileError):
-        manifest = msgspec.json.decode(read_json_file(out_dir / MANIFEST), type=_Manifest)
+        manifest = record_in(read_json_file(out_dir / MANIFEST), _Manifest)
         return {name: entry.sha256 for name, entry in manifest.files.items() if is_printable(name)}
     return {}
 

@@ -22,6 +22,7 @@ import msgspec
 
 from splatnode.capture.process.durable import sync_folder
 from splatnode.capture.process.folders import made
+from splatnode.capture.process.records import record_in
 
 _MARK = "[0-9a-f]{12}"
 _TEMPORARY, _NOTE = re.compile(rf"\..+\.{_MARK}\.tmp"), re.compile(rf"\.{_MARK}\.renaming")
@@ -220,7 +221,7 @@ def _read_note(path: Path) -> _Note:
     """An empty one where it cannot be read: no process leaves half a note."""
     with path.open("rb") as file:
         try:
-            return msgspec.json.decode(file.read(_LARGEST_NOTE), type=_Note)
+            return record_in(file.read(_LARGEST_NOTE), _Note)
         except msgspec.DecodeError:
             return _Note([], {})
 

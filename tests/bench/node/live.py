@@ -23,7 +23,8 @@ from splatnode.capture.messaging.broadcast import Subscriber
 from splatnode.capture.messaging.services import CAPTURE_PREVIEW
 from splatnode.capture.preview import PreviewHeader
 from splatnode.recon.config import Config
-from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate
+from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
 from splatnode.recon.evaluate.splits import Split, load_split
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
 from splatnode.recon.pipeline import reconstruct

@@ -21,7 +21,8 @@ import cv2
 import numpy as np
 from torch import Tensor
 
-from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate
+from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
 from splatnode.recon.merging.command import write_map

@@ -1,19 +1,20 @@
 """Photographs by a lens that bends lines and is not told: `python -m tests.bench bent --out bent.json`.
 
-Scenes whose photographs were all taken by a pinhole are bent by a radial coefficient k1, training and held-out
-photographs alike. `balanced` makes a scene with the distortion that registration estimates taken out of the photographs
-("straight"), and of the same cameras with the photographs as they are ("as photographed"). Held-out photographs are
-scored as their scene shows them: straight, or as they are. There only pixels count that the straight ones show, too; in
-SSIM and LPIPS the others count as well rendered, which favours the scenes of photographs as they are.
+Scenes whose photographs were all taken by a pinhole are bent by radial coefficients k1 and, where it is told, k2,
+training and held-out photographs alike. `balanced` makes a scene with the distortion that registration estimates taken
+out of the photographs ("straight"), and of the same cameras with the photographs as they are ("as photographed"). Held-
+out photographs are scored as their scene shows them: straight, or as they are. There only pixels count that the
+straight ones show, too; in SSIM and LPIPS the others count as well rendered, which favours the scenes of photographs as
+they are.
 
 Scenes as they came follow: how far the estimated distortion moves a corner, and whether photographs are straightened.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -21,23 +22,24 @@ import numpy.typing as npt
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.config import preset
 from splatnode.recon.estimation import Estimate, estimate_depth
-from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate
+from splatnode.recon.evaluate.perceptual import Networks
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.stability.places import Photo
 from splatnode.recon.evaluate.stability.warps import distorted
-from splatnode.recon.evaluate.start import Start, continued, find_start, foundation
+from splatnode.recon.evaluate.start import Start, find_start, foundation
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.preparation import load_prior
-from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.registration.straightened import corner_shift, straight_pixels, straightened
-from tests.bench.quality.real_sets import measure
+from tests.bench.quality.real_sets import last, measure, timed
 
 SETS = (
     "fountain_p11:6:-0.1",
     "fountain_p11:6:-0.25",
     "llff_fern:6:-0.1",
     "llff_fern:6:-0.25",
+    "fountain_p11:6:-0.25:0.1",
+    "llff_fern:6:-0.25:0.1",
     "fountain_p11:6:0",
     "llff_fern:6:0",
     "llff_flower:6:0",
@@ -56,8 +58,10 @@ class Row:
     scene: str
     views: int
     k1: float  # by which the photographs were bent
+    k2: float  # likewise
     verdict: str
     estimated_k1: float | None  # None: no cameras
+    estimated_k2: float | None
     corner_shift_px: float | None  # of SIDE, as estimated, away from the middle
     straightened: bool  # whether it was taken out of the photographs
     kind: str = "as it came"  # straight; as photographed
@@ -65,6 +69,8 @@ class Row:
     ssim: float | None = None
     lpips: float | None = None
     focal_error_pct: float | None = None
+    rotation_error_deg: float | None = None
+    centre_error_pct: float | None = None
     num_gaussians: int | None = None
     seconds: float | None = None  # of the processor, from depth on
 
@@ -92,9 +98,9 @@ class Bent(EvaluationScene):
         return image, inside.reshape(height, width)
 
 
-def bent(scene: EvaluationScene, names: Sequence[str], k1: float) -> Bent:
-    """The photographs of these names as a lens with the radial coefficient `k1` shows them."""
-    photos = {name: distorted(Photo(name, scene.image(name), scene.cameras[name]), k1) for name in names}
+def bent(scene: EvaluationScene, names: Sequence[str], k1: float, k2: float) -> Bent:
+    """The photographs of these names as a lens with these radial coefficients shows them."""
+    photos = {name: distorted(Photo(name, scene.image(name), scene.cameras[name]), k1, k2) for name in names}
     cameras = {name: photo.camera for name, photo in photos.items() if photo.camera is not None}
     return Bent(scene.name, scene.paths, cameras, None, photos)
 
@@ -103,22 +109,23 @@ def as_photographed(estimate: Estimate) -> Estimate:
     """The same cameras, of which nothing is known but that they are pinholes."""
     if estimate.registration is None:
         raise ValueError("there are no cameras")
-    cameras = tuple(replace(camera, radial=0.0) for camera in estimate.registration.cameras)
+    cameras = tuple(replace(camera, radial=np.zeros(2)) for camera in estimate.registration.cameras)
     known = replace(estimate, registration=replace(estimate.registration, cameras=cameras), pointmaps={})
     return estimate_depth(known, load_prior(CONFIG))
 
 
-def told(scene: EvaluationScene, views: int, k1: float, estimate: Estimate) -> Row:
+def told(scene: EvaluationScene, views: int, k1: float, k2: float, estimate: Estimate) -> Row:
     """What was estimated of the lens."""
     registration, code = estimate.registration, estimate.verdict.code.value
     if registration is None or not estimate.publishable:
-        return Row(scene.name, views, k1, code, None, None, False)
+        return Row(scene.name, views, k1, k2, code, None, None, None, False)
     camera = registration.cameras[0]
     frame = estimate.graph.keyframes[camera.index].frame
     lens = lens_of(estimate, frame)
     straight = straightened(estimate.graph, registration)[0] is not estimate.graph
     shift = SIDE * corner_shift(lens)
-    return Row(scene.name, views, k1, code, round(camera.radial, 4), round(shift, 2), straight)
+    found = (round(coefficient, 4) for coefficient in camera.radial.tolist())
+    return Row(scene.name, views, k1, k2, code, *found, round(shift, 2), straight)
 
 
 def lens_of(estimate: Estimate, frame: Frame) -> Intrinsics:
@@ -127,15 +134,11 @@ def lens_of(estimate: Estimate, frame: Frame) -> Intrinsics:
         raise ValueError("there are no cameras")
     camera = estimate.registration.cameras[0]
     focal, (cx, cy) = camera.focal, camera.principal.tolist()
-    return Intrinsics(frame.width, frame.height, focal, focal, cx, cy, "estimated", (camera.radial, 0.0, 0.0, 0.0))
+    return Intrinsics(frame.width, frame.height, focal, focal, cx, cy, "estimated", (*camera.radial.tolist(), 0.0, 0.0))
 
 
 def scored(start: Start, kind: str, scene: Bent, split: Split, networks: Networks, known: Row) -> Row:
-    begun = time.process_time()
-    snapshot = list(continued(start, CONFIG))[-1]
-    seconds = time.process_time() - begun
-    run = Run("balanced", 0, None, {"total": seconds}, None)
-    row = evaluate(snapshot, scene, split, run, rasterize=rasterize, networks=networks, settings=Settings())
+    snapshot, row, seconds = timed(partial(last, start, CONFIG), scene, split, networks)
     return replace(
         known,
         kind=kind,
@@ -144,22 +147,24 @@ def scored(start: Start, kind: str, scene: Bent, split: Split, networks: Network
         ssim=row.ssim,
         lpips=row.lpips_alex,
         focal_error_pct=row.focal_error_pct,
+        rotation_error_deg=row.rotation_error_deg,
+        centre_error_pct=row.centre_error_pct,
         num_gaussians=row.num_gaussians,
         seconds=round(seconds, 1),
     )
 
 
 def rows(scene: EvaluationScene, split: Split, rest: Sequence[str], networks: Networks) -> list[Row]:
-    k1 = float(rest[0])
+    k1, k2, *_ = (*map(float, rest), 0.0)
     if not k1:
         work = IncrementalReconstruction(foundation(CONFIG))
         for frame in scene.frames(split.train):
             work.take(frame)
-        return [told(scene, len(split.train), k1, work.estimate_thoroughly())]
+        return [told(scene, len(split.train), k1, k2, work.estimate_thoroughly())]
     split = replace(split, test=split.test[::EVERY])
-    place = bent(scene, (*split.train, *split.test), k1)
+    place = bent(scene, (*split.train, *split.test), k1, k2)
     start = find_start(place.frames(split.train), foundation(CONFIG))
-    known = told(scene, len(split.train), k1, start.estimate)
+    known = told(scene, len(split.train), k1, k2, start.estimate)
     if not known.straightened or start.estimate.registration is None:
         return [known]
     graph, _ = straightened(start.estimate.graph, start.estimate.registration)
@@ -175,16 +180,16 @@ def rows(scene: EvaluationScene, split: Split, rest: Sequence[str], networks: Ne
 
 
 def in_words(row: Row) -> str:
-    estimated = f"{row.scene} {row.views}, bent by {row.k1:g}: {row.verdict}"
+    estimated = f"{row.scene} {row.views}, bent by {row.k1:g}, {row.k2:g}: {row.verdict}"
     if row.corner_shift_px is not None:
-        estimated += f", estimated {row.estimated_k1:+.4f}, {row.corner_shift_px:+.1f} px"
+        estimated += f", estimated {row.estimated_k1:+.4f}, {row.estimated_k2:+.4f}, {row.corner_shift_px:+.1f} px"
     if row.psnr is None or row.ssim is None:
         return f"{estimated}, {'straightened' if row.straightened else 'as they are'}"
     return f"{estimated}, {row.kind}: {row.psnr:.2f} dB, SSIM {row.ssim:.3f}, focal {row.focal_error_pct:.1f} %"
 
 
 def main() -> None:
-    measure("bent", __doc__, SETS, "SCENE:VIEWS:K1", rows, in_words)
+    measure("bent", __doc__, SETS, "SCENE:VIEWS:K1[:K2]", rows, in_words)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,8 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.protocol import Networks, Settings
+from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.protocol import Settings
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.frames.undistort import undistorted
@@ -49,10 +50,10 @@ class Result:
     num_gaussians: int | None
 
 
-def equidistant(across_deg: float) -> Intrinsics:
+def equidistant(across_deg: float, width: int = WIDTH, height: int = HEIGHT) -> Intrinsics:
     """A fisheye that sees so much from left to right."""
-    focal = WIDTH / math.radians(across_deg)
-    return Intrinsics(WIDTH, HEIGHT, focal, focal, WIDTH / 2, HEIGHT / 2, "calibration", model="fisheye")
+    focal = width / math.radians(across_deg)
+    return Intrinsics(width, height, focal, focal, width / 2, height / 2, "calibration", model="fisheye")
 
 
 def measured(across_deg: float, views: int, pinhole: bool, chosen: str, folder: Path) -> Result:

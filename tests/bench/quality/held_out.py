@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate, load_networks
+from splatnode.recon.evaluate.perceptual import Networks, load_networks
 from splatnode.recon.evaluate.protocol import Row as Scored
+from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
 from splatnode.recon.evaluate.splits import Split, load_split
 from splatnode.recon.evaluate.start import find_start
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene

@@ -10,10 +10,10 @@ times what is found for the photographs as they were taken, and after the median
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from types import MappingProxyType
 
 import msgspec
 import numpy as np
@@ -21,15 +21,15 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.config import Config, preset
-from splatnode.recon.evaluate.protocol import Networks, Run, Settings, evaluate
+from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.protocol import Settings
 from splatnode.recon.evaluate.splits import Split
-from splatnode.recon.evaluate.start import Start, continued, find_start, foundation
+from splatnode.recon.evaluate.start import Start, find_start, foundation
 from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.incremental import IncrementalReconstruction
-from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import light
-from tests.bench.quality.real_sets import measure
+from tests.bench.quality.real_sets import last, measure, timed
 
 SETS = ("fountain_p11:6", "llff_fern:6", "fox:12")
 LEAST, MOST, BALANCE = 0.5, 2.0, 0.2
@@ -64,17 +64,22 @@ def changed(frame: Frame, gains: npt.NDArray[np.float64]) -> Frame:
     return replace(frame, image=image, encoded=None)
 
 
-def logs_of(start: Start) -> Mapping[str, npt.NDArray[np.float64]]:
-    """(3,) logarithms of the gains that are found, by photograph."""
+def logs_of(start: Start, told: Mapping[str, float] = MappingProxyType({})) -> Mapping[str, npt.NDArray[np.float64]]:
+    """(3,) logarithms of the gains that are found, by photograph; `told` is what cameras say of them."""
     maps = list(start.estimate.pointmaps.values())
     images = {keyframe.name: keyframe.image for keyframe in start.estimate.graph.keyframes}
-    found = light.log_gains(maps, [images[each.name] for each in maps])
+    found = light.log_gains(maps, [images[each.name] for each in maps], told)
     return {each.name: own for each, own in zip(maps, found, strict=True)}
 
 
-def gain_errors(plain: Start, under: Start, true: Mapping[str, npt.NDArray[np.float64]]) -> tuple[float, float]:
-    """Percent: median and largest."""
-    before, after = logs_of(plain), logs_of(under)
+def gain_errors(
+    plain: Start,
+    under: Start,
+    true: Mapping[str, npt.NDArray[np.float64]],
+    told: Mapping[str, float] = MappingProxyType({}),
+) -> tuple[float, float]:
+    """Percent: median and largest. `told` is what cameras say of the photographs `under` gains."""
+    before, after = logs_of(plain), logs_of(under, told)
     names = [name for name in after if name in before]
     off = np.array([after[name] - before[name] - np.log(true[name]) for name in names])
     errors = 100.0 * np.abs(np.expm1(off - np.median(off, axis=0)))
@@ -108,19 +113,13 @@ def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Netwo
     errors = gain_errors(starts["plain"], starts["under"], true)
 
     def scored(kind: str, made: Callable[[], Snapshot], shown: Sequence[Frame], *found: float) -> Row:
-        begun = time.process_time()
-        snapshot = made()
-        seconds = time.process_time() - begun
-        run = Run("balanced", 0, None, {"total": seconds}, None)
-        row = evaluate(
-            snapshot, scene, split, run, rasterize=rasterize, networks=networks, settings=Settings(best_gain=True)
-        )
+        _, row, seconds = timed(made, scene, split, networks, Settings(best_gain=True))
         saturated = 100.0 * float(np.mean([(frame.image >= light.SATURATED).any(-1).mean() for frame in shown]))
         scores = row.psnr, row.ssim, row.lpips_alex, row.num_gaussians
         return Row(scene.name, len(frames), kind, row.verdict, *scores, round(seconds, 1), round(saturated, 2), found)
 
     def offline(kind: str, config: Config) -> Callable[[], Snapshot]:
-        return lambda: list(continued(starts[kind], config))[-1]
+        return partial(last, starts[kind], config)
 
     result = [
         scored("one exposure", offline("plain", ON), frames),

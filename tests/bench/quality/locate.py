@@ -11,6 +11,11 @@ right    placed within 1 degree and 1 % of the distance to the scene, the median
 Then every held-out photograph is looked for in one set, the largest, of every other scene, where it must be refused.
 castle_p30, entry_p10, fountain_p11 and hard_rotation_exact show one real courtyard: pairs of these count apart.
 Seconds are of the processor, for photographs shrunk to 800 pixels, on one thread.
+
+One of four held-out photographs is also placed as one that follows another: near to a camera that is beside its own,
+and near to the farthest camera of the scene, which is wrong. A photograph of another scene is looked for near to three
+cameras of the scene, too, as if these had taken it; what is refused there would be looked for everywhere, as above. A
+video of the built-in capture is followed frame by frame.
 """
 
 from __future__ import annotations
@@ -24,6 +29,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -36,22 +42,22 @@ from splatnode.recon.evaluate.splits import load_split
 from splatnode.recon.evaluate.true_cameras import TrueCamera
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
 from splatnode.recon.frames.screening import screen_all
-from splatnode.recon.geometry import align_cameras, angles_deg
+from splatnode.recon.geometry import align_cameras
 from splatnode.recon.ladder.ladder import climbed
-from splatnode.recon.locating.follow import follow
-from splatnode.recon.locating.locate import Photograph, described, locate, located
+from splatnode.recon.locating.follow import QUICK, follow
+from splatnode.recon.locating.locate import described, locate, located
 from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.matching.match import match
 from splatnode.recon.preparation import load_prior, prepare
 from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.landmarks_file import decode_landmarks, encode_landmarks
+from tests.bench.quality.following import SIDE, FollowingFrame, errors_of, nearby, of_frames, placed_near, video
 from tests.conftest import ROOT
 
 Array = npt.NDArray[np.float64]
 
 COURTYARD = {"castle_p30", "entry_p10", "fountain_p11", "hard_rotation_exact"}
 RIGHT_DEG, RIGHT_PERCENT = 1.0, 1.0
-SIDE = 800  # pixels, of the photographs that seconds and cover are of
 RATIO, SAMPSON_PX, MATCHES, PARTNERS = 0.8, 3.0, 30, 2
 _STEP = np.eye(4)
 _STEP[:3, :3] = cv2.Rodrigues(np.radians([0.0, 3.0, 0.0]))[0]
@@ -76,6 +82,8 @@ class Trial:
     seconds_following: float | None = None  # likewise, once it is known where one was taken that it follows
     rotation_following_deg: float | None = None  # the error then; None: it was refused, too
     centre_following_percent: float | None = None
+    quickly: bool | None = None  # whether it was found near to that, without looking everywhere
+    near_farthest: str | None = None  # near to the farthest camera of the scene: "right", "wrong", or "refused"
 
     @property
     def right(self) -> bool:
@@ -92,6 +100,7 @@ class Stranger:
     photograph: str
     same_place: bool  # both scenes show the courtyard
     outcome: str
+    outcome_following: str  # "placed" where it was, near to one of the scene's cameras; else "refused"
 
 
 def estimated(scene: EvaluationScene, names: Sequence[str], config: Config) -> Estimate:
@@ -116,28 +125,15 @@ def trials(scene: EvaluationScene, views: int, landmarks: Landmarks, names: Sequ
         found = locate(landmarks, image)
         truth = to_scene.camera(scene.cameras[name].T_world_camera)
         timed = _timed(landmarks, image, truth) if number % EVERY == 0 else {}
-        errors = _errors(found, truth, landmarks.unit)
+        errors = errors_of(found, truth, landmarks.unit)
         yield Trial(scene.name, views, name, partners >= PARTNERS, outcome(found), **errors, **timed)
-
-
-def _errors(found: Located | NotLocated, truth: Array, unit: float) -> dict[str, float]:
-    if isinstance(found, NotLocated):
-        return {}
-    T = found.T_world_camera
-    return {
-        "points": found.num_points,
-        "rotation_deg": float(angles_deg(T[None, :3, :3], truth[None, :3, :3])[0]),
-        "centre_percent": 100.0 * float(np.linalg.norm(T[:3, 3] - truth[:3, 3])) / unit,
-        "rotation_claim_deg": found.claim.rotation_deg,
-        "centre_claim_percent": found.claim.centre_percent,
-    }
 
 
 def outcome(found: Located | NotLocated) -> str:
     return "placed" if isinstance(found, Located) else found.code.value
 
 
-def _timed(landmarks: Landmarks, image: npt.NDArray[np.uint8], truth: Array) -> dict[str, float]:
+def _timed(landmarks: Landmarks, image: npt.NDArray[np.uint8], truth: Array) -> dict[str, Any]:
     """Seconds at 800 pixels; then those of one that follows it: the same photograph, beside the nearest of the scene.
 
     What it follows was taken a tenth of the distance to the scene, and 3 degrees, from it.
@@ -152,12 +148,16 @@ def _timed(landmarks: Landmarks, image: npt.NDArray[np.uint8], truth: Array) -> 
     begun = time.process_time()
     found = follow(landmarks, small, replace(first, T_world_camera=before))
     seconds["seconds_following"] = time.process_time() - begun
-    errors = _errors(found, truth, landmarks.unit)
-    return seconds | {
-        f"{kind}_following_{unit}": errors[f"{kind}_{unit}"]
-        for kind, unit in (("rotation", "deg"), ("centre", "percent"))
-        if errors
-    }
+    errors = errors_of(found, truth, landmarks.unit)
+    return (
+        seconds
+        | {
+            f"{kind}_following_{unit}": errors[f"{kind}_{unit}"]
+            for kind, unit in (("rotation", "deg"), ("centre", "percent"))
+            if errors
+        }
+        | nearby(landmarks, small, first, before)
+    )
 
 
 def _shrunk(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
@@ -196,11 +196,14 @@ def _shared(one: Keypoints, camera1: TrueCamera, other: Keypoints, camera2: True
     return int((error < SAMPSON_PX).sum())
 
 
-def summary(own: Sequence[Trial], strangers: Sequence[Stranger]) -> dict[str, object]:
+def summary(
+    own: Sequence[Trial], strangers: Sequence[Stranger], frames: Sequence[FollowingFrame] = ()
+) -> dict[str, object]:
     """What docs/measurement.md prints."""
     covered, placed = [t for t in own if t.covered], [t for t in own if t.outcome == "placed"]
     apart = [s for s in strangers if not s.same_place]
     seconds = [t.seconds for t in own if t.seconds is not None]
+    timed = [t for t in own if t.quickly is not None]
     following = [t.seconds_following for t in own if t.seconds_following is not None]
     within = {
         "rotation": [(t.rotation_deg or 0.0) <= (t.rotation_claim_deg or 0.0) for t in placed],
@@ -225,6 +228,14 @@ def summary(own: Sequence[Trial], strangers: Sequence[Stranger]) -> dict[str, ob
         "seconds_most": max(seconds, default=None),
         "seconds_following_median": float(np.median(following)) if following else None,
         "seconds_following_most": max(following, default=None),
+        "following": len(timed),
+        "following_quickly": sum(bool(t.quickly) for t in timed),
+        "seconds_quickly_most": max((t.seconds_following or 0.0 for t in timed if t.quickly), default=None),
+        "near_farthest": {
+            outcome: sum(t.near_farthest == outcome for t in timed) for outcome in ("right", "wrong", "refused")
+        },
+        "strangers_followed": sum(s.outcome_following == "placed" for s in apart),
+        **of_frames(frames),
     }
 
 
@@ -234,6 +245,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, nargs="+", default=[6, 12])
     parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/")
     parser.add_argument("--strangers", type=int, default=100, help="held-out photographs of a scene, for other scenes")
+    parser.add_argument("--videos", type=int, default=3, help="of places of the built-in capture")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     args = parser.parse_args()
     cv2.setNumThreads(1)
@@ -255,16 +267,28 @@ def main() -> None:
             largest[name] = decode_landmarks(data)
             own += trials(scene, views, largest[name], split.test)
         print(name, json.dumps(summary(own, [])), flush=True)
-    _write(args.out, sets, own, [])
+    frames = [frame for place in range(args.videos) for frame in video(place)]
+    _write(args.out, sets, own, [], frames)
     strangers = list(_strangers(scenes, {name: splits[name]["test"][: args.strangers] for name in scenes}, largest))
-    _write(args.out, sets, own, strangers)
-    print(json.dumps(summary(own, strangers)))
+    _write(args.out, sets, own, strangers, frames)
+    print(json.dumps(summary(own, strangers, frames)))
 
 
-def _write(path: Path, sets: dict[str, str], own: Sequence[Trial], strangers: Sequence[Stranger]) -> None:
+def _write(
+    path: Path,
+    sets: dict[str, str],
+    own: Sequence[Trial],
+    strangers: Sequence[Stranger],
+    frames: Sequence[FollowingFrame],
+) -> None:
     head = {"command": shlex.join(["python", "-m", "tests.bench", "locate", *sys.argv[1:]]), "commit": _commit()}
-    rows = {"trials": [asdict(trial) for trial in own], "strangers": [asdict(pair) for pair in strangers]}
-    path.write_text(json.dumps({**head, "summary": summary(own, strangers), "sets": sets, **rows}, indent=1) + "\n")
+    rows = {
+        "trials": [asdict(trial) for trial in own],
+        "strangers": [asdict(pair) for pair in strangers],
+        "frames": [asdict(frame) for frame in frames],
+    }
+    found = summary(own, strangers, frames)
+    path.write_text(json.dumps({**head, "summary": found, "sets": sets, **rows}, indent=1) + "\n")
 
 
 def _strangers(
@@ -272,11 +296,13 @@ def _strangers(
 ) -> Iterator[Stranger]:
     for of, scene in scenes.items():
         for name in photographs[of]:
-            photograph: Photograph = described(scene.image(name))
+            image = scene.image(name)
+            photograph, quick = described(image), described(_shrunk(image), None, QUICK)
             for other, landmarks in known.items():
                 if other != of:
                     found = outcome(located(landmarks, photograph))
-                    yield Stranger(other, of, name, {of, other} <= COURTYARD, found)
+                    following = "placed" if placed_near(landmarks, quick) else "refused"
+                    yield Stranger(other, of, name, {of, other} <= COURTYARD, found, following)
 
 
 def _commit() -> str:

@@ -18,7 +18,8 @@ from pathlib import Path
 from splatnode.capture.frame import Frame
 from splatnode.capture.masks import masked
 from splatnode.recon.config import preset
-from splatnode.recon.evaluate.protocol import Networks, Settings
+from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.protocol import Settings
 from splatnode.recon.offline import run
 from tests.bench.quality.held_out import Case, Folders, Scoring, load_case
 from tests.support.moving import look_of, pasted

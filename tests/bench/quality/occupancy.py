@@ -59,6 +59,7 @@ _GLASS = Pane.upright((1.95, 1.95, 0.75), width=1.0, height=1.2)
 _TOURS = {0: 10, 3: 70}  # rooms of the building, and the first keyframe that is taken of each
 _AT_THE_MIRROR = 316
 _BEFORE = 1.0  # metres
+_BUILDING = building.Config()
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +125,8 @@ def glass(views: int) -> Place:
     )
 
 
-def room(name: str, keyframes: Sequence[int], mirror: bool = False) -> Place:
+def room(name: str, keyframes: Sequence[int], mirror: bool = False, config: building.Config = _BUILDING) -> Place:
     """Keyframes of the building."""
-    config = building.Config()
     return Place(
         name,
         lambda: [building.photograph(config, index) for index in keyframes],
@@ -181,8 +181,8 @@ def mapped(place: Place) -> tuple[Snapshot, list[int]]:
     return snapshot, [int(camera.name[:3]) for camera in cameras]
 
 
-def row(place: Place, views: int) -> Row:
-    snapshot, numbers = mapped(place)
+def row(place: Place, snapshot: Snapshot, numbers: Sequence[int], views: int) -> Row:
+    """What the map of `snapshot` is worth; `numbers` say which of the place's cameras its own are."""
     head = place.name, views, snapshot.verdict.code.value, len(snapshot.cameras)
     begun = time.process_time()
     try:
@@ -284,7 +284,7 @@ def main() -> None:
     told = {"command": shlex.join(["python", "-m", "tests.bench", "occupancy", *sys.argv[1:]]), "commit": commit}
     with at_most(1):
         for place, views in places(args.views, args.seeds):
-            rows.append(asdict(row(place, views)))
+            rows.append(asdict(row(place, *mapped(place), views)))
             print(json.dumps(rows[-1]), flush=True)
             args.out.write_text(json.dumps({**told, "rows": rows}, indent=1) + "\n")
 

@@ -24,8 +24,10 @@ from splatnode.capture.frame import Frame
 from splatnode.capture.process.progress import say
 from splatnode.recon.config import Config
 from splatnode.recon.evaluate import methods
-from splatnode.recon.evaluate.bench import Entrants, Plan, Scoring, run_bench
-from splatnode.recon.evaluate.protocol import INTERPOLATED_START, Settings, load_networks
+from splatnode.recon.evaluate.bench import Entrants, Plan, run_bench
+from splatnode.recon.evaluate.one_run import Scoring
+from splatnode.recon.evaluate.perceptual import Networks, load_networks
+from splatnode.recon.evaluate.protocol import INTERPOLATED_START, Settings
 from splatnode.recon.evaluate.records import Bench
 from splatnode.recon.evaluate.report import redraw
 from splatnode.recon.evaluate.start import Start, continued, foundation
@@ -102,6 +104,10 @@ def run(case: Case, wanted: Sequence[str], seeds: int, scenes: Path, out: Path, 
     return go_on(plan(tuple(wanted)), Entrants(entrants.reconstruct, entrants.start_of))
 
 
+def quick_networks(weights_dir: Path) -> Networks:
+    return load_networks(weights_dir).quickest
+
+
 def command() -> str:
     return shlex.join(["python", "-m", "tests.bench", "race"])
 
@@ -116,8 +122,10 @@ def main() -> None:
     parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
     args = parser.parse_args()
     settings = INTERPOLATED_START if args.interpolated_start else Settings()
-    scoring = Scoring(rasterize, load_networks(args.shared / "weights").quickest, settings, by_region=True)
-    if scoring.networks.alex is None:
+    scoring = Scoring(
+        rasterize, partial(quick_networks, (args.shared / "weights").absolute()), settings, by_region=True
+    )
+    if scoring.networks().alex is None:
         parser.error(f"{args.shared}/weights must hold LPIPS's weights for AlexNet. Run: splatnode weights")
     chosen = [case for case in cases() if not args.names or case.name in args.names]
     if not chosen:

@@ -6,15 +6,43 @@ import argparse
 import json
 import shlex
 import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from splatnode.capture.process.progress import say
-from splatnode.recon.evaluate.protocol import Networks, load_networks
+from splatnode.recon.config import Config
+from splatnode.recon.evaluate.perceptual import Networks, load_networks
+from splatnode.recon.evaluate.protocol import Row, Run, Settings, evaluate
 from splatnode.recon.evaluate.splits import Split, load_split
+from splatnode.recon.evaluate.start import Start, continued
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.result.snapshot import Snapshot
+
+
+def timed(
+    made: Callable[[], Snapshot],
+    scene: EvaluationScene,
+    split: Split,
+    networks: Networks,
+    settings: Settings = Settings(),  # noqa: B008 (it is frozen)
+) -> tuple[Snapshot, Row, float]:
+    """What `made` makes with `balanced`, its scores, and the seconds of the processor that it took."""
+    begun = time.process_time()
+    snapshot = made()
+    seconds = time.process_time() - begun
+    run = Run("balanced", 0, None, {"total": seconds}, None)
+    row = evaluate(snapshot, scene, split, run, rasterize=rasterize, networks=networks, settings=settings)
+    return snapshot, row, seconds
+
+
+def last(start: Start, config: Config) -> Snapshot:
+    """The scene of these cameras and points, as it is in the end."""
+    *_, snapshot = continued(start, config)
+    return snapshot
 
 
 def measure(

@@ -17,6 +17,7 @@ import pytest
 
 from splatnode.capture.cameras import depthai as oak
 from splatnode.capture.cameras.depthai import Config, Source, find, read, stream, to_frame, to_pair
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.right_image import Baseline
 from splatnode.capture.stamp import Clock
@@ -138,6 +139,25 @@ def test_a_frame_has_its_own_calibration():
     assert framed(message(distortion=(0.0,) * 14), 0).intrinsics.distortion == ()
     fisheye = framed(message(distortion=(0.1, 0.02, 0, 0) + (0.0,) * 10, model="CameraModel.Fisheye"), 0).intrinsics
     assert (fisheye.model, fisheye.distortion) == ("fisheye", (0.1, 0.02, 0, 0))
+
+
+def test_a_frame_has_the_exposure_that_the_camera_tells():
+    assert framed(message(), 0).exposure == ExposureSettings(0.008, 200.0)
+    left = to_pair(Baseline(0.075), pair(), 0)
+    assert isinstance(left, Frame) and left.exposure == ExposureSettings(0.008, 200.0)
+
+
+@pytest.mark.parametrize(
+    ("told", "strange"),
+    [
+        *(("getExposureTime", each) for each in (timedelta(0), timedelta(days=-1), timedelta.max, None, 8000)),
+        *(("getSensitivity", each) for each in (0, -1, 2**31, None, "200")),
+    ],
+)
+def test_an_exposure_that_cannot_be_is_none(told, strange):
+    changed = message()
+    setattr(changed, told, lambda: strange)
+    assert framed(changed, 0).exposure is None
 
 
 @pytest.mark.parametrize(
@@ -334,3 +354,9 @@ def test_depthai_has_what_pairs_need():
     assert stereo.setRectification and stereo.rectifiedLeft and stereo.rectifiedRight and stereo.left and stereo.right
     assert dai.CalibrationHandler().getBaselineDistance and dai.LengthUnit.METER
     assert dai.CameraBoardSocket.CAM_B and dai.CameraBoardSocket.CAM_C
+
+
+def test_depthai_s_messages_tell_time_and_sensitivity_or_zeros():
+    dai = pytest.importorskip("depthai", reason="needs the extra oak")
+    fresh = dai.ImgFrame()
+    assert (fresh.getExposureTime(), fresh.getSensitivity()) == (timedelta(0), 0)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras.watched import Config, stream
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.unavailable import CameraUnavailable
@@ -55,12 +56,15 @@ def test_photographs_come_once_in_their_order(tmp_path):
 
 
 def test_a_photograph_has_its_own_time_and_else_that_of_its_file(tmp_path):
-    (tmp_path / "a.jpg").write_bytes(with_exif(photograph(0), {}, {0x9003: "2024:05:06 10:00:07"}))
+    told = {0x9003: "2024:05:06 10:00:07", 0x829A: (1, 125), 0x8827: 400}
+    (tmp_path / "a.jpg").write_bytes(with_exif(photograph(0), {}, told))
     (tmp_path / "b.jpg").write_bytes(photograph(1))
     os.utime(tmp_path / "b.jpg", ns=(0, 1_714_989_607_123_456_000))
     (tmp_path / "c_20240506_100009.jpg").write_bytes(photograph(2))
     frames = watch(tmp_path)
-    assert next(frames).captured_at == Stamp(1_714_989_607_000_000_000, Clock.LOCAL)
+    first = next(frames)
+    assert first.captured_at == Stamp(1_714_989_607_000_000_000, Clock.LOCAL)
+    assert first.exposure == ExposureSettings(0.008, 400.0)
     assert next(frames).captured_at == Stamp(1_714_989_607_123_456_000, Clock.FILE)
     assert next(frames).captured_at == Stamp(1_714_989_609_000_000_000, Clock.LOCAL)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,9 @@ import pytest
 
 from splatnode.capture import film, video_process
 from splatnode.capture.cameras import lerobot
+from splatnode.capture.lerobot import data_set
 from splatnode.capture.lerobot.data_set import UnusableDataSet, parts
+from splatnode.command_line import main
 from splatnode.recon.replay_source import Request, source
 from tests.support.lerobot_sets import write
 
@@ -115,6 +118,40 @@ def test_a_data_set_without_videos_says_so(copy):
     (copy / "meta" / "info.json").write_text(json.dumps(info))
     with pytest.raises(UnusableDataSet, match="has no videos: .* pictures in the tables of data/ are not read"):
         source(Request(copy))
+
+
+def test_a_data_set_without_episodes_says_what_is_missing(copy):
+    file = copy / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    pq.write_table(pq.read_table(file).slice(0, 0), file)
+    expected = r"copy' must have a row for each episode in meta/episodes/\*/\*.parquet; "
+    with pytest.raises(UnusableDataSet, match=f"{expected}what is there has no rows: record an episode first"):
+        source(Request(copy))
+    with pytest.raises(UnusableDataSet, match="what is there has no rows"):
+        frames(copy, f"1/{TOP}")
+    file.unlink()
+    for given in (copy, film.part_of(copy, f"1/{TOP}")):
+        with pytest.raises(UnusableDataSet, match=f"{expected}there are no such files: copy or download the whole"):
+            source(Request(given))
+
+
+def test_without_pyarrow_it_says_what_pyarrow_is_needed_for(copy, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.delitem(sys.modules, "splatnode.capture.lerobot.pyarrow", raising=False)
+    monkeypatch.delattr("splatnode.capture.lerobot.pyarrow", raising=False)
+    assert main(["replay", str(copy), "--out", str(copy / "out")]) == 69
+    said = "copy' is a LeRobot data set, and its tables are read with pyarrow, which is not installed. Run: pip install"
+    assert f"{said} 'splatnode[batch]'" in capsys.readouterr().err
+
+
+def test_tables_are_read_once_until_they_change(copy, monkeypatch):
+    read, asked = pq.read_table, []
+    monkeypatch.setattr(pq, "read_table", lambda file, **how: asked.append(file) or read(file, **how))
+    for number in (0, 1, 2, 0):
+        data_set.film(copy, f"{number}/{TOP}")
+    assert len(asked) == 1
+    change(copy, **{f"videos__{TOP}__from_timestamp": 0.5})
+    asked.clear()
+    assert data_set.film(copy, f"1/{TOP}").from_s == 0.5 and len(asked) == 1
 
 
 def test_depth_is_no_camera(copy):

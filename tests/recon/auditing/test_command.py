@@ -13,26 +13,11 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.diorama.cast import Camera
 from splatnode.capture.image_file import encode_png
 from splatnode.command_line import main
-from splatnode.recon.result.landmarks_file import LANDMARKS, encode_landmarks
-from tests.support.located import PLACE, known_place
-
-
-def moved(camera: Camera, turn_deg: float) -> Camera:
-    T, K = camera
-    turn, angle = np.eye(4), np.radians(turn_deg)
-    turn[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-    return T @ turn, K
+from tests.support.located import PLACE, turned
 
 
 def picture(camera: Camera, seed: int) -> bytes:
     return encode_png(synthetic.photograph(PLACE, camera, seed))
-
-
-@pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("out")
-    (folder / LANDMARKS).write_bytes(encode_landmarks(known_place().landmarks))
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +27,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     visits = [folder / day for day in ("monday", "tuesday", "wednesday")]
     for day, visit in enumerate(visits):
         visit.mkdir()
-        (visit / "left.png").write_bytes(picture(moved(left, 1.0 if day == 2 else 0.0), 10 + day))
+        (visit / "left.png").write_bytes(picture(turned(left, 1.0 if day == 2 else 0.0), 10 + day))
         hidden = encode_png(np.full((PLACE.height, PLACE.width, 3), 90, np.uint8))
         (visit / "right.png").write_bytes(hidden if day == 1 else picture(right, 20 + day))
     return visits
@@ -71,7 +56,7 @@ def test_a_camera_that_moves_within_a_recording_is_not_compared(result, tmp_path
     for day in ("monday", "tuesday"):
         (tmp_path / day / "wrist").mkdir(parents=True)
         for index in range(2):
-            (tmp_path / day / "wrist" / f"{index}.png").write_bytes(picture(moved(left, 2.0 * index), index))
+            (tmp_path / day / "wrist" / f"{index}.png").write_bytes(picture(turned(left, 2.0 * index), index))
     assert main(["audit", str(result), str(tmp_path / "monday"), str(tmp_path / "tuesday")]) == 65
     out = capsys.readouterr().out
     assert "wrist was not compared in monday: MOVING: since 0.png it turned by 2 degrees" in out
@@ -83,7 +68,7 @@ def test_mistakes_are_told_in_a_sentence(result, recordings, tmp_path, capsys):
     empty.mkdir()
     for arguments, expected in (
         ((result, recordings[0], recordings[0]), "is given twice"),
-        ((result, tmp_path / "nowhere"), "is no folder"),
+        ((result, tmp_path / "nowhere"), "is not there; give a folder, a video, an MCAP file, a data set, or a list"),
         ((result, empty), "no photographs"),
         ((empty, recordings[0]), "is not a result of splatnode"),
     ):

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.auditing.history import Move, moves, periods
+from splatnode.recon.auditing.history import Move, Period, extended, moves
 from splatnode.recon.auditing.motion import MIN_COMMON, motion
 from splatnode.recon.auditing.sighting import Sighting
-from splatnode.recon.locating.camera_model import CameraModel, Lens
+from splatnode.recon.locating.camera_model import PINHOLE, CameraModel, Lens
 from splatnode.recon.locating.correspondences import Correspondences
 from splatnode.recon.locating.locate import Placed
 from splatnode.recon.locating.outcome import Claim, Located
 
-LENS = Lens(500.0, 0.0, np.zeros(2), 0.0, 0.0, 0.0)
+LENS = Lens(500.0, PINHOLE, np.zeros(2), 0.0, 0.0, 0.0)
 SIZE = (640, 480)
 NOISE_PX = 0.3
 LEFT, RIGHT = np.array([-0.3, 0.0, 0.0]), np.array([0.3, 0.1, 0.0])
@@ -41,6 +41,13 @@ def placed(T_world_camera: np.ndarray, seed: int, count: int = 300) -> Placed:
 
 def history(*Ts: np.ndarray, first_seed: int = 1) -> dict[int, Sighting]:
     return {i: Sighting(f"{i}.png", placed(T, first_seed + i)) for i, T in enumerate(Ts)}
+
+
+def periods(sightings: dict[int, Sighting]) -> list[Period]:
+    found: list[Period] = []
+    for number, sighting in sightings.items():
+        found = extended(found, number, sighting)
+    return found
 
 
 def test_noise_moves_nothing():

@@ -11,10 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY
+from splatnode.recon.batch.answer import without_answer
 from splatnode.recon.batch.engine import Plan, run_all
 from splatnode.recon.batch.keeping import LOG
 from splatnode.recon.batch.sources import Recording
-from splatnode.recon.jobs.child import Limits
+from splatnode.recon.jobs.child import NOT_RUN, Limits
 from tests.conftest import ROOT
 from tests.support.recordings import GOOD, REFUSED, simulated
 
@@ -85,6 +87,17 @@ def test_a_recording_that_takes_too_much_memory_is_ended_alone(tmp_path):
     for name in ("taking", "helper"):
         assert "MB of memory; --max-memory allows 200" in found[name].message and found[name].memory_mb > 200
     assert found["good"].verdict == "OK"
+
+
+def test_what_a_batch_can_do_about_a_want_of_memory_is_told(tmp_path):
+    short = f"echo 'splatnode: {SHORT_OF_MEMORY} (MemoryError)'; exit 70"
+    found = outcomes(tmp_path, short=short, killed="kill -9 $$")
+    assert found["short"].message.startswith(SHORT_OF_MEMORY)
+    assert all("fewer --cores, or --max-memory, leave more" in each.message for each in found.values())
+    lost = without_answer(
+        Recording("a", "b"), NOT_RUN, "its worker was lost 6 times: the node is running low on memory"
+    )
+    assert lost.message.endswith("in a batch fewer --cores, or --max-memory, leave more of it")
 
 
 @pytest.mark.skipif(len(CORES) < 2, reason="needs two cores")

@@ -28,6 +28,11 @@ def test_a_batch_is_as_on_one_machine(tmp_path, capsys):
     assert there == {"good", "no", "bad.log", "batch.csv", "batch.jsonl", "batch.parquet", "index.html"}
 
 
+def test_more_memory_than_a_machine_has_is_told_in_place_of_waiting(tmp_path):
+    with pytest.raises(ValueError, match="has the 1e.09 MB that --max-memory sets aside .*: give less"):
+        run_batch(options(tmp_path / "out", ray="", cores=1, max_memory=1e9), FOUND, simulated, ["act"])
+
+
 def test_a_cluster_that_cannot_be_reached_is_told(tmp_path):
     with socket.socket() as unused:
         unused.bind(("127.0.0.1", 0))

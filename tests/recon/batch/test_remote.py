@@ -67,7 +67,7 @@ def test_results_go_to_a_store(tmp_path):
 def test_a_worker_with_another_splatnode_says_so(tmp_path):
     other = Job(simulated, str(tmp_path), Limits(), "0.0.1 (12345678)")
     found = run_recording(Recording("a", GOOD), other)
-    assert found.failed and f"has splatnode {own_version()}, the batch was begun with 0.0.1" in found.message
+    assert found.failed and f"has splatnode {own_version()}, the work was begun with 0.0.1" in found.message
     assert found.message.endswith("install the same on all machines") and not visible(tmp_path)
 
 

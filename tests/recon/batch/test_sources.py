@@ -57,6 +57,13 @@ def test_a_list_names_sources_beside_it_that_need_not_be_there(tmp_path):
     assert found[3].source == str(tmp_path / "lost.mp4")
 
 
+def test_a_list_that_leads_to_itself_is_told(tmp_path):
+    (tmp_path / "one.txt").write_text("two.txt\n")
+    (tmp_path / "two.txt").write_text("one.txt\n")
+    with pytest.raises(ValueError, match=r"the list '.*one.txt' leads to itself"):
+        names(tmp_path / "one.txt")
+
+
 def test_recordings_of_one_name_are_told_apart_whatever_their_order(tmp_path):
     for name in ("a/x/1.jpg", "b/x/1.jpg", "b/y/1.jpg", "index.html/1.jpg"):
         put(tmp_path / name)

@@ -12,6 +12,7 @@ import pytest
 from msgspec import inspect
 
 from splatnode.capture import preview, status
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.given_pose import GivenPose
 from splatnode.capture.gravity import Gravity
@@ -32,7 +33,7 @@ SCHEMAS = [
     Want, ReconStatus, SceneHeader, MapHeader,
 ]  # fmt: skip
 # Their __post_init__ knows all their bounds.
-CHECKED_BY_THEMSELVES = (Intrinsics, GivenPose, Motion, Gravity, Baseline)
+CHECKED_BY_THEMSELVES = (Intrinsics, GivenPose, Motion, Gravity, ExposureSettings, Baseline)
 
 
 def unbounded(kind: inspect.Type, where: str) -> Iterator[str]:

@@ -15,7 +15,8 @@ import torch
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.evaluate.metrics import psnr
-from splatnode.recon.evaluate.protocol import Run, evaluate, mean_intrinsics
+from splatnode.recon.evaluate.protocol import Run, evaluate
+from splatnode.recon.evaluate.same_lens import mean_intrinsics
 from splatnode.recon.evaluate.stability.places import Photo
 from splatnode.recon.evaluate.stability.warps import distorted
 from splatnode.recon.evaluate.test_pose import find_test_pose

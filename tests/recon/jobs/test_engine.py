@@ -16,7 +16,9 @@ def test_what_an_end_adds_is_run_too(tmp_path):
     todo = deque(["first"])
     order = []
     take = lambda: todo.popleft() if todo else None  # noqa: E731
-    for name, end in ends(take, lambda name, cores: Child(["true"], tmp_path / name, cores), [CORES[:1]], Limits()):
+    for name, end in ends(
+        take, lambda name, cores: Child.started(["true"], tmp_path / name, cores), [CORES[:1]], Limits()
+    ):
         order.append(name)
         assert end.exit_code == 0
         if name == "first":
@@ -28,6 +30,6 @@ def test_a_place_may_have_several_cores(tmp_path):
     told = [sys.executable, "-c", "import os; print(sorted(os.sched_getaffinity(0)))"]
     todo = iter(["all"])
     (found,) = ends(
-        lambda: next(todo, None), lambda name, cores: Child(told, tmp_path / name, cores), [CORES], Limits()
+        lambda: next(todo, None), lambda name, cores: Child.started(told, tmp_path / name, cores), [CORES], Limits()
     )
     assert found[1].exit_code == 0 and (tmp_path / "all").read_text().strip() == str(list(CORES))

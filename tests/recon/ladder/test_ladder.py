@@ -1,8 +1,10 @@
-"""The ladder: rungs are climbed while they are needed and the seconds last, and the better answer is kept."""
+"""The ladder: rungs are climbed while they are needed and there is work left, and the better answer is kept."""
 
 from __future__ import annotations
 
 import itertools
+import math
+import time
 from collections.abc import Collection, Iterator
 from dataclasses import replace
 from types import SimpleNamespace
@@ -39,11 +41,11 @@ NO_OVERLAP = estimate(Code.NO_OVERLAP, 2)
 
 
 def rung(name: str, parts: int = 1, obstacle: str = "") -> Rung:
-    """Adds so many pieces of work; the seed of its means' configuration counts them all."""
+    """Adds so many pieces of work of 1 each; the seed of its means' configuration counts them all."""
 
     def climb(means: Means, doubtful: Collection[str]) -> Iterator[Means]:
         for _ in range(parts):
-            means = replace(means, config=overlaid(means.config, {"seed": means.config.seed + 1}))
+            means = replace(means, config=overlaid(means.config, {"seed": means.config.seed + 1})).after(1.0)
             yield means
 
     return Rung(name, climb, lambda: obstacle)
@@ -67,8 +69,12 @@ def estimated(monkeypatch):
     return of
 
 
+def working(work: float) -> Config:
+    return overlaid(Config(), {"ladder": {"work": work}})
+
+
 def climb(first: Estimate, *rungs: Rung, config: Config | None = None) -> Estimate:
-    return climbed(first, (), config or Config(), rungs=rungs)
+    return climbed(first, (), config or working(100.0), rungs=rungs)
 
 
 def test_rungs_add_up_until_one_leads_to_an_answer(estimated):
@@ -98,17 +104,33 @@ def test_quick_stops_at_the_first_rung(estimated):
     assert climb(NO_OVERLAP, rung("a"), config=Config(quick=True)) is NO_OVERLAP and estimated() == []
 
 
-def test_the_seconds_end_the_climb_between_pieces_of_work_and_between_rungs(estimated, monkeypatch):
+def test_the_work_ends_the_climb_between_pieces_and_between_rungs(estimated):
     seeds = estimated(NO_OVERLAP, NO_OVERLAP)
-    clock = itertools.count(0.0, 1.0)
-    monkeypatch.setattr(ladder.time, "monotonic", lambda: next(clock))
-    found = climb(NO_OVERLAP, rung("long", 100), rung("late"), config=overlaid(Config(), {"ladder": {"seconds": 6.0}}))
-    assert len(seeds) == 1 and 1 < seeds[0] < 6
-    assert found.verdict.message.endswith("Also tried: long.")
+    found = climb(NO_OVERLAP, rung("long", 100), rung("late"), config=working(6.0))
+    assert seeds == [6] and found.verdict.message.endswith("Also tried: long.")
 
 
-def test_no_seconds_are_no_ladder(estimated):
-    assert climb(NO_OVERLAP, rung("a"), config=overlaid(Config(), {"ladder": {"seconds": 0}})) is NO_OVERLAP
+@pytest.mark.parametrize(("beyond", "tried"), [(-0.1, [2]), (0.1, [2, 3])])
+def test_to_estimate_again_is_work_too(beyond, tried, estimated):
+    seeds = estimated(NO_OVERLAP, NO_OVERLAP)
+    work = 2.0 + ladder.CAMERAS * len(NAMES) + beyond
+    climb(NO_OVERLAP, rung("short", 2), rung("late"), config=working(work))
+    assert seeds == tried
+
+
+def test_no_work_is_no_ladder(estimated):
+    assert climb(NO_OVERLAP, rung("a"), config=working(0.0)) is NO_OVERLAP
+
+
+def test_a_deadline_ends_the_climb_and_without_one_no_clock_is_read(estimated, monkeypatch):
+    seeds, clock = estimated(NO_OVERLAP, NO_OVERLAP, NO_OVERLAP), itertools.count(0.0, 1.0)
+    monkeypatch.setattr(time, "monotonic", lambda: next(clock))
+    climbed(NO_OVERLAP, (), working(1000.0), rungs=[rung("long", 100)], until=6.0)
+    assert 1 < seeds[0] <= 6 and (read := next(clock)) < 10
+    climbed(NO_OVERLAP, (), working(1000.0), rungs=[rung("long", 100)], until=math.inf)
+    assert seeds[1] == 100 and next(clock) == read + 1
+    climb(NO_OVERLAP, rung("long", 100), config=overlaid(working(1000.0), {"ladder": {"most_s": 6.0}}))
+    assert 1 < seeds[2] <= 6
 
 
 def test_the_better_answer_is_kept(estimated):

@@ -44,6 +44,16 @@ def test_only_weak_pairs_of_doubtful_keyframes_are_matched_further(far_aside):
     assert weak_pairs(far_aside, set()) == []
 
 
+def test_tilting_is_work_by_what_there_is_to_do(far_aside):
+    both = {far_aside.names[2]}
+    *_, once = tilts.RUNG.climb(Means(far_aside, Config()), both)
+    *_, twice = tilts.RUNG.climb(once, both)
+    assert once.work > 0.2  # three photographs of 1000 x 750 pixels are tilted, and compared
+    assert 0.0 < twice.work - once.work < 0.5 * once.work  # and then compared alone
+    first = next(iter(tilts.RUNG.climb(Means(far_aside, Config()), both)))
+    assert 0.0 < first.work < once.work
+
+
 def test_a_network_without_weights_says_how_to_get_them(monkeypatch, tmp_path):
     monkeypatch.setenv("SPLATNODE_WEIGHTS", str(tmp_path))
     assert learned.RUNG.obstacle() in (

@@ -15,7 +15,7 @@ from splatnode.recon.locating.refinement import CORRELATED, pose_covariance, ref
 CAMERA = CameraModel(
     Rotation.from_rotvec([0.2, -0.4, 0.1]).as_matrix(),
     np.array([0.1, -0.2, 0.5]),
-    Lens(500.0, -0.05, np.array([3.0, -2.0]), 0.0, 0.0, 0.0),
+    Lens(500.0, (-0.05, 0.02), np.array([3.0, -2.0]), 0.0, 0.0, 0.0),
 )
 
 
@@ -55,7 +55,7 @@ def test_derivatives_by_the_points():
 
 def test_pixels_without_distortion_are_those_of_a_pinhole():
     world = points(9)
-    straight = replace(CAMERA, lens=replace(CAMERA.lens, radial=0.0, shift=np.zeros(2)))
+    straight = replace(CAMERA, lens=replace(CAMERA.lens, radial=(0.0, 0.0), shift=np.zeros(2)))
     assert np.allclose(without_distortion(CAMERA.project(world)[0], CAMERA.lens), straight.project(world)[0], atol=0.01)
 
 

@@ -9,13 +9,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from splatnode.recon.locating import checks, posing
-from splatnode.recon.locating.camera_model import CameraModel, Lens
+from splatnode.recon.locating.camera_model import PINHOLE, CameraModel, Lens
 from splatnode.recon.locating.case import Case, Judged
 from splatnode.recon.locating.correspondences import Correspondences
 from splatnode.recon.locating.outcome import Claim, Reason
 
 WIDTH, HEIGHT = 1024, 768
-LENS = Lens(800.0, 0.0, np.zeros(2), 0.01, 0.0, 0.0)
+LENS = Lens(800.0, PINHOLE, np.zeros(2), 0.01, 0.0, 0.0)
 CAMERA = CameraModel(np.eye(3), np.zeros(3), LENS)
 
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import lru_cache
 
 import msgspec
+import numpy as np
 import pytest
 
 from splatnode.recon.config import overlaid, preset
@@ -13,6 +14,7 @@ from splatnode.recon.matching.config import Moving
 from splatnode.recon.matching.moving import moving_masks, without_moving
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.offline import run
+from splatnode.recon.pipeline import reconstruct_stream
 from splatnode.recon.result.report import build_report
 from tests.support.moving import look_of, pasted
 from tests.support.synthetic import SMALL, errors, photographs, view_graph
@@ -63,6 +65,17 @@ def test_the_scene_is_reconstructed_without_it_and_the_report_names_its_share():
     report = build_report(snapshot, seed=0, preset="preview", peak_rss_mb=None)
     assert report["masked"] == {}
     assert report["moving"] == {frame.name: pytest.approx(SHARE, rel=0.6) for frame, _ in with_thing()}
+
+
+def test_a_live_scene_leaves_it_out_once_it_is_final():
+    frames = [frame for frame, _ in with_thing()]
+    *_, live = reconstruct_stream(frames, CONFIG)
+    offline = run(frames, CONFIG)
+    assert live.final and live.verdict.publishable and live.moving == offline.moving
+    placed = [{each.name: each.T_world_camera for each in snapshot.cameras} for snapshot in (live, offline)]
+    assert placed[0].keys() == placed[1].keys() == {frame.name for frame in frames}
+    for name, T_world_camera in placed[1].items():
+        np.testing.assert_allclose(placed[0][name], T_world_camera, atol=1e-6)
 
 
 def test_it_can_be_switched_off():

@@ -54,6 +54,49 @@ def test_it_equals_brute_force(sizes, instruction_set):
     np.testing.assert_array_equal(back, (products - half_norms1[:, None]).argmax(0))
 
 
+@pytest.mark.parametrize("sizes", [(0, 5), (5, 0), (1, 1), (3, 130), (97, 33), (260, 259)])
+@pytest.mark.parametrize("reach", [7.0, 40.0, 1000.0])
+@pytest.mark.parametrize("instruction_set", instruction_sets())
+def test_nearby_it_equals_brute_force(sizes, reach, instruction_set):
+    first, second = descriptors(sizes[0], 0), descriptors(sizes[1], 1)
+    draw = np.random.default_rng(2)
+    at1, at2 = (draw.uniform(-50, [250, 150], (count, 2)).astype(np.float32) for count in sizes)
+    nearest, score, second_score = (np.empty(sizes[0], np.int32) for _ in range(3))
+    back = np.empty(sizes[1], np.int32)
+    given = first, at1, sizes[0], second, at2, sizes[1], ctypes.c_float(reach), nearest, score, second_score, back
+    library(instruction_set).core_match_near(
+        *(ctypes.c_void_p(each.ctypes.data) if isinstance(each, np.ndarray) else each for each in given)
+    )
+    products = first.astype(np.int64) @ second.astype(np.int64).T
+    half_norms1, half_norms2 = ((d.astype(np.int64) ** 2).sum(1) // 2 for d in (first, second))
+    near = ((at1[:, None] - at2[None]) ** 2).sum(2) < reach**2
+    scores = np.pad(np.where(near, 16320 - half_norms2 + products, 0), ((0, 0), (0, 2)))
+    backward = np.pad(np.where(near, products - half_norms1[:, None] + 16320, 0), ((0, 1), (0, 0)))
+    np.testing.assert_array_equal(nearest, np.where(near.any(1), scores.argmax(1), -1))
+    np.testing.assert_array_equal(score, scores.max(1))
+    np.testing.assert_array_equal(second_score, np.sort(scores, axis=1)[:, -2])
+    np.testing.assert_array_equal(back, np.where(near.any(0), backward.argmax(0), -1))
+
+
+def test_matches_nearby_are_those_of_all_where_all_are_near():
+    first, second = pairs(101, 57)
+    config = nearest_neighbours.Config()
+    places = [np.random.default_rng(0).uniform(0, 100, (len(each), 2)) for each in (first, second)]
+    found = nearest_neighbours.match_near(first, places[0], second, places[1], 200.0, config)
+    np.testing.assert_array_equal(found, nearest_neighbours.match(first, second, config))
+    far = nearest_neighbours.match_near(first, places[0], second, places[1] + 1000.0, 200.0, config)
+    assert far.shape == (0, 2)
+
+
+@pytest.mark.parametrize("points", [np.zeros((3, 2)), np.full((4, 2), np.nan), np.zeros((4, 3))])
+def test_what_is_no_place_is_refused(points):
+    four = descriptors(4, 0)
+    with pytest.raises(ValueError, match="finite"):
+        nearest_neighbours.match_near(four, points, four, np.zeros((4, 2)), 1.0, nearest_neighbours.Config())
+    with pytest.raises(ValueError, match="reach"):
+        nearest_neighbours.match_near(four, np.zeros((4, 2)), four, np.zeros((4, 2)), 0.0, nearest_neighbours.Config())
+
+
 def test_the_most_distinct_matches_come_first():
     first, second = pairs(60, 40, noise=0.08)
     found = nearest_neighbours.match(first, second, nearest_neighbours.Config(ratio=1.0))

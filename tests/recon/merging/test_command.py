@@ -7,9 +7,12 @@ import json
 import numpy as np
 import pytest
 
+import splatnode
 from splatnode.command_line import main
+from splatnode.recon.occupancy.occupancy_map import State
 from splatnode.recon.result.export import read_cameras, read_gaussians
 from splatnode.recon.result.pieces import pieces_of
+from splatnode.recon.result.verdict import Code
 from splatnode.recon.result.whole import read_whole
 from tests.support.walk import place, walk, write_walk
 
@@ -38,6 +41,20 @@ def test_a_map_becomes_one_result(merged_out):
     assert len(read_cameras(folder / "cameras.json")) == 6
     listed = json.loads((folder / "manifest.json").read_text())["files"]
     assert {"scene.ply", "levels.json", "colmap/points3D.txt", "preview.png", "pieces/scene-0002.ply"} <= set(listed)
+
+
+AHEAD = np.array([[0.6, 0.0, 0.5], [2.4, 0.0, 0.6]])  # between the wall and the cameras: of the first scene, the second
+
+
+@pytest.mark.parametrize("second", [Code.OK, Code.OK_ROUGH])
+def test_free_space_is_mapped_through_all_scenes_that_are_known_well(tmp_path, second):
+    out = write_walk(tmp_path / "out", second=second)
+    assert main(["merge", str(out)]) == 0
+    found = splatnode.load(out / "map-scene-0001").map(voxel=0.05)
+    mapped = State.FREE if second is Code.OK else State.NOT_SEEN
+    assert found.at(AHEAD).tolist() == [State.FREE, mapped]
+    on_wall = AHEAD * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
+    assert found.at(on_wall).tolist() == [State.OCCUPIED, State.OCCUPIED if second is Code.OK else State.NOT_SEEN]
 
 
 def test_the_pieces_are_the_whole(merged_out):

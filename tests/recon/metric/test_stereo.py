@@ -63,7 +63,7 @@ def landmarks() -> Landmarks:
         photograph_of=np.concatenate(of),
         names=tuple(known()),
         Ts_world_camera=np.stack([view.T_world_camera for view in views]),
-        lenses=KnownLenses(focals, np.zeros(2), np.zeros((2, 2)), shapes),
+        lenses=KnownLenses(focals, np.zeros((2, 2)), np.zeros((2, 2)), shapes),
         rotation_bounds=np.zeros(2),
         centre_bounds=np.zeros(2),
         noise_px=0.3,
@@ -75,7 +75,7 @@ def known() -> dict[str, View]:
     for index, (T, K) in enumerate(synthetic.scene_cameras(PLACE)):
         smaller = T.copy()
         smaller[:3, 3] /= UNIT
-        found[synthetic.frame_name(index)] = View(smaller, K[0, 0] / PLACE.width, 0.0, np.zeros(2), 0.0)
+        found[synthetic.frame_name(index)] = View(smaller, K[0, 0] / PLACE.width, *np.zeros((2, 2)), 0.0)
     return found
 
 

@@ -56,7 +56,7 @@ def test_factors_scale_rows(computed_by):
     torch.testing.assert_close(params["x"].detach()[:, 0], torch.tensor([0.0, -0.1, -0.2, -0.05]))
 
 
-def test_parameters_without_gradient_stay():
+def test_parameters_without_gradient_stay(computed_by):
     params = random_params(1)
     before = params["means"].detach().clone()
     optimizer = Adam(params, dict.fromkeys(SHAPES, 0.1))
@@ -88,7 +88,7 @@ def test_old_rows_go_on_as_if_nothing_was_added_or_removed(computed_by):
     step_both(torch.tensor([0, 2, 3, 5]))
 
 
-def test_a_new_row_starts_without_a_past():
+def test_a_new_row_starts_without_a_past(computed_by):
     params = {"x": leaf(torch.zeros(2))}
     optimizer = Adam(params, {"x": 0.1})
     params["x"].grad = torch.ones(2)
@@ -100,7 +100,7 @@ def test_a_new_row_starts_without_a_past():
     assert moved.tolist() == [False, True, False]  # only what had a past goes on without a gradient
 
 
-def test_autograd_notices_the_change():
+def test_autograd_notices_the_change(computed_by):
     param = leaf(torch.ones(3))
     optimizer = Adam({"x": param}, {"x": 0.1})
     square = (param * param).sum()

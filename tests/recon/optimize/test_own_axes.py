@@ -3,7 +3,14 @@ import pytest
 import torch
 
 from splatnode.recon.optimize import own_axes
-from splatnode.recon.optimize.own_axes import LARGEST_EXTENT, Shifts, along_axes, in_world, turned_by_torch
+from splatnode.recon.optimize.own_axes import (
+    LARGEST_EXTENT,
+    Shifts,
+    along_axes,
+    axes_by_torch,
+    in_world,
+    turned_by_torch,
+)
 from splatnode.recon.scene.gaussians import Gaussians
 
 pytestmark = pytest.mark.numerical
@@ -41,7 +48,7 @@ def test_derivatives_by_offsets_are_those_by_the_chain_rule():
     some = random_gaussians()
     offsets = torch.zeros(len(some), 3, requires_grad=True)
     weights = torch.rand(len(some), 3, generator=torch.Generator().manual_seed(1))
-    (turned_by_torch(offsets, some.quats, some.log_scales, to_world=True) * weights).sum().backward()
+    (turned_by_torch(axes_by_torch(some.quats, some.log_scales), offsets, to_world=True) * weights).sum().backward()
     assert along_axes(weights, some).numpy() == pytest.approx(offsets.grad.numpy(), abs=1e-6)
 
 
@@ -50,7 +57,7 @@ def test_the_core_computes_what_torch_computes(to_world: bool):
     some = random_gaussians()
     vectors = torch.randn(len(some), 3, generator=torch.Generator().manual_seed(2))
     function = in_world if to_world else along_axes
-    expected = turned_by_torch(vectors, some.quats, some.log_scales, to_world)
+    expected = turned_by_torch(axes_by_torch(some.quats, some.log_scales), vectors, to_world)
     assert function(vectors, some).numpy() == pytest.approx(expected.numpy(), abs=1e-5)
 
 

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from splatnode.recon import core
-from splatnode.recon.optimize import photometric_loss, photometric_reference
+from splatnode.recon.optimize import photometric_by_torch, photometric_loss, photometric_reference
 from splatnode.recon.optimize.photometric_loss import PhotometricLoss
+from splatnode.recon.rasterize import dispatch
 
 
 def textured(height: int, width: int, seed: int) -> tuple[Tensor, Tensor]:
@@ -41,6 +42,40 @@ def test_value_and_gradient(height, width, weighted, instruction_set, monkeypatc
     error = (actual_rgb.grad.double() / 3 - expected_rgb.grad).norm() / expected_rgb.grad.norm()
     assert error < 2e-5
     assert actual_rgb.grad[weights == 0].abs().sum() == 0
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 1), (3, 50), (37, 5), (48, 64)])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_the_closed_form_is_the_references(height, width, weighted):
+    rgb, target = textured(height, width, height)
+    weights = torch.rand(height, width, generator=torch.Generator().manual_seed(2)).double() if weighted else None
+    if weights is not None:
+        weights[weights < 0.3] = 0
+        weights[0, 0] = 1
+    target = target.permute(2, 0, 1).contiguous()
+    expected_rgb = rgb.clone().requires_grad_()
+    expected = photometric_reference.photometric_loss(expected_rgb, target, 0.4, weights)
+    expected.backward()
+    weighing = photometric_by_torch.weights_of(target, 0.4, weights)
+    value, gradient = photometric_by_torch.evaluated(rgb.permute(2, 0, 1), target, weighing)
+    assert value.item() == pytest.approx(expected.item(), rel=1e-10)
+    torch.testing.assert_close(gradient.permute(1, 2, 0), expected_rgb.grad, rtol=1e-8, atol=1e-12)
+    assert gradient.permute(1, 2, 0).is_contiguous()  # as the rasteriser wants it
+
+
+def test_where_torch_computes_single_precision_suffices(monkeypatch):
+    monkeypatch.setattr(dispatch, "by_core", lambda tensor: False)
+    rgb, target = textured(60, 80, 5)
+    rgb, target = 0.02 * rgb + 0.9, 0.02 * target + 0.9  # bright and almost plain: where variances lose most digits
+    expected_rgb, actual_rgb = rgb.clone().requires_grad_(), rgb.float().requires_grad_()
+    expected = photometric_reference.photometric_loss(expected_rgb, target.permute(2, 0, 1), 0.4)
+    expected.backward()
+    actual = PhotometricLoss(target, 0.4)(actual_rgb)
+    (3 * actual).backward()
+    assert actual.item() == pytest.approx(expected.item(), rel=1e-4)
+    assert expected_rgb.grad is not None and actual_rgb.grad is not None
+    error = (actual_rgb.grad.double() / 3 - expected_rgb.grad).norm() / expected_rgb.grad.norm()
+    assert error < 1e-3
 
 
 def test_equal_images_have_no_loss(computed_by):

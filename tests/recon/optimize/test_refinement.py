@@ -17,6 +17,9 @@ from splatnode.recon.optimize.losses.loss import LossChoice
 from splatnode.recon.optimize.pseudo_views import PseudoView
 from splatnode.recon.optimize.refinement import Config, Rates, refine
 from splatnode.recon.priors.pointmap import Pointmap
+from splatnode.recon.result.sources import SHELL
+from splatnode.recon.scene import pixelwise
+from splatnode.recon.scene.gaussians import logit
 from splatnode.recon.scene.scene import Scene, TrainingView
 from tests.support.known_scene import disturbed, photographed, render, turned
 
@@ -256,3 +259,25 @@ def test_the_steps_of_cameras_fall_by_a_part_of_their_own(truth):
     same_gaussians, slower_camera = moved(final_pose=0.01)
     assert slower_gaussians == pytest.approx(0.1 * gaussians, rel=1e-3) and same_camera == camera
     assert slower_camera == pytest.approx(0.1 * camera, rel=1e-2) and same_gaussians == gaussians
+
+
+def test_a_begun_scene_starts_soft_and_one_that_goes_on_does_not(truth):
+    gaussians = replace(truth.gaussians, logit_opacities=torch.full_like(truth.gaussians.logit_opacities, logit(0.5)))
+    sources = torch.zeros_like(gaussians.source_frame)
+    sources[0] = SHELL
+    scene = replace(truth, gaussians=replace(gaussians, source_frame=sources), iterations=0)
+    still = plain(iterations=refinement.MIN_SOFT, rates=FROZEN)
+    soft = last(scene, still).gaussians.opacities
+    assert soft[0] == pytest.approx(0.5) and soft[1:].tolist() == pytest.approx([0.1] * (len(soft) - 1))
+    gone_on, as_seeded = replace(scene, iterations=1), structs.replace(still, first_opacity=None)
+    few, limited = plain(iterations=2, rates=FROZEN), time.monotonic() + 60
+    for end in (last(gone_on, still), last(scene, as_seeded), last(scene, few), last(scene, still, deadline=limited)):
+        assert end.gaussians.opacities.tolist() == pytest.approx([0.5] * len(soft))
+
+
+def test_what_is_as_soft_already_is_left_to_the_bit(truth):
+    from_photographs = replace(truth.gaussians, source_frame=torch.zeros_like(truth.gaussians.source_frame))
+    soft = refinement.softened(from_photographs, 0.1)
+    assert soft.opacities.max() < 0.11
+    again = refinement.softened(soft, pixelwise.Config().opacity)
+    assert torch.equal(soft.logit_opacities, again.logit_opacities)

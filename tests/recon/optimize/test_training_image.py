@@ -43,7 +43,7 @@ def test_a_render_may_be_brighter_where_the_photograph_is_saturated(scale):
     saturated = np.zeros((HEIGHT, WIDTH, 3), bool)
     saturated[:, :20] = True
     K = torch.tensor([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
-    view = TrainingView("a", 0, image, torch.eye(4), K, exposure=Exposure((2.0, 2.0, 2.0), saturated))
+    view = TrainingView("a", 0, image, torch.eye(4), K, exposure=Exposure((2.0, 2.0, 2.0), 0.0, saturated))
     compared = training_image(view, np.ones((HEIGHT, WIDTH), bool), scale, 0.0)
     for level, expected in ((0.9, False), (0.2, True)):
         render = torch.full((compared.height, compared.width, 3), level, requires_grad=True)
@@ -60,7 +60,7 @@ def test_what_is_left_of_the_exposure_is_a_gain_that_fits_the_render():
     render = 1.1 * torch.from_numpy(image).float() / 255
     as_it_is = training_image(TrainingView("a", 0, image, torch.eye(4), K), shown, 1.0, 0.0)
     exposed = training_image(
-        TrainingView("a", 0, image, torch.eye(4), K, exposure=Exposure((2.0, 2.0, 2.0), None)), shown, 1.0, 0.0
+        TrainingView("a", 0, image, torch.eye(4), K, exposure=Exposure((2.0, 2.0, 2.0), 0.0, None)), shown, 1.0, 0.0
     )
     assert float(exposed.loss(render)) < 0.2 * float(as_it_is.loss(render))
     assert float(exposed.loss(2 * render)) > float(exposed.loss(render))  # the prior: not any gain will do

@@ -13,13 +13,16 @@ from splatnode.recon.rasterize import device, dispatch, gsplat, reference
 from splatnode.recon.rasterize.device import DeviceUnavailable
 from tests.support import gsplat_by_torch
 from tests.support.rasterize_cases import (
+    CASES,
     HEIGHT,
     NAMES,
     WIDTH,
+    changed,
     moderate,
     random_case,
     relative_error,
     render_and_differentiate,
+    single,
 )
 
 
@@ -41,9 +44,52 @@ def test_images_and_all_gradients_are_the_references(by_torch, channels, antiali
         assert (gradient - expected_gradient).norm() <= 1e-4 * expected_gradient.norm(), name
 
 
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize("made", CASES)
+def test_known_intrinsics_change_nothing_but_the_time(by_torch, made, antialias):
+    """Without a gradient of K gsplat gets the Gaussians in the world, otherwise in the camera's frame."""
+
+    def known(*tensors, **options):
+        return gsplat.rasterize(*tensors[:6], tensors[6].detach(), **options)
+
+    expected_images, expected = render_and_differentiate(gsplat.rasterize, made(35), antialias=antialias)
+    actual_images, actual = render_and_differentiate(known, made(35), antialias=antialias)
+    for image, expected_image in zip(actual_images, expected_images, strict=True):
+        torch.testing.assert_close(image, expected_image, rtol=0, atol=1e-6)
+    for name, gradient, expected_gradient in zip(NAMES[:6], actual, expected, strict=False):
+        assert relative_error(gradient, expected_gradient) < 1e-5, name
+    assert actual[6].abs().max() == 0
+
+
+@pytest.mark.parametrize("bases", [1, 4, 9, 16])
+def test_colours_of_every_degree(by_torch, bases):
+    case = moderate(36)
+    harmonics = torch.randn(len(case.means), bases, 3, generator=torch.Generator().manual_seed(0)).double()
+    case = changed(case, sh=0.5 * harmonics)
+    expected_images, expected = render_and_differentiate(reference.rasterize, case, channels=("rgb",))
+    actual_images, actual = render_and_differentiate(gsplat.rasterize, case, channels=("rgb",))
+    assert (actual_images[0] - expected_images[0]).abs().max() < 1e-4
+    for name, gradient, expected_gradient in zip(NAMES, actual, expected, strict=True):
+        assert relative_error(gradient, expected_gradient) < 1e-4, name
+
+
+@pytest.mark.parametrize(("beside", "drawn"), [(0.29, True), (0.31, False)])
+@pytest.mark.parametrize("direction", [(-1, 0), (1, 0), (0, -1), (0, 1)])
+@pytest.mark.parametrize("known", [False, True])
+def test_what_is_too_far_beside_the_image_is_not_drawn(by_torch, beside, drawn, direction, known):
+    """However large it is: a ball as large as its distance."""
+    half = torch.tensor([WIDTH / 2, HEIGHT / 2])
+    pixel = half + torch.tensor(direction) * (half + beside * 2 * half)
+    K = torch.tensor([[20.0, 0, WIDTH / 2], [0, 20, HEIGHT / 2], [0, 0, 1]], requires_grad=not known)
+    x, y = ((pixel - half) / 20 * 2).tolist()
+    one = single(mean=(x, y, 2.0), opacity=0.9, scale=2.0)
+    render = gsplat.rasterize(*one[:6], K, WIDTH, HEIGHT, channels=("alpha",))
+    assert render.alpha is not None and bool(render.alpha.max() > 0) == drawn
+
+
 @pytest.mark.parametrize("packed", [False, True])
 def test_it_is_what_gsplat_makes_of_quaternions_harmonics_and_a_pose(by_torch, packed):
-    """We hand it covariances and colours in the camera's frame; this is the usual way, with gsplat's gradients."""
+    """Of a camera without distortion; by gsplat's function for everything."""
     import gsplat as package  # pyright: ignore[reportMissingImports]
 
     ours, theirs = moderate(32).tensors(), moderate(32).tensors()
@@ -70,8 +116,8 @@ def test_a_background_shows_through_what_alpha_leaves(by_torch, monkeypatch):
 
     tensors, white = moderate(33).tensors(), torch.full((1, 3), 1.0).double()
     black = gsplat.rasterize(*tensors, width=WIDTH, height=HEIGHT, channels=("rgb", "alpha"))
-    plain = package.rasterization  # pyright: ignore[reportAttributeAccessIssue]
-    monkeypatch.setattr(package, "rasterization", lambda *a, **options: plain(*a, **options, backgrounds=white))
+    plain = package.rasterize_to_pixels  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setattr(package, "rasterize_to_pixels", lambda *given: plain(*given, backgrounds=white))
     on_white = gsplat.rasterize(*tensors, width=WIDTH, height=HEIGHT, channels=("rgb", "alpha"))
     assert black.rgb is not None and black.alpha is not None
     torch.testing.assert_close(on_white.rgb, black.rgb + (1 - black.alpha)[..., None], rtol=0, atol=1e-6)

@@ -13,7 +13,7 @@ from splatnode.recon.core import default_threads, set_threads
 from splatnode.recon.registration import bundle
 
 NOISE_PX = 0.3
-PRIOR = bundle.LensPrior(np.log([950.0]), np.array([0.3]), np.array([0.1]), np.array([10.0]))
+PRIOR = bundle.LensPrior(np.log([950.0]), np.array([0.3]), np.array([[0.1, 0.05]]), np.array([10.0]))
 
 
 def problem(num_points: int = 60, seed: int = 0, noise_px: float = NOISE_PX) -> bundle.Problem:
@@ -29,7 +29,7 @@ def problem(num_points: int = 60, seed: int = 0, noise_px: float = NOISE_PX) -> 
         translations=-np.einsum("cij,cj->ci", rotations, centres),
         lens_of_camera=np.zeros(4, np.int64),
         log_focals=np.log([900.0]),
-        radials=np.array([0.03]),
+        radials=np.array([[0.03, -0.02]]),
         shifts=np.array([[4.0, -3.0]]),
         points=points,
         camera_of=camera_of,
@@ -53,7 +53,7 @@ def disturbed(true: bundle.Problem, seed: int = 1) -> bundle.Problem:
         rotations=turns @ true.rotations,
         translations=true.translations + moves,
         log_focals=true.log_focals + 0.1,
-        radials=np.zeros(1),
+        radials=np.zeros((1, 2)),
         shifts=np.zeros((1, 2)),
         points=true.points + generator.normal(size=true.points.shape) * 0.05,
     )
@@ -66,12 +66,12 @@ def turned_deg(one: bundle.Problem, other: bundle.Problem) -> float:
 
 def test_what_was_disturbed_comes_back_exactly_without_noise():
     true = problem(noise_px=0.0)
-    prior = replace(PRIOR, sigmas=np.array([1e3]), radial_sigmas=np.array([1e3]), shift_sigmas=np.array([1e6]))
+    prior = replace(PRIOR, sigmas=np.array([1e3]), radial_sigmas=np.full((1, 2), 1e3), shift_sigmas=np.array([1e6]))
     found = bundle.adjust(disturbed(true), prior, bundle.Config(tolerance=1e-14, max_iterations=200))
     assert bundle.reprojection_errors(found).max() < 1e-4
     assert turned_deg(found, true) < 1e-4
     assert np.exp(found.log_focals[0]) == pytest.approx(900.0, abs=0.01)
-    assert found.radials[0] == pytest.approx(0.03, abs=1e-5)
+    np.testing.assert_allclose(found.radials[0], [0.03, -0.02], atol=1e-4)
     np.testing.assert_allclose(found.shifts[0], [4.0, -3.0], atol=0.01)
 
 
@@ -90,16 +90,16 @@ def test_scipy_finds_no_lower_cost_from_where_it_ends():
             rotations=rotations,
             translations=translations,
             log_focals=found.log_focals + step[18],
-            radials=found.radials + step[19],
-            shifts=found.shifts + step[20:22],
-            points=found.points + step[22:].reshape(-1, 3),
+            radials=found.radials + step[19:21],
+            shifts=found.shifts + step[21:23],
+            points=found.points + step[23:].reshape(-1, 3),
         )
 
     def cost(step: np.ndarray) -> float:
         at = moved(step)
         pulls = (
             ((at.log_focals - PRIOR.log_focals) / PRIOR.sigmas) ** 2
-            + (at.radials / PRIOR.radial_sigmas) ** 2
+            + ((at.radials / PRIOR.radial_sigmas) ** 2).sum(1)
             + ((at.shifts / PRIOR.shift_sigmas[:, None]) ** 2).sum(1)
         )
         return bundle.robust_cost(at, config) + float(pulls.sum())
@@ -107,11 +107,11 @@ def test_scipy_finds_no_lower_cost_from_where_it_ends():
     def residuals(step: np.ndarray) -> np.ndarray:
         return np.sqrt([cost(step)])  # its square is the cost
 
-    start = cost(np.zeros(22 + 60))
-    gradient = np.array([(cost(d) - cost(-d)) / 2e-6 for d in np.eye(82) * 1e-6])
+    start = cost(np.zeros(23 + 60))
+    gradient = np.array([(cost(d) - cost(-d)) / 2e-6 for d in np.eye(83) * 1e-6])
     at_start = bundle.robust_cost(disturbed(problem(num_points=20)), config)
     assert np.abs(gradient).max() < 1e-3 * at_start
-    polished = least_squares(residuals, np.zeros(82), max_nfev=20)
+    polished = least_squares(residuals, np.zeros(83), max_nfev=20)
     assert start <= 2.0 * polished.cost * (1.0 + 1e-6)
 
 
@@ -125,9 +125,9 @@ def test_outliers_hardly_move_the_cameras():
 
 def test_a_sigma_of_zero_fixes_a_parameter():
     start = disturbed(problem())
-    found = bundle.adjust(start, replace(PRIOR, sigmas=np.zeros(1), radial_sigmas=np.zeros(1)), bundle.Config())
+    found = bundle.adjust(start, replace(PRIOR, sigmas=np.zeros(1), radial_sigmas=np.zeros((1, 2))), bundle.Config())
     assert found.log_focals[0] == start.log_focals[0]
-    assert found.radials[0] == 0.0
+    assert not found.radials.any()
     assert np.abs(found.shifts).max() > 0.0
     np.testing.assert_array_equal(found.rotations[0], start.rotations[0])
 

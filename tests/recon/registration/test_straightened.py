@@ -14,7 +14,14 @@ from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.matching import config as matching
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.register import Registration
-from splatnode.recon.registration.straightened import LEAST_SHIFT, corner_shift, straight, straightened, with_lenses
+from splatnode.recon.registration.straightened import (
+    LEAST_SHIFT,
+    corner_shift,
+    radial_of,
+    straight,
+    straightened,
+    with_lenses,
+)
 from tests.support.row_of_views import NO_FEATURES, graph_of, registration_of
 
 LENS = Intrinsics(160, 120, 150.0, 150.0, 80.5, 59.5, "estimated", (-0.25, 0.0, 0.0, 0.0))
@@ -44,7 +51,7 @@ def seen(lens: Intrinsics) -> tuple[ViewGraph, Registration, np.ndarray]:
         registration_of(1).cameras[0],
         focal=lens.fx,
         principal=np.array([lens.cx, lens.cy]),
-        radial=lens.distortion[0],
+        radial=np.array(radial_of(lens)),
     )
     registration = replace(
         registration_of(1),
@@ -62,6 +69,8 @@ def test_a_corner_moves_by_the_cube_of_its_slope():
     assert corner_shift(lens) == pytest.approx(0.1 * 1.0**3 * 250 / 400)  # the corner is at a slope of 1
     assert corner_shift(replace(lens, distortion=(-0.1,))) == pytest.approx(-0.0625)
     assert corner_shift(replace(lens, distortion=())) == corner_shift(None) == 0.0
+    second = replace(lens, distortion=(0.0, 0.1))
+    assert corner_shift(second) == pytest.approx(0.0625)  # and to the fifth power
 
 
 def test_observations_are_those_of_the_pinhole():
@@ -69,14 +78,15 @@ def test_observations_are_those_of_the_pinhole():
     straight_graph, found = straightened(graph, registration)
     (keyframe,), (camera,) = straight_graph.keyframes, found.cameras
     lens = keyframe.lens
-    assert lens == LENS and camera.radial == 0.0
+    assert lens == LENS and not camera.radial.any()
     at = points[found.observed_point]
     expected = camera.focal * at[:, :2] / at[:, 2:] + camera.principal
     np.testing.assert_allclose(found.observed_pixels, expected, atol=1e-3)
     shown = np.all((expected >= 0) & (expected < (160, 120)), axis=1)
     assert shown.all() and 200 < len(shown) < 400  # what the pinhole does not show is left out
     np.testing.assert_allclose(keyframe.features.points[found.observed_point], expected, atol=1e-3)
-    assert graph.keyframes[0].lens is None and registration.cameras[0].radial == -0.25  # what came is as it was
+    as_it_came = registration.cameras[0].radial.tolist()
+    assert graph.keyframes[0].lens is None and as_it_came == [-0.25, 0.0]
 
 
 def test_the_photograph_is_that_of_the_pinhole():
@@ -102,7 +112,7 @@ def test_a_large_photograph_and_its_mask_are_straightened_at_twice_the_modelled_
 
 @pytest.mark.parametrize("radial", [0.0, 0.01, -0.03])
 def test_nothing_changes_where_the_shift_is_small(radial):
-    lens = replace(LENS, distortion=(radial,))
+    lens = replace(LENS, distortion=(radial, 0.0))
     assert abs(corner_shift(lens)) < LEAST_SHIFT
     graph, registration, _ = seen(lens)
     same = straightened(graph, registration)
@@ -111,7 +121,7 @@ def test_nothing_changes_where_the_shift_is_small(radial):
 
 def test_a_lens_that_folds_the_picture_over_is_not_believed(caplog):
     graph, registration, _ = seen(LENS)
-    folds = replace(registration, cameras=(replace(registration.cameras[0], radial=-3.0),))
+    folds = replace(registration, cameras=(replace(registration.cameras[0], radial=np.array([-3.0, 0.0])),))
     found = straightened(graph, folds)
     assert found[0] is graph and found[1] is folds
     assert "stay as they are" in caplog.text
@@ -119,7 +129,7 @@ def test_a_lens_that_folds_the_picture_over_is_not_believed(caplog):
 
 def test_only_the_photographs_of_a_bending_lens_are_straightened():
     graph, registration = graph_of(2), registration_of(2)
-    cameras = registration.cameras[0], replace(registration.cameras[1], radial=-0.4)
+    cameras = registration.cameras[0], replace(registration.cameras[1], radial=np.array([-0.4, 0.0]))
     found, straight_registration = straightened(graph, replace(registration, cameras=cameras))
     assert found.keyframes[0] is graph.keyframes[0] and straight_registration.cameras[0] is cameras[0]
     assert found.keyframes[1].lens is not None and isinstance(found.keyframes[1].frame, Frame)
@@ -131,5 +141,6 @@ def test_a_known_lens_is_that_of_all_cameras_that_share_it():
     apart = replace(registration, cameras=(*shared, replace(other, lens=1)))
     lens = Intrinsics(64, 48, 80.0, 80.0, 33.0, 23.0, "estimated", (-0.4, 0.0, 0.0, 0.0))
     found = with_lenses(apart, graph, {"00.png": lens, "02.png": None}).cameras
-    assert [(camera.focal, *camera.principal, camera.radial) for camera in found[:2]] == [(40.0, 16.5, 11.5, -0.4)] * 2
+    known = [(camera.focal, *camera.principal, *camera.radial) for camera in found[:2]]
+    assert known == [(40.0, 16.5, 11.5, -0.4, 0.0)] * 2
     assert found[2] is apart.cameras[2]

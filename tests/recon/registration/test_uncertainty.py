@@ -19,7 +19,7 @@ CONFIG = bundle.Config(robust_px=50.0, noise_px=NOISE_PX)  # nearly squares, for
 QUIET = bundle.Config(
     robust_px=50.0, noise_px=0.05, tolerance=1e-9
 )  # errors so small that they are linear in the noise
-FIXED_LENS = bundle.LensPrior(np.log([900.0]), np.zeros(1), np.zeros(1), np.zeros(1))
+FIXED_LENS = bundle.LensPrior(np.log([900.0]), np.zeros(1), np.zeros((1, 2)), np.zeros(1))
 ALL = (0, 1, 2, 3)
 
 
@@ -65,7 +65,7 @@ def test_ellipsoids_of_cameras_that_know_their_depth_least_lie_along_the_view():
     generator = np.random.default_rng(0)
     rotations = np.stack([cv2.Rodrigues(vector)[0] for vector in generator.normal(size=(30, 3))])
     ring = bundle.without_points(
-        rotations, generator.normal(size=(30, 3)), np.zeros(30, np.int64), np.zeros(1), np.zeros(1), np.zeros((1, 2))
+        rotations, generator.normal(size=(30, 3)), np.zeros(30, np.int64), np.zeros(1), *np.zeros((2, 1, 2))
     )
     of_pose = np.diag(np.square([0.0, 0.0, 0.0, 0.001, 0.001, 0.01]))
     covariance = bundle.Covariance(np.kron(np.eye(30), of_pose), np.zeros(1))

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
+from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.recon.result.sources import frame_of
 from splatnode.recon.scene import background, light
 from splatnode.recon.scene.growth import NUM_NEIGHBOURS, grow, limited, without_views
@@ -35,6 +37,20 @@ def test_a_further_view_is_compared_with_its_neighbours_only():
     near = maps_of(range(count - NUM_NEIGHBOURS - 1, count))  # growing does not ask for the maps of the others
     grown = grow(scene_of(count - 1, graph), near, graph, registration_of(count), CONFIG, LIGHT)
     assert len(grown.views) == count
+
+
+def test_a_further_view_that_shares_too_little_has_the_light_that_its_camera_tells():
+    told = {index: ExposureSettings(0.01 if index < 3 else 0.04, 100.0) for index in range(4)}
+    gain = 4.0 ** (1.0 / 2.2)
+    for exposures, expected in ((told, gain), ({}, None), ({3: told[3]}, None)):
+        graph = graph_of(4, exposures)
+        grown = grow(scene_of(3, graph), maps_of(range(4)), graph, registration_of(4), CONFIG, LIGHT)
+        joined, image = grown.views[-1], graph.keyframes[3].image
+        if expected is None:
+            assert joined.exposure is None and np.array_equal(joined.image, image)
+        else:
+            assert joined.exposure is not None and joined.exposure.gains == pytest.approx((expected,) * 3, rel=0.05)
+            assert joined.image.mean() == pytest.approx(image.mean() / expected, rel=0.05)
 
 
 def test_without_a_further_view_nothing_changes():

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
+import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.scene.light import Config, alike, differing, joining, log_gains, relit
+from splatnode.recon.scene.scene import Exposure
 
 PLACE = synthetic.Config(views=5, width=240, height=180)
+LIT = {"0": Exposure((1.0, 1.0, 1.0), 0.0, None)}  # the light of the scene was changed
 GAINS = np.array([[0.5, 0.45, 0.5], [1.0, 1.0, 1.1], [2.0, 2.0, 1.8], [1.0, 1.0, 1.0], [0.8, 0.9, 0.8]])
 
 
@@ -32,8 +37,8 @@ def exposed(images: list[np.ndarray], gains: np.ndarray = GAINS) -> list[np.ndar
     return [np.clip(np.rint(image * own), 0, 255).astype(np.uint8) for image, own in zip(images, gains, strict=True)]
 
 
-def by_name(images: list[np.ndarray]) -> dict[str, np.ndarray]:
-    return {f"{index}": image for index, image in enumerate(images)}
+def by_name(values: list[Any]) -> dict[str, Any]:
+    return {f"{index}": value for index, value in enumerate(values)}
 
 
 def test_gains_are_found_within_three_per_cent():
@@ -99,16 +104,16 @@ def test_photographs_that_share_nothing_keep_their_light():
 def test_a_photograph_that_joins_others_gets_the_exposure_by_which_it_differs_from_them():
     maps, images = place()
     changed = by_name(exposed(images, np.where(np.arange(5)[:, None] == 4, [0.6, 0.5, 0.7], 1.0)))
-    found = joining(maps, changed, {"4"}, False, Config())
+    found = joining(maps, changed, {"4": 0.0}, {}, Config())
     assert set(found) == {"4"} and np.abs(np.array(found["4"].gains) / [0.6, 0.5, 0.7] - 1.0).max() < 0.03
 
 
 def test_a_photograph_that_joins_as_the_others_are_is_left_as_it_is_where_they_are():
     maps, images = place()
     alike_all = by_name(exposed(images, np.ones((5, 3))))
-    assert joining(maps, alike_all, {"4"}, False, Config()) == {}
-    assert joining(maps, alike_all, {"4"}, True, Config(enabled=False)) == {}
-    (found,) = joining(maps, alike_all, {"4"}, True, Config()).values()
+    assert joining(maps, alike_all, {"4": 0.0}, {}, Config()) == {}
+    assert joining(maps, alike_all, {"4": 0.0}, LIT, Config(enabled=False)) == {}
+    (found,) = joining(maps, alike_all, {"4": 0.0}, LIT, Config()).values()
     assert np.abs(np.array(found.gains) - 1.0).max() < 0.03
 
 
@@ -118,3 +123,79 @@ def test_a_photograph_is_brought_to_the_light_of_its_scene_by_its_gains_alone():
     shown, exposure = relit(image, (2.0, 2.0, 1.8))
     assert exposure is not None and np.array_equal(shown, alike(image, exposure))
     assert exposure.saturated is not None and np.array_equal(exposure.saturated, image >= 250)
+
+
+def apart() -> list[Pointmap]:
+    """Photographs that share nothing."""
+    away = np.eye(4)
+    maps = []
+    for index, pointmap in enumerate(place()[0]):
+        away[:3, 3] = 100.0 * index
+        maps.append(replace(pointmap, T_world_camera=away.copy()))
+    return maps
+
+
+GREY = np.array([0.5, 1.0, 2.0, 1.0, 0.8])
+TOLD = by_name(list(np.log(GREY) + 3.0))  # up to an offset, which no camera tells
+
+
+def gains_of(found: Mapping[str, Exposure]) -> np.ndarray:
+    """(V, 3) in the order of the names."""
+    return np.array([found[name].gains for name in sorted(found)])
+
+
+def test_photographs_that_share_nothing_get_the_light_that_their_cameras_tell():
+    changed = by_name(exposed(place()[1], GREY[:, None]))
+    assert differing(apart(), changed, Config()) == {}
+    found = gains_of(differing(apart(), changed, Config(), TOLD))
+    assert found == pytest.approx(np.repeat(GREY[:, None], 3, 1), rel=0.03)
+    some = {name: TOLD[name] for name in ("0", "1", "2")}
+    assert gains_of(differing(apart(), changed, Config(), some))[:3] == pytest.approx(found[:3], rel=0.03)
+    assert differing(apart(), changed, Config(), {"2": TOLD["2"]}) == {}  # one alone tells no difference
+    assert differing(apart(), changed, Config(enabled=False), TOLD) == {}
+
+
+def test_a_small_or_a_drifting_difference_that_cameras_tell_is_left():
+    along = np.arange(5) - 2
+    assert differing(apart(), by_name(place()[1]), Config(), by_name(list(0.05 * along))) == {}
+    maps, images = place()
+    drifting = by_name(exposed(images, 1.2 ** along[:, None]))
+    assert differing(maps, drifting, Config(), by_name(list(np.log(1.2) * along))) == {}
+
+
+def test_what_photographs_share_counts_for_more_than_what_their_cameras_tell():
+    maps, images = place()
+    changed = by_name(exposed(images))
+    alone = gains_of(differing(maps, changed, Config()))
+    assert gains_of(differing(maps, changed, Config(), TOLD)) == pytest.approx(alone, rel=0.01)
+    for nonsense in (np.log(0.2), np.log(5.0), 20.0):
+        wrong = TOLD | {"1": TOLD["1"] + nonsense}
+        assert gains_of(differing(maps, changed, Config(), wrong)) == pytest.approx(alone, rel=0.03)
+    upside_down = {name: -told for name, told in TOLD.items()}
+    assert gains_of(differing(maps, changed, Config(), upside_down)) == pytest.approx(alone, rel=0.03)
+    assert differing(maps, by_name(images), Config(), TOLD) == {}
+
+
+def test_a_wrong_word_of_a_camera_that_alone_could_spoil_its_photograph_is_not_believed():
+    found = gains_of(differing(apart(), by_name(place()[1]), Config(), TOLD | {"1": TOLD["1"] + 20.0}))
+    assert found[1] == pytest.approx([1.0] * 3, rel=0.25)
+
+
+def test_without_a_word_of_these_photographs_all_is_the_same_to_the_bit():
+    maps, images = place()
+    changed = by_name(exposed(images))
+    plain, other = differing(maps, changed, Config()), differing(maps, changed, Config(), {"elsewhere": 2.0})
+    assert [each.gains for each in plain.values()] == [each.gains for each in other.values()]
+
+
+def test_a_photograph_that_joins_others_and_shares_nothing_has_the_light_that_its_camera_tells():
+    changed = by_name(exposed(place()[1], GREY[:, None]))
+    lit = {name: Exposure((gain, gain, gain), 0.0, None) for name, gain in zip("0123", GREY[:4], strict=True)}
+    in_light = {name: alike(image, lit[name]) if name in lit else image for name, image in changed.items()}
+    (found,) = joining(apart(), in_light, {"4": 0.0}, lit, Config(), TOLD).values()
+    assert np.array(found.gains) == pytest.approx([0.8] * 3, rel=0.03)
+    told = {name: 0.0 for name in "0123"} | {"4": np.log(0.6)}
+    (joined,) = joining(apart(), changed, {"4": 0.0}, {}, Config(), told).values()
+    assert np.array(joined.gains) == pytest.approx([0.6] * 3, rel=0.03)
+    assert joining(apart(), changed, {"4": 0.0}, {}, Config(), told | {"4": np.log(0.9)}) == {}
+    assert joining(apart(), changed, {"4": 0.0}, {}, Config(), {"4": np.log(0.6)}) == {}

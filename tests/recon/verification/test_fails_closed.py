@@ -109,7 +109,7 @@ def test_a_pose_that_is_not_a_number_refuses(field, value):
     found = registration(ALL)
     camera = found.cameras[1]
     wrong = np.full_like(camera.T_world_camera, value) if field == "T_world_camera" else value
-    wrong = np.full(2, value) if field == "principal" else wrong
+    wrong = np.full(2, value) if field == "principal" else np.array([value, 0.0]) if field == "radial" else wrong
     cameras = (found.cameras[0], replace(camera, **{field: wrong}), found.cameras[2])
     given = decide(graph(3, all_pairs(3)), replace(found, cameras=cameras), GOOD, Config())
     assert given.code == Code.UNDETERMINED and "the poses themselves" in given.message

@@ -10,6 +10,7 @@ from splatnode.recon.evaluate.stability.fitting.odds import FOR
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.verification.claims import claims
+from splatnode.recon.verification.cycles import Cycles
 from splatnode.recon.verification.decision import Config, decide
 from splatnode.recon.verification.errors import Errors
 from splatnode.recon.verification.fitted import FITTED
@@ -125,7 +126,23 @@ def doubting(measure: str) -> Fitted:
     ("measure", "what", "whole", "code", "frames", "said"),
     [
         ("inlier_ratio", {2: {"inlier_ratio": 0.45}}, {"inlier_ratio": 0.5}, Code.AMBIGUOUS, (2,), "50 % of their"),
-        ("camera_inlier_ratio", {2: {"inlier_ratio": 0.45}}, {}, Code.AMBIGUOUS, (2,), "of their matches fit"),
+        ("camera_inlier_ratio", {2: {"inlier_ratio": 0.45}}, {}, Code.AMBIGUOUS, (2,), "45 % of its matches fit"),
+        (
+            "directions",
+            {2: {"inlier_ratio": 0.45}},
+            {"cycles": Cycles(4, 0.5, 1.0, 25.0)},
+            Code.AMBIGUOUS,
+            (2,),
+            "disagree by 25 degrees",
+        ),
+        (
+            "link_inlier_ratio",
+            {2: {"inlier_ratio": 0.45}},
+            {"weakest_link": replace(evidence((0, 1, 2, 3)).weakest_link, smaller_part=("2.png",), inliers=20.0)},
+            Code.AMBIGUOUS,
+            (2,),
+            "The smaller part has 1 of them",
+        ),
         ("coverage", {2: {"coverage": 0.06}}, {}, Code.AMBIGUOUS, (2,), "fills only 6 % of its picture"),
         ("confirmed", {3: {"confirmed": 2}, 1: {"confirmed": 60}}, {}, Code.AMBIGUOUS, (3,), "only 2 of its points"),
         ("patches", {1: {"patches": BY_CHANCE, "confirmed": 80}}, {}, Code.AMBIGUOUS, (1,), "could stand elsewhere"),

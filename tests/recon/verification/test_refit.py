@@ -29,7 +29,7 @@ def made_up(noise_px: float = 0.2, depth: float = 1.0, radial: float = 0.0, foca
         translations=np.stack(translations),
         lens_of_camera=np.zeros(4, np.int64),
         log_focals=np.log([FOCAL]),
-        radials=np.array([radial]),
+        radials=np.array([[radial, 0.0]]),
         shifts=np.zeros((1, 2)),
         points=points,
         camera_of=np.array([camera for camera, _ in observed]),
@@ -37,10 +37,9 @@ def made_up(noise_px: float = 0.2, depth: float = 1.0, radial: float = 0.0, foca
         pixels=np.zeros((len(observed), 2)),
     )
     pixels = bundle.project(exact)[0]
-    problem = replace(
-        exact, pixels=pixels + rng.normal(0, noise_px, pixels.shape), log_focals=np.log([focal]), radials=np.zeros(1)
-    )
-    prior = bundle.LensPrior(problem.log_focals, np.array([refit.FREE_SIGMA]), np.zeros(1), np.zeros(1))
+    seen, pinhole = pixels + rng.normal(0, noise_px, pixels.shape), np.zeros((1, 2))
+    problem = replace(exact, pixels=seen, log_focals=np.log([focal]), radials=pinhole)
+    prior = bundle.LensPrior(problem.log_focals, np.array([refit.FREE_SIGMA]), np.zeros((1, 2)), np.zeros(1))
     return refit.Fit(problem, prior, bundle.Config(robust_px=1.0), np.ones(4), np.full(1, np.nan))
 
 

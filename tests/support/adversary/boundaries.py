@@ -202,8 +202,8 @@ def _read_recording(files: stored.Files, folder: Path) -> object:
 
 
 def _read_photograph(data: bytes, folder: Path) -> object:
-    image, lens, captured_at = decode_image(data, _MAX_PIXELS)
-    return Frame(0, "a.png", 0, image, lens, captured_at=captured_at)
+    image, lens, captured_at, exposure = decode_image(data, _MAX_PIXELS)
+    return Frame(0, "a.png", 0, image, lens, captured_at=captured_at, exposure=exposure)
 
 
 _CAPTURE = {"camera": {"kind": "folder", "folder": "photos"}, "spool": {"max_mb": 5}, "reader": {"silence_s": 1.0}}
@@ -215,7 +215,10 @@ _FRAMES = Reader((WireError,), (*_WIRE.modules, f"{_MESSAGING}.keyframe_messages
 _PREVIEWS = Reader((WireError,), ("splatnode.capture.preview", f"{_MESSAGING}.jpeg"))
 _SCENES = Reader((WireError,), ("splatnode.recon.result.message",))
 _IMAGES = Reader(
-    (UnusableImage,), tuple(f"splatnode.capture.{name}" for name in ("image_file", "image_header", "exif", "exif_time"))
+    (UnusableImage,),
+    tuple(
+        f"splatnode.capture.{name}" for name in ("image_file", "image_header", "exif", "exif_time", "exposure_settings")
+    ),
 )
 _CAMERAS = Reader((SceneFileError,), (f"{_EXPORT}.cameras",))
 _RESULTS = Reader((SceneFileError, FileNotFoundError), ("splatnode.recon.result.stored_snapshot",))

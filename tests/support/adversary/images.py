@@ -127,7 +127,9 @@ def tiff(rng: random.Random) -> bytes:
         _entry(order, 279, 4, 1, rng.choice((576, edges.unsigned(rng, 32)))),
     ]
     for _ in range(rng.choice((0, 1, 2, 4))):
-        tag = rng.choice((256, 257, 258, 277, 278, 279, 322, 323, 324, 330, 339, 271, 274, 34665, 37386, 41989, 33434))
+        tag = rng.choice(
+            (256, 257, 258, 277, 278, 279, 322, 323, 324, 330, 339, 271, 274, 34665, 37386, 41989, 33434, 33437, 34855)
+        )
         kind = rng.choice((*_TIFF_SIZES, 0, 99))
         count = rng.choice((1, 1, edges.unsigned(rng, 32)))
         entries.insert(rng.randrange(len(entries) + 1), _entry(order, tag, kind, count, edges.unsigned(rng, 32)))

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
+from splatnode.capture.process.records import record_of
 from splatnode.recon.evaluate.stability.claim import CameraError, all_right
 from splatnode.recon.evaluate.stability.windows.row import OURS, Row
 from splatnode.recon.result.verdict import Code
@@ -67,7 +66,7 @@ def read(paths: list[Path]) -> list[Sample]:
     for path in paths:
         content = load(path)
         if "rows" in content:
-            rows = msgspec.convert(content["rows"], list[Row])
+            rows = record_of(content["rows"], list[Row])
             found += [of_window(row) for row in rows if row.method == OURS and row.evidence is not None]
         elif "trials" in content:
             found += list(_of_trials(content["trials"]))
@@ -98,12 +97,12 @@ def _still(published: bool, verdict: str) -> bool:
 
 
 def _errors(records: list[dict]) -> dict[str, CameraError]:
-    return {record["name"]: msgspec.convert(record, CameraError) for record in records}
+    return {record["name"]: record_of(record, CameraError) for record in records}
 
 
 def _evidence(record: dict[str, Any]) -> Evidence:
     """The evidence of a report, in which None stands for a number that was not finite."""
-    return msgspec.convert({name: _finite(value) for name, value in record.items() if name != "log_odds"}, Evidence)
+    return record_of({name: _finite(value) for name, value in record.items() if name != "log_odds"}, Evidence)
 
 
 def _finite(value: Any) -> Any:

@@ -1,29 +1,39 @@
-"""All windows of a plan, scene after scene; what is on the disk already is not run again."""
+"""All windows of a plan, some at a time; what is on the disk already is not run again."""
 
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import msgspec
 
+from splatnode.capture.process.records import record_of
 from splatnode.recon.config import Config
 from splatnode.recon.evaluate.json_file import read_json
+from splatnode.recon.evaluate.kept import Kept
 from splatnode.recon.evaluate.records import this_machine
 from splatnode.recon.evaluate.stability.places import Place
 from splatnode.recon.evaluate.stability.windows import ours
-from splatnode.recon.evaluate.stability.windows.row import OURS, Answer, Found, Row, judged, key_of
+from splatnode.recon.evaluate.stability.windows.row import OURS, Answer, Found, Key, Row, judged
+from splatnode.recon.evaluate.stability.windows.store import Pieces
 from splatnode.recon.evaluate.stability.windows.summary import summarise
-from splatnode.recon.evaluate.stability.windows.window import COUNTS, Window, moving, windows_of
+from splatnode.recon.evaluate.stability.windows.turns import Job, Turns
+from splatnode.recon.evaluate.stability.windows.window import COUNTS, moving, windows_of
+from splatnode.recon.evaluate.timing import check_same_cores
+from splatnode.recon.jobs.call import Work, packed
+from splatnode.recon.jobs.calls import Engine, Task, work_folder
+from splatnode.recon.jobs.child import Limits
 from splatnode.recon.result.export.staged import json_bytes, write_file
+from splatnode.recon.result.folder import result_folder
 
 logger = logging.getLogger(__name__)
 
 FILE = "windows.json"
-WRITE_EVERY_S = 5.0
+_JOURNAL = "windows.jsonl"
 
 
 @dataclass(frozen=True)
@@ -34,73 +44,112 @@ class Plan:
     seed: int = 0  # of the draw of the windows
     given_lens: bool = False  # splatnode is told the true intrinsics, as of a calibrated camera
     fresh: bool = False  # measures each window's seconds from photographs on, too
-    timeout_s: float = 120.0  # of a rival on one window
+    timeout_s: float = 120.0  # of one method on one window, from the start of its process on
+    max_memory_mb: float | None = None  # of the same
     config: Config = field(default_factory=Config)
 
 
-def run_windows(plan: Plan, places: Sequence[Place], out: Path, command: str) -> list[Row]:
+def run_windows(plan: Plan, places: Sequence[Place], out: Path, command: str, engine: Engine) -> list[Row]:
     """Runs what is missing in `out`/windows.json and returns all its rows. Rows without an answer are run again.
 
-    The file is rewritten every few seconds and at the end, also where that is an exception or an interruption.
+    What came to an end is on the disk at once, in a journal beside the file, which is rewritten every few seconds. A
+    window that fails, or exceeds its time or memory, becomes a row with the verdict "FAILED" and the reason. Seconds
+    are those of windows that had their cores alone. Raises ValueError where the file is of windows with another number
+    of cores.
     """
-    rows = {row.key: row for row in read_rows(out / FILE)}
-    done = {key for key, row in rows.items() if _is_done(row, plan)}
-    chosen = [(place, windows_of(place, plan.per_kind, plan.seed, plan.counts)) for place in moving(places)]
-    asked = [key_of(window, method) for _, windows in chosen for window in windows for method in plan.methods]
-    number, written = sum(key in done for key in asked), time.monotonic()
-    try:
-        for place, windows in chosen:
-            jobs = [(method, window) for window in windows for method in plan.methods]
-            for method, window, answer in _answers(place, [j for j in jobs if key_of(j[1], j[0]) not in done], plan):
-                row = judged(window, method, answer, place.scene.cameras)
-                rows[row.key] = row
-                number += 1
-                logger.info(
-                    f"windows {number}/{len(asked)}: {row.scene}, {row.count} at stride {row.stride} from {row.start}, "
-                    f"{row.method}: {row.verdict}, {row.found.value}"
-                )
-                if time.monotonic() - written > WRITE_EVERY_S:
-                    write_file(out / FILE, _content(list(rows.values()), plan, command))
-                    written = time.monotonic()
-    finally:
-        write_file(out / FILE, _content(list(rows.values()), plan, command))
-    return list(rows.values())
+    rows = {row.key: row for row in _resumed(out / FILE, engine.cores_each)}
+    jobs = _jobs(plan, places)
+    whole = partial(_write, out / FILE, plan, rows, [job.key for job in jobs], command)
+    with result_folder(out), work_folder(out) as folder, Kept(out / _JOURNAL, whole) as kept:
+        left = (record_of(record, Row) for record in kept.left())
+        rows |= {row.key: row for row in left}
+        todo = [job for job in jobs if job.key not in rows or not _is_done(rows[job.key], plan)]
+        for number, row in enumerate(_results(plan, todo, engine, folder), start=len(jobs) - len(todo) + 1):
+            rows[row.key] = row
+            kept.add(asdict(row))
+            logger.info(
+                f"windows {number}/{len(jobs)}: {row.scene}, {row.count} at stride {row.stride} from {row.start}, "
+                f"{row.method}: {row.verdict}, {row.found.value}"
+            )
+        if not todo:
+            whole()  # it tells of this command, too
+    return _ordered(rows, [job.key for job in jobs])
+
+
+def _jobs(plan: Plan, places: Sequence[Place]) -> list[Job]:
+    """Scene after scene; in a scene splatnode's windows come first."""
+    found = []
+    for place in moving(places):
+        windows = windows_of(place, plan.per_kind, plan.seed, plan.counts)
+        asked = [Job(place, window, method) for window in windows for method in plan.methods]
+        found += sorted(asked, key=lambda job: job.method != OURS)
+    return found
 
 
 def _is_done(row: Row, plan: Plan) -> bool:
     return row.found is not Found.FAILED and (row.fresh_seconds is not None or not plan.fresh)
 
 
+def _results(plan: Plan, todo: Sequence[Job], engine: Engine, folder: Path) -> Iterator[Row]:
+    """Rows as they are done."""
+    turns = Turns(todo, folder / "found")
+
+    def take() -> Task | None:
+        turn = turns.next()
+        return turn and Task(turn[0], packed(_work(plan, *turn)))
+
+    limits = Limits(plan.max_memory_mb, plan.timeout_s)
+    for job, answer in engine.answers(take, limits, folder / "calls"):
+        nothing = Answer(None, message=answer.reason), {}
+        said, found = nothing if answer.pickled is None else answer.value()
+        turns.ended(job, found)
+        yield judged(job.window, job.method, said, job.place.scene.cameras)
+
+
+def _work(plan: Plan, job: Job, known: Pieces) -> Work:
+    if job.method == OURS:
+        return partial(ours.answered, job.place, job.window, plan.config, plan.fresh, plan.given_lens, known)
+    from splatnode.recon.evaluate.stability.windows import rivals  # needs pycolmap
+
+    return partial(rivals.answered, job.place, job.window, job.method, plan.config.seed, plan.fresh, known)
+
+
 class _Rows(msgspec.Struct, frozen=True):
     rows: list[Row]
+    machine: dict[str, Any] = {}
 
 
 def read_rows(path: Path) -> list[Row]:
     """The rows of a windows.json; none where there is no such file. Raises EvaluationFileError for another file."""
-    if not path.exists():
-        return []
-    return read_json(path, _Rows, "the windows.json of this version").rows
+    return _read(path).rows
 
 
-def _answers(place: Place, todo: Sequence[tuple[str, Window]], plan: Plan) -> Iterator[tuple[str, Window, Answer]]:
-    mine = [window for method, window in todo if method == OURS]
-    for window, answer in ours.answers(place, mine, plan.config, plan.fresh, plan.given_lens):
-        yield OURS, window, answer
-    others = [(method, window) for method, window in todo if method != OURS]
-    if others:
-        from splatnode.recon.evaluate.stability.windows import rivals  # needs pycolmap
-
-        for (method, window), answer in rivals.answers(place, others, plan.config, plan.fresh, plan.timeout_s):
-            yield method, window, answer
+def _resumed(path: Path, cores_each: int) -> list[Row]:
+    content = _read(path)
+    before = content.machine.get("threads")  # which each window had, before a row said so itself
+    known = [row.cores or before for row in content.rows if row.seconds is not None]
+    check_same_cores([cores for cores in known if cores], cores_each, path)
+    return content.rows
 
 
-def _content(rows: Sequence[Row], plan: Plan, command: str) -> bytes:
+def _read(path: Path) -> _Rows:
+    return read_json(path, _Rows, "the windows.json of this version") if path.exists() else _Rows([])
+
+
+def _ordered(rows: dict[Key, Row], asked: Sequence[Key]) -> list[Row]:
+    """Those of the plan in its order, whichever came to its end first, after those of earlier plans."""
+    planned = set(asked)
+    return [*(rows[key] for key in rows if key not in planned), *(rows[key] for key in asked if key in rows)]
+
+
+def _write(path: Path, plan: Plan, rows: dict[Key, Row], asked: Sequence[Key], command: str) -> None:
+    ordered = _ordered(rows, asked)
     content = {
         "command": command,
         "machine": this_machine(),
         "seed": plan.seed,
         "given_lens": plan.given_lens,
-        "summary": summarise(rows),
-        "rows": [{**asdict(row), "right": row.right, "found": row.found.value} for row in rows],
+        "summary": summarise(ordered),
+        "rows": [{**asdict(row), "right": row.right, "found": row.found.value} for row in ordered],
     }
-    return json_bytes(content)
+    write_file(path, json_bytes(content))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import logging
+import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -14,8 +15,10 @@ from splatnode.capture.process.terminal import say
 from splatnode.recon.evaluate.stability.methods import NAMES, by_name
 from splatnode.recon.evaluate.stability.places import loaded_places
 from splatnode.recon.evaluate.stability.windows.campaign import FILE, Plan, run_windows
-from splatnode.recon.evaluate.stability.windows.row import OURS, Row
+from splatnode.recon.evaluate.stability.windows.row import OURS, Found, Row
 from splatnode.recon.evaluate.stability.windows.summary import KINDS, by_angle, by_count, by_method, coverage, tally
+from splatnode.recon.evaluate.timing import untimed
+from splatnode.recon.jobs.calls import engine as opened
 
 logger = logging.getLogger(__name__)
 
@@ -32,13 +35,28 @@ def windows(args: argparse.Namespace) -> int:
         given_lens=args.given_lens,
         fresh=args.fresh,
         timeout_s=args.timeout_s,
+        max_memory_mb=args.max_memory,
     )
-    rows = run_windows(plan, loaded_places(args.scenes, args.out), args.out, shlex.join(["splatnode", *sys.argv[1:]]))
+    command = shlex.join(["splatnode", *sys.argv[1:]])
+    scenes, out = [Path(os.path.abspath(scene)) for scene in args.scenes], Path(os.path.abspath(args.out))
+    with opened(args.cores, args.ray) as engine:  # other machines see the scenes, too, not this process's folder
+        rows = run_windows(plan, loaded_places(scenes, out), args.out, command, engine)
     drawn = _drawn(args.out, rows)
-    for line in report_lines(rows):
-        say(line)
+    tell(rows)
     say(f"results: {args.out}/ ({', '.join((FILE, *drawn))})")
     return 0
+
+
+def tell(rows: Sequence[Row]) -> None:
+    """The tables, the windows without an answer with the reason, and of how many there are no seconds."""
+    for line in report_lines(rows):
+        say(line)
+    for row in rows:
+        if row.found is Found.FAILED:
+            window = f"{row.scene}, {row.count} at stride {row.stride} from {row.start}, {row.method}"
+            say(f"no answer: {window}: {row.message.strip().splitlines()[-1]}")
+    if why := untimed([row.others for row in rows]):
+        say(why)
 
 
 def default_methods() -> tuple[str, ...]:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import time
-import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.config import Config
@@ -12,43 +11,36 @@ from splatnode.recon.estimation import Estimate, estimate_cameras
 from splatnode.recon.evaluate.stability.own_cameras import cameras_of, registered
 from splatnode.recon.evaluate.stability.places import Place
 from splatnode.recon.evaluate.stability.windows.row import Answer
-from splatnode.recon.evaluate.stability.windows.store import matched
+from splatnode.recon.evaluate.stability.windows.store import Key, Pieces, matched, plain_features
 from splatnode.recon.evaluate.stability.windows.window import Window
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.evaluate.timing import Timing, timing
 from splatnode.recon.frames.screening import screen_all
+from splatnode.recon.jobs.alone import now
 from splatnode.recon.ladder.ladder import climbed
 from splatnode.recon.matching.match import match
 from splatnode.recon.matching.moving import without_moving
-from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.preparation import load_prior, prepare
 
 
-def answers(
-    place: Place, windows: Sequence[Window], config: Config, fresh: bool, given_lens: bool = False
-) -> Iterator[tuple[Window, Answer]]:
-    """One answer a window, in their order; `given_lens`: the true intrinsics come with the photographs.
+def answered(
+    place: Place, window: Window, config: Config, fresh: bool, given_lens: bool, known: Pieces
+) -> tuple[Answer, dict[Key, bytes]]:
+    """The answer, and what was found for it that is not `known` of the scene. It is called in a process of its own.
 
-    An exception is an answer, too: the others are asked all the same.
+    `given_lens`: the true intrinsics come with the photographs; `fresh`: measures the seconds from photographs on, too.
     """
-    prior = load_prior(config)
-    known: dict[str, Keyframe] = {}
-    store = ViewGraph(config.matching)
-    for window in windows:
-        frames = frames_of(place, window, given_lens)
-        try:
-            kept, _, rejected = screen_all(frames, config.screening)
-            for frame in kept:
-                known[frame.name] = known.get(frame.name) or prepare(frame, config)
-            graph, store = matched(store, [known[frame.name] for frame in kept], prior.matcher)
-            graph = without_moving(graph, prior.matcher)
-            started = time.perf_counter()
-            estimate = climbed(estimate_cameras(graph, rejected, config), rejected, config)
-            seconds = time.perf_counter() - started
-            fresh_seconds = _fresh_seconds(frames, config) if fresh else None
-            answer = _answer(registered(estimate, config), seconds, fresh_seconds)
-        except Exception:
-            answer = Answer(None, message=traceback.format_exc())
-        yield window, answer
+    matcher, frames = load_prior(config).matcher, frames_of(place, window, given_lens)
+    kept, _, rejected = screen_all(frames, config.screening)
+    keyframes = [prepare(frame, config, plain_features(known, frame.name)) for frame in kept]
+    graph, found = matched(keyframes, known, config.matching, matcher)
+    graph = without_moving(graph, matcher)
+    since, started = now(), time.perf_counter()
+    estimate = climbed(estimate_cameras(graph, rejected, config), rejected, config)
+    seconds, timed_on = time.perf_counter() - started, timing(since)
+    fresh_seconds, fresh_on = _fresh_seconds(frames, config) if fresh else (None, None)
+    estimate = registered(estimate, config)
+    cameras, evidence = cameras_of(estimate), estimate.evidence_record
+    return Answer(estimate.verdict, cameras, seconds, timed_on, fresh_seconds, fresh_on, evidence), found
 
 
 def frames_of(place: Place, window: Window, given_lens: bool = False) -> list[Frame]:
@@ -77,11 +69,7 @@ def from_scratch(frames: Sequence[Frame], config: Config) -> Estimate:
     return climbed(estimate_cameras(graph, rejected, config), rejected, config)
 
 
-def _fresh_seconds(frames: Sequence[Frame], config: Config) -> float:
-    started = time.perf_counter()
+def _fresh_seconds(frames: Sequence[Frame], config: Config) -> tuple[float, Timing]:
+    since, started = now(), time.perf_counter()
     from_scratch(frames, config)
-    return time.perf_counter() - started
-
-
-def _answer(estimate: Estimate, seconds: float, fresh_seconds: float | None) -> Answer:
-    return Answer(estimate.verdict, cameras_of(estimate), seconds, fresh_seconds, estimate.evidence_record)
+    return time.perf_counter() - started, timing(since)

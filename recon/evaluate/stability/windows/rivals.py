@@ -1,92 +1,66 @@
-"""COLMAP's and GLOMAP's answers to windows: a scene's features and matches are made once, each window is mapped."""
+"""COLMAP's and GLOMAP's answers to windows: a photograph's features and a pair's matches are found once in a scene."""
 
 from __future__ import annotations
 
 import itertools
-import multiprocessing
+import pickle
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
-from multiprocessing.context import ForkServerContext
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from splatnode.capture.frame import Frame
-from splatnode.recon.config import Config
-from splatnode.recon.evaluate.process import call_alone
 from splatnode.recon.evaluate.rivals import colmap
 from splatnode.recon.evaluate.rivals.outcome import verdict
 from splatnode.recon.evaluate.stability.places import Place
 from splatnode.recon.evaluate.stability.stock import camera_estimate
+from splatnode.recon.evaluate.stability.windows.ours import frames_of
 from splatnode.recon.evaluate.stability.windows.row import Answer
+from splatnode.recon.evaluate.stability.windows.store import Key, Pieces
 from splatnode.recon.evaluate.stability.windows.window import Window
+from splatnode.recon.evaluate.timing import Timing, timing
+from splatnode.recon.jobs.alone import now
 
 MAPPERS: Mapping[str, colmap.Mapper] = {"colmap": colmap.incremental, "glomap": colmap.global_}
-Job = tuple[str, Window]
+_KIND = "colmap"  # of pieces: those of both mappers
 
 
-def answers(
-    place: Place, jobs: Sequence[Job], config: Config, fresh: bool, timeout_s: float
-) -> Iterator[tuple[Job, Answer]]:
-    """One answer for each method and window, each mapped in a process of its own: one that crashes harms no other.
+def answered(
+    place: Place, window: Window, method: str, seed: int, fresh: bool, known: Pieces
+) -> tuple[Answer, dict[Key, bytes]]:
+    """The answer, and what was found for it that is not `known` of the scene. It is called in a process of its own.
 
-    What is left in memory and on the disk between windows is the scene's features and matches, in a temporary folder.
+    `fresh`: measures the seconds from photographs on, too.
     """
-    if not jobs:
-        return
-    with TemporaryDirectory(prefix="splatnode-windows-") as name:
+    frames, mapper = frames_of(place, window), MAPPERS[method]
+    with TemporaryDirectory(prefix="splatnode-window-") as name:
         folder = Path(name)
-        named = _prepared(folder, place, [window for _, window in jobs], config.seed)
-        for number, (method, window) in enumerate(jobs):
-            mine = {image: frame for image, frame in named.items() if frame.name in window.names}
-            colmap.part(folder, mine.keys(), folder / f"window_{number}")
-            mapping = partial(_mapped, folder / f"window_{number}", mine, config.seed, MAPPERS[method])
-            from_scratch = partial(_from_scratch, list(mine.values()), config.seed, MAPPERS[method])
-            try:
-                answer = call_alone(mapping, timeout_s, _context())
-                if fresh:
-                    answer = replace(answer, fresh_seconds=call_alone(from_scratch, timeout_s, _context()))
-            except RuntimeError as error:
-                answer = Answer(None, message=str(error))
-            yield (method, window), answer
+        named = colmap.image_names(frames)
+        found = _matched(folder, named, seed, known)
+        since, started = now(), time.perf_counter()
+        model = colmap.largest_model(folder, named, seed, mapper)
+        seconds, timed_on = time.perf_counter() - started, timing(since)
+    fresh_seconds, fresh_on = _from_scratch(frames, seed, mapper) if fresh else (None, None)
+    registered = () if model is None else model.registered
+    said = verdict(frames, {each.frame.name for each in registered})
+    cameras = tuple(map(camera_estimate, registered))
+    return Answer(said, cameras, seconds, timed_on, fresh_seconds, fresh_on), found
 
 
-def _prepared(folder: Path, place: Place, windows: Sequence[Window], seed: int) -> dict[str, Frame]:
-    """The photographs that any window has, by the names of their images, with features and the pairs of all windows."""
-    names = {name for window in windows for name in window.names}
-    positions = [i for i, name in enumerate(place.names) if name in names]
-    named = colmap.image_names(
-        [Frame(i, place.names[i], i, place.scene.image(place.names[i]), None) for i in positions]
-    )
-    image_of = {frame.name: image for image, frame in named.items()}
-    colmap.extract_features(folder, named, seed)
-    pairs = {
-        (image_of[first], image_of[second])
-        for window in windows
-        for first, second in itertools.combinations(window.names, 2)
-    }
-    colmap.match_pairs(folder, sorted(pairs))
-    return named
+def _matched(folder: Path, named: Mapping[str, Frame], seed: int, known: Pieces) -> dict[Key, bytes]:
+    """Makes the database of the images, which are `named`, in `folder`; returns what was found that is not known."""
+    keys = {image: (_KIND, frame.name) for image, frame in named.items()}
+    described = {image: pickle.loads(known[key]) for image, key in keys.items() if key in known}
+    of_pair = {pair: (_KIND, *(named[image].name for image in pair)) for pair in itertools.combinations(named, 2)}
+    matches = {pair: pickle.loads(known[key]) for pair, key in of_pair.items() if key in known}
+    colmap.extract_features(folder, named, seed, described)
+    colmap.match_pairs(folder, list(of_pair), seed, matches)
+    found = {keys[image]: each for image, each in colmap.features(folder, set(named) - set(described)).items()}
+    found |= {of_pair[pair]: each for pair, each in colmap.matches(folder, set(of_pair) - set(matches)).items()}
+    return {key: pickle.dumps(piece) for key, piece in found.items()}
 
 
-def _mapped(folder: Path, named: Mapping[str, Frame], seed: int, mapper: colmap.Mapper) -> Answer:
-    started = time.perf_counter()
-    model = colmap.largest_model(folder, named, seed, mapper)
-    seconds = time.perf_counter() - started
-    found = () if model is None else model.registered
-    said = verdict(list(named.values()), {each.frame.name for each in found})
-    return Answer(said, tuple(map(camera_estimate, found)), seconds)
-
-
-def _from_scratch(frames: Sequence[Frame], seed: int, mapper: colmap.Mapper) -> float:
-    started = time.perf_counter()
+def _from_scratch(frames: Sequence[Frame], seed: int, mapper: colmap.Mapper) -> tuple[float, Timing]:
+    since, started = now(), time.perf_counter()
     colmap.sparse_model(frames, seed, mapper)
-    return time.perf_counter() - started
-
-
-def _context() -> ForkServerContext:
-    """Processes that find everything imported."""
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__])
-    return context
+    return time.perf_counter() - started, timing(since)

@@ -9,6 +9,7 @@ from typing import Any
 
 from splatnode.recon.evaluate.stability.claim import ROUGH, CameraError, all_right, errors_of, whole_errors
 from splatnode.recon.evaluate.stability.windows.window import Window
+from splatnode.recon.evaluate.timing import Timing, had_alone, most_taken
 from splatnode.recon.evaluate.truth import TrueCamera
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.result.verdict import Verdict
@@ -36,7 +37,9 @@ class Answer:
     verdict: Verdict | None  # None: there was no answer, `message` says why
     cameras: tuple[CameraEstimate, ...] = ()  # where nothing is published, those that were registered all the same
     seconds: float | None = None
+    timed_on: Timing | None = None  # of `seconds`
     fresh_seconds: float | None = None
+    fresh_on: Timing | None = None
     evidence: Mapping[str, object] | None = None
     message: str = ""
 
@@ -55,12 +58,15 @@ class Row:
     verdict: str  # a code; FAILED where there was no answer
     published: bool
     message: str
-    seconds: float | None  # from matched pairs to the verdict, or to the model
+    seconds: float | None  # from matched pairs to the verdict, or to the model; None also: not alone
     fresh_seconds: float | None  # from photographs to the same, with nothing kept of other windows
     cameras: tuple[CameraError, ...]  # those published; of a refusal, those that were registered
     rotation_deg: float | None  # the largest error of any relative rotation
     centre_pct: float | None  # RMS error of the centres, in percent of the true ones' spread
     evidence: Mapping[str, Any] | None  # recon.verification.likelihood.record
+    cores: int | None = None  # that it could use
+    processor: str | None = None
+    others: float | None = None  # the share of the cores' time that others took meanwhile; None also: nobody can tell
 
     @property
     def key(self) -> Key:
@@ -96,7 +102,9 @@ def key_of(window: Window, method: str) -> Key:
 def judged(window: Window, method: str, answer: Answer, truth: Mapping[str, TrueCamera]) -> Row:
     """The answer against the true cameras of all photographs of the window."""
     whole = whole_errors(answer.cameras, truth)
-    verdict = answer.verdict
+    verdict, timed_on = answer.verdict, answer.timed_on
+    others = most_taken((timed_on, answer.fresh_on))
+    alone = had_alone(others)
     return Row(
         scene=window.scene,
         count=window.count,
@@ -108,10 +116,13 @@ def judged(window: Window, method: str, answer: Answer, truth: Mapping[str, True
         verdict=FAILED if verdict is None else verdict.code.value,
         published=verdict is not None and verdict.publishable,
         message=answer.message if verdict is None else verdict.message,
-        seconds=answer.seconds,
-        fresh_seconds=answer.fresh_seconds,
+        seconds=answer.seconds if alone else None,
+        fresh_seconds=answer.fresh_seconds if alone else None,
         cameras=errors_of(answer.cameras, truth),
         rotation_deg=whole.rotation_pair_deg,
         centre_pct=whole.centre_pct,
         evidence=answer.evidence,
+        cores=timed_on and timed_on.cores,
+        processor=timed_on and timed_on.processor,
+        others=others,
     )

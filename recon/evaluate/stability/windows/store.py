@@ -1,23 +1,119 @@
-"""What was matched in a scene, kept for all of its windows: what two frames share depends on no third one."""
+"""What was found in a scene, kept for its further windows: of one photograph or of two, whatever others there are."""
 
 from __future__ import annotations
 
+import pickle
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
-from splatnode.recon.frames.keyframe import Keyframe
+import msgspec
+
+from splatnode.recon.frames.keyframe import PLAIN, Features, Keyframe
+from splatnode.recon.matching.config import Config
 from splatnode.recon.matching.match import Matcher, completed
-from splatnode.recon.matching.view_graph import ViewGraph
+from splatnode.recon.matching.pair_matching import MatchedPair
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.matching.view_graph import Pair, ViewGraph
+
+Key = tuple[str, ...]  # what was found; then the name of the photograph, or the names of both
+Pieces = Mapping[Key, bytes]  # each pickled: who keeps them need not know what they are
+
+_PLAIN, _TILTED = "plain", "tilted"  # features of a photograph, or matches of two, in the order of content
 
 
-def matched(store: ViewGraph, keyframes: Sequence[Keyframe], matcher: Matcher | None) -> tuple[ViewGraph, ViewGraph]:
-    """The complete view graph of `keyframes`, and the store with what was matched for it.
+def among(keys: Collection[Key], names: Collection[str]) -> list[Key]:
+    """Those of photographs that are all among `names`."""
+    chosen = frozenset(names)
+    return [key for key in keys if chosen.issuperset(key[1:])]
 
-    The graph is that which matching from scratch gives: which pairs tilted features are chosen for is asked anew.
+
+def plain_features(known: Pieces, name: str) -> Features | None:
+    """Of a photograph; None where they are not known."""
+    return _read(known, (_PLAIN, name))
+
+
+def matched(
+    keyframes: Sequence[Keyframe], known: Pieces, config: Config, matcher: Matcher | None
+) -> tuple[ViewGraph, dict[Key, bytes]]:
+    """The complete view graph of `keyframes`, which have plain features, and what was found for it and not known.
+
+    The graph is to the bit that which matching from scratch gives: which pairs tilted features are chosen for is asked
+    anew. Where not all pairs are matched, which are depends on what was matched before: of pairs nothing is used then.
     """
-    asked = ViewGraph(store.config)
+    graph = ViewGraph(config)
     for keyframe in keyframes:
-        asked = asked.with_keyframe(keyframe)
-    known = store.without(set(store.names) - set(asked.names))
-    (graph,) = deque(completed(asked.joined(known), matcher), maxlen=1)
-    return graph, store.joined(graph)
+        graph = graph.with_keyframe(keyframe)
+    found: dict[Key, object] = {(_PLAIN, keyframe.name): keyframe.features for keyframe in keyframes}
+    if len(keyframes) > config.candidates.exhaustive:
+        graph = _last(completed(graph, matcher))
+    else:
+        graph = _plainly_matched(_with_plain(graph, known))
+        found |= {(_PLAIN, *_names(graph, pair)): each for pair, each in graph.plain.items()}
+        graph = _last(completed(graph if matcher else _with_tilted(graph, known), matcher))
+        graph = replace(graph, tilted=_in_order(graph.tilted))
+    if matcher is None:  # else the features of its points are among them
+        found |= {
+            (_TILTED, each.name): each.features for each in graph.keyframes if (each.features.tilt != PLAIN).any()
+        }
+        found |= {(_TILTED, *_names(graph, pair)): each for pair, each in graph.tilted.items()}
+    return graph, {key: pickle.dumps(piece) for key, piece in found.items() if key not in known}
+
+
+def _plainly_matched(graph: ViewGraph) -> ViewGraph:
+    """With all pairs matched by plain features, in the order of matching from scratch, and none by tilted ones."""
+    config = graph.config
+    untilted = msgspec.structs.replace(config, tilting=msgspec.structs.replace(config.tilting, tilts=()))
+    whole = _last(completed(replace(graph, config=untilted), None))
+    return replace(whole, config=config, plain=_in_order(whole.plain))
+
+
+def _with_plain(graph: ViewGraph, known: Pieces) -> ViewGraph:
+    """With the pairs that are known matched by plain features."""
+    plain: dict[Pair, MatchedPair] = {}
+    pairs: dict[Pair, TwoView] = {}
+    done: set[Pair] = set()
+    for pair in graph.pending:
+        first, second = graph.in_order_of_content(*pair)
+        found = _read(known, (_PLAIN, *_names(graph, (first, second))))
+        if found is None:
+            continue
+        done.add(pair)
+        plain[first, second] = found
+        if found.geometry is not None:
+            pairs[pair] = found.geometry if first < second else found.geometry.swapped()
+    return replace(graph, pairs=pairs, plain=plain, pending=graph.pending - done)
+
+
+def _with_tilted(graph: ViewGraph, known: Pieces) -> ViewGraph:
+    """With the weak pairs that are known matched by tilted features, which their keyframes then have."""
+    keyframes, tilted = list(graph.keyframes), dict(graph.tilted)
+    for pair in sorted(graph.to_tilt()):
+        found = _read(known, (_TILTED, *_names(graph, pair)))
+        if found is None:
+            continue
+        tilted[pair] = found
+        for index in pair:
+            features = _read(known, (_TILTED, keyframes[index].name))
+            keyframes[index] = replace(keyframes[index], features=features)
+    return replace(graph, keyframes=tuple(keyframes), tilted=tilted)
+
+
+def _in_order(pairs: Mapping[Pair, MatchedPair]) -> dict[Pair, MatchedPair]:
+    """Of matching from scratch."""
+    return dict(sorted(pairs.items(), key=lambda item: sorted(item[0])))
+
+
+def _names(graph: ViewGraph, pair: Pair) -> tuple[str, str]:
+    return graph.keyframes[pair[0]].name, graph.keyframes[pair[1]].name
+
+
+def _read(known: Pieces, key: Key) -> Any:
+    """None where it is not known."""
+    return pickle.loads(known[key]) if key in known else None
+
+
+def _last(graphs: Iterable[ViewGraph]) -> ViewGraph:
+    (last,) = deque(graphs, maxlen=1)
+    return last

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import fields
 from pathlib import Path
 from typing import cast
 
@@ -12,6 +13,7 @@ import pytest
 from msgspec.structs import replace
 
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
+from splatnode.capture.messaging.wire import Message
 from splatnode.recon.config import PREVIEW, Config
 from splatnode.recon.daemon.checkpoint import checkpoint, saved_estimate
 from splatnode.recon.daemon.checkpoint.made_anew import MADE_ANEW
@@ -19,6 +21,7 @@ from splatnode.recon.daemon.checkpoint.saved import GraphRecord
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.preparation import prepare
+from splatnode.recon.registration.register import RegisteredCamera
 from tests.support.synthetic import photographs
 
 CONFIG = Config(size=160, preview=replace(PREVIEW, iterations=1))
@@ -47,6 +50,21 @@ def store(saved, tmp_path):
     opened = Store(shutil.copytree(saved[0], tmp_path / "copy"))
     yield opened
     opened.close()
+
+
+def test_cameras_of_before_lenses_had_a_second_radial_coefficient_come_back(work):
+    known = work.remembered()
+    record, arrays = saved_estimate.estimate_message(known, ())
+    of_one = [field.name for field in fields(RegisteredCamera) if field.name not in record.cameras[0]]
+    radial = of_one.index("radial")
+    cameras = [{**numbers, "radial": -0.1} for numbers in record.cameras]
+    first = len(of_one) * len(cameras)
+    kept = [array for index, array in enumerate(arrays[:first]) if index % len(of_one) != radial]
+    message = Message(replace(record, cameras=cameras), (*kept, *arrays[first:]))
+    for one, other in zip(
+        saved_estimate.estimate_from(message, known.graph).registration.cameras, known.registration.cameras, strict=True
+    ):
+        assert one.radial.tolist() == [-0.1, 0.0] and np.array_equal(one.T_world_camera, other.T_world_camera)
 
 
 def test_what_was_estimated_and_measured_comes_back_and_is_not_made_anew(store, work, monkeypatch):

@@ -113,12 +113,13 @@ def test_what_another_version_wrote_is_told(graph, scene):
 
 def test_the_gains_of_a_scenes_photographs_come_back(graph, scene):
     keyframes = {keyframe.name: keyframe for keyframe in graph.keyframes}
-    image, exposure = light.relit(graph.keyframes[1].image, (2.0, 1.5, 0.5))
+    image, exposure = light.relit(graph.keyframes[1].image, (2.0, 1.5, 0.5), 0.7)
     first, second, third = scene.views
     lit = replace(scene, views=(first, replace(second, image=image, exposure=exposure), third))
     header, arrays = scene_message(lit, final=False)
     found = scene_from(over_the_disk(header, arrays), keyframes)
     assert [view.exposure and view.exposure.gains for view in found.views] == [None, (2.0, 1.5, 0.5), None]
+    assert [view.exposure and view.exposure.falloff for view in found.views] == [None, 0.7, None]
     assert np.array_equal(found.views[1].image, image)
     earlier = SceneRecord(header.views, header.iterations, header.final)  # of a version that knew no gains
     assert all(view.exposure is None for view in scene_from(over_the_disk(earlier, arrays), keyframes).views)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
+import subprocess
+import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -14,14 +17,17 @@ import pytest
 
 from splatnode.capture.frame import Frame
 from splatnode.command_line import build_parser
-from splatnode.recon.evaluate.stability import campaign
 from splatnode.recon.evaluate.stability.campaign import Plan, run_campaign
-from splatnode.recon.evaluate.stability.case import Case, Demand, Row
+from splatnode.recon.evaluate.stability.case import Case, Demand, Row, accepted
 from splatnode.recon.evaluate.stability.methods import by_name
-from splatnode.recon.evaluate.stability.places import Places
-from splatnode.recon.evaluate.stability.trial import Trial, run_trial
+from splatnode.recon.evaluate.stability.places import Photo, Places
+from splatnode.recon.jobs.calls import engine
+from splatnode.recon.jobs.cores import usable_cores
 from splatnode.recon.result.verdict import Code
+from tests.support.calls import in_this_process
 from tests.support.stability_places import three_places
+from tests.support.synthetic import photographs
+from tests.support.trials import without_costs
 
 
 @pytest.fixture(scope="module")
@@ -38,54 +44,122 @@ def one_frame() -> list[Frame]:
     return [Frame(0, "only", 0, np.zeros((48, 64, 3), np.uint8), None)]
 
 
+def takes_memory() -> list[Frame]:
+    held = bytearray(1_200_000_000)
+    time.sleep(600)
+    return [] if held else one_frame()
+
+
 def case(source) -> Case:
     return Case("a note", source, Demand.REFUSE, frozenset({Code.TOO_FEW_VIEWS}))
 
 
-def test_a_trial_ends_whatever_happens_in_it():
-    run = partial(run_trial, row=4, name="single", seed=0, method="splatnode")
-    refused = run(case(one_frame), timeout_s=60.0)
-    assert (refused.verdict, refused.outcome, refused.right) == ("TOO_FEW_VIEWS", "refused", True)
-    assert refused.seconds is not None and refused.peak_rss_mb is not None
-    hangs = run(case(hang), timeout_s=0.5)
-    assert (hangs.verdict, hangs.outcome, hangs.message) == ("FAILED", "failed", "stopped after 0.5 s")
-    crashes = run(case(partial(os._exit, 9)), timeout_s=60.0)
-    assert crashes.outcome == "failed" and "ended with code 9" in crashes.message
-    raises = run(case(partial(int, "x")), timeout_s=60.0)
-    assert raises.outcome == "failed" and "ValueError" in raises.message
+def row(number: int, source) -> Row:
+    return Row(number, "row", lambda sampler: case(source))
 
 
-def test_a_campaign_goes_on_where_it_was_stopped(tmp_path, places, monkeypatch):
-    tried = []
+def test_a_trial_ends_whatever_happens_in_it(tmp_path, places):
+    sources = one_frame, partial(os._exit, 9), partial(int, "x"), takes_memory
+    rows = tuple(row(number, source) for number, source in enumerate(sources))
+    with engine(1, None) as on:
+        plan = Plan(rows, (0,), ("splatnode",), max_memory_mb=1000.0)
+        refused, dies, raises, greedy = run_campaign(plan, places, tmp_path / "a", "command", on)
+        (hangs,) = run_campaign(Plan((row(4, hang),), (0,), ("splatnode",), 1.0), places, tmp_path / "b", "command", on)
+    assert (refused["verdict"], refused["outcome"], refused["right"]) == ("TOO_FEW_VIEWS", "refused", True)
+    assert refused["peak_rss_mb"] is not None and refused["cores"] == 1
+    assert [trial["outcome"] for trial in (dies, raises, greedy, hangs)] == ["failed"] * 4
+    assert dies["message"] == "ended with exit code 9 and said nothing"
+    assert "ValueError" in raises["message"]
+    assert "--max-memory allows 1000" in greedy["message"]
+    assert hangs["message"] == "took longer than the 1 s that --timeout-s allows"
 
-    def fake(case, row, name, seed, method, timeout_s):
-        tried.append((row, seed))
-        return Trial(
-            row=row,
-            name=name,
-            seed=seed,
-            method=method,
-            note=case.note,
-            demand="refuse",
-            expected=("TOO_FEW_VIEWS",),
-            verdict="TOO_FEW_VIEWS",
-            published=False,
-            right=True,
-            outcome="refused",
-        )
 
-    monkeypatch.setattr(campaign, "run_trial", fake)
-    rows = tuple(Row(number, "quick", lambda sampler: case(one_frame)) for number in (1, 2))
-    run_campaign(Plan(rows, (0,), ("splatnode",)), places, tmp_path, "command")
-    assert tried == [(1, 0), (2, 0)]
-    trials = run_campaign(Plan(rows, (0, 1), ("splatnode",), jobs=2), places, tmp_path, "command")
-    assert sorted(tried[2:]) == [(1, 1), (2, 1)] and len(trials) == 4
+def test_a_campaign_goes_on_where_it_was_stopped(tmp_path, places):
+    rows, on = (row(1, one_frame), row(2, one_frame)), in_this_process()
+    assert len(run_campaign(Plan(rows, (0,), ("splatnode",)), places, tmp_path, "command", on)) == 2
+    first = json.loads((tmp_path / "stability.json").read_text())["trials"]
+    trials = run_campaign(Plan(rows, (0, 1), ("splatnode",)), places, tmp_path, "command", on)
+    assert trials[:2] == first and len(trials) == 4  # not run again: seconds are the same
     content = json.loads((tmp_path / "stability.json").read_text())
     assert [(t["row"], t["seed"]) for t in content["trials"]] == [(1, 0), (1, 1), (2, 0), (2, 1)]
     assert content["false_accept_rate"] == 0.0 and content["false_refuse_rate"] is None
+    assert {path.name for path in tmp_path.iterdir()} == {"stability.json"}
     elsewhere = Places(places.walked[:1])
     with pytest.raises(ValueError, match="is of the scenes east, south, west, now there are east"):
-        run_campaign(Plan(rows, (0,), ("splatnode",)), elsewhere, tmp_path, "command")
+        run_campaign(Plan(rows, (0,), ("splatnode",)), elsewhere, tmp_path, "command", on)
+
+
+def test_seconds_of_one_core_and_of_several_are_not_mixed(tmp_path, places):
+    plan = Plan((row(1, one_frame),), (0,), ("splatnode",))
+    (trial,) = run_campaign(plan, places, tmp_path, "command", in_this_process())
+    content = json.loads((tmp_path / "stability.json").read_text())
+    trial |= {"seconds": 1.0, "cores": 1}
+    (tmp_path / "stability.json").write_text(json.dumps({**content, "trials": [trial]}))
+    said = r"stability.json holds runs that had 1 core each, now each would have 4 cores, .* give the same --cores"
+    with pytest.raises(ValueError, match=said):
+        run_campaign(plan, places, tmp_path, "command", in_this_process(cores_each=4))
+    trial |= {"seconds": None}  # others had disturbed it: there is nothing to mix
+    (tmp_path / "stability.json").write_text(json.dumps({**content, "trials": [trial]}))
+    assert len(run_campaign(plan, places, tmp_path, "command", in_this_process(cores_each=4))) == 1
+
+
+def six_views() -> Case:
+    photos = [Photo(frame.name, frame.image, None) for frame in photographs()]
+    return accepted(photos, "the built-in place")
+
+
+def test_one_core_and_two_give_the_same(tmp_path, places):
+    if len(usable_cores()) < 2:
+        pytest.skip("needs two cores")
+    rows = Row(1, "six", lambda sampler: six_views()), row(2, one_frame)
+    found = []
+    for cores in (1, 2):
+        with engine(cores, None) as on:
+            run_campaign(Plan(rows, (0,), ("splatnode",)), places, tmp_path / str(cores), "command", on)
+        found.append(json.loads((tmp_path / str(cores) / "stability.json").read_text()))
+    assert [trial["num_gaussians"] for trial in found[0]["trials"]] > [1000, 0]
+    assert without_costs(found[0]["trials"]) == without_costs(found[1]["trials"])
+
+
+DRIVER = """
+import sys
+from pathlib import Path
+from splatnode.recon.jobs.calls import engine
+from tests.recon.evaluate.stability.test_campaign import noted
+with engine(1, None) as on:
+    noted(Path(sys.argv[1]), on)
+"""
+
+
+def note(path: Path, number: int) -> list[Frame]:
+    """One frame; the third trial takes long when it is begun for the first time."""
+    with path.open("a") as file:
+        file.write(f"{number} {os.getpid()}\n")
+    if number == 2 and [line[0] for line in path.read_text().splitlines()].count("2") == 1:
+        time.sleep(600)
+    return one_frame()
+
+
+def begun(path: Path) -> list[str]:
+    """The trials, each as often as it was begun: one that is refused asks for its frames twice."""
+    return [line[0] for line in dict.fromkeys(path.read_text().splitlines())] if path.exists() else []
+
+
+def noted(out: Path, on) -> list[dict]:
+    rows = tuple(row(number, partial(note, out / "begun.txt", number)) for number in range(4))
+    return run_campaign(Plan(rows, (0,), ("splatnode",)), Places(()), out, "command", on)
+
+
+def test_a_driver_that_is_killed_repeats_what_was_running_alone(tmp_path):
+    driver = subprocess.Popen([sys.executable, "-c", DRIVER, str(tmp_path)])
+    while begun(tmp_path / "begun.txt") != ["0", "1", "2"]:
+        assert driver.poll() is None
+        time.sleep(0.05)
+    driver.send_signal(signal.SIGKILL)
+    driver.wait()
+    assert len(noted(tmp_path, in_this_process(cores_each=1))) == 4
+    assert begun(tmp_path / "begun.txt") == ["0", "1", "2", "2", "3"]
+    assert {path.name for path in tmp_path.iterdir()} == {"begun.txt", "stability.json"}
 
 
 def test_command_line():
@@ -94,7 +168,7 @@ def test_command_line():
         ["stability", "a", "b", "--rows", "1,7", "--seeds", "2", "--methods", "splatnode,colmap", "--out", "o"]
     )
     assert (args.scenes, args.rows, args.seeds) == ([Path("a"), Path("b")], (1, 7), 2)
-    assert args.methods == ("splatnode", "colmap") and args.jobs == 1
+    assert args.methods == ("splatnode", "colmap") and args.cores is None and args.ray is None
     assert isinstance(args, argparse.Namespace)
     with pytest.raises(ValueError, match="no method 'magic'; there are: splatnode, colmap, glomap"):
         by_name("magic")

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
+import pickle
+
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from splatnode.capture.cameras import synthetic
 from splatnode.recon import estimation
@@ -11,10 +15,16 @@ from splatnode.recon.config import Config
 from splatnode.recon.evaluate.demo import write_capture
 from splatnode.recon.evaluate.stability.own_cameras import cameras_of
 from splatnode.recon.evaluate.stability.places import Place
-from splatnode.recon.evaluate.stability.windows import ours
-from splatnode.recon.evaluate.stability.windows.row import Found, judged
+from splatnode.recon.evaluate.stability.windows import ours, store
+from splatnode.recon.evaluate.stability.windows.row import Answer, Found, judged
+from splatnode.recon.evaluate.stability.windows.store import Key, among
 from splatnode.recon.evaluate.stability.windows.window import Window, angle_deg
+from splatnode.recon.evaluate.timing import Timing
 from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.jobs.cores import usable_cores
+from splatnode.recon.matching import pair_matching
+from splatnode.recon.matching.match import match
+from splatnode.recon.preparation import prepare
 from splatnode.recon.result.verdict import Code, Verdict
 
 PLACE = synthetic.Config(views=6, width=320, height=240)
@@ -32,10 +42,18 @@ def window(place: Place, start: int, stride: int, count: int = 3) -> Window:
     return Window(place.name, count, stride, start, place.names[span], angle_deg(place.Ts_world_camera[span]))
 
 
-def test_a_window_from_the_store_is_answered_as_from_scratch(place):
+def answered(place: Place, each: Window, known: dict[Key, bytes], config: Config, **asked) -> Answer:
+    """What splatnode answers; what it finds is known from then on."""
+    answer, found = ours.answered(place, each, config, asked.get("fresh", False), False, known)
+    known |= found
+    return answer
+
+
+def test_what_is_known_of_a_scene_changes_no_answer(place):
     config = Config()
     windows = [window(place, 0, 2), window(place, 1, 1, 4)]  # which share a pair
-    found = [answer for _, answer in ours.answers(place, windows, config, fresh=False)]
+    known: dict[Key, bytes] = {}
+    found = [answered(place, each, known, config) for each in windows]
     for each, answer in zip(windows, found, strict=True):
         estimate = ours.from_scratch(ours.frames_of(place, each), config)
         assert answer.verdict == estimate.verdict
@@ -48,34 +66,75 @@ def test_a_window_from_the_store_is_answered_as_from_scratch(place):
     assert any(answer.verdict.publishable for answer in found), "else nothing was compared"
 
 
+def assert_same(one: object, other: object) -> None:
+    """To the bit, field by field."""
+    for field in dataclasses.fields(one):
+        np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
+
+
+def test_a_graph_of_what_is_known_is_that_of_matching_from_scratch(place, monkeypatch):
+    """Of firm pairs and of weak ones, which tilted features are made for, and which are chosen by window."""
+    config = Config()
+    few = replace(config.matching.features, num_features=1000)
+    matching = replace(config.matching, features=few, tilting=replace(config.matching.tilting, firm_matches=100))
+    config = replace(config, matching=matching)
+    keyframes = [prepare(frame, config) for frame in ours.frames_of(place, window(place, 0, 1, 6))]
+    known: dict[Key, bytes] = {}
+    for some in (keyframes[:4], keyframes[2:], keyframes[1::2], keyframes):
+        graph, found = store.matched(
+            some, {key: known[key] for key in among(known, [k.name for k in some])}, matching, None
+        )
+        known |= found
+        scratch = match(some, matching)
+        assert list(graph.pairs) == list(scratch.pairs) and list(graph.tilted) == list(scratch.tilted)
+        for pair, geometry in graph.pairs.items():
+            assert_same(geometry, scratch.pairs[pair])
+        for one, other in zip(graph.keyframes, scratch.keyframes, strict=True):
+            assert_same(one.features, other.features)
+    assert 0 < len(graph.tilted) < len(graph.plain), "else there was nothing to choose"
+    for work in ("match_plain", "match_tilted"):
+        monkeypatch.setattr(pair_matching, work, None)
+    assert store.matched(keyframes, known, matching, None)[1] == {}, "nothing is matched twice"
+
+
 def test_a_refusal_keeps_its_cameras_and_evidence(place, monkeypatch):
     monkeypatch.setattr(estimation, "refuse_before_registration", lambda *_: Verdict(Code.BLUR, "No.", ""))
     each = window(place, 0, 2)
-    (answer,) = [answer for _, answer in ours.answers(place, [each], Config(), fresh=True)]
+    answer = answered(place, each, {}, Config(), fresh=True)
+    assert answer.fresh_seconds is not None and answer.fresh_seconds > 0
     row = judged(each, "splatnode", answer, place.scene.cameras)
-    assert row.found is Found.REFUSED and row.fresh_seconds is not None and row.fresh_seconds > 0
+    assert row.found is Found.REFUSED and row.cores == len(usable_cores())
     assert row.evidence is not None and row.right and len(row.cameras) == 3
     assert all(camera.bounds is not None for camera in row.cameras)
 
 
-def test_an_exception_is_an_answer(place, monkeypatch):
-    def fails(*_):
-        raise FloatingPointError("worse luck")
+def test_seconds_are_those_of_a_window_that_had_its_cores_alone(place):
+    each = window(place, 0, 1)
+    alone, beside = Timing(1, "a processor", 0.01), Timing(1, "a processor", 0.3)
+    answer = Answer(Verdict(Code.NO_OVERLAP, "Nothing.", ""), (), 2.0, alone, 5.0, alone)
+    row = judged(each, "splatnode", answer, place.scene.cameras)
+    assert (row.seconds, row.fresh_seconds, row.others, row.cores) == (2.0, 5.0, 0.01, 1)
+    for one, other in ((alone, beside), (beside, alone)):
+        row = judged(each, "splatnode", dataclasses.replace(answer, timed_on=one, fresh_on=other), place.scene.cameras)
+        assert (row.seconds, row.fresh_seconds, row.others) == (None, None, 0.3)
 
-    monkeypatch.setattr(ours, "estimate_cameras", fails)
-    (answer,) = [answer for _, answer in ours.answers(place, [window(place, 0, 1)], Config(), fresh=False)]
-    row = judged(window(place, 0, 1), "splatnode", answer, place.scene.cameras)
-    assert row.found is Found.FAILED and "worse luck" in row.message and not row.published
 
-
-def test_rivals_map_what_the_scene_s_database_holds(place):
+def test_rivals_map_what_is_known_of_the_scene(place):
     pytest.importorskip("pycolmap", reason="stock COLMAP needs pycolmap (pip install 'splatnode[bench]')")
     from splatnode.recon.evaluate.stability.windows import rivals
 
-    jobs = [("colmap", window(place, 0, 1)), ("glomap", window(place, 3, 1)), ("colmap", window(place, 3, 1))]
-    found = dict(rivals.answers(place, jobs, Config(), fresh=False, timeout_s=60.0))
-    assert list(found) == jobs
-    for (method, each), answer in found.items():
+    jobs = [("colmap", window(place, 0, 1, 4)), ("glomap", window(place, 1, 1)), ("colmap", window(place, 2, 1, 4))]
+    known: dict[Key, bytes] = {}
+    for number, (method, each) in enumerate(jobs):
+        answer, found = rivals.answered(place, each, method, 0, number == 0, known)
+        assert len(found) == (10, 0, 7)[number], "what is known is not found again"
+        known |= found
         row = judged(each, method, answer, place.scene.cameras)
         assert row.found is Found.RIGHT and {camera.name for camera in row.cameras} == set(each.names)
-        assert all(camera.bounds is None for camera in row.cameras) and row.seconds > 0
+        assert all(camera.bounds is None for camera in row.cameras)
+        assert answer.seconds > 0 and (answer.fresh_seconds is not None) == (number == 0)
+        _, found = rivals.answered(place, each, method, 0, False, {})
+        for key in (key for key in found if len(key) == 3):
+            one, other = (pickle.loads(pieces[key]) for pieces in (known, found))
+            np.testing.assert_array_equal(one.matches, other.matches)
+            np.testing.assert_array_equal(one.geometry.inlier_matches, other.geometry.inlier_matches)

@@ -3,19 +3,35 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
+from splatnode.capture.cameras import synthetic
 from splatnode.command_line import build_parser
+from splatnode.recon.evaluate.demo import write_capture
 from splatnode.recon.evaluate.stability.claim import CameraError, Claim
+from splatnode.recon.evaluate.stability.places import Place
 from splatnode.recon.evaluate.stability.windows import campaign
 from splatnode.recon.evaluate.stability.windows.campaign import Plan, read_rows, run_windows
-from splatnode.recon.evaluate.stability.windows.command import report_lines
+from splatnode.recon.evaluate.stability.windows.command import report_lines, tell
 from splatnode.recon.evaluate.stability.windows.row import Answer, Found, Row
 from splatnode.recon.evaluate.stability.windows.summary import coverage, summarise, tally
+from splatnode.recon.evaluate.stability.windows.window import Window
+from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.jobs.calls import engine
+from splatnode.recon.jobs.cores import usable_cores
 from splatnode.recon.result.verdict import Code, Verdict
+from tests.support.calls import in_this_process
 from tests.support.stability_places import three_places
+from tests.support.trials import without_costs
 
 BOUNDS = Claim(rotation_deg=1.0, centre_percent=2.0, focal_percent=4.0)
 
@@ -73,32 +89,133 @@ def test_coverage_is_of_published_cameras():
     assert coverage(ROWS[7:]).within == {"rotation": None, "centre": None, "focal": None}
 
 
+NOTHING = Verdict(Code.NO_OVERLAP, "Nothing.", "")
+
+
+def note(place: Place, window: Window) -> list[str]:
+    """The windows that were asked for so far, by their start and stride, in a file beside the scene."""
+    path = place.scene.paths[window.names[0]].parents[1] / "asked.txt"
+    with path.open("a") as file:
+        file.write(f"{window.start} {window.stride}\n")
+    return path.read_text().splitlines()
+
+
+def first_broken(place, window, config, fresh, given_lens, known):
+    if len(note(place, window)) == 1:
+        raise ValueError("worse luck")
+    return Answer(NOTHING, seconds=1.0, fresh_seconds=1.0 if fresh else None), {}
+
+
 def test_what_is_on_the_disk_is_not_run_again(tmp_path, monkeypatch):
-    places = three_places(tmp_path).walked[:1]
-    asked = []
-
-    def answers(place, windows, config, fresh, given_lens):
-        for window in windows:
-            asked.append(window)
-            refusal = Verdict(Code.NO_OVERLAP, "Nothing.", "")
-            broken = len(asked) == 1
-            yield window, Answer(None if broken else refusal, fresh_seconds=1.0 if fresh else None, message="broken")
-
-    monkeypatch.setattr(campaign.ours, "answers", answers)
+    places, on = three_places(tmp_path).walked[:1], in_this_process()
+    monkeypatch.setattr(campaign.ours, "answered", first_broken)
     plan = Plan(("splatnode",), counts=(3,))
-    rows = run_windows(plan, places, tmp_path, "command")
-    assert len(asked) == len(rows) == 8 and rows[0].found is Found.FAILED
-    assert run_windows(plan, places, tmp_path, "command")[0].found is Found.REFUSED
-    assert len(asked) == 9, "only what had no answer is run again"
-    assert all(row.fresh_seconds == 1.0 for row in run_windows(replace(plan, fresh=True), places, tmp_path, "command"))
-    assert len(asked) == 17, "seconds from photographs on have to be measured"
+
+    def asked() -> int:
+        return len((tmp_path / "asked.txt").read_text().splitlines())
+
+    rows = run_windows(plan, places, tmp_path, "command", on)
+    assert asked() == len(rows) == 8 and rows[0].found is Found.FAILED and rows[0].message == "worse luck"
+    assert run_windows(plan, places, tmp_path, "command", on)[0].found is Found.REFUSED
+    assert asked() == 9, "only what had no answer is run again"
+    rows = run_windows(replace(plan, fresh=True), places, tmp_path, "command", on)
+    assert all(row.fresh_seconds == 1.0 for row in rows)
+    assert asked() == 17, "seconds from photographs on have to be measured"
     content = json.loads((tmp_path / "windows.json").read_text())
     assert content["summary"]["splatnode"]["all"]["refused"] == 8 and content["command"] == "command"
     assert content["rows"][0]["found"] == "refused" and content["machine"]
-    assert len(read_rows(tmp_path / "windows.json")) == 8
+    assert read_rows(tmp_path / "windows.json") == rows
+    with pytest.raises(ValueError, match="holds runs that had .* now each would have 77 cores"):
+        run_windows(plan, places, tmp_path, "command", in_this_process(cores_each=77))
     (tmp_path / "windows.json").write_text('{"trials": []}')
     with pytest.raises(ValueError, match=r"must be the windows\.json of this version"):
         read_rows(tmp_path / "windows.json")
+
+
+def befallen(place, window, config, fresh, given_lens, known):
+    """What befalls a window is told by its stride: 1 raises, 2 ends its process, 3 hangs."""
+    if window.stride == 1:
+        raise FloatingPointError("worse luck")
+    if window.stride == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if window.stride == 3:
+        time.sleep(600)
+    return Answer(NOTHING), {}
+
+
+def test_a_window_that_fails_costs_only_itself(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(campaign.ours, "answered", befallen)
+    plan = Plan(("splatnode",), per_kind=1, counts=(3,), timeout_s=1.5)
+    with engine(1, None) as on:
+        rows = run_windows(plan, three_places(tmp_path).walked[:1], tmp_path, "command", on)
+    assert [row.found for row in rows] == [Found.FAILED] * 3 + [Found.REFUSED]
+    raised, died, hung, _ = (row.message for row in rows)
+    assert "FloatingPointError: worse luck" in raised and "was killed (SIGKILL)" in died
+    assert hung == "took longer than the 1.5 s that --timeout-s allows"
+    tell(rows)
+    assert "no answer: east, 3 at stride 1 from" in capsys.readouterr().out
+
+
+DRIVER = """
+import sys
+from pathlib import Path
+from splatnode.recon.jobs.calls import engine
+from tests.recon.evaluate.stability.windows.test_campaign import third_slow_at_first
+with engine(1, None) as on:
+    third_slow_at_first(Path(sys.argv[1]), on)
+"""
+
+
+def slow(place, window, config, fresh, given_lens, known):
+    if len(note(place, window)) == 3:
+        time.sleep(600)
+    return Answer(NOTHING), {}
+
+
+def third_slow_at_first(out: Path, on) -> list[Row]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(campaign.ours, "answered", slow)
+        plan = Plan(("splatnode",), per_kind=1, counts=(3,))
+        return run_windows(plan, three_places(out).walked[:1], out, "command", on)
+
+
+def test_a_driver_that_is_killed_repeats_what_was_running_alone(tmp_path):
+    driver, asked = subprocess.Popen([sys.executable, "-c", DRIVER, str(tmp_path)]), tmp_path / "asked.txt"
+    while not asked.exists() or len(asked.read_text().splitlines()) < 3:
+        assert driver.poll() is None
+        time.sleep(0.05)
+    driver.kill()
+    driver.wait()
+    assert (tmp_path / "windows.jsonl").exists()
+    assert len(third_slow_at_first(tmp_path, in_this_process(cores_each=1))) == 4
+    strides = [line.split()[1] for line in asked.read_text().splitlines()]
+    assert strides == ["1", "2", "3", "3", "4"]
+    assert {path.name for path in tmp_path.iterdir() if path.is_file()} == {"asked.txt", "windows.json"}
+
+
+def pair_of_scenes(folder: Path) -> list[Place]:
+    """Two scenes of the built-in place, small ones."""
+    config = synthetic.Config(views=4, width=320, height=240)
+    names = tuple(synthetic.frame_name(index) for index in range(config.views))
+    for name in ("one", "other"):
+        write_capture(folder / name, config)
+    return [Place(load_scene(folder / name), names) for name in ("one", "other")]
+
+
+def answered_by(on, places: Sequence[Place], out: Path) -> list[dict]:
+    """The rows as they lie on the disk, without costs."""
+    run_windows(Plan(("splatnode",), counts=(3,)), places, out, "command", on)
+    return without_costs(json.loads((out / "windows.json").read_text())["rows"])
+
+
+def test_one_core_and_two_give_the_same(tmp_path):
+    if len(usable_cores()) < 2:
+        pytest.skip("needs two cores")
+    places, found = pair_of_scenes(tmp_path), []
+    for cores in (1, 2):
+        with engine(cores, None) as on:
+            found.append(answered_by(on, places, tmp_path / str(cores)))
+    assert found[0] == found[1] and [row["published"] for row in found[0]] == [True] * 4
 
 
 def test_charts(tmp_path):
@@ -115,5 +232,6 @@ def test_charts(tmp_path):
 
 
 def test_command_line():
-    args = build_parser().parse_args(["stability", "a", "--windows", "--per-kind", "3", "--fresh", "--out", "o"])
-    assert (args.windows, args.per_kind, args.fresh, args.methods) == (True, 3, True, None)
+    command = ["stability", "a", "--windows", "--per-kind", "3", "--fresh", "--cores", "2", "--out", "o"]
+    args = build_parser().parse_args(command)
+    assert (args.windows, args.per_kind, args.fresh, args.methods, args.cores) == (True, 3, True, None, 2)

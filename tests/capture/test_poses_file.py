@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame
+from splatnode.capture.poses_file import PosesFileError, Trajectory, poses_of, read_poses
 from splatnode.capture.stamp import Clock, Stamp
-from splatnode.recon.metric.poses_file import PosesFileError, Trajectory, poses_of, read_poses
 from splatnode.recon.result.export import export_scene
 from splatnode.recon.result.write import finish
 from tests.recon.metric.test_poses import NAMES, TRUE, scene

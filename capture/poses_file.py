@@ -13,19 +13,20 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
+from splatnode.capture.colmap_images import ImageRow, binary_images, text_images
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.given_pose import rigid_problem
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import printable
-from splatnode.recon.result.camera_check import camera_problem
-from splatnode.recon.result.colmap_images import ImageRow, binary_images, text_images
-from splatnode.recon.result.export.quaternions import matrices_from_quats
+from splatnode.capture.process.records import record_in
 
 Array = npt.NDArray[np.float64]
 
 _MAX_BYTES = 200_000_000
 _LONGEST_GAP_S = 1.0  # between two poses, over which a time between them is interpolated
 _NEAREST_S = 0.02  # of a time to the one pose that counts where there is none on its other side
+_FARTHEST_M = 1e9  # of a coordinate
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # nerfstudio's cameras: x right, y up, z back
 _Row = tuple[float, float, float, float]
 _Name = Annotated[str, msgspec.Meta(max_length=4096)]
@@ -54,16 +55,20 @@ class Trajectory:
 
     def of(self, frames: Iterable[Frame | DroppedFrame]) -> dict[str, Array]:
         """The poses of the frames that have one, by their names."""
-        found = {each.name: self._of(each) for each in frames if isinstance(each, Frame)}
+        found = {each.name: self.pose_of(each) for each in frames if isinstance(each, Frame)}
         return {name: T for name, T in found.items() if T is not None}
 
-    def _of(self, frame: Frame) -> Array | None:
+    def pose_of(self, frame: Frame) -> Array | None:
+        """That of one frame, T_world_camera (4, 4); None where it has none."""
         if self.by_name:
-            known = self.by_name.get(frame.name)
-            return known if known is not None else self.by_name.get(frame.name.rpartition(".")[0])
+            return self.by_name[known] if (known := self.names(frame.name)) else None
         if frame.captured_at is not None and (found := self._at(frame.captured_at.ns / 1e9)) is not None:
             return found
         return self._at(float(frame.frame_id)) if _are_numbers(self.seconds) else None
+
+    def names(self, photograph: str) -> str:
+        """The name by which it knows the photograph, which may lack the suffix; empty where it does not."""
+        return next((name for name in (photograph, photograph.rpartition(".")[0]) if name in self.by_name), "")
 
     def _at(self, seconds: float) -> Array | None:
         """The pose at this time, between its two neighbours; None where they are too far away."""
@@ -133,7 +138,7 @@ def read_poses(path: Path) -> Trajectory:
 
 def _read(path: Path, data: bytes) -> Trajectory:
     if path.suffix == ".json":
-        content = msgspec.json.decode(data, type=_Transforms)
+        content = record_in(data, _Transforms)
         return named((each.file_path, np.array(each.transform_matrix) @ _OPENGL) for each in content.frames)
     if path.suffix == ".bin":
         return named(_of_colmap(binary_images(data)))
@@ -184,14 +189,23 @@ def _of_tum(row: Sequence[str]) -> Array:
 
 def _motion(translation: Sequence[float], quat: Sequence[float]) -> Array:
     T = np.eye(4)
-    with np.errstate(invalid="ignore"):  # a quaternion of zeros is no rotation, which is found when it is checked
-        T[:3, :3], T[:3, 3] = matrices_from_quats(quat), translation
+    T[:3, 3] = translation
+    w, x, y, z = quat
+    length = float(np.linalg.norm(quat))
+    # A quaternion of zeros is no rotation, which is found when it is checked.
+    usable = np.isfinite(length) and length > 0
+    T[:3, :3] = Rotation.from_quat(np.array([x, y, z, w]) / length).as_matrix() if usable else np.nan
     return T
 
 
 def _checked(name: str, T: Array) -> Array:
     """Raises ValueError where it is no rigid motion of finite numbers."""
-    problem = camera_problem(np.asarray(T, np.float64), np.eye(3), 1, 1)
+    T = np.asarray(T, np.float64)
+    in_place = T.copy()
+    in_place[:3, 3] = 0.0
+    problem = rigid_problem(in_place.ravel().tolist())
+    if not (np.abs(T[:3, 3]) <= _FARTHEST_M).all():  # NaN, too
+        problem = f"at finite coordinates within {_FARTHEST_M:g} m"
     if problem:
-        raise ValueError(f"the pose of {printable(name, 100)}: {problem}")
-    return np.asarray(T, np.float64)
+        raise ValueError(f"the pose of {printable(name, 100)} must be {problem}")
+    return T

@@ -1,0 +1,30 @@
+"""The networks that tell how alike two images look; without their weights nothing is measured."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatnode.recon.networks.lpips import Lpips, load_lpips
+
+
+@dataclass(frozen=True, eq=False)
+class Networks:
+    """The perceptual metrics for which there are weights."""
+
+    alex: Lpips | None
+    vgg: Lpips | None
+
+    @property
+    def quickest(self) -> Networks:
+        """Without VGG, which takes twenty times as long as AlexNet, where the other serves."""
+        return self if self.alex is None else Networks(self.alex, None)
+
+
+def load_networks(weights_dir: Path | None = None) -> Networks:
+    return Networks(load_lpips("alex", weights_dir), load_lpips("vgg", weights_dir))
+
+
+def no_networks() -> Networks:
+    """For who measures nothing that needs them."""
+    return Networks(None, None)

@@ -1,0 +1,61 @@
+"""A function of values as a process: what it returned, or why it returned nothing.
+
+The call lies in a folder, `called` is the process, and the answer lies in the same folder.
+"""
+
+from __future__ import annotations
+
+import pickle
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from splatnode.recon.jobs.child import Child, End
+
+CALL, ANSWER, ERROR, LOG = "call", "answer", "error.txt", "log"  # files of a call's folder
+
+Work = Callable[[], Any]  # that can be pickled: a functools.partial of a module's function
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What came of a call."""
+
+    pickled: bytes | None  # what the function returned; None: nothing
+    reason: str  # why it returned nothing: a sentence, or what it raised with its traceback; else empty
+    end: End  # of its process
+
+    def value(self) -> Any:
+        """What the function returned. Raises RuntimeError with the reason where it returned nothing."""
+        if self.pickled is None:
+            raise RuntimeError(self.reason)
+        return pickle.loads(self.pickled)
+
+
+def packed(work: Work) -> bytes:
+    """A call for any machine with this splatnode: where modules are found, the function's module, the function."""
+    module = getattr(work, "func", work).__module__
+    return b"".join(map(pickle.dumps, (sys.path, module, work)))
+
+
+def laid_down(call: bytes, folder: Path) -> Path:
+    """Makes the folder of a `packed` call. Raises OSError."""
+    folder.mkdir(parents=True)
+    (folder / CALL).write_bytes(call)
+    return folder
+
+
+def begun(folder: Path, cores: Sequence[int]) -> Child:
+    """A fresh process that makes the call of a folder on `cores`. Raises OSError."""
+    return Child.started([sys.executable, "-m", "splatnode.recon.jobs.called", str(folder)], folder / LOG, cores)
+
+
+def answer_of(folder: Path, end: End) -> Answer:
+    """The answer of a call whose process has ended."""
+    if end.exit_code == 0 and (folder / ANSWER).exists():
+        return Answer((folder / ANSWER).read_bytes(), "", end)
+    if (folder / ERROR).exists():
+        return Answer(None, (folder / ERROR).read_text(), end)
+    return Answer(None, end.reason or f"ended with exit code {end.exit_code} and said nothing", end)

@@ -1,0 +1,130 @@
+"""Calls, some at a time: in processes on cores of this machine, or on a Ray cluster."""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import shutil
+import tempfile
+from collections.abc import Callable, Generator, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from splatnode.recon.jobs.call import Answer, answer_of, begun, laid_down
+from splatnode.recon.jobs.child import NOT_RUN, Limits, finished
+from splatnode.recon.jobs.copies import copying
+from splatnode.recon.jobs.cores import chosen_cores, free_core, usable_cores
+from splatnode.recon.jobs.engine import ends
+from splatnode.recon.jobs.version import other_version, own_version
+
+
+@dataclass(frozen=True)
+class Task:
+    about: Any  # what the caller knows it by
+    call: bytes  # `call.packed`
+
+
+Take = Callable[[], Task | None]  # the next one; None where there is nothing to begin now
+Answers = Callable[[Take, Limits, Path], Generator[tuple[Any, Answer], None, None]]
+
+
+@dataclass(frozen=True)
+class Engine:
+    """Where calls are made.
+
+    `answers(take, limits, folder)` gives what each task is about, with its answer, as they come. `take` is asked again
+    after each end, and all is over when nothing runs any more. Calls that run on this machine lie in `folder` (of
+    `work_folder`) meanwhile. What is running when the iterator is closed is ended.
+    """
+
+    cores_each: int  # that a call has
+    answers: Answers
+
+
+@contextlib.contextmanager
+def work_folder(out: Path) -> Iterator[Path]:
+    """A hidden folder in `out`, which this process holds, for what is under way: empty, and removed at the end."""
+    folder = out / ".calls"
+    shutil.rmtree(folder, ignore_errors=True)  # of a driver that was killed
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def one_at_a_time() -> Engine:
+    """One call at a time, on all cores that this process may use."""
+    return _here([usable_cores()])
+
+
+@contextlib.contextmanager
+def engine(cores: int | None, ray: str | None) -> Iterator[Engine]:
+    """`cores` calls at a time, each on one core; None: one at a time, on all cores.
+
+    `ray` is the address of a cluster; "": of one that is begun here. There each call has one core, and None means as
+    many as keep all cores busy. Raises ValueError for more cores than there are; NoCluster; ModuleNotFoundError without
+    ray.
+    """
+    if ray is None:
+        yield one_at_a_time() if cores is None else _here([(core,) for core in chosen_cores(cores)])
+        return
+    from splatnode.recon.jobs import ray as cluster  # takes a second, and is an extra
+
+    with cluster.joined(ray, None if ray else len(chosen_cores(cores))):
+        yield Engine(1, partial(_answers_on_ray, cores))
+
+
+def _here(places: Sequence[Sequence[int]]) -> Engine:
+    return Engine(len(places[0]), partial(_answers_here, places))
+
+
+def _answers_here(
+    places: Sequence[Sequence[int]], take: Take, limits: Limits, folder: Path
+) -> Generator[tuple[Any, Answer], None, None]:
+    numbers = itertools.count()
+
+    def next_call() -> tuple[Any, Path] | None:
+        return (task := take()) and (task.about, laid_down(task.call, folder / str(next(numbers))))
+
+    with copying(places[0]) as copies:
+        running = ends(next_call, lambda item, cores: copies.begun(item[1], cores), places, limits)
+        with contextlib.closing(running):
+            for (about, place), end in running:
+                answer = answer_of(place, end)
+                shutil.rmtree(place, ignore_errors=True)
+                yield about, answer
+
+
+def _answers_on_ray(most: int | None, take: Take, limits: Limits, _: Path) -> Generator[tuple[Any, Answer], None, None]:
+    from splatnode.recon.jobs import ray
+
+    numbers, under_way = itertools.count(), dict[int, Any]()
+
+    def next_call() -> tuple[int, bytes] | None:
+        if (task := take()) is None:
+            return None
+        under_way[number := next(numbers)] = task.about  # which stays here
+        return number, task.call
+
+    run = partial(_numbered, limits=limits, version=own_version())
+    for (number, _call), found in ray.mapped(next_call, run, most, limits.memory_mb):
+        yield under_way.pop(number), Answer(None, found.reason, NOT_RUN) if isinstance(found, ray.Lost) else found
+
+
+def _numbered(item: tuple[int, bytes], limits: Limits, version: str) -> Answer:
+    return run_here(item[1], limits, version)
+
+
+def run_here(call: bytes, limits: Limits, version: str) -> Answer:
+    """Makes the call of a driver with this `version` of splatnode, on a core of this machine that no other work is on.
+
+    It may be made more than once, after a worker or a machine is lost. Raises OSError where no file can be written.
+    """
+    if (other := other_version(version)) is not None:
+        return Answer(None, other, NOT_RUN)
+    with tempfile.TemporaryDirectory(prefix="splatnode-call-") as name, free_core() as core:
+        place = laid_down(call, Path(name, "0"))
+        return answer_of(place, finished(begun(place, (core,)), limits))

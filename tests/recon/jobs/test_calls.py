@@ -1,0 +1,120 @@
+"""Calls in processes: what a function returns comes back, and one that fails costs only itself."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from splatnode.recon.jobs.call import Answer, packed
+from splatnode.recon.jobs.calls import Engine, Task, engine, one_at_a_time, run_here, work_folder
+from splatnode.recon.jobs.child import NOT_RUN, Limits
+from splatnode.recon.jobs.cores import usable_cores
+from splatnode.recon.jobs.version import own_version
+
+
+def answers(on: Engine, folder: Path, limits: Limits, **works: Callable[[], object]) -> dict[str, Answer]:
+    tasks = iter([Task(name, packed(work)) for name, work in works.items()])
+    return dict(on.answers(lambda: next(tasks, None), limits, folder))
+
+
+def takes_memory() -> int:
+    held = bytearray(400_000_000)
+    time.sleep(60)
+    return len(held)
+
+
+def started_a_helper() -> None:
+    os.spawnlp(os.P_NOWAIT, "sleep", "sleep", "60")
+    time.sleep(60)
+
+
+def test_each_call_has_its_answer_or_its_reason(tmp_path):
+    with engine(1, None) as on:
+        found = answers(
+            on,
+            tmp_path / "calls",
+            Limits(memory_mb=200.0, timeout_s=20.0),
+            good=partial(divmod, 7, 2),
+            raises=partial(divmod, 7, 0),
+            dies=partial(os._exit, 9),
+            silent=partial(os._exit, 0),
+            greedy=takes_memory,
+            last=partial(os.sched_getaffinity, 0),
+        )
+    assert list(found) == ["good", "raises", "dies", "silent", "greedy", "last"]
+    assert found["good"].value() == (3, 1) and found["last"].value() == {usable_cores()[0]}
+    assert "ZeroDivisionError" in found["raises"].reason and "called.py" in found["raises"].reason
+    assert found["dies"].reason == "ended with exit code 9 and said nothing"
+    assert found["silent"].reason == "ended with exit code 0 and said nothing"
+    assert "MB of memory; --max-memory allows 200" in found["greedy"].reason
+    with pytest.raises(RuntimeError, match="exit code 9"):
+        found["dies"].value()
+    assert not any((tmp_path / "calls").iterdir())
+
+
+def test_a_call_that_hangs_is_ended_with_what_it_started(tmp_path):
+    began_s = time.monotonic()
+    found = answers(one_at_a_time(), tmp_path / "calls", Limits(timeout_s=1.0), hangs=started_a_helper)
+    assert found["hangs"].reason == "took longer than the 1 s that --timeout-s allows"
+    assert time.monotonic() - began_s < 30.0
+
+
+def ends_its_template() -> None:
+    os.kill(os.getppid(), signal.SIGKILL)
+    time.sleep(60)
+
+
+def test_calls_are_copies_of_one_process_and_go_on_where_that_is_ended(tmp_path):
+    found = answers(
+        one_at_a_time(),
+        tmp_path / "calls",
+        Limits(),
+        one=os.getppid,
+        two=os.getppid,
+        ends=ends_its_template,
+        three=os.getppid,
+    )
+    templates = [found[name].value() for name in ("one", "two", "three")]
+    assert templates[0] == templates[1] != templates[2]
+    assert "was killed (SIGKILL)" in found["ends"].reason
+
+
+def test_one_at_a_time_has_all_cores(tmp_path):
+    on = one_at_a_time()
+    found = answers(on, tmp_path / "calls", Limits(), cores=partial(os.sched_getaffinity, 0))
+    assert found["cores"].value() == set(usable_cores()) and on.cores_each == len(usable_cores())
+
+
+def test_what_a_killed_driver_left_is_removed(tmp_path):
+    left = tmp_path / ".calls" / "0"
+    left.mkdir(parents=True)
+    (left / "answer").write_bytes(b"old")
+    with work_folder(tmp_path) as folder:
+        assert answers(one_at_a_time(), folder, Limits(), new=partial(abs, -1))["new"].value() == 1
+    assert not any(tmp_path.iterdir())
+
+
+def test_more_cores_than_there_are_are_refused():
+    with pytest.raises(ValueError, match=f"--cores must be at most {len(usable_cores())}"), engine(1000, None):
+        pass
+
+
+def test_a_worker_with_another_version_says_so():
+    call = packed(partial(sum, (1, 2)))
+    other = run_here(call, Limits(), "0.0.1")
+    assert other.end == NOT_RUN and "the work was begun with 0.0.1" in other.reason
+    assert run_here(call, Limits(), own_version()).value() == 3
+
+
+def test_modules_are_found_where_the_driver_finds_them(tmp_path, monkeypatch):
+    (tmp_path / "only_here.py").write_text("def answer():\n    return 42\n")
+    monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+    work = __import__("only_here").answer
+    assert answers(one_at_a_time(), tmp_path / "calls", Limits(), work=work)["work"].value() == 42
