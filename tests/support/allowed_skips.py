@@ -33,6 +33,7 @@ ALLOWED = (
     AllowedSkip("capture/lerobot/test_data_set.py*", "needs PyAV", "its wheel could not be installed"),
     AllowedSkip("capture/logged/test_messages.py*", "needs *-*", "the schemas' own writers could not be installed"),
     AllowedSkip("recon/batch/test_ray.py*", "needs ray", "300 MB; test_remote.py has what a worker does"),
+    AllowedSkip("recon/evaluate/test_ray.py*", "needs ray", "likewise; test_calls.py has what runs without a cluster"),
     AllowedSkip("vm/test_network.py*", "needs the kernel's netem*", "the machine's kernel decides"),
     AllowedSkip("vm/test_network.py*", "needs virtual cables*", "the machine's kernel decides"),
     AllowedSkip("vm/test_network.py*", "needs the right to make network namespaces", "containers rarely have it"),
