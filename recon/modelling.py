@@ -77,7 +77,7 @@ def begin_scene(estimate: Estimate, config: Config, all_at_hand: bool = True) ->
     masks = {keyframe.name: keyframe.mask for keyframe in keyframes}
     lenses = {keyframe.name: keyframe.lens for keyframe in keyframes}
     told = told_logs(keyframe for keyframe in keyframes if keyframe.name in estimate.pointmaps)
-    exposures = light.differing(pointmaps, images, config.light, told)
+    exposures, headroom = light.with_headroom(images, light.differing(pointmaps, images, config.light, told))
     images = light.in_one_light(images, exposures)
     seen_through = _seen_through(pointmaps, images, masks, config) if all_at_hand else {}
     for name, hidden in seen_through.items():
@@ -86,7 +86,8 @@ def begin_scene(estimate: Estimate, config: Config, all_at_hand: bool = True) ->
         images[name] = filled(images[name], free)
     scene = initial_scene(pointmaps, images, config.initialisation, masks, exposures, lenses)
     shares = {name: float(hidden.mean()) for name, hidden in seen_through.items()}
-    return replace(scene, views=tuple(replace(view, moved=shares.get(view.name, 0.0)) for view in scene.views))
+    views = tuple(replace(view, moved=shares.get(view.name, 0.0)) for view in scene.views)
+    return replace(scene, views=views, headroom=headroom)
 
 
 def _seen_through(
@@ -156,7 +157,7 @@ def snapshot(
         verdict=verdict,
         cameras=scene.cameras(conclusion.bounds, conclusion.captured_at) if scene else (),
         gaussians=scene.arrays() if scene else GaussianArrays.empty(),
-        images={view.name: view.image for view in scene.views} if scene else {},
+        images=scene.images() if scene else {},
         dropped=tuple(dropped),
         iterations=scene.iterations if scene else 0,
         seconds=dict(seconds),
@@ -168,7 +169,7 @@ def snapshot(
         depths=_confirmed(scene) if scene and final else {},
         masked=conclusion.masked,
         moving=_moving(conclusion, scene),
-        gains=_gains(scene) if scene else {},
+        gains=scene.gains() if scene else {},
         falloffs=_falloffs(scene) if scene else {},
     )
 
@@ -177,12 +178,6 @@ def _falloffs(scene: Scene) -> dict[str, float]:
     """By photograph whose lens's vignetting was taken out: its falloff."""
     lit = {view.name: view.exposure for view in scene.views if view.exposure is not None}
     return {name: exposure.falloff for name, exposure in lit.items() if exposure.falloff}
-
-
-def _gains(scene: Scene) -> dict[str, tuple[float, float, float]]:
-    """By photograph; none where all are as they were."""
-    found = {view.name: view.exposure.gains for view in scene.views if view.exposure is not None}
-    return found if any(gains != (1.0, 1.0, 1.0) for gains in found.values()) else {}
 
 
 def _moving(conclusion: Conclusion, scene: Scene | None) -> dict[str, float]:

@@ -14,7 +14,7 @@ from torch import Tensor
 from splatnode.recon.rasterize.render import Render
 from splatnode.recon.result.export import viewer_safe
 from splatnode.recon.result.export.formats.ply import ply_bytes
-from splatnode.recon.result.preview import render_rgb
+from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 
 Array = npt.NDArray[np.float64]
@@ -43,7 +43,7 @@ class Appearance(Protocol):
         ...
 
     def render(self, T_world_camera: Array, K: Array, width: int, height: int) -> Tensor:
-        """(H, W, 3) the image, in [0, 1]."""
+        """(H, W, 3) the image; above 1 where it is brighter than white."""
         ...
 
 
@@ -94,4 +94,4 @@ class Splats:
         return (rgb - image).abs().mean()
 
     def render(self, T_world_camera: Array, K: Array, width: int, height: int) -> Tensor:
-        return torch.from_numpy(render_rgb(self._gaussians, T_world_camera, K, width, height))
+        return torch.from_numpy(render_arrays(self._gaussians, T_world_camera, K, width, height).rgb)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.optimize import photometric_reference
+from splatnode.recon.scene.light import SATURATED
 
 
 def psnr(image: Tensor, truth: Tensor, used: Tensor | None = None) -> float:
@@ -35,6 +36,12 @@ def _check_same_shape(image: Tensor, truth: Tensor) -> None:
 
 
 def best_gains(truth: Tensor, image: Tensor, used: Tensor) -> Tensor:
-    """(3,) by which `image` fits `truth` best, both (H, W, 3), in each channel, where `used` (H, W) says so."""
-    seen, known = image[used], truth[used]
-    return ((seen * known).sum(0) / (seen * seen).sum(0).clamp_min(1e-12)).clamp_min(1e-3)
+    """(3,) by which `image` fits `truth` best, both (H, W, 3), in each channel, where `used` (H, W) says so.
+
+    What is white in `truth` may have been brighter, and does not count; where nothing does, the gain is 1.
+    """
+    told = used[..., None] & (truth < SATURATED / 255.0)
+    seen, known = image * told, truth * told
+    squares = (seen * seen).sum((0, 1))
+    fitting = (seen * known).sum((0, 1)) / squares.clamp_min(1e-12)
+    return torch.where(squares > 0, fitting, 1.0).clamp_min(1e-3)

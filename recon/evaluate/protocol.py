@@ -219,14 +219,15 @@ def _score_test_views(
         target = (truth / light[rows, columns]).clamp(0.0, 1.0)
         if settings.best_gain:
             begun = appearance.render(start, K, truth.shape[1], truth.shape[0])
-            target = (target / best_gains(target, begun, used[rows, columns])).clamp(0.0, 1.0)
+            target = target / best_gains(target, begun, used[rows, columns])
         aligned = find_test_pose(appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate)
         T_world_camera = aligned.T_world_camera
         found.setdefault(name, T_world_camera)
         with_rim = light * appearance.render(T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
         if settings.best_gain:
             gains = best_gains(truth, with_rim[rows, columns], used[rows, columns])
-            with_rim = (with_rim * gains).clamp(0.0, 1.0)
+            with_rim = with_rim * gains
+        with_rim = with_rim.clamp(0.0, 1.0)
         show(name, truth, with_rim[rows, columns])
         scores.append(_view_score(with_rim, whole, used, (rows, columns), networks, counts.get(name)))
     return scores

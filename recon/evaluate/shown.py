@@ -43,6 +43,7 @@ class Surface:
     T_world_camera: Array  # (4, 4)
     K: Array  # (3, 3), of a photograph of this size
     depth: npt.NDArray[np.float32]  # (h, w) z, 0 where unknown
+    used: Mask | None = None  # (h, w) False where a mask hides the photograph; None: nowhere
 
     def pixels(self, points: Array) -> tuple[Mask, Indices, Indices, Array]:
         """(M,) which points (M, 3) lie within the photograph; the row and column of each, 0 beyond it; its depth z."""
@@ -86,10 +87,11 @@ def shown_counts(view: Surface, training: Sequence[Surface]) -> Counts:
 
 
 def _shows(camera: Surface, points: Array) -> Mask:
-    """(M,) which points (M, 3) lie within a photograph and are not hidden there."""
+    """(M,) which points (M, 3) lie within a photograph and are not hidden there, by what stands before or by a mask."""
     inside, row, column, z = camera.pixels(points)
     before = camera.depth[row, column]
-    return inside & ((before == 0) | (z <= (1 + _OFF) * before))
+    shows = inside & ((before == 0) | (z <= (1 + _OFF) * before))
+    return shows if camera.used is None else shows & camera.used[row, column]
 
 
 def _closed(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:

@@ -252,7 +252,7 @@ class _Fit:
         )
         learnt = self._gaussians.map(lambda tensor: tensor.detach().clone())
         served_by = {} if self._regularisation is None else self._regularisation.served_by
-        return Scene(views, learnt, self._iterations, served_by=served_by)
+        return Scene(views, learnt, self._iterations, served_by=served_by, headroom=self._scene.headroom)
 
 
 def _leaves(gaussians: Gaussians, shifts: Shifts | None) -> dict[str, Tensor]:

@@ -50,6 +50,12 @@ class Gaussians:
         """The Gaussians at `index` (integers or a mask)."""
         return self.map(lambda tensor: tensor[index])
 
+    def brightened(self, factor: float) -> Gaussians:
+        """The Gaussians with colours `factor` times as bright."""
+        sh = factor * self.sh
+        sh[:, 0] += (factor - 1.0) * 0.5 / SH_C0
+        return replace(self, sh=sh)
+
     def transformed(self, scale: float, rotation: Tensor, translation: Tensor) -> Gaussians:
         """The Gaussians after the similarity x -> scale * rotation @ x + translation; SH are not rotated.
 

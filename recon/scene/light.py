@@ -36,6 +36,8 @@ KNOWN_SIGMA = 1e-3  # likewise, of a photograph that is in the scene's light alr
 TOLD_SIGMA = 0.15  # likewise, of what a photograph's camera tells of it: the curves of cameras differ
 MOST_TOLD = 2.0  # of its size, from the median of all; what tells more is not believed: 8 bits could not bear it
 OFFSET_SIGMA = 10.0  # of what all cameras tell, together: they only tell how photographs differ
+MOST_CLIPPED = 0.01  # share of the pixels of a photograph that may be told and not kept
+MOST_HEADROOM = 2.0  # beyond, dark things would have too few grey levels
 _NOTHING: Mapping[str, float] = MappingProxyType({})
 
 
@@ -111,6 +113,30 @@ def exposed(image: Image, gains: Array, falloff: float = 0.0) -> Exposure:
     red, green, blue = gains.tolist()
     saturated = (image >= SATURATED) & (_share(image, gains, falloff) > 1.0)
     return Exposure((red, green, blue), falloff, saturated if saturated.any() else None)
+
+
+def with_headroom(images: Mapping[str, Image], exposures: Mapping[str, Exposure]) -> tuple[dict[str, Exposure], float]:
+    """Exposures by which what photographs tell stays below white, and how much darker these leave the photographs.
+
+    A dark photograph tells how bright things are that are brighter than white in the light of the median. Of the
+    pixels that are not saturated, all but MOST_CLIPPED of each photograph are kept. `images` (h, w, 3) are as they were
+    taken.
+    """
+    headroom = 1.0
+    for name, exposure in exposures.items():
+        told = (images[name] < SATURATED).all(axis=2)
+        if told.any():
+            share = _share(images[name], np.array(exposure.gains), exposure.falloff)
+            brightest = np.quantile((images[name] / share)[told].max(axis=1), 1.0 - MOST_CLIPPED)
+            headroom = max(headroom, float(brightest) / SATURATED)
+    headroom = min(headroom, MOST_HEADROOM)
+    if headroom == 1.0:
+        return dict(exposures), 1.0
+    darker = {
+        name: exposed(images[name], headroom * np.array(exposure.gains), exposure.falloff)
+        for name, exposure in exposures.items()
+    }
+    return darker, headroom
 
 
 def in_one_light(images: Mapping[str, Image], exposures: Mapping[str, Exposure]) -> dict[str, Image]:

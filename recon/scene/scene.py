@@ -69,6 +69,9 @@ class Scene:
     losses: tuple[float, ...] = ()  # photometric, of each iteration of a refinement that has ended
     num_unlimited: int = 0  # Gaussians that it would have begun with without a limit
     served_by: Mapping[str, str] = field(default_factory=dict)  # by loss that was used: the network or measure in it
+    # Published colours over those in here: dark photographs tell of things that are brighter than white in the light
+    # of the median, so that photographs are kept darker than that.
+    headroom: float = 1.0
 
     def on(self, device: torch.device) -> Scene:
         """The same scene with its Gaussians on `device`. Cameras and photographs stay on the processor."""
@@ -98,9 +101,25 @@ class Scene:
             for view in self.views
         )
 
+    def images(self) -> dict[str, npt.NDArray[np.uint8]]:
+        """The photographs (h, w, 3) in the light of what is published, by name."""
+        if self.headroom == 1.0:
+            return {view.name: view.image for view in self.views}
+        table = np.minimum(np.rint(self.headroom * np.arange(256)), 255).astype(np.uint8)
+        return {view.name: table[view.image] for view in self.views}
+
+    def gains(self) -> dict[str, tuple[float, float, float]]:
+        """Red, green and blue of the photographs whose light was changed, over what is published; by name."""
+        lit = {view.name: view.exposure.gains for view in self.views if view.exposure is not None}
+        published = {name: (r / self.headroom, g / self.headroom, b / self.headroom) for name, (r, g, b) in lit.items()}
+        return published if any(gains != (1.0, 1.0, 1.0) for gains in published.values()) else {}
+
     def arrays(self) -> GaussianArrays:
-        """The Gaussians as they are published: activated copies, with quaternions of unit length."""
-        gaussians = self.gaussians
+        """The Gaussians as they are published: activated copies, with quaternions of unit length.
+
+        Colours above 1 are brighter than white in the light of the median.
+        """
+        gaussians = self.gaussians if self.headroom == 1.0 else self.gaussians.brightened(self.headroom)
         quats = gaussians.quats / gaussians.quats.norm(dim=1, keepdim=True).clamp_min(1e-12)
         return GaussianArrays(
             means=gaussians.means.numpy().copy(),

@@ -14,7 +14,7 @@ from splatnode.recon.config import overlaid, preset
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.offline import run
-from splatnode.recon.result.preview import render_rgb
+from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.vignetting import light_at
@@ -43,7 +43,7 @@ def held_out_psnr(snapshot: Snapshot) -> float:
     K, errors = snapshot.cameras[0].K, []
     for T, _ in synthetic.held_out_cameras(SMALL):
         photograph = synthetic.photograph(SMALL, (T, K), 99) / 255.0
-        shown = np.asarray(render_rgb(snapshot.gaussians, similarity.camera(T), K, SMALL.width, SMALL.height))
+        shown = render_arrays(snapshot.gaussians, similarity.camera(T), K, SMALL.width, SMALL.height).rgb
         gain = (shown * photograph).sum((0, 1)) / (shown * shown).sum((0, 1))
         errors.append(((gain * shown - photograph) ** 2).mean())
     return float(-10 * np.log10(np.mean(errors)))
@@ -65,6 +65,22 @@ def test_held_out_views_are_as_good_as_of_one_exposure():
     alike = held_out_psnr(snapshot_of(False))
     assert held_out_psnr(snapshot_of(True)) > alike - 0.5
     assert held_out_psnr(snapshot_of(True, enabled=False)) < alike - 1.5  # it is not for nothing
+
+
+def test_a_scene_has_what_is_white_in_all_but_a_few_photographs():
+    gains = np.array([0.5, 1.0, 0.5, 1.0, 1.0, 1.0]) * 1.8
+
+    def bright(frame: Frame) -> Frame:
+        image = np.minimum(np.rint(frame.image * gains[frame.frame_id]), 255).astype(np.uint8)
+        return replace(frame, image=image, encoded=None)
+
+    frames = [bright(each) for each in photographs()]
+    assert np.mean([(frame.image == 255).any(-1).mean() for frame in frames]) > 0.4
+    snapshot = run(frames, CONFIG)
+    assert np.median([snapshot.gains[camera.name] for camera in snapshot.cameras]) == pytest.approx(1.0, abs=0.02)
+    assert held_out_psnr(snapshot) > held_out_psnr(snapshot_of(False)) - 3.0  # by 8, were it clipped
+    brightest = max(snapshot.images.values(), key=lambda image: image.mean())
+    assert brightest.max() == 255  # photographs, too, are in the light that is published
 
 
 def test_photographs_of_one_exposure_are_untouched():

@@ -15,8 +15,8 @@ from splatnode.capture.messaging.wire import Limits, decode, encode
 log = logging.getLogger(__name__)
 
 # Of a checkpoint's files: 1 knew no time of capture, 2 no parts of places, 3 no masks, 4 no fisheyes, 5 neither given
-# poses nor lenses that were estimated, 6 one radial coefficient of a lens.
-VERSION = 7
+# poses nor lenses that were estimated, 6 one radial coefficient of a lens, 7 nothing brighter than white.
+VERSION = 8
 FILE = "ledger"
 # Of what this process wrote itself.
 LIMITS = Limits(header_bytes=64 << 20, arrays=1 << 20, total_bytes=4 << 30, own=True)

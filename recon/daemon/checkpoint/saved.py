@@ -43,6 +43,7 @@ class SceneRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     lenses: list[Intrinsics | None] = []  # estimated, of each view; empty: of none
     gains: list[tuple[float, float, float] | None] = []  # of each view's photograph over its image; empty: of none
     falloffs: list[float] = []  # of each view's lens; empty: none dims its corners
+    headroom: float = 1.0
 
 
 def graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
@@ -84,7 +85,7 @@ def scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDAr
     lenses = [view.lens for view in scene.views]
     gains = [view.exposure and view.exposure.gains for view in scene.views]
     falloffs = [view.exposure.falloff if view.exposure else 0.0 for view in scene.views]
-    header = SceneRecord(views, scene.iterations, final, lenses, gains, falloffs)
+    header = SceneRecord(views, scene.iterations, final, lenses, gains, falloffs, scene.headroom)
     return header, [tensor.numpy() for tensor in (*cameras, *gaussians)]
 
 
@@ -105,7 +106,7 @@ def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe])
             header.views, lenses, zip(gains, falloffs, strict=True), Ts_world_camera, Ks, strict=True
         )
     )
-    return Scene(views, Gaussians(*gaussians), header.iterations)
+    return Scene(views, Gaussians(*gaussians), header.iterations, headroom=header.headroom)
 
 
 def _view(

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import pickle
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from splatnode.recon.config import preset
 from splatnode.recon.evaluate.perceptual import Networks, load_networks
 from splatnode.recon.evaluate.protocol import Row as Scored
 from splatnode.recon.evaluate.protocol import Run, Settings, evaluate
+from splatnode.recon.evaluate.regions import Counts
 from splatnode.recon.evaluate.splits import Split, load_split
 from splatnode.recon.evaluate.start import find_start
 from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
@@ -38,12 +40,17 @@ class Case:
     scene: EvaluationScene
     split: Split
 
-    def score(self, snapshot: Snapshot, method: str, scoring: Scoring) -> Scored:
+    def score(
+        self,
+        snapshot: Snapshot,
+        method: str,
+        scoring: Scoring,
+        shown: Mapping[str, Counts] | None = None,
+    ) -> Scored:
+        """`shown` as for `evaluate`."""
         run = Run(method, 0, None, {}, None)
-        networks, settings = scoring.networks, scoring.settings
-        return evaluate(
-            snapshot, self.scene, self.split, run, rasterize=rasterize, networks=networks, settings=settings
-        )
+        how = partial(evaluate, rasterize=rasterize, networks=scoring.networks, settings=scoring.settings)
+        return how(snapshot, self.scene, self.split, run, shown=shown)
 
     def start(self, folders: Folders) -> bytes:
         """Cameras and points of the photographs, pickled: every method gets a copy of its own."""

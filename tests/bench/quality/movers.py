@@ -3,7 +3,8 @@
     python -m tests.bench movers --scenes shared/scenes --out movers.json
 
 The thing is an ellipse of the built-in capture, of one look and another place in each photograph. Held-out photographs
-have none, and are scored whole: a place that the thing hides in the photographs beside them counts, too.
+have none. They are scored whole, and by how many photographs show a pixel beside the thing (`shown.py`): what the thing
+hides in all of them can only be guessed. The scene of the photographs as they are is scored on the same pixels.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from splatnode.capture.frame import Frame
@@ -20,7 +21,11 @@ from splatnode.capture.masks import masked
 from splatnode.recon.config import preset
 from splatnode.recon.evaluate.perceptual import Networks
 from splatnode.recon.evaluate.protocol import Settings
+from splatnode.recon.evaluate.regions import Counts
+from splatnode.recon.evaluate.shown import Surface, shown_counts, surfaces
+from splatnode.recon.frames.keyframe import modelled_mask
 from splatnode.recon.offline import run
+from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality.held_out import Case, Folders, Scoring, load_case
 from tests.support.moving import look_of, pasted
 
@@ -34,35 +39,62 @@ class Result:
     scene: str
     views: int
     share: float  # of every photograph that the thing covers
-    masks: bool
+    kind: str  # "without": the photographs as they are, scored as those with the thing; "masks": given; "found"
     verdict: str
     psnr: float | None  # dB, mean over the held-out photographs
+    psnr_two: float | None  # dB, of the pixels that two photographs show beside the thing
+    two_pct: float | None  # their share of all pixels
     rotation_error_deg: float | None
     centre_error_pct: float | None
     num_gaussians: int | None
     seconds: float
 
 
-def measured(case: Case, frames: Sequence[Frame], share: float, masks: bool) -> Result:
-    """One reconstruction, scored."""
+@dataclass(frozen=True, eq=False)
+class _Made:
+    kind: str
+    snapshot: Snapshot
+    seconds: float
+
+
+def _made(kind: str, frames: Sequence[Frame]) -> _Made:
     began_s = time.monotonic()
     snapshot = run(frames, preset("balanced"))
-    seconds = time.monotonic() - began_s
-    scored = case.score(snapshot, "balanced", Scoring(Networks(None, None), Settings(alignment_steps=STEPS)))
+    return _Made(kind, snapshot, round(time.monotonic() - began_s, 1))
+
+
+def _scored(case: Case, made: _Made, share: float, shown: Mapping[str, Counts]) -> Result:
+    scoring = Scoring(Networks(None, None), Settings(alignment_steps=STEPS))
+    scored = case.score(made.snapshot, "balanced", scoring, shown)
+    two = scored.regions.get("two")
+    seen = (None, None) if two is None else (two.psnr, two.share_pct)
     errors = scored.rotation_error_deg, scored.centre_error_pct
     verdict, num = scored.verdict, scored.num_gaussians
-    return Result(case.scene.name, len(frames), share, masks, verdict, scored.psnr, *errors, num, round(seconds, 1))
+    of_case = case.scene.name, len(case.split.train), share
+    return Result(*of_case, made.kind, verdict, scored.psnr, *seen, *errors, num, made.seconds)
 
 
 def results(case: Case) -> Iterable[Result]:
-    """Of the photographs as they are, then with the thing, without and with masks."""
+    """For each share: of the photographs as they are, then with the thing, with masks and without."""
     frames, look = case.scene.frames(case.split.train), look_of(0)
-    yield measured(case, frames, 0.0, False)
+    seen = surfaces(case.scene, Settings().longer_side)
+    clean = _made("without", frames)
     for share in SHARES:
         moved = [pasted(frame, share, seed, look) for seed, frame in enumerate(frames)]
-        for masks in (True, False):
-            kept = [masked(frame, mask) if masks else frame for frame, mask in moved]
-            yield measured(case, [frame for frame in kept if isinstance(frame, Frame)], share, masks)
+        training = [
+            replace(seen[frame.name], used=modelled_mask(mask, *seen[frame.name].depth.shape))
+            for frame, mask in moved
+            if frame.name in seen
+        ]
+        shown = _counts(case, seen, training)
+        yield _scored(case, clean, share, shown)
+        given = [kept for frame, mask in moved if isinstance(kept := masked(frame, mask), Frame)]
+        yield _scored(case, _made("masks", given), share, shown)
+        yield _scored(case, _made("found", [frame for frame, _ in moved]), share, shown)
+
+
+def _counts(case: Case, seen: Mapping[str, Surface], training: Sequence[Surface]) -> dict[str, Counts]:
+    return {name: shown_counts(seen[name], training) for name in case.split.test if name in seen}
 
 
 def main() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -34,6 +36,13 @@ def test_what_stands_before_a_surface_hides_it():
     hiding = wall(depth=2.0)
     assert (shown_counts(wall(), [hiding]) == 0).all()
     assert (shown_counts(wall(depth=2.0), [wall()]) == 1).all()
+
+
+def test_what_a_mask_hides_is_not_shown():
+    used = np.ones((30, 40), bool)
+    used[:, 20:] = False
+    counts = shown_counts(wall(), [replace(wall(), used=used), wall(1.0)])
+    assert (counts[:, :10] == 1).all() and (counts[:, 10:20] == 2).all() and (counts[:, 20:] == 1).all()
 
 
 def test_a_pixel_without_depth_is_unknown_and_in_no_region():

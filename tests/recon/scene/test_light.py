@@ -12,7 +12,7 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.recon.priors.pointmap import Pointmap
-from splatnode.recon.scene.light import Config, alike, differing, joining, log_gains, relit
+from splatnode.recon.scene.light import Config, alike, differing, joining, log_gains, relit, with_headroom
 from splatnode.recon.scene.scene import Exposure
 
 PLACE = synthetic.Config(views=5, width=240, height=180)
@@ -91,6 +91,32 @@ def test_pixels_that_do_not_tell_their_brightness_are_known():
     brightest = found["2"].saturated
     assert brightest is not None and np.array_equal(brightest, changed["2"] >= 250) and brightest.any()
     assert found["0"].saturated is None  # darker than the median: what it shows white, others do, too
+
+
+BRIGHT = np.array([0.45, 1.5, 1.6, 1.5, 1.4])[:, None]  # white in all but the first, which is dark
+
+
+def test_what_a_dark_photograph_tells_is_kept_though_it_is_brighter_than_white_in_the_others():
+    maps, images = place()
+    natural = [np.minimum(2 * image.astype(int), 255).astype(np.uint8) for image in images]
+    changed = by_name(exposed(natural, BRIGHT))
+    about_the_median = differing(maps, changed, Config())
+    kept, headroom = with_headroom(changed, about_the_median)
+    clipped = [float((alike(changed["0"], of["0"]) == 255).any(-1).mean()) for of in (about_the_median, kept)]
+    assert clipped[0] > 0.05 and clipped[1] < 0.02
+    assert 1.1 < headroom <= 2.0
+    assert gains_of(kept) == pytest.approx(headroom * gains_of(about_the_median))
+    published = headroom * alike(changed["0"], kept["0"]).astype(float)
+    assert np.median(np.abs(published - 1.5 * natural[0])) < 4.0  # the median of the gains, unclipped
+
+
+def test_photographs_that_fit_below_white_need_no_headroom():
+    maps, images = place()
+    changed = by_name(exposed(images))
+    found = differing(maps, changed, Config())
+    assert with_headroom(changed, found) == (found, 1.0)
+    assert with_headroom(changed, {}) == ({}, 1.0)
+    assert with_headroom(by_name([np.full_like(images[0], 255)]), {"0": found["0"]})[1] == 1.0  # nothing is told
 
 
 def test_photographs_that_share_nothing_keep_their_light():

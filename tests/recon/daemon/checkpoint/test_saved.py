@@ -120,6 +120,8 @@ def test_the_gains_of_a_scenes_photographs_come_back(graph, scene):
     found = scene_from(over_the_disk(header, arrays), keyframes)
     assert [view.exposure and view.exposure.gains for view in found.views] == [None, (2.0, 1.5, 0.5), None]
     assert [view.exposure and view.exposure.falloff for view in found.views] == [None, 0.7, None]
-    assert np.array_equal(found.views[1].image, image)
+    assert np.array_equal(found.views[1].image, image) and found.headroom == 1.0
+    darker = scene_from(over_the_disk(*scene_message(replace(lit, headroom=1.25), final=False)), keyframes)
+    assert darker.headroom == 1.25
     earlier = SceneRecord(header.views, header.iterations, header.final)  # of a version that knew no gains
     assert all(view.exposure is None for view in scene_from(over_the_disk(earlier, arrays), keyframes).views)
