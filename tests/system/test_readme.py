@@ -867,17 +867,18 @@ def test_the_race():
 
 
 def test_things_that_move():
-    found = {(row["scene"], row["share"], row["masks"]): row for row in raw("movers")["results"]}
-
-    def told(*case) -> str:
-        psnr = found[case]["psnr"]
-        return found[case]["verdict"] if psnr is None else f"{psnr:.1f}"
-
-    cases = [(scene, share) for scene, share, masks in found if masks]
-    assert len(cases) == 9
+    found = {(row["scene"], row["share"], row["kind"]): row for row in raw("movers")["results"]}
+    kinds = ("without", "masks", "found")
+    cases = dict.fromkeys((scene, share) for scene, share, _ in found)
+    assert len(found) == len(kinds) * len(cases) == 27
     for scene, share in cases:
-        with_masks, without = (told(scene, share, masks) for masks in (True, False))
-        says(f"| {scene} | {share:.0%} | {told(scene, 0.0, False)} | {with_masks} | {without} |")
+        rows = [found[scene, share, kind] for kind in kinds]
+        whole = [row["verdict"] if row["psnr"] is None else f"{row['psnr']:.1f}" for row in rows]
+        shown = ["–" if row["psnr_two"] is None else f"{row['psnr_two']:.1f}" for row in rows]
+        says(f"| {scene} | {share:.0%} | {' | '.join((*whole, *shown))} |")
+    fountain, fern, fox = (f"{found[scene, 0.3, 'without']['two_pct']:.0f}" for scene in dict(cases.keys()))
+    assert fountain == fern
+    says(f"where 30 % are covered, {fern} % of all, of fox {fox} %")
 
 
 def test_fisheyes():
