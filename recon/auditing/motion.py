@@ -83,17 +83,19 @@ def motion(before: Placed, after: Placed) -> Motion:
         measured = _measured(before, own, after.seen.pixels[other] - before.seen.pixels[own])
         if measured is not None:
             depth = float(np.median(before.camera.project(before.seen.points[own])[1]))
-            return replace(measured, covariance=measured.covariance + _seen_otherwise(measured, depth) ** 2 * apart)
+            otherwise = _seen_otherwise(measured, min(depth, before.spread))
+            return replace(measured, covariance=measured.covariance + otherwise**2 * apart)
     return Motion(T, apart, 0)
 
 
-def _seen_otherwise(motion: Motion, depth: float) -> float:
+def _seen_otherwise(motion: Motion, reach: float) -> float:
     """The share of what is wrong with the scene that is not the same for both cameras, in [0, 1].
 
-    It grows with the angle between the directions in which they see it, and between those in which they look; `depth`
-    is the scene's, in its unit.
+    A scene that is bent turns its cameras against each other, those that are farther apart by more: it is all for two
+    that are `reach` apart, which is how far the scene's cameras stand from each other, or from the scene, if that is
+    less. It grows with the angle between the directions in which the two look, too.
     """
-    return min(1.0, motion.distance / depth + np.radians(motion.degrees))
+    return min(1.0, motion.distance / reach + np.radians(motion.degrees))
 
 
 def _common(before: Placed, after: Placed) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:

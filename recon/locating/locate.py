@@ -16,6 +16,7 @@ import numpy.typing as npt
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.frames.keyframe import Features, longer_side, principal_point
 from splatnode.recon.frames.undistort import undistorted
+from splatnode.recon.geometry import spread
 from splatnode.recon.locating import candidates, checks, claims, posing
 from splatnode.recon.locating.camera_model import CameraModel, Lens
 from splatnode.recon.locating.case import Case, Judged
@@ -56,6 +57,7 @@ class Placed:
     camera: CameraModel
     seen: Correspondences  # what agrees with the camera: each landmark, and each of the photograph's features, once
     size: tuple[int, int]  # (width, height) of the photograph, pixels
+    spread: float  # RMS distance of the scene's cameras from their middle, in the unit of the result
 
 
 def locate(
@@ -108,7 +110,8 @@ def claimed(case: Case, frame: Frame, landmarks: Landmarks, config: Config) -> P
     K = np.diag([camera.lens.focal, camera.lens.focal, 1.0])
     K[:2, 2] = principal_point(frame) + camera.lens.shift
     at = Located(camera.T_world_camera, K, covariance, claim, int(case.posed.agreeing.sum()), landmarks.metric)
-    return Placed(at, camera, case.agreeing, (frame.width, frame.height))
+    apart = spread(landmarks.Ts_world_camera[:, :3, 3])
+    return Placed(at, camera, case.agreeing, (frame.width, frame.height), apart)
 
 
 def _case(known: Correspondences, frame: Frame, landmarks: Landmarks, config: Config) -> Case:

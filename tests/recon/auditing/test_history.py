@@ -36,7 +36,7 @@ def placed(T_world_camera: np.ndarray, seed: int, count: int = 300) -> Placed:
     seen = Correspondences(camera.project(points)[0] + noise, number, points, zero, number, number, points)
     covariance = 1e-6 * np.eye(6)
     located = Located(T_world_camera, np.eye(3), covariance, Claim(0.1, 0.01, 1.0, 1.0), count, False)
-    return Placed(located, camera, seen, SIZE)
+    return Placed(located, camera, seen, SIZE, spread=1.0)
 
 
 def history(*Ts: np.ndarray, first_seed: int = 1) -> dict[int, Sighting]:
