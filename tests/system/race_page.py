@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 
 from splatnode.recon.evaluate.contest import OURS, SHOWN, WHOLE, Margin, margins
 from splatnode.recon.evaluate.protocol import Row
@@ -22,8 +23,8 @@ def lines() -> list[str]:
     """A line of the table for each case; those that were refused are told with their verdict."""
     by_measure = [{(each.scene, each.views): each for each in margins(ends(), measure)} for measure in WHOLE]
     found = []
-    for row in (row for row in ends() if row.method == OURS):
-        case = row.scene, row.views
+    ours = [row for row in ends() if row.method == OURS]
+    for case, row in {(row.scene, row.views): row for row in ours}.items():
         if row.psnr is None:
             found.append(f"| {row.scene}, {row.views} | refused: {row.verdict} | – | – | – | – | – |")
             continue
@@ -46,6 +47,17 @@ def summary() -> str:
         f"{seen[0]} dB, {seen[1]} and {seen[2]}. InstantSplat-XL has {sizes:.0f} times as many Gaussians."
     )
     return text.replace("-0.", "−.").replace("+0.", "+.")
+
+
+def seeds() -> str:
+    """By how much ours differs from seed to seed."""
+    found: dict[tuple[str, int], list[float]] = {}
+    for row in ends():
+        if row.method == OURS and row.psnr is not None:
+            found.setdefault((row.scene, row.views), []).append(row.psnr)
+    assert {len(each) for each in found.values()} == {3}
+    apart = [max(each) - min(each) for each in found.values()]
+    return f"differ by {median(apart):.1f} dB in the median, by {max(apart):.1f} at most".replace("0.", ".")
 
 
 def headline() -> str:
