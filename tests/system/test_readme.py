@@ -9,7 +9,7 @@ import json
 import re
 import subprocess
 from collections.abc import Callable, Iterable, Sequence
-from statistics import mean, median
+from statistics import mean, median, quantiles
 
 import pytest
 
