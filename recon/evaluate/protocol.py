@@ -225,8 +225,7 @@ def _score_test_views(
         found.setdefault(name, T_world_camera)
         with_rim = light * appearance.render(T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
         if settings.best_gain:
-            gains = best_gains(truth, with_rim[rows, columns], used[rows, columns])
-            with_rim = with_rim * gains
+            with_rim = with_rim * best_gains(truth, with_rim[rows, columns], used[rows, columns])
         with_rim = with_rim.clamp(0.0, 1.0)
         show(name, truth, with_rim[rows, columns])
         scores.append(_view_score(with_rim, whole, used, (rows, columns), networks, counts.get(name)))

@@ -41,6 +41,7 @@ BENCHMARKS = {
         "movers",
         "fisheyes",
         "light",
+        "told_lenses",
         "told_light",
         "vignetting",
         "bent",

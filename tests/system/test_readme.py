@@ -721,6 +721,20 @@ def test_photographs_of_different_exposure():
         says(f"| {gains['scene']} | {gains['views']} | {' | '.join(_twice(live[i : i + 2]) for i in (0, 2, 4))} |")
 
 
+def test_lenses_that_are_told():
+    rows = raw("told_lenses")["rows"]
+    assert {row["verdict"] for row in rows} == {"OK"}
+    worse = dict.fromkeys(("rotation_error_deg", "centre_error_pct"), ())
+    for first in range(0, len(rows), 5):
+        straight, *bent = of_set = rows[first : first + 5]
+        found = [f"{part(row['rotation_error_deg'], 2)}, {part(row['centre_error_pct'], 2)}" for row in of_set]
+        says(f"| {straight['scene']} | {straight['views']} | {' | '.join(found)} |")
+        for error in worse:
+            worse[error] += tuple(row["scene"] for row in bent if row[error] > 1.5 * straight[error])
+    assert list(worse.values()) == [("sceaux", "fox"), ("llff_fern",) * 3]
+    says("Of 16 bent sets two turn a camera by more than 1.5 times", "and three, all of llff_fern, move one by more")
+
+
 def test_cameras_that_tell_their_exposure():
     rows = raw("told_light")["rows"]
     assert all(row["left"] for row in rows)

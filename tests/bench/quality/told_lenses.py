@@ -1,0 +1,131 @@
+"""Cameras of real photographs that a known lens bends, and is told: `python -m tests.bench told_lenses --out FILE`.
+
+The photographs of each set are resampled as a radial lens and as an equidistant fisheye would show them, enlarged just
+enough that nothing is missing. The reconstruction gets them with that calibration. Errors are those of the cameras
+against the true ones, beside those of the photographs as they came, of which the intrinsics are told, too.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import cv2
+import numpy as np
+
+from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.recon.config import preset
+from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
+from splatnode.recon.evaluate.perceptual import Networks
+from splatnode.recon.evaluate.splits import Split
+from splatnode.recon.evaluate.stability.places import Photo
+from splatnode.recon.evaluate.stability.warps import distorted
+from splatnode.recon.evaluate.truth import EvaluationScene
+from splatnode.recon.offline import run
+from splatnode.recon.result.snapshot import Snapshot
+from tests.bench.quality.real_sets import measure
+
+SETS = ("fountain_p11:6", "llff_fern:6", "sceaux:6", "fox:12")
+RADIALS = ((-0.25, 0.0), (-0.25, 0.1), (0.1, 0.0))
+
+
+@dataclass(frozen=True)
+class Row:
+    scene: str
+    views: int
+    lens: str
+    verdict: str
+    corner_shift_percent: float  # of the corner's distance from the middle
+    rotation_error_deg: float | None
+    centre_error_pct: float | None
+    seconds: float
+
+
+def as_it_came(photo: Photo) -> Photo:
+    return replace(photo, intrinsics=_told(photo))
+
+
+def radial(photo: Photo, k1: float, k2: float) -> Photo:
+    bent = distorted(photo, k1, k2)
+    return replace(bent, intrinsics=replace(_told(bent), distortion=(k1, k2, 0.0, 0.0)))
+
+
+def fisheye(photo: Photo) -> Photo:
+    """As an equidistant fisheye shows it whose corners look where the photograph's do."""
+    lens = _told(photo)
+    height, width = photo.image.shape[:2]
+    across = np.hypot(width / 2.0, height / 2.0) / lens.fx
+    focal = lens.fx * across / float(np.arctan(across))
+    x, y = np.meshgrid(np.arange(width) + 0.5 - lens.cx, np.arange(height) + 0.5 - lens.cy)
+    angle = np.hypot(x, y) / focal
+    farther = np.where(angle > 1e-9, np.tan(angle) / np.maximum(angle, 1e-9), 1.0) * lens.fx / focal
+    source = [(part * farther + middle - 0.5).astype(np.float32) for part, middle in ((x, lens.cx), (y, lens.cy))]
+    image = cv2.remap(photo.image, *source, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8)
+    told = Intrinsics(width, height, focal, focal, lens.cx, lens.cy, "calibration", model="fisheye")
+    return replace(photo, image=image, intrinsics=told)
+
+
+LENSES: dict[str, Callable[[Photo], Photo]] = {
+    "as it came": as_it_came,
+    **{f"radial {k1:+g} {k2:+g}": partial(radial, k1=k1, k2=k2) for k1, k2 in RADIALS},
+    "fisheye": fisheye,
+}
+
+
+def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Networks) -> list[Row]:
+    photos = [Photo(name, scene.image(name), scene.cameras[name]) for name in split.train]
+    found = []
+    for lens, bent in LENSES.items():
+        shown = [bent(photo) for photo in photos]
+        frames = [Frame(i, each.name, i, each.image, each.intrinsics) for i, each in enumerate(shown)]
+        begun = time.process_time()
+        snapshot = run(frames, preset("preview"))
+        seconds = round(time.process_time() - begun, 1)
+        code, moved = snapshot.verdict.code.value, round(_corner_shift(shown[0]), 1)
+        errors = _errors(snapshot, scene) if len(snapshot.cameras) > 1 else None
+        off = (None, None) if errors is None else (errors.rotation_deg, errors.centre_pct)
+        found.append(Row(scene.name, len(photos), lens, code, moved, *off, seconds))
+    return found
+
+
+def _told(photo: Photo) -> Intrinsics:
+    """The true intrinsics of a photograph that a pinhole took."""
+    assert photo.camera is not None
+    K, (height, width) = photo.camera.K, photo.image.shape[:2]
+    return Intrinsics(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], "calibration")
+
+
+def _corner_shift(photo: Photo) -> float:
+    """By how much the lens moves a corner towards the middle, in % of its distance from there."""
+    lens = photo.intrinsics
+    assert lens is not None
+    pinhole = np.hypot(lens.cx / lens.fx, lens.cy / lens.fy)
+    corner = np.zeros((1, 1, 2))
+    K = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
+    undistorted = cv2.fisheye.undistortPoints if lens.model == "fisheye" else cv2.undistortPoints
+    straight = undistorted(corner, K, np.array([*lens.distortion, *[0.0] * (4 - len(lens.distortion))]))
+    return 100.0 * (float(np.linalg.norm(straight)) / float(pinhole) - 1.0)
+
+
+def _errors(snapshot: Snapshot, scene: EvaluationScene) -> CameraErrors:
+    true = [scene.cameras[camera.name] for camera in snapshot.cameras]
+    Ts = np.stack([camera.T_world_camera for camera in snapshot.cameras])
+    Ks = np.stack([camera.K for camera in snapshot.cameras])  # lenses were told: their errors say nothing
+    return camera_errors(Ts, np.stack([camera.T_world_camera for camera in true]), Ks, Ks)
+
+
+def in_words(row: Row) -> str:
+    if row.rotation_error_deg is None:
+        return f"{row.scene} {row.views}, {row.lens}: {row.verdict}"
+    errors = f"{row.rotation_error_deg:.3f} degrees, {row.centre_error_pct:.3f} %"
+    return f"{row.scene} {row.views}, {row.lens} ({row.corner_shift_percent:.0f} %): {row.verdict}, {errors}"
+
+
+def main() -> None:
+    measure("told_lenses", __doc__, SETS, "SCENE:VIEWS", rows, in_words)
+
+
+if __name__ == "__main__":
+    main()
