@@ -95,6 +95,8 @@ def _seen_otherwise(motion: Motion, reach: float) -> float:
     that are `reach` apart, which is how far the scene's cameras stand from each other, or from the scene, if that is
     less. It grows with the angle between the directions in which the two look, too.
     """
+    if motion.distance >= reach:
+        return 1.0
     return min(1.0, motion.distance / reach + np.radians(motion.degrees))
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -67,6 +69,15 @@ def test_a_move_is_measured(turn, shift):
     assert np.degrees(Rotation.from_matrix(move[:3, :3]).magnitude()) == pytest.approx(found.degrees, abs=0.06)
     assert np.linalg.norm(found.T_before_after[:3, 3] - shift) < 0.001
     assert found.degrees_sigma < 0.1 and found.distance_sigma < 0.003
+
+
+def test_a_move_is_known_the_less_the_closer_the_cameras_of_the_scene_stand_together():
+    T = rigid((3.0, -5.0, 2.0), LEFT)
+    move = rigid((0.0, 1.0, 0.0), (0.03, 0.0, 0.0))
+    sigmas = [
+        motion(replace(placed(T, 1), spread=spread), placed(T @ move, 2)).degrees_sigma for spread in (1.0, 0.1, 0.0)
+    ]
+    assert sigmas[0] < sigmas[1] < sigmas[2] < 0.1  # where they stand at one place, all that is wrong counts
 
 
 def test_what_is_the_least_to_be_noticed_is_noticed_and_half_of_it_is_not():
