@@ -15,7 +15,7 @@ from splatnode.recon.evaluate.perceptual import Networks
 from splatnode.recon.evaluate.protocol import STAGES, Poses, Row, Run, Settings, evaluate, ignore_render
 from splatnode.recon.evaluate.regions import Counts
 from splatnode.recon.evaluate.renders import Renders
-from splatnode.recon.evaluate.shown import shown_counts, surfaces
+from splatnode.recon.evaluate.shown import counts_of, surfaces
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.start import Start, find_start
 from splatnode.recon.evaluate.timing import Timing, had_alone, most_taken, timing
@@ -81,7 +81,7 @@ def seen(scene: EvaluationScene, splits: Sequence[Split], longer_side: int) -> S
     counts = {}
     for split in splits:
         training = [found[name] for name in split.train if name in found]
-        counts[len(split.train)] = {n: shown_counts(found[n], training) for n in split.test if n in found}
+        counts[len(split.train)] = counts_of(split.test, found, training)
     return counts
 
 

@@ -7,7 +7,7 @@ it. Made once for each scene; it is read by nothing but the scores.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -84,6 +84,11 @@ def shown_counts(view: Surface, training: Sequence[Surface]) -> Counts:
     counts = np.full(view.depth.shape, UNKNOWN, np.uint8)
     counts[rows, columns] = np.minimum(shown, 2)
     return counts
+
+
+def counts_of(names: Iterable[str], views: Mapping[str, Surface], training: Sequence[Surface]) -> dict[str, Counts]:
+    """`shown_counts` of those photographs whose surface is known, by name."""
+    return {name: shown_counts(views[name], training) for name in names if name in views}
 
 
 def _shows(camera: Surface, points: Array) -> Mask:

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.frame import Intrinsics
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import LONGEST_TEXT, printable
 from splatnode.recon.evaluate.colmap_model import read_model
@@ -37,6 +38,11 @@ class TrueCamera:
     def K_for(self, width: int, height: int) -> npt.NDArray[np.float64]:
         """K of the image resized to `width` x `height`."""
         return self.K * np.array([width / self.width, height / self.height, 1.0])[:, None]
+
+    def intrinsics_for(self, width: int, height: int) -> Intrinsics:
+        """What a reconstruction that is given the lens is told of the image resized to `width` x `height`."""
+        K = self.K_for(width, height)
+        return Intrinsics(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], "given")
 
 
 class _Photograph(msgspec.Struct, frozen=True):

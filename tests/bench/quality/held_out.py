@@ -6,7 +6,6 @@ import argparse
 import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from splatnode.recon.config import preset
@@ -49,8 +48,16 @@ class Case:
     ) -> Scored:
         """`shown` as for `evaluate`."""
         run = Run(method, 0, None, {}, None)
-        how = partial(evaluate, rasterize=rasterize, networks=scoring.networks, settings=scoring.settings)
-        return how(snapshot, self.scene, self.split, run, shown=shown)
+        return evaluate(
+            snapshot,
+            self.scene,
+            self.split,
+            run,
+            rasterize=rasterize,
+            networks=scoring.networks,
+            settings=scoring.settings,
+            shown=shown,
+        )
 
     def start(self, folders: Folders) -> bytes:
         """Cameras and points of the photographs, pickled: every method gets a copy of its own."""

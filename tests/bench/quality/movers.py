@@ -22,7 +22,7 @@ from splatnode.recon.config import preset
 from splatnode.recon.evaluate.perceptual import Networks
 from splatnode.recon.evaluate.protocol import Settings
 from splatnode.recon.evaluate.regions import Counts
-from splatnode.recon.evaluate.shown import Surface, shown_counts, surfaces
+from splatnode.recon.evaluate.shown import counts_of, surfaces
 from splatnode.recon.frames.keyframe import modelled_mask
 from splatnode.recon.offline import run
 from splatnode.recon.result.snapshot import Snapshot
@@ -86,15 +86,11 @@ def results(case: Case) -> Iterable[Result]:
             for frame, mask in moved
             if frame.name in seen
         ]
-        shown = _counts(case, seen, training)
+        shown = counts_of(case.split.test, seen, training)
         yield _scored(case, clean, share, shown)
         given = [kept for frame, mask in moved if isinstance(kept := masked(frame, mask), Frame)]
         yield _scored(case, _made("masks", given), share, shown)
         yield _scored(case, _made("found", [frame for frame, _ in moved]), share, shown)
-
-
-def _counts(case: Case, seen: Mapping[str, Surface], training: Sequence[Surface]) -> dict[str, Counts]:
-    return {name: shown_counts(seen[name], training) for name in case.split.test if name in seen}
 
 
 def main() -> None:

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.lenses.lens import project, unproject
 from splatnode.recon.config import preset
 from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
 from splatnode.recon.evaluate.perceptual import Networks
@@ -26,6 +27,7 @@ from splatnode.recon.evaluate.truth import EvaluationScene
 from splatnode.recon.offline import run
 from splatnode.recon.result.snapshot import Snapshot
 from tests.bench.quality.real_sets import measure
+from tests.bench.quality.unknown_lenses import corner_moves_pct
 
 SETS = ("fountain_p11:6", "llff_fern:6", "sceaux:6", "fox:12")
 RADIALS = ((-0.25, 0.0), (-0.25, 0.1), (0.1, 0.0))
@@ -37,7 +39,7 @@ class Row:
     views: int
     lens: str
     verdict: str
-    corner_shift_percent: float  # of the corner's distance from the middle
+    corner_moves_pct: float | None  # of its distance from the middle
     rotation_error_deg: float | None
     centre_error_pct: float | None
     seconds: float
@@ -54,16 +56,15 @@ def radial(photo: Photo, k1: float, k2: float) -> Photo:
 
 def fisheye(photo: Photo) -> Photo:
     """As an equidistant fisheye shows it whose corners look where the photograph's do."""
-    lens = _told(photo)
+    pinhole = _told(photo)
     height, width = photo.image.shape[:2]
-    across = np.hypot(width / 2.0, height / 2.0) / lens.fx
-    focal = lens.fx * across / float(np.arctan(across))
-    x, y = np.meshgrid(np.arange(width) + 0.5 - lens.cx, np.arange(height) + 0.5 - lens.cy)
-    angle = np.hypot(x, y) / focal
-    farther = np.where(angle > 1e-9, np.tan(angle) / np.maximum(angle, 1e-9), 1.0) * lens.fx / focal
-    source = [(part * farther + middle - 0.5).astype(np.float32) for part, middle in ((x, lens.cx), (y, lens.cy))]
-    image = cv2.remap(photo.image, *source, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8)
-    told = Intrinsics(width, height, focal, focal, lens.cx, lens.cy, "calibration", model="fisheye")
+    across = np.hypot(width / 2.0, height / 2.0) / pinhole.fx
+    focal = pinhole.fx * across / float(np.arctan(across))
+    told = replace(pinhole, fx=focal, fy=focal, model="fisheye")
+    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1).reshape(-1, 2)
+    source = project(unproject(pixels, told), pinhole) - 0.5
+    columns, rows = source.astype(np.float32).reshape(height, width, 2).transpose(2, 0, 1)
+    image = cv2.remap(photo.image, columns, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).astype(np.uint8)
     return replace(photo, image=image, intrinsics=told)
 
 
@@ -83,7 +84,7 @@ def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Netwo
         begun = time.process_time()
         snapshot = run(frames, preset("preview"))
         seconds = round(time.process_time() - begun, 1)
-        code, moved = snapshot.verdict.code.value, round(_corner_shift(shown[0]), 1)
+        code, moved = snapshot.verdict.code.value, corner_moves_pct(frames[0].intrinsics or _told(photos[0]))
         errors = _errors(snapshot, scene) if len(snapshot.cameras) > 1 else None
         off = (None, None) if errors is None else (errors.rotation_deg, errors.centre_pct)
         found.append(Row(scene.name, len(photos), lens, code, moved, *off, seconds))
@@ -93,20 +94,7 @@ def rows(scene: EvaluationScene, split: Split, _: Sequence[str], networks: Netwo
 def _told(photo: Photo) -> Intrinsics:
     """The true intrinsics of a photograph that a pinhole took."""
     assert photo.camera is not None
-    K, (height, width) = photo.camera.K, photo.image.shape[:2]
-    return Intrinsics(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], "calibration")
-
-
-def _corner_shift(photo: Photo) -> float:
-    """By how much the lens moves a corner towards the middle, in % of its distance from there."""
-    lens = photo.intrinsics
-    assert lens is not None
-    pinhole = np.hypot(lens.cx / lens.fx, lens.cy / lens.fy)
-    corner = np.zeros((1, 1, 2))
-    K = np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
-    undistorted = cv2.fisheye.undistortPoints if lens.model == "fisheye" else cv2.undistortPoints
-    straight = undistorted(corner, K, np.array([*lens.distortion, *[0.0] * (4 - len(lens.distortion))]))
-    return 100.0 * (float(np.linalg.norm(straight)) / float(pinhole) - 1.0)
+    return photo.camera.intrinsics_for(photo.image.shape[1], photo.image.shape[0])
 
 
 def _errors(snapshot: Snapshot, scene: EvaluationScene) -> CameraErrors:
@@ -120,7 +108,7 @@ def in_words(row: Row) -> str:
     if row.rotation_error_deg is None:
         return f"{row.scene} {row.views}, {row.lens}: {row.verdict}"
     errors = f"{row.rotation_error_deg:.3f} degrees, {row.centre_error_pct:.3f} %"
-    return f"{row.scene} {row.views}, {row.lens} ({row.corner_shift_percent:.0f} %): {row.verdict}, {errors}"
+    return f"{row.scene} {row.views}, {row.lens} ({row.corner_moves_pct:.0f} %): {row.verdict}, {errors}"
 
 
 def main() -> None:

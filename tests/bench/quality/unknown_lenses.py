@@ -74,12 +74,20 @@ def measured(name: str, lens: Intrinsics, views: int, seed: int, config: Config)
     graph = match((prepare(frame, config) for frame in frames), config.matching)
     estimate = estimate_cameras(graph, (), config)
     row = Row(name, seed, views, None, estimate.verdict.code.value, estimate.publishable, *(None,) * 5)
-    rays = unproject(CORNERS, lens)
-    if (rays[:, 2] > 0).all():
-        pinhole = lens.fx * rays[:, :2] / rays[:, 2:] + (lens.cx, lens.cy)
-        furthest = np.linalg.norm(pinhole - CORNERS, axis=1).max()
-        row = replace(row, corner_moves_pct=100 * float(furthest) / math.hypot(WIDTH / 2, HEIGHT / 2))
-    return against_truth(row, estimate, lens, [T for T, _ in synthetic.scene_cameras(place)], rays)
+    row = replace(row, corner_moves_pct=corner_moves_pct(lens))
+    true = [T for T, _ in synthetic.scene_cameras(place)]
+    return against_truth(row, estimate, lens, true, unproject(CORNERS, lens))
+
+
+def corner_moves_pct(lens: Intrinsics) -> float | None:
+    """By how much of its distance from the middle a lens moves a corner at most; None where one looks back."""
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]]) * (lens.width, lens.height)
+    rays = unproject(corners, lens)
+    if (rays[:, 2] <= 0).any():
+        return None
+    pinhole = lens.fx * rays[:, :2] / rays[:, 2:] + (lens.cx, lens.cy)
+    furthest = np.linalg.norm(pinhole - corners, axis=1).max()
+    return 100 * float(furthest) / math.hypot(lens.width / 2, lens.height / 2)
 
 
 def against_truth(row: Row, estimate: Estimate, lens: Intrinsics, Ts_true: Sequence[Array], rays: Array) -> Row:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 
-from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.frame import Frame
 from splatnode.recon.config import Config
 from splatnode.recon.estimation import Estimate, estimate_cameras
 from splatnode.recon.evaluate.stability.own_cameras import cameras_of, registered
@@ -51,14 +51,10 @@ def frames_of(place: Place, window: Window, given_lens: bool = False) -> list[Fr
     frames = []
     for name in window.names:
         index, image = place.names.index(name), place.scene.image(name)
-        intrinsics = _true_intrinsics(place, name, image.shape[1], image.shape[0]) if given_lens else None
+        camera = place.scene.cameras[name] if given_lens else None
+        intrinsics = None if camera is None else camera.intrinsics_for(image.shape[1], image.shape[0])
         frames.append(Frame(index, name, index, image, intrinsics))
     return frames
-
-
-def _true_intrinsics(place: Place, name: str, width: int, height: int) -> Intrinsics:
-    K = place.scene.cameras[name].K_for(width, height)
-    return Intrinsics(width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], "given")
 
 
 def from_scratch(frames: Sequence[Frame], config: Config) -> Estimate:
