@@ -4,7 +4,8 @@ race_cases.json names the sets: scenes that no default or preset was chosen on, 
 scenes on which some were. Presets run against the recipes of others, as published and in a start with our filled depths
 and far shell (`+fill`), from the same cameras and points; `mcmc` has as many Gaussians as `balanced` chose. Every
 held-out view is scored whole and by what the training photographs show of it. DIR holds what `splatnode bench` writes;
-runs that it holds already are not run again.
+runs that it holds already are not run again. With `--device cuda` scenes are refined, and held-out cameras searched, on
+a GPU, which runs share: their rows have no seconds.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.frame import Frame
+from splatnode.capture.process.arguments import names, positive
 from splatnode.capture.process.progress import say
 from splatnode.recon.config import Config
 from splatnode.recon.evaluate import methods
@@ -31,8 +33,12 @@ from splatnode.recon.evaluate.protocol import INTERPOLATED_START, Settings
 from splatnode.recon.evaluate.records import Bench
 from splatnode.recon.evaluate.report import redraw
 from splatnode.recon.evaluate.start import Start, continued, foundation
+from splatnode.recon.jobs.calls import Engine, engine
 from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.rasterize.device import Device
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.shared_arguments import add_device
+from tests.bench.quality.gpu_scoring import rasterize_on_gpu
 from tests.bench.quality.parsimony import configurations
 from tests.bench.quality.parsimony_chart import PIXEL, RIVAL
 
@@ -50,12 +56,17 @@ class Case(msgspec.Struct, frozen=True):
     train: tuple[str, ...]
     test: tuple[str, ...]
 
+    @property
+    def label(self) -> str:
+        return f"{self.name}:{len(self.train)}"
+
 
 @dataclass(frozen=True)
 class Field:
     """Who runs, where `chosen` is the number of Gaussians for `mcmc`."""
 
     chosen: int
+    device: Device = "cpu"
 
     def config(self, name: str) -> Config | None:
         """Of a method that only this bench has."""
@@ -68,8 +79,8 @@ class Field:
     def reconstruct(self, frames: Sequence[Frame], name: str, seed: int, start: Start | None) -> Iterator[Snapshot]:
         config = self.config(name)
         if config is None or start is None:
-            return methods.by_name(frames, name, seed, start)
-        return continued(start, msgspec.structs.replace(config, seed=seed))
+            return methods.by_name(frames, name, seed, start, self.device)
+        return continued(start, msgspec.structs.replace(config, seed=seed, device=self.device))
 
     def start_of(self, name: str) -> Config | None:
         config = self.config(name)
@@ -92,16 +103,29 @@ def linked(case: Case, scenes: Path, folder: Path) -> Path:
     return link
 
 
-def run(case: Case, wanted: Sequence[str], seeds: int, scenes: Path, out: Path, scoring: Scoring) -> Bench:
+@dataclass(frozen=True)
+class How:
+    """How runs are made and scored, the same for all cases."""
+
+    methods: tuple[str, ...]
+    seeds: tuple[int, ...]
+    scoring: Scoring
+    engine: Engine
+    device: Device
+
+
+def run(case: Case, how: How, scenes: Path, out: Path) -> Bench:
     """Adds the runs of a case to what `out` holds."""
-    plan = partial(Plan, (linked(case, scenes, out / "scenes"),), (len(case.train),), seeds=tuple(range(seeds)))
-    go_on = partial(run_bench, out_dir=out, scoring=scoring, command=command(), resume=True)
-    bench = go_on(plan((REFERENCE,)), Entrants(methods.by_name, methods.start_of))
+    scene = linked(case, scenes, out / "scenes")
+    plan = partial(Plan, (scene,), (len(case.train),), seeds=how.seeds, timed=how.device == "cpu")
+    go_on = partial(run_bench, out_dir=out, scoring=how.scoring, command=command(), resume=True, engine=how.engine)
+    first = Field(1, how.device)  # the number of Gaussians is for others
+    bench = go_on(plan((REFERENCE,)), Entrants(first.reconstruct, first.start_of))
     mine = [row for row in bench.rows if (row.scene, row.views, row.method) == (case.name, len(case.train), REFERENCE)]
     if mine[0].psnr is None:
         return bench  # refused: the others start from the same cameras, so there is nothing to compare
-    entrants = Field(mine[0].num_gaussians or 1)
-    return go_on(plan(tuple(wanted)), Entrants(entrants.reconstruct, entrants.start_of))
+    entrants = Field(mine[0].num_gaussians or 1, how.device)
+    return go_on(plan(how.methods), Entrants(entrants.reconstruct, entrants.start_of))
 
 
 def quick_networks(weights_dir: Path) -> Networks:
@@ -114,26 +138,29 @@ def command() -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", help="of cases (default: all)")
+    parser.add_argument("names", nargs="*", help="of cases, or NAME:VIEWS (default: all)")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--methods", type=lambda text: text.split(","), default=METHODS)
+    parser.add_argument("--seeds", type=positive, default=1, metavar="N", help="seeds 0 to N-1")
+    parser.add_argument("--methods", type=names, default=METHODS)
     parser.add_argument("--interpolated-start", action="store_true", help="as `splatnode bench` has it")
+    parser.add_argument("--cores", type=positive, metavar="N", help="as `splatnode bench` has it")
+    add_device(parser)
     parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
     args = parser.parse_args()
     settings = INTERPOLATED_START if args.interpolated_start else Settings()
-    scoring = Scoring(
-        rasterize, partial(quick_networks, (args.shared / "weights").absolute()), settings, by_region=True
-    )
-    if scoring.networks().alex is None:
+    device: Device = args.device or "cpu"
+    networks = partial(quick_networks, (args.shared / "weights").absolute())
+    scoring = Scoring(rasterize_on_gpu if device == "cuda" else rasterize, networks, settings, by_region=True)
+    if networks().alex is None:
         parser.error(f"{args.shared}/weights must hold LPIPS's weights for AlexNet. Run: splatnode weights")
-    chosen = [case for case in cases() if not args.names or case.name in args.names]
+    chosen = [case for case in cases() if not args.names or {case.name, case.label} & set(args.names)]
     if not chosen:
-        sys.exit(f"no such case; there are {', '.join(dict.fromkeys(case.name for case in cases()))}")
-    for case in chosen:
-        bench = run(case, args.methods, args.seeds, args.shared / "scenes", args.out, scoring)
-        redraw(bench, args.out)
-        say(f"{case.name}, {len(case.train)} views: done")
+        sys.exit(f"no such case; there are {', '.join(case.label for case in cases())}")
+    with engine(args.cores, None) as where:
+        how = How(tuple(args.methods), tuple(range(args.seeds)), scoring, where, device)
+        for case in chosen:
+            redraw(run(case, how, args.shared / "scenes", args.out), args.out)
+            say(f"{case.name}, {len(case.train)} views: done")
 
 
 if __name__ == "__main__":
