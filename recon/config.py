@@ -13,6 +13,8 @@ from splatnode.recon.frames import screening
 from splatnode.recon.matching import config as matching
 from splatnode.recon.metric import config as metric
 from splatnode.recon.optimize import dropout, refinement
+from splatnode.recon.optimize.control import prune
+from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.priors import classical
 from splatnode.recon.rasterize.device import Device
 from splatnode.recon.registration import config as registration
@@ -102,11 +104,22 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return initialisation.Config(self.completion, self.seeding, self.background, self.pixelwise, most)
 
 
+# Three tenths of the others' for as many more iterations: with long steps, what one photograph alone shows drifts away
+_SHORT_STEPS = refinement.Rates(means=0.12, quats=6e-3, log_scales=3e-2, logit_opacities=3e-2, sh=9e-3)
+
 PRESETS: dict[str, Config] = {
     "preview": Config(size=384, optimize=refinement.Config(half_resolution_share=0.25, iterations=150)),
     "fast": Config(optimize=refinement.Config(iterations=200)),
     "balanced": Config(),
-    "quality": Config(optimize=refinement.Config(iterations=1500, checkpoints=(150, 500))),
+    "quality": Config(
+        seeding=seeding.Config(max_error=0.0014),
+        optimize=refinement.Config(
+            iterations=1500,
+            checkpoints=(500,),
+            rates=_SHORT_STEPS,
+            control=ControlChoice("prune", prune.Config(least_change=0.0025)),
+        ),
+    ),
 }
 
 

@@ -140,7 +140,7 @@ def _grid(
             if row == len(views) - 1:
                 chart.set_xlabel(x_label, color=_MUTED)
     handles = [
-        Line2D([], [], color=_style(i)[0], marker=_style(i)[1], label=method, linewidth=1.8)
+        Line2D([], [], color=style(i)[0], marker=style(i)[1], label=method, linewidth=1.8)
         for i, method in enumerate(methods)
     ]
     handles.append(Line2D([], [], color=_MUTED, linestyle=(0, (4, 3)), linewidth=1.2, label="Pareto front"))
@@ -164,7 +164,7 @@ def _chart(
         )
     for i, method in enumerate(methods):
         curve = [entry for entry in drawn if entry[0].method == method]
-        colour, marker = _style(i)
+        colour, marker = style(i)
         costs, values = [cost for _, cost, _ in curve], [value for _, _, value in curve]
         chart.plot(costs, values, color=colour, linewidth=1.8, zorder=2)
         chart.scatter(
@@ -205,7 +205,8 @@ def _qualities(measured: Sequence[MethodMean]) -> list[Quality]:
     return [_PSNR, _SSIM, *([most] if counts[most] else [])]
 
 
-def _style(index: int) -> tuple[str, str]:
+def style(index: int) -> tuple[str, str]:
+    """The colour and the marker of the method in this place."""
     return _COLOURS[index % len(_COLOURS)], _MARKERS[index % len(_MARKERS)]
 
 

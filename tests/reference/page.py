@@ -136,7 +136,9 @@ def _presets() -> str:
     lines = []
     for name, preset in PRESETS.items():
         changed = [
-            f"`{key[1]}: {_as_in_files(value)}`" for key, value in _values_of(preset).items() if value != usual[key]
+            f"`{key[1]}: {_as_in_files(value)}`"
+            for key, value in _values_of(preset).items()
+            if value != usual[key] and _as_in_files(value) != _as_in_files(usual[key])
         ]
         lines.append(f"- `{name}`: {', '.join(changed) or 'the defaults'}")
     return "\n".join(lines)

@@ -1,0 +1,151 @@
+"""The race as a chart: speed against accuracy, and size, of each method beside ours on the same sets of photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import mean, median, stdev
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
+
+from splatnode.recon.config import PRESETS
+from splatnode.recon.evaluate.charts import INK, plain, png, style
+from splatnode.recon.evaluate.contest import OURS, WHOLE
+from splatnode.recon.evaluate.protocol import Row
+from splatnode.recon.evaluate.tables import Measure
+
+TICKS = (0.5, 1.0, 2.0, 4.0, 8.0)  # of time, over ours
+SMALLEST, LARGEST = 25.0, 330.0  # bubble areas, in points^2
+
+
+@dataclass(frozen=True)
+class Point:
+    """A method beside ours, in the mean over the sets of so many photographs that both were scored on."""
+
+    method: str
+    sets: int
+    time: float  # over ours
+    size: float  # number of Gaussians, over ours
+    lead: float  # of the measure over ours, positive where it is better
+    spread: float | None  # standard deviation of `lead` between seeds; None: of one seed
+
+
+def times(ends: Sequence[Row]) -> dict[str, float]:
+    """By method: its time over ours, in the median of the sets where both had a core of one kind alone."""
+    timed = [row for row in ends if row.psnr is not None and row.seconds.get("total") is not None]
+    ours: dict[tuple[str, int, str | None, int | None], list[float]] = {}
+    for row in timed:
+        if row.method == OURS:
+            ours.setdefault((row.scene, row.views, row.processor, row.cores), []).append(row.seconds["total"] or 0.0)
+    ratios: dict[str, list[float]] = {}
+    for row in timed:
+        if same := ours.get((row.scene, row.views, row.processor, row.cores)):
+            ratios.setdefault(row.method, []).append((row.seconds["total"] or 0.0) / mean(same))
+    return {method: 1.0 if method == OURS else median(found) for method, found in ratios.items()}
+
+
+def points(ends: Sequence[Row], views: int, measure: Measure) -> list[Point]:
+    """A point a method; none of a method whose time was nowhere measured."""
+    took = times(ends)
+    by_method: dict[str, dict[str, list[Row]]] = {}
+    for row in ends:
+        if row.views == views and measure.value(row) is not None:
+            by_method.setdefault(row.method, {}).setdefault(row.scene, []).append(row)
+    ours = by_method.get(OURS, {})
+    found = []
+    for method, scenes in by_method.items():
+        common = [scene for scene in scenes if scene in ours]
+        if not common or method not in took:
+            continue
+        sizes = [_size(scenes[scene]) / _size(ours[scene]) for scene in common]
+        leads = _leads({s: scenes[s] for s in common}, {s: ours[s] for s in common}, measure)
+        spread = stdev(leads) if len(leads) > 1 else None
+        found.append(Point(method, len(common), took[method], mean(sizes), mean(leads), spread))
+    return found
+
+
+def _size(rows: Sequence[Row]) -> float:
+    return mean(row.num_gaussians or 0 for row in rows)
+
+
+def _leads(scenes: dict[str, list[Row]], ours: dict[str, list[Row]], measure: Measure) -> list[float]:
+    """For each seed that all sets have: the mean over them of how much better than our mean over seeds."""
+    sign = 1.0 if measure.higher_is_better else -1.0
+    seeds = set.intersection(*({row.seed for row in rows} for rows in scenes.values()))
+    found = []
+    for seed in sorted(seeds):
+        differences = []
+        for scene, rows in scenes.items():
+            (value,) = (_value(measure, row) for row in rows if row.seed == seed)
+            differences.append(sign * (value - mean(_value(measure, row) for row in ours[scene])))
+        found.append(mean(differences))
+    return found
+
+
+def _value(measure: Measure, row: Row) -> float:
+    value = measure.value(row)
+    assert value is not None  # rows without it were left out
+    return value
+
+
+def draw(ends: Sequence[Row]) -> bytes:
+    """A PNG: a row of charts a number of photographs, a column a measure."""
+    views = sorted({row.views for row in ends if row.psnr is not None})
+    figure = Figure(figsize=(4.3 * len(WHOLE), 3.2 * len(views) + 1.9), dpi=150, layout="constrained")
+    axes = figure.subplots(len(views), len(WHOLE), squeeze=False, sharex=True)
+    recipes = list(dict.fromkeys(row.method.partition("+")[0] for row in ends))
+    for charts, count in zip(axes, views, strict=True):
+        for chart, measure in zip(charts, WHOLE, strict=True):
+            found = points(ends, count, measure)
+            _chart(chart, found, recipes)
+            chart.set_ylabel(f"{measure.name}: how much better than {OURS}", fontsize=8)
+            sets = sorted({point.sets for point in found})
+            if chart is charts[0]:
+                title = f"{count} photographs, {' to '.join(map(str, dict.fromkeys((sets[0], sets[-1]))))} sets"
+                chart.set_title(title, loc="left", color=INK, fontsize=10, weight="bold")
+    for chart in axes[-1]:
+        chart.set_xlabel(f"time over {OURS}'s (log scale)", fontsize=8)
+    _legend(figure, recipes)
+    figure.suptitle(
+        f"The race: every method beside {OURS}, in the mean of the sets that both have; up and left is better\n"
+        "Area: number of Gaussians. Bars: standard deviation between three seeds, where a method has them",
+        x=0.01,
+        ha="left",
+        color=INK,
+        fontsize=11,
+    )
+    return png(figure)
+
+
+def _chart(chart: Axes, found: Sequence[Point], recipes: Sequence[str]) -> None:
+    largest = max(point.size for point in found)
+    for point in found:
+        recipe, _, filled = point.method.partition("+")
+        colour, marker = style(recipes.index(recipe))
+        if point.spread is not None:
+            chart.errorbar(point.time, point.lead, yerr=point.spread, color=colour, linewidth=1.2, capsize=3, zorder=2)
+        area = SMALLEST + (LARGEST - SMALLEST) * point.size / largest
+        face = colour if filled or recipe in PRESETS else "none"
+        chart.scatter(point.time, point.lead, s=area, marker=marker, edgecolors=colour, facecolors=face, zorder=3)
+    chart.axhline(0.0, color=INK, linewidth=1.0, zorder=1)
+    chart.set_xscale("log")
+    chart.set_xticks(TICKS)
+    chart.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    chart.xaxis.set_minor_locator(NullLocator())
+    chart.xaxis.set_minor_formatter(NullFormatter())
+    chart.margins(0.12, 0.15)
+    plain(chart)
+
+
+def _legend(figure: Figure, recipes: Sequence[str]) -> None:
+    handles = [
+        Line2D([], [], color=colour, marker=marker, label=recipe, linestyle="none", markersize=7)
+        for recipe in recipes
+        for colour, marker in (style(recipes.index(recipe)),)
+    ]
+    hollow = Line2D([], [], color=INK, marker="o", markerfacecolor="none", linestyle="none", label="as published")
+    full = Line2D([], [], color=INK, marker="o", linestyle="none", label="with our background, or ours")
+    figure.legend(handles=[*handles, full, hollow], loc="outside lower center", ncols=5, frameon=False, fontsize=9)
