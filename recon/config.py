@@ -55,7 +55,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     size: Annotated[int, Meta(ge=64)] = 512  # longer side of the modelled images, pixels
     # Of the generators of random numbers: the same seed and photographs give the same scene
     seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
-    device: Device = "cpu"  # that Gaussians are refined on; cuda was run once by us, on an NVIDIA H200
+    device: Device = "cpu"  # that Gaussians are refined on; cuda was run by us on NVIDIA H200s alone
     quick: bool = False  # the first answer stands, also where it is no: nothing that takes longer is tried
     # What gives depth, and matches that plain features miss
     prior: PriorChoice = PriorChoice("classical", classical.Config())

@@ -1,7 +1,7 @@
 """`python -m tests.gpu [--out FILE]`: does a GPU give what the processor gives, and how fast? For people who have one.
 
 Prints each difference with its bound, seconds and milliseconds, and a verdict; ends with 0 if all bounds are kept, 1 if
-not, 69 without a GPU that can be used. It was run once, on an NVIDIA H200: what it prints on another GPU is worth
+not, 69 without a GPU that can be used. It was run on NVIDIA H200s: what it prints on another GPU is worth
 sending to the project.
 """
 

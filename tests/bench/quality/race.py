@@ -36,8 +36,10 @@ from splatnode.recon.evaluate.start import Start, continued, foundation
 from splatnode.recon.jobs.calls import Engine, engine
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.rasterize.device import Device
+from splatnode.recon.result.export.staged import write_files
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.shared_arguments import add_device
+from tests.bench.quality import race_chart
 from tests.bench.quality.gpu_scoring import rasterize_on_gpu
 from tests.bench.quality.parsimony import configurations
 from tests.bench.quality.parsimony_chart import PIXEL, RIVAL
@@ -159,7 +161,11 @@ def main() -> None:
     with engine(args.cores, None) as where:
         how = How(tuple(args.methods), tuple(range(args.seeds)), scoring, where, device)
         for case in chosen:
-            redraw(run(case, how, args.shared / "scenes", args.out), args.out)
+            bench = run(case, how, args.shared / "scenes", args.out)
+            redraw(bench, args.out)
+            ends = [row for row in bench.rows if row.final]
+            if race_chart.times(ends):
+                write_files(args.out, {"race.png": race_chart.draw(ends)})
             say(f"{case.name}, {len(case.train)} views: done")
 
 

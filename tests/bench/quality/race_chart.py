@@ -92,8 +92,8 @@ def _value(measure: Measure, row: Row) -> float:
 
 
 def draw(ends: Sequence[Row]) -> bytes:
-    """A PNG: a row of charts a number of photographs, a column a measure."""
-    views = sorted({row.views for row in ends if row.psnr is not None})
+    """A PNG: a row of charts a number of photographs, a column a measure. Some of ours must have been timed."""
+    views = [count for count in sorted({row.views for row in ends}) if points(ends, count, WHOLE[0])]
     figure = Figure(figsize=(4.3 * len(WHOLE), 3.2 * len(views) + 1.9), dpi=150, layout="constrained")
     axes = figure.subplots(len(views), len(WHOLE), squeeze=False, sharex=True)
     recipes = list(dict.fromkeys(row.method.partition("+")[0] for row in ends))
