@@ -5,16 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from statistics import mean, median
+from statistics import median
 
 from splatnode.recon.evaluate.contest import OURS, SHOWN, WHOLE, Margin, margins
 from splatnode.recon.evaluate.protocol import Row
 from splatnode.recon.evaluate.records import read_bench
-from splatnode.recon.evaluate.tables import Measure
 from tests.bench.quality import race_chart
 
 RAW = Path(__file__).parents[1] / "bench" / "results" / "race.json"
 DIGITS = (1, 3, 3)
+LARGEST = "instantsplat-xl+fill"  # the method whose number of Gaussians is told
 
 
 def ends() -> list[Row]:
@@ -39,53 +39,33 @@ def summary() -> str:
     """What is lost, then what is won."""
     whole, shown = ([margins(ends(), measure) for measure in measures] for measures in (WHOLE, SHOWN))
     lost = [_lost(each, digits) for each, digits in zip(whole, DIGITS, strict=True)]
-    means = [f"{_mean(each):+.{digits}f}" for each, digits in zip(whole, (2, 3, 3), strict=True)]
-    seen = [f"{_mean(each):+.{digits}f}" for each, digits in zip(shown, (2, 3, 3), strict=True)]
-    sizes = _mean_ratio("instantsplat-xl+fill")
-    text = (
+    means, seen = (
+        [_signed(_mean(each), digits) for each, digits in zip(found, (2, 3, 3), strict=True)]
+        for found in (whole, shown)
+    )
+    sizes = _beside()[LARGEST][0].size
+    return (
         f"Of {len(whole[0])} cases that were published, `{OURS}` is behind the best other in PSNR in {lost[0]}, "
         f"in SSIM in {lost[1]}, in LPIPS in {lost[2]}. Its mean lead is {means[0]} dB, {means[1]} in SSIM and "
         f"{means[2]} in LPIPS (positive is better); on the pixels that a training photograph shows "
         f"{seen[0]} dB, {seen[1]} and {seen[2]}. InstantSplat-XL has {sizes:.0f} times as many Gaussians."
     )
-    return text.replace("-0.", "−.").replace("+0.", "+.")
 
 
 def against() -> list[str]:
     """A line for each other method: ours beside it in the mean of the cases that both have."""
-    methods = dict.fromkeys(row.method for row in ends() if row.method != OURS)
-    took = race_chart.times(ends())
     found = []
-    for method in sorted(methods):
-        mine = [row for row in ends() if row.method in (method, OURS) and row.psnr is not None]
-        leads = [
-            _signed(mean([_lead(mine, case, measure) for case in _cases(mine, method)]), digits)
-            for measure, digits in zip(WHOLE, (2, 3, 3), strict=True)
-        ]
-        sizes = mean([1 / _lead_size(mine, case, method) for case in _cases(mine, method)])
-        time = f"{took[method]:.1f}" if method in took else "not measured"
-        found.append(f"| {method} | {len(_cases(mine, method))} | {' | '.join(leads)} | {sizes:.1f} | {time} |")
+    for method, (psnr, ssim, lpips) in sorted(_beside().items()):
+        leads = [_signed(-point.lead, digits) for point, digits in ((psnr, 2), (ssim, 3), (lpips, 3))]
+        time = "not measured" if psnr.time is None else f"{psnr.time:.1f}"
+        found.append(f"| {method} | {psnr.sets} | {' | '.join(leads)} | {psnr.size:.1f} | {time} |")
     return found
 
 
-def _cases(rows: Sequence[Row], method: str) -> list[tuple[str, int]]:
-    """The cases that ours and the other method were scored on."""
-    both = [{(row.scene, row.views) for row in rows if row.method == name} for name in (method, OURS)]
-    return sorted(both[0] & both[1])
-
-
-def _lead(rows: Sequence[Row], case: tuple[str, int], measure: Measure) -> float:
-    """Of ours over the only other method of `rows`, positive where ours is better."""
-    here = [row for row in rows if (row.scene, row.views) == case]
-    ours, others = ([measure.value(row) or 0.0 for row in here if (row.method == OURS) == own] for own in (True, False))
-    return (mean(ours) - mean(others)) * (1 if measure.higher_is_better else -1)
-
-
-def _lead_size(rows: Sequence[Row], case: tuple[str, int], method: str) -> float:
-    """Our number of Gaussians over the other method's."""
-    here = [row for row in rows if (row.scene, row.views) == case]
-    ours, others = ([row.num_gaussians or 0 for row in here if row.method == name] for name in (OURS, method))
-    return mean(ours) / mean(others)
+def _beside() -> dict[str, tuple[race_chart.Point, ...]]:
+    """By other method: it beside ours, in each measure."""
+    by_measure = (race_chart.beside(ends(), measure, race_chart.times(ends())) for measure in WHOLE)
+    return {each[0].method: each for each in zip(*by_measure, strict=True) if each[0].method != OURS}
 
 
 def _signed(value: float, digits: int) -> str:
@@ -107,8 +87,8 @@ def headline() -> str:
     """The line of the README's table."""
     found = margins(ends(), WHOLE[0])
     ahead = sum(each.lead >= 0 for each in found)
-    lead = f"{_mean(found):+.2f}".replace("-0.", "−.").replace("+0.", "+.")
-    share = f"a {_mean_ratio('instantsplat-xl+fill'):.0f}th of InstantSplat-XL's Gaussians"
+    lead = _signed(_mean(found), 2)
+    share = f"a {_beside()[LARGEST][0].size:.0f}th of InstantSplat-XL's Gaussians"
     return (
         f"| held-out PSNR on {len(found)} sets that nothing was tuned on, "
         "against the best of up to five other recipes\\* in each "
@@ -129,10 +109,3 @@ def _cells(margin: Margin, digits: int) -> str:
 
 def _mean(found: Sequence[Margin]) -> float:
     return sum(each.lead for each in found) / len(found)
-
-
-def _mean_ratio(method: str) -> float:
-    """How many times as many Gaussians a method has, in the mean over the cases."""
-    sizes = {(row.scene, row.views, row.method): row.num_gaussians or 0 for row in ends() if row.psnr is not None}
-    ratios = [size / sizes[case[0], case[1], OURS] for (*case, name), size in sizes.items() if name == method]
-    return sum(ratios) / len(ratios)

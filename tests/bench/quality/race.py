@@ -34,13 +34,12 @@ from splatnode.recon.evaluate.records import Bench
 from splatnode.recon.evaluate.report import redraw
 from splatnode.recon.evaluate.start import Start, continued, foundation
 from splatnode.recon.jobs.calls import Engine, engine
-from splatnode.recon.rasterize.cpu import rasterize
-from splatnode.recon.rasterize.device import Device
+from splatnode.recon.rasterize.device import Device, DeviceUnavailable, chosen
+from splatnode.recon.rasterize.dispatch import rasterizer
 from splatnode.recon.result.export.staged import write_files
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.shared_arguments import add_device
 from tests.bench.quality import race_chart
-from tests.bench.quality.gpu_scoring import rasterize_on_gpu
 from tests.bench.quality.parsimony import configurations
 from tests.bench.quality.parsimony_chart import PIXEL, RIVAL
 
@@ -114,12 +113,13 @@ class How:
     scoring: Scoring
     engine: Engine
     device: Device
+    timed: bool  # False: runs share a GPU
 
 
 def run(case: Case, how: How, scenes: Path, out: Path) -> Bench:
     """Adds the runs of a case to what `out` holds."""
     scene = linked(case, scenes, out / "scenes")
-    plan = partial(Plan, (scene,), (len(case.train),), seeds=how.seeds, timed=how.device == "cpu")
+    plan = partial(Plan, (scene,), (len(case.train),), seeds=how.seeds, timed=how.timed)
     go_on = partial(run_bench, out_dir=out, scoring=how.scoring, command=command(), resume=True, engine=how.engine)
     first = Field(1, how.device)  # the number of Gaussians is for others
     bench = go_on(plan((REFERENCE,)), Entrants(first.reconstruct, first.start_of))
@@ -150,17 +150,21 @@ def main() -> None:
     parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/ and weights/")
     args = parser.parse_args()
     settings = INTERPOLATED_START if args.interpolated_start else Settings()
-    device: Device = args.device or "cpu"
+    wanted: Device = args.device or "cpu"
+    try:
+        on = chosen(wanted)
+    except DeviceUnavailable as error:
+        parser.error(str(error))
     networks = partial(quick_networks, (args.shared / "weights").absolute())
-    scoring = Scoring(rasterize_on_gpu if device == "cuda" else rasterize, networks, settings, by_region=True)
+    scoring = Scoring(rasterizer(on), networks, settings, by_region=True)
     if networks().alex is None:
         parser.error(f"{args.shared}/weights must hold LPIPS's weights for AlexNet. Run: splatnode weights")
-    chosen = [case for case in cases() if not args.names or {case.name, case.label} & set(args.names)]
-    if not chosen:
+    found = [case for case in cases() if not args.names or {case.name, case.label} & set(args.names)]
+    if not found:
         sys.exit(f"no such case; there are {', '.join(case.label for case in cases())}")
     with engine(args.cores, None) as where:
-        how = How(tuple(args.methods), tuple(range(args.seeds)), scoring, where, device)
-        for case in chosen:
+        how = How(tuple(args.methods), tuple(range(args.seeds)), scoring, where, wanted, on.type == "cpu")
+        for case in found:
             bench = run(case, how, args.shared / "scenes", args.out)
             redraw(bench, args.out)
             ends = [row for row in bench.rows if row.final]

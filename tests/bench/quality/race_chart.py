@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import mean, median, stdev
 
@@ -23,14 +23,17 @@ SMALLEST, LARGEST = 25.0, 330.0  # bubble areas, in points^2
 
 @dataclass(frozen=True)
 class Point:
-    """A method beside ours, in the mean over the sets of so many photographs that both were scored on."""
+    """A method beside ours, in the mean over the sets that both were scored on."""
 
     method: str
     sets: int
-    time: float  # over ours
+    time: float | None  # over ours; None: nowhere measured
     size: float  # number of Gaussians, over ours
     lead: float  # of the measure over ours, positive where it is better
     spread: float | None  # standard deviation of `lead` between seeds; None: of one seed
+
+
+_Set = tuple[str, int]  # scene, number of photographs
 
 
 def times(ends: Sequence[Row]) -> dict[str, float]:
@@ -48,22 +51,27 @@ def times(ends: Sequence[Row]) -> dict[str, float]:
 
 
 def points(ends: Sequence[Row], views: int, measure: Measure) -> list[Point]:
-    """A point a method; none of a method whose time was nowhere measured."""
-    took = times(ends)
-    by_method: dict[str, dict[str, list[Row]]] = {}
+    """Of the sets of so many photographs, a point a method; none of a method whose time was nowhere measured."""
+    found = beside([row for row in ends if row.views == views], measure, times(ends))
+    return [point for point in found if point.time is not None]
+
+
+def beside(ends: Sequence[Row], measure: Measure, took: Mapping[str, float]) -> list[Point]:
+    """A point a method that has a set in common with ours; `took` is what `times` gives."""
+    by_method: dict[str, dict[_Set, list[Row]]] = {}
     for row in ends:
-        if row.views == views and measure.value(row) is not None:
-            by_method.setdefault(row.method, {}).setdefault(row.scene, []).append(row)
+        if measure.value(row) is not None:
+            by_method.setdefault(row.method, {}).setdefault((row.scene, row.views), []).append(row)
     ours = by_method.get(OURS, {})
     found = []
-    for method, scenes in by_method.items():
-        common = [scene for scene in scenes if scene in ours]
-        if not common or method not in took:
+    for method, theirs in by_method.items():
+        common = {each: rows for each, rows in theirs.items() if each in ours}
+        if not common:
             continue
-        sizes = [_size(scenes[scene]) / _size(ours[scene]) for scene in common]
-        leads = _leads({s: scenes[s] for s in common}, {s: ours[s] for s in common}, measure)
+        size = mean(_size(rows) / _size(ours[each]) for each, rows in common.items())
+        leads = _leads(common, ours, measure)
         spread = stdev(leads) if len(leads) > 1 else None
-        found.append(Point(method, len(common), took[method], mean(sizes), mean(leads), spread))
+        found.append(Point(method, len(common), took.get(method), size, mean(leads), spread))
     return found
 
 
@@ -71,18 +79,16 @@ def _size(rows: Sequence[Row]) -> float:
     return mean(row.num_gaussians or 0 for row in rows)
 
 
-def _leads(scenes: dict[str, list[Row]], ours: dict[str, list[Row]], measure: Measure) -> list[float]:
+def _leads(theirs: Mapping[_Set, Sequence[Row]], ours: Mapping[_Set, Sequence[Row]], measure: Measure) -> list[float]:
     """For each seed that all sets have: the mean over them of how much better than our mean over seeds."""
     sign = 1.0 if measure.higher_is_better else -1.0
-    seeds = set.intersection(*({row.seed for row in rows} for rows in scenes.values()))
-    found = []
-    for seed in sorted(seeds):
-        differences = []
-        for scene, rows in scenes.items():
-            (value,) = (_value(measure, row) for row in rows if row.seed == seed)
-            differences.append(sign * (value - mean(_value(measure, row) for row in ours[scene])))
-        found.append(mean(differences))
-    return found
+    seeds = set.intersection(*({row.seed for row in rows} for rows in theirs.values()))
+    means = {each: mean(_value(measure, row) for row in ours[each]) for each in theirs}
+    return [
+        sign
+        * mean(_value(measure, row) - means[each] for each, rows in theirs.items() for row in rows if row.seed == s)
+        for s in sorted(seeds)
+    ]
 
 
 def _value(measure: Measure, row: Row) -> float:
@@ -102,10 +108,9 @@ def draw(ends: Sequence[Row]) -> bytes:
             found = points(ends, count, measure)
             _chart(chart, found, recipes)
             chart.set_ylabel(f"{measure.name}: how much better than {OURS}", fontsize=8)
-            sets = sorted({point.sets for point in found})
-            if chart is charts[0]:
-                title = f"{count} photographs, {' to '.join(map(str, dict.fromkeys((sets[0], sets[-1]))))} sets"
-                chart.set_title(title, loc="left", color=INK, fontsize=10, weight="bold")
+        sets = [point.sets for point in points(ends, count, WHOLE[0])]
+        title = f"{count} photographs, {min(sets)} to {max(sets)} sets"
+        charts[0].set_title(title, loc="left", color=INK, fontsize=10, weight="bold")
     for chart in axes[-1]:
         chart.set_xlabel(f"time over {OURS}'s (log scale)", fontsize=8)
     _legend(figure, recipes)
@@ -142,9 +147,8 @@ def _chart(chart: Axes, found: Sequence[Point], recipes: Sequence[str]) -> None:
 
 def _legend(figure: Figure, recipes: Sequence[str]) -> None:
     handles = [
-        Line2D([], [], color=colour, marker=marker, label=recipe, linestyle="none", markersize=7)
-        for recipe in recipes
-        for colour, marker in (style(recipes.index(recipe)),)
+        Line2D([], [], color=style(i)[0], marker=style(i)[1], label=recipe, linestyle="none", markersize=7)
+        for i, recipe in enumerate(recipes)
     ]
     hollow = Line2D([], [], color=INK, marker="o", markerfacecolor="none", linestyle="none", label="as published")
     full = Line2D([], [], color=INK, marker="o", linestyle="none", label="with our background, or ours")
