@@ -102,7 +102,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return initialisation.Config(self.completion, self.seeding, self.background, self.pixelwise, most)
 
 
-# Three tenths of the others' for as many more iterations: with long steps, what one photograph alone shows drifts away
+# Three tenths as long as the others', for three times as many: long ones let drift what one photograph alone shows
 _SHORT_STEPS = refinement.Rates(means=0.12, quats=6e-3, log_scales=3e-2, logit_opacities=3e-2, sh=9e-3)
 
 PRESETS: dict[str, Config] = {
