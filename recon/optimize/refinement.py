@@ -14,7 +14,7 @@ from msgspec import Meta
 from torch import Tensor
 
 from splatnode.recon.geometry import exp_se3, twist_gradient
-from splatnode.recon.optimize import dropout, regularise
+from splatnode.recon.optimize import dropout, perceptual_loss, regularise
 from splatnode.recon.optimize.adam import Adam, Moments, adam_direction
 from splatnode.recon.optimize.control import prune
 from splatnode.recon.optimize.control.control import Control, ControlChoice, Step
@@ -70,6 +70,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # Largest opacity of what photographs seeded, as the refinement of a begun scene starts: soft Gaussians settle more
     # freely, in a hundred steps and more, so they are left as seeded where a time limit may end it. null: as seeded
     first_opacity: Annotated[float, Meta(gt=0, lt=1)] | None = 0.1
+    perceptual: perceptual_loss.Config = perceptual_loss.Config()  # LPIPS of renders against photographs
     dropout: dropout.Config = dropout.Config()
     refine_poses: bool = True  # whether cameras are refined together with the Gaussians
     rates: Rates = Rates()
@@ -152,9 +153,11 @@ class _Fit:
         self._pose_moments = [Moments(torch.zeros(6), torch.zeros(6)) for _ in scene.views]
         shown = fitted_pixels(scene.views)
         few = sum(view.width * view.height for view in scene.views) <= _KEPT_PIXELS
+        device = gaussians.means.device
+        self._network = perceptual_loss.load(config.perceptual, device)
         self._images = {
             half: [
-                training_image(*each, scale, config.dssim, gaussians.means.device, keep_moments=few)
+                training_image(*each, scale, config.dssim, device, keep=few, network=self._network)
                 for each in zip(scene.views, shown, strict=True)
             ]
             for half, scale in _SCALES.items()
@@ -178,6 +181,9 @@ class _Fit:
         assert render.rgb is not None  # it was asked for
         loss = image.loss(render.rgb)
         self._losses.append(loss.detach())
+        weight = self._config.perceptual.in_step(self._done, progress)
+        if image.perceptual is not None and weight:
+            loss = loss + weight * image.perceptual(render.rgb)
         if self._regularisation is not None:
             loss = loss + self._further_losses(self._regularisation, index, render, progress).to(loss)
         loss.backward()
@@ -189,6 +195,11 @@ class _Fit:
         self._control_density(index, self._images[half], progress)
         self._adam.zero_grad()
         self._gaussians.means.grad = None
+
+    @property
+    def _done(self) -> int:
+        """Steps of this refinement."""
+        return self._iterations - self._scene.iterations
 
     def _move_gaussians(self, progress: float) -> None:
         """An Adam step of all parameters of the Gaussians."""
@@ -204,7 +215,7 @@ class _Fit:
         cameras = tuple(T.detach() for T in self._Ts_world_camera)
         change = self._control.after_step(
             Step(
-                iteration=self._iterations - self._scene.iterations,
+                iteration=self._done,
                 iterations=self._config.iterations,
                 progress=progress,
                 view=index,
@@ -251,7 +262,9 @@ class _Fit:
             for view, T in zip(self._scene.views, self._Ts_world_camera, strict=True)
         )
         learnt = self._gaussians.map(lambda tensor: tensor.detach().clone())
-        served_by = {} if self._regularisation is None else self._regularisation.served_by
+        served_by = {} if self._regularisation is None else dict(self._regularisation.served_by)
+        if self._config.perceptual.weight:
+            served_by["perceptual"] = perceptual_loss.NETWORK if self._network else "nothing: no weights"
         return Scene(views, learnt, self._iterations, served_by=served_by, headroom=self._scene.headroom)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -11,6 +12,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from splatnode.recon.networks.lpips import Lpips
+from splatnode.recon.optimize.perceptual_loss import perceptual_loss
 from splatnode.recon.optimize.photometric_loss import PhotometricLoss
 from splatnode.recon.scene.scene import TrainingView
 
@@ -24,18 +27,20 @@ class TrainingImage:
     K: Tensor  # (3, 3) intrinsics at this size, pixels
     width: int  # pixels
     height: int
-    loss: Callable[[Tensor], Tensor]  # of a render (height, width, 3), against the photograph where it shows the scene
+    # Of a render (height, width, 3), against the photograph where that shows the scene
+    loss: Callable[[Tensor], Tensor]  # photometric
+    perceptual: Callable[[Tensor], Tensor] | None = None  # None: there is no network for it
 
 
 @dataclass(frozen=True, eq=False)
 class _Exposed:
-    """The loss of a photograph whose exposure was taken out.
+    """A loss against a photograph whose exposure was taken out.
 
     A tone curve is no gain, so a part of the exposure is left in it: a gain a channel, the one that fits the render
     best, under the prior that it is 1. Where the photograph is saturated, a render that is brighter is right.
     """
 
-    loss: PhotometricLoss
+    loss: Callable[[Tensor], Tensor]
     target: Tensor  # (height, width, 3) the photograph
     told: Tensor  # (height, width, 3) bool: False where it is saturated, or does not show the scene
     prior: Tensor  # (3,) as much as _PRIOR of the photograph, squared
@@ -57,12 +62,13 @@ def training_image(
     scale: float,
     dssim: float,
     device: torch.device = _PROCESSOR,
-    keep_moments: bool = True,
+    keep: bool = True,
+    network: Lpips | None = None,
 ) -> TrainingImage:
-    """The photograph of `view` at `scale` of its size, with `dssim` the weight of D-SSIM in its loss.
+    """The photograph of `view` at `scale` of its size, with `dssim` the weight of D-SSIM in its photometric loss.
 
-    The photograph lies, and the loss is computed, on `device`: that of the Gaussians which are rendered. `keep_moments`
-    is the loss's.
+    The photograph lies, and the losses are computed, on `device`: that of the Gaussians which are rendered, where the
+    `network` of the perceptual loss has to be, too. `keep`: whether what the losses compute of the photograph is kept.
 
     `shown` (h, w), at the photograph's own size, is False on the black border that undistortion leaves. A pixel of the
     smaller image is compared only if all pixels that it covers are shown.
@@ -75,16 +81,18 @@ def training_image(
         share = cv2.resize(shown.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         weights = torch.from_numpy(np.floor(share + np.float32(_WHOLLY_SHOWN))).to(device)
     target = torch.tensor(image, device=device).float() / 255.0  # a copy: what is read from a file is read-only
-    loss = PhotometricLoss(target, dssim, weights, keep_moments)
+    loss = PhotometricLoss(target, dssim, weights, keep)
+    perceptual = perceptual_loss(network, target, weights, keep)
     if view.exposure is None:
-        return TrainingImage(K, width, height, loss)
+        return TrainingImage(K, width, height, loss, perceptual)
     told = torch.ones_like(target, dtype=torch.bool) if weights is None else (weights > 0)[..., None].expand_as(target)
     if view.exposure.saturated is not None:
         share = cv2.resize(view.exposure.saturated.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
         told = told & torch.from_numpy(share == 0).to(device)
     known = target * told
     prior = _PRIOR * (known * known).sum((0, 1))
-    return TrainingImage(K, width, height, _Exposed(loss, target, told, prior))
+    exposed = partial(_Exposed, target=target, told=told, prior=prior)
+    return TrainingImage(K, width, height, exposed(loss), perceptual and exposed(perceptual))
 
 
 def scaled(K: Tensor, width: int, height: int, scale: float) -> tuple[Tensor, int, int]:

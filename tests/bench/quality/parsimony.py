@@ -4,7 +4,7 @@ Each set of photographs is registered once, and scenes are made from the same ca
 splatnode chooses; of a quarter to four times of it; with a Gaussian a pixel; and, of the size that was chosen, by
 Markov chain Monte Carlo from an even choice of the pixels. All are refined for as many iterations and scored alike.
 Rows that the file holds already are not measured again, so it can be filled in parts: about 4 minutes of a core a case.
-Of a set that is refused there is one row, without scores.
+Of a set that is refused there is one row, without scores. With --race the sets are those of the race.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import json
 import pickle
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from splatnode.recon.result.export.formats.spz import encode_spz
 from splatnode.recon.result.export.prepare import viewer_safe
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.scene import pixelwise
+from tests.bench.quality import race_cases
 from tests.bench.quality.held_out import Case, Folders, Scoring, load_case, parsed, parser_of
 from tests.bench.quality.parsimony_chart import PIXEL, RIVAL, SELF, draw, summary
 
@@ -90,6 +92,18 @@ def measure(case: Case, start: Start, method: str, config: Config, scoring: Scor
     )
 
 
+def named(labels: Sequence[str], folders: Folders) -> Iterator[Case]:
+    return (load_case(label, folders) for label in labels)
+
+
+def sets(labels: Sequence[str], folders: Folders) -> Iterator[Case]:
+    """Those of the race with these labels; all, if there are none."""
+    for case in race_cases.cases():
+        if not labels or case.label in labels:
+            place = race_cases.linked(case, folders.scenes, folders.starts / "scenes")
+            yield load_case(case.label, Folders(place.parent, folders.starts))
+
+
 def fill(case: Case, rows: list[Row], folders: Folders, scoring: Scoring, out: Path, only: tuple[str, ...]) -> None:
     """Adds to `rows`, and to the file, what `case` lacks of the methods in `only`; of all, if that is empty."""
     mine = case.scene.name, len(case.split.train)
@@ -115,14 +129,15 @@ def write(rows: list[Row], settings: Settings, out: Path) -> None:
 def main() -> None:
     parser = parser_of(__doc__, CASES)
     parser.add_argument("--methods", nargs="+", default=(), help="of these only, besides the chosen size")
+    parser.add_argument("--race", action="store_true", help="the sets of the race, on which no size was chosen")
     parser.add_argument("--chart", type=Path, help="PNG file to draw from it")
     arguments, folders, scoring = parsed(parser)
     known = json.loads(arguments.out.read_text()) if arguments.out.exists() else {"rows": []}
     if known["rows"] and known["settings"] != asdict(scoring.settings):
         parser.error(f"{arguments.out} was scored with other settings: {known['settings']}. Name another file")
     rows = [Row(**row) for row in known["rows"]]
-    for case in arguments.cases or CASES:
-        fill(load_case(case, folders), rows, folders, scoring, arguments.out, tuple(arguments.methods))
+    for case in sets(arguments.cases, folders) if arguments.race else named(arguments.cases or CASES, folders):
+        fill(case, rows, folders, scoring, arguments.out, tuple(arguments.methods))
     print(json.dumps(summary([asdict(row) for row in rows]), indent=1))
     if arguments.chart:
         arguments.chart.write_bytes(draw([asdict(row) for row in rows]))

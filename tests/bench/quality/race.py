@@ -11,7 +11,6 @@ a GPU, which runs share: their rows have no seconds.
 from __future__ import annotations
 
 import argparse
-import json
 import shlex
 import sys
 from collections.abc import Iterator, Sequence
@@ -42,24 +41,13 @@ from splatnode.recon.shared_arguments import add_device
 from tests.bench.quality import race_chart
 from tests.bench.quality.parsimony import configurations
 from tests.bench.quality.parsimony_chart import PIXEL, RIVAL
+from tests.bench.quality.race_cases import Case, cases, linked
 
-CASES = Path(__file__).with_name("race_cases.json")
 REFERENCE = "balanced"  # run first: others get as many Gaussians as it chose
 METHODS = (
     *(REFERENCE, "fast", "instantsplat-xl+fill", "instantsplat-xl", "pixel+fill", "mcmc+fill"),
     *("instantsplat-s+fill", "instantsplat-s", "paper+fill", "paper", "pixel", "mcmc", "quality"),
 )
-
-
-class Case(msgspec.Struct, frozen=True):
-    name: str
-    scene: str
-    train: tuple[str, ...]
-    test: tuple[str, ...]
-
-    @property
-    def label(self) -> str:
-        return f"{self.name}:{len(self.train)}"
 
 
 @dataclass(frozen=True)
@@ -86,22 +74,6 @@ class Field:
     def start_of(self, name: str) -> Config | None:
         config = self.config(name)
         return methods.start_of(name) if config is None else foundation(config)
-
-
-def cases() -> list[Case]:
-    return msgspec.json.decode(CASES.read_bytes(), type=list[Case])
-
-
-def linked(case: Case, scenes: Path, folder: Path) -> Path:
-    """A folder of the case's own name that shows the scene, beside the splits.json that lists its photographs."""
-    place = folder / f"{case.name}_{len(case.train)}"
-    place.mkdir(parents=True, exist_ok=True)
-    link = place / case.name
-    if not link.is_symlink():
-        link.symlink_to((scenes / case.scene).resolve())
-    split = {case.name: {f"train{len(case.train)}": case.train, "test": case.test}}
-    (place / "splits.json").write_text(json.dumps(split))
-    return link
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,93 @@
+"""The perceptual loss compares what shows the scene, in every few steps, and is left out without a network."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from msgspec import structs
+
+from splatnode.recon.networks.lpips import Layer, Lpips
+from splatnode.recon.optimize import perceptual_loss
+from splatnode.recon.optimize.perceptual_loss import Config
+from splatnode.recon.optimize.refinement import Config as Refinement
+from splatnode.recon.optimize.refinement import refine
+from splatnode.recon.optimize.training_image import training_image
+from splatnode.recon.scene.scene import Exposure, TrainingView
+from tests.support.known_scene import disturbed, photographed
+
+HEIGHT, WIDTH = 40, 56
+
+
+@pytest.fixture
+def network() -> Lpips:
+    """One layer that sees differences of neighbouring pixels."""
+    kernels = torch.randn(4, 3, 3, 3, generator=torch.Generator().manual_seed(0))
+    return Lpips(
+        (Layer(tap=True),),
+        {"net.0.weight": kernels, "net.0.bias": torch.zeros(4), "lin0.weight": torch.ones(1, 4, 1, 1)},
+    )
+
+
+@pytest.fixture
+def photograph() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 180, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+
+
+def view_of(photograph: np.ndarray, exposure: Exposure | None = None) -> TrainingView:
+    return TrainingView("a.png", 0, photograph, torch.eye(4), torch.eye(3), exposure=exposure)
+
+
+def test_it_counts_in_every_few_steps_as_much_as_in_all():
+    config = Config(weight=0.5, start=0.5, every=3)
+    assert [config.in_step(step, 0.6) for step in range(5)] == [1.5, 0.0, 0.0, 1.5, 0.0]
+    assert config.in_step(0, 0.4) == 0.0
+    assert not any(Config().in_step(step, 0.9) for step in range(10))
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_only_what_shows_the_scene_is_compared(network, photograph, keep):
+    shown = np.ones((HEIGHT, WIDTH), bool)
+    shown[:9] = False
+    compared = training_image(view_of(photograph), shown, 1.0, 0.2, keep=keep, network=network)
+    assert compared.perceptual is not None
+    same = torch.from_numpy(photograph).float() / 255
+    hidden = same.clone()
+    hidden[:9] = 0.5
+    assert float(compared.perceptual(same)) == float(compared.perceptual(hidden)) == 0.0
+    other = torch.full_like(same, 0.3).requires_grad_(True)
+    compared.perceptual(other).backward()
+    assert other.grad is not None and not other.grad[:9].any() and bool(other.grad[9:].any())
+
+
+def test_what_is_left_of_the_exposure_costs_nothing(network, photograph):
+    exposed = view_of(photograph, Exposure((2.0, 2.0, 2.0), 0.0, None))
+    shown = np.ones((HEIGHT, WIDTH), bool)
+    render = 0.8 * torch.from_numpy(photograph).float() / 255
+    found = [training_image(view, shown, 1.0, 0.2, network=network) for view in (exposed, view_of(photograph))]
+    with_gain, without = (float(each.perceptual(render)) for each in found if each.perceptual)
+    assert with_gain < 0.1 * without
+
+
+def test_a_photograph_that_the_network_would_pool_away_has_none(network):
+    thin = np.zeros((31, 90, 3), np.uint8)
+    assert training_image(view_of(thin), np.ones((31, 90), bool), 1.0, 0.2, network=network).perceptual is None
+
+
+def test_it_changes_a_scene_where_there_is_a_network_and_nothing_where_there_is_none(network, monkeypatch):
+    start = disturbed(photographed())
+    refined = Refinement(iterations=6, checkpoints=(), control=None)
+    configured = structs.replace(refined, perceptual=Config(weight=0.2, start=0.0, every=2))
+
+    def end(config, found):
+        monkeypatch.setattr(perceptual_loss, "load_lpips", lambda name: found)
+        *_, scene = refine(start, config, seed=0)
+        return scene
+
+    plain, without, with_it = end(refined, network), end(configured, None), end(configured, network)
+    assert torch.equal(plain.gaussians.sh, without.gaussians.sh)
+    assert not torch.equal(plain.gaussians.sh, with_it.gaussians.sh)
+    assert plain.losses[0] == with_it.losses[0]  # which are photometric
+    assert plain.served_by == {}
+    assert without.served_by == {"perceptual": "nothing: no weights"}
+    assert with_it.served_by == {"perceptual": perceptual_loss.NETWORK}
