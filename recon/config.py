@@ -13,8 +13,6 @@ from splatnode.recon.frames import screening
 from splatnode.recon.matching import config as matching
 from splatnode.recon.metric import config as metric
 from splatnode.recon.optimize import dropout, perceptual_loss, refinement
-from splatnode.recon.optimize.control import prune
-from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.priors import classical
 from splatnode.recon.rasterize.device import Device
 from splatnode.recon.registration import config as registration
@@ -111,15 +109,13 @@ PRESETS: dict[str, Config] = {
     "preview": Config(size=384, optimize=refinement.Config(half_resolution_share=0.25, iterations=150)),
     "fast": Config(optimize=refinement.Config(iterations=200)),
     "balanced": Config(),
-    # With more and smaller Gaussians, and LPIPS in the loss where its weights are: for texture
+    # With LPIPS in the loss where its weights are: for texture
     "quality": Config(
-        seeding=seeding.Config(max_error=0.0014),
         optimize=refinement.Config(
             iterations=1500,
             checkpoints=(500,),
             rates=_SHORT_STEPS,
             perceptual=perceptual_loss.Config(weight=0.03),
-            control=ControlChoice("prune", prune.Config(least_change=0.0025)),
         ),
     ),
 }

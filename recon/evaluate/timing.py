@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatnode.recon.core import instruction_sets
 from splatnode.recon.jobs.alone import ALONE, Moment, now, others_share
 
 
@@ -58,7 +59,12 @@ def check_same_cores(known: Collection[int], each: int, where: Path) -> None:
 
 
 def processor() -> str:
-    """The name of this machine's."""
+    """The name of this machine's, with the instructions that the core uses: one name has several generations."""
+    used = instruction_sets()[:1]
+    return ", ".join([_name(), *used])
+
+
+def _name() -> str:
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
