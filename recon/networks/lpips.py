@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from splatnode.recon.networks import lpips_checkpoint
 from splatnode.recon.networks.weight_folder import located
+from splatnode.recon.networks.weight_loading import read_weights
 
 
 @dataclass(frozen=True)
@@ -119,8 +120,7 @@ def load_lpips(network: str, weights_dir: Path | None = None) -> Lpips | None:
     path = next((found for name in file_names if (found := _file(name, weights_dir)) is not None), None)
     if path is None:
         return None
-    of_jax = path.suffix == ".ckpt"
-    weights = lpips_checkpoint.read(path) if of_jax else torch.load(path, map_location="cpu", weights_only=True)
+    weights = lpips_checkpoint.read(path) if path.suffix == ".ckpt" else read_weights(path)
     expected = {f"net.{i}.{part}" for i in range(len(layers)) for part in ("weight", "bias")}
     expected |= {f"lin{i}.weight" for i in range(sum(layer.tap for layer in layers))}
     if set(weights) != expected:

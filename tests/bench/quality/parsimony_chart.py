@@ -20,6 +20,11 @@ SELF, PIXEL, RIVAL = "chosen", "pixel", "mcmc"
 MEASURES = {"psnr": 1, "ssim": 1, "lpips": -1}  # and whether more is better
 LOSS = {"psnr": 0.1, "ssim": 0.005}  # that a small scene may have beside a Gaussian a pixel; of LPIPS:
 LPIPS_LOSS = 0.02  # relative
+GAIN = {
+    "psnr": 0.1,
+    "ssim": 0.003,
+}  # of twice the size, from which on the chosen one is too small; of LPIPS: LPIPS_LOSS
+HALF, TWICE = "x0.5", "x2"
 
 Record = Mapping[str, Any]
 
@@ -54,11 +59,27 @@ def no_worse_than_pixels(methods: Mapping[str, Record]) -> dict[str, bool]:
     }
 
 
+def half_is_worse(methods: Mapping[str, Record]) -> bool:
+    """Whether half the chosen size is worse in at least two of the three measures."""
+    chosen, half = methods[SELF], methods[HALF]
+    return sum(sign * half[key] < sign * chosen[key] for key, sign in MEASURES.items()) >= 2
+
+
+def twice_is_better(methods: Mapping[str, Record]) -> dict[str, bool]:
+    """By measure, whether twice the chosen size is better by more than is worth it."""
+    chosen, twice = methods[SELF], methods[TWICE]
+    return {
+        **{key: twice[key] > chosen[key] + gain for key, gain in GAIN.items()},
+        "lpips": twice["lpips"] < (1 - LPIPS_LOSS) * chosen["lpips"],
+    }
+
+
 def summary(rows: Sequence[Record]) -> dict[str, Any]:
     """What the issue asks for, of the cases that have what it takes."""
     cases = by_case(rows)
     fronts = {case: on_front(methods) for case, methods in cases.items() if len(methods) > 1}
     against = {case: methods for case, methods in cases.items() if PIXEL in methods}
+    sized = [methods for methods in cases.values() if HALF in methods and TWICE in methods]
     six = [methods[SELF] for methods in cases.values() if methods[SELF]["views"] == 6]
     return {
         "cases": len(cases),
@@ -71,6 +92,9 @@ def summary(rows: Sequence[Record]) -> dict[str, Any]:
             key: _mean(methods[SELF][key] - methods[PIXEL][key] for methods in against.values()) for key in MEASURES
         },
         "compared_with_pixels": len(against),
+        "sized": len(sized),
+        "half_is_worse": sum(map(half_is_worse, sized)),
+        "twice_is_better": {key: sum(twice_is_better(methods)[key] for methods in sized) for key in MEASURES},
         "spz_mb_6_views": _mean(row["spz_bytes"] / 1e6 for row in six),
         "peak_rss_mb_6_views": max((row["peak_rss_mb"] or 0.0 for row in six), default=None),
         "chosen": {case: methods[SELF]["num_gaussians"] for case, methods in cases.items()},

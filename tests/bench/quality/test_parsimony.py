@@ -5,7 +5,17 @@ from __future__ import annotations
 import pytest
 
 from tests.bench.quality.parsimony import configurations
-from tests.bench.quality.parsimony_chart import PIXEL, RIVAL, SELF, draw, no_worse_than_pixels, on_front, summary
+from tests.bench.quality.parsimony_chart import (
+    PIXEL,
+    RIVAL,
+    SELF,
+    draw,
+    half_is_worse,
+    no_worse_than_pixels,
+    on_front,
+    summary,
+    twice_is_better,
+)
 
 
 def row(method: str, count: int, psnr: float, ssim: float = 0.8, lpips: float = 0.1, views: int = 6) -> dict:
@@ -30,6 +40,17 @@ def test_no_worse_than_a_gaussian_a_pixel_means_within_the_bars():
     chosen = row(SELF, 100, 25.0, 0.800, 0.100)
     assert all(no_worse_than_pixels(methods(chosen, row(PIXEL, 1000, 25.09, 0.804, 0.099))).values())
     assert not any(no_worse_than_pixels(methods(chosen, row(PIXEL, 1000, 25.11, 0.806, 0.097))).values())
+
+
+def test_half_is_worse_where_two_measures_are_and_twice_is_better_beyond_a_margin():
+    chosen = row(SELF, 100, 25.0, 0.800, 0.100)
+    assert half_is_worse(methods(chosen, row("x0.5", 50, 24.9, 0.799, 0.09)))
+    assert not half_is_worse(methods(chosen, row("x0.5", 50, 25.1, 0.801, 0.11)))
+    within, beyond = row("x2", 200, 25.09, 0.8029, 0.0981), row("x2", 200, 25.11, 0.8031, 0.0979)
+    assert not any(twice_is_better(methods(chosen, within)).values())
+    assert all(twice_is_better(methods(chosen, beyond)).values())
+    told = summary([chosen, row("x0.5", 50, 24.0, 0.7, 0.2), beyond, row(SELF, 100, 20.0, views=3)])
+    assert (told["sized"], told["half_is_worse"], told["twice_is_better"]["lpips"]) == (1, 1, 1)
 
 
 def test_the_summary_takes_means_over_cases():
