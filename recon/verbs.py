@@ -57,6 +57,11 @@ def _export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="PATH", help="default: beside the scene")
     add_only_seen(parser)
     parser.add_argument(
+        "--no-background",
+        action="store_true",
+        help="leave out the far background alone: it is all around, and from outside it hides the scene",
+    )
+    parser.add_argument(
         "--crop",
         type=box,
         metavar="X0,Y0,Z0,X1,Y1,Z1",

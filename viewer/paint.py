@@ -15,6 +15,7 @@ import numpy as np
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays
 from splatnode.viewer.canvas import BACKGROUND, Array, Canvas, Image, empty_canvas
+from splatnode.viewer.outside import seen_from
 from splatnode.viewer.overlay import paint_shapes
 from splatnode.viewer.points import paint_points
 from splatnode.viewer.shapes import Shapes
@@ -44,6 +45,7 @@ def paint_gaussians(
     """The Gaussians on the background, as Gaussians or as points, or only the background."""
     if not state.gaussians or not len(gaussians):
         return empty_canvas(width, height)
+    gaussians = seen_from(gaussians, T_world_camera[:3, 3])
     if state.as_points:
         return paint_points(gaussians, np.linalg.inv(T_world_camera), K, state.point_size, width, height)
     rendered = render_arrays(

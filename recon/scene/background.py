@@ -1,4 +1,4 @@
-"""The far shell: Gaussians on a sphere behind the scene, so that what no view has seen has the colours around it."""
+"""The far shell: Gaussians on a sphere around the scene, so that what no view has seen has the colours around it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ MIN_WIDENING = 1.1  # of the spacing in each attempt to have fewer Gaussians
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     spacing_deg: float = 5.0  # between neighbouring Gaussians of the shell; 0: there is no shell
-    margin: float = 2.0  # how far beyond the images' borders the shell reaches, in units of the images' size
+    margin: float = 2.0  # how far beyond the images' borders they are so near, in units of the images' size
+    elsewhere_deg: float = 10.0  # between those in all other directions; 0: there are none
     distance: float = 1.3  # radius, in units of the farthest known depth
     opacity: float = 0.95  # of the shell's Gaussians
 
@@ -42,11 +43,15 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def far_shell(
     pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Config, max_gaussians: int | None = None
 ) -> Gaussians:
-    """Gaussians on a sphere around the cameras, in the directions in which these look; at most `max_gaussians`.
+    """Gaussians on a sphere around the cameras, closer where these look than elsewhere; at most `max_gaussians`.
 
-    `images` (h, w, 3) are those of the point maps. Where there would be more Gaussians, they are farther apart.
+    `images` (h, w, 3) are those of the point maps. Where there would be more Gaussians, there are none elsewhere, and
+    if that does not suffice the others are farther apart.
     """
     shell = _shell(pointmaps, images, config)
+    if max_gaussians is not None and len(shell) > max_gaussians:
+        config = msgspec.structs.replace(config, elsewhere_deg=0.0)
+        shell = _shell(pointmaps, images, config)
     while max_gaussians is not None and len(shell) > max_gaussians:
         wider = max(MIN_WIDENING, (len(shell) / max(max_gaussians, 1)) ** 0.5)
         config = msgspec.structs.replace(config, spacing_deg=wider * config.spacing_deg)
@@ -55,23 +60,25 @@ def far_shell(
 
 
 def _shell(pointmaps: Sequence[Pointmap], images: Sequence[Image], config: Config) -> Gaussians:
-    """Gaussians `config.spacing_deg` apart, with the colours that the images have there, or suggest."""
+    """Gaussians with the colours that the images have there, or suggest."""
     centres = np.stack([pointmap.T_world_camera[:3, 3] for pointmap in pointmaps])
     centre = centres.mean(0)
     farthest = max(1e-9, *(float(pointmap.depth.max()) for pointmap in pointmaps))  # no depth may be known anywhere
     spread = float(np.linalg.norm(centres - centre, axis=1).max())
     radius = config.distance * max(farthest, spread)
-    directions = _fibonacci_sphere(config.spacing_deg)
+    fine = _fibonacci_sphere(config.spacing_deg)
+    coarse = _fibonacci_sphere(config.elsewhere_deg if len(fine) else 0.0)
+    directions = np.concatenate([fine, coarse])
+    spacing_deg = np.repeat([config.spacing_deg, config.elsewhere_deg], [len(fine), len(coarse)])
     outside, colours = _seen(centre + radius * directions, farthest, pointmaps, images)
-    kept = outside < config.margin
-    directions, outside, colours = directions[kept], outside[kept], colours[kept]
+    kept = (outside < config.margin) == (np.arange(len(directions)) < len(fine))
+    directions, outside, colours, spacing_deg = directions[kept], outside[kept], colours[kept], spacing_deg[kept]
     inside = outside <= 0
     if inside.any():
         upward = -np.sum([pointmap.T_world_camera[:3, 1] for pointmap in pointmaps], axis=0)
         colours[~inside] = _continued(directions[~inside], directions[inside], colours[inside], upward)
     count = len(directions)
-    extent = EXTENT * radius * np.radians(config.spacing_deg)
-    scales = np.tile(extent * np.array([1.0, 1.0, THICKNESS]), (count, 1))
+    scales = EXTENT * radius * np.radians(spacing_deg)[:, None] * np.array([1.0, 1.0, THICKNESS])
     return Gaussians(
         means=torch.from_numpy(centre + radius * directions).float(),
         quats=quat_from_matrix(torch.from_numpy(_frames(directions)).float()),

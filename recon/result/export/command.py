@@ -13,6 +13,6 @@ from splatnode.recon.result.export.selection import Box, Selection
 def export(args: argparse.Namespace) -> int:
     within = None if args.crop is None else Box(args.crop[:3], args.crop[3:])
     with waiting(f"writing the scene as {args.to}"):
-        written = export_scene(args.scene, args.to, args.out, Selection(args.only_seen, within))
+        written = export_scene(args.scene, args.to, args.out, Selection(args.only_seen, within, args.no_background))
     say(written)
     return 0

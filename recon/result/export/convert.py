@@ -22,7 +22,9 @@ def export_scene(source: Path, to: str, destination: Path | None = None, selecti
     """
     format_ = load_format(to)
     if not selection.everything and not getattr(format_, "GAUSSIANS", True):
-        raise ValueError(f"{to} holds cameras and no Gaussians: --only-seen and --crop have nothing to leave out")
+        raise ValueError(
+            f"{to} holds cameras and no Gaussians: --only-seen, --no-background and --crop have nothing to leave out"
+        )
     result = StoredResult.at(source, selection)
     if destination is None:
         destination = result.scene.with_name(format_.DEFAULT_NAME)

@@ -1,4 +1,4 @@
-"""Which Gaussians of a scene an export keeps: all, those that two photographs have seen, those in a box."""
+"""Which Gaussians of a scene an export keeps: all, those that two photographs have seen, the near, those in a box."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy.typing as npt
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.prepare import take
 from splatnode.recon.result.snapshot import GaussianArrays
-from splatnode.recon.result.sources import seen
+from splatnode.recon.result.sources import SHELL, seen
 
 Corner = tuple[float, float, float]
 
@@ -37,13 +37,19 @@ class Box:
 class Selection:
     only_seen: bool = False  # without what no two photographs confirm, and without the far shell
     box: Box | None = None  # those whose centre is in it; None: wherever they are
+    no_background: bool = False  # without the far shell
 
     @property
     def everything(self) -> bool:
-        return not self.only_seen and self.box is None
+        return not self.by_source and self.box is None
+
+    @property
+    def by_source(self) -> bool:
+        """Whether the Gaussians' source frames decide."""
+        return self.only_seen or self.no_background
 
     def of(self, gaussians: GaussianArrays, name: str) -> GaussianArrays:
-        """What is kept of `gaussians`, whose source frames must be known for `only_seen`.
+        """What is kept of `gaussians`, whose source frames must be known if `by_source`.
 
         Raises SceneFileError, which names the file as `name`, where nothing is.
         """
@@ -51,6 +57,10 @@ class Selection:
             gaussians = take(gaussians, seen(gaussians.source_frame))
             if not len(gaussians):
                 raise SceneFileError(f"{name} has no Gaussian that two photographs confirm: nothing would be left")
+        if self.no_background:
+            gaussians = take(gaussians, gaussians.source_frame != SHELL)
+            if not len(gaussians):
+                raise SceneFileError(f"{name} is nothing but the far background: nothing would be left")
         if self.box is None or not len(gaussians):
             return gaussians
         kept = take(gaussians, self.box.holds(gaussians.means))

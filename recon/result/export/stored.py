@@ -38,7 +38,7 @@ class StoredResult:
 
     def gaussians(self) -> GaussianArrays:
         """Those that are selected, with finite values and bounded extents."""
-        sources = self._sources() if self.selection.only_seen else None
+        sources = self._sources() if self.selection.by_source else None
         return self.selection.of(read_gaussians(_existing(self.scene), sources), self.scene.name)
 
     def cameras(self) -> tuple[CameraEstimate, ...]:
@@ -49,11 +49,12 @@ class StoredResult:
         return decode_scale(read_json_file(self._cameras), self._cameras.name) if self._cameras.is_file() else RELATIVE
 
     def _sources(self) -> Path:
-        """Where it is told which Gaussians two photographs confirm. Raises SceneFileError where it is not."""
+        """Where it is told what each Gaussian began from. Raises SceneFileError where it is not."""
         path = self.scene.with_name(SOURCES)
         if self.scene.suffix.lower() != ".ply" or not path.is_file():
             raise SceneFileError(
-                f"{self.scene} does not tell which Gaussians two photographs confirm: that is in the {SOURCES} beside "
+                f"{self.scene} does not tell which Gaussians two photographs confirm, or which are the far background: "
+                f"that is in the {SOURCES} beside "
                 "a result's scene.ply, which merged maps, and results of earlier versions, do not have. "
                 "Make the scene anew: splatnode replay FOLDER --out DIR"
             )

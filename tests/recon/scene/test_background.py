@@ -51,16 +51,17 @@ def test_the_shell_stands_at_its_distance_and_faces_the_cameras():
 
 
 def test_neighbours_are_about_the_spacing_apart():
-    shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config(spacing_deg=6.0))
+    shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config(spacing_deg=6.0, elsewhere_deg=0.0))
     cosines = directions(shell) @ directions(shell).T - 2 * np.eye(len(shell))
     nearest = np.degrees(np.arccos(cosines.max(1)))
     assert nearest.min() > 0.7 * 6 and nearest.max() < 1.3 * 6
 
 
-def test_it_reaches_beyond_the_image_by_its_margin_and_no_further():
+def test_it_is_close_up_to_its_margin_beyond_the_image_and_no_further():
     view = pointmap(np.eye(4))
     for margin in (0.0, 0.5):
-        ray = directions(far_shell([view], [two_colours()], Config(margin=margin, spacing_deg=2.0)))
+        alone = Config(margin=margin, spacing_deg=2.0, elsewhere_deg=0.0)
+        ray = directions(far_shell([view], [two_colours()], alone))
         u = ray[:, 0] / ray[:, 2] * view.K[0, 0] / WIDTH + 0.5
         v = ray[:, 1] / ray[:, 2] * view.K[1, 1] / HEIGHT + 0.5
         for share in (u, v):
@@ -69,7 +70,7 @@ def test_it_reaches_beyond_the_image_by_its_margin_and_no_further():
 
 
 def test_it_has_the_colour_of_the_image_there():
-    shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config(margin=0.0))
+    shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config(margin=0.0, elsewhere_deg=0.0))
     ray = directions(shell)
     left, right = ray[:, 0] < -0.1, ray[:, 0] > 0.1
     torch.testing.assert_close(shell.rgb[left], torch.tensor([[1.0, 0, 0]]).expand(left.sum(), 3), rtol=0, atol=0.03)
@@ -80,7 +81,7 @@ def test_beside_the_images_it_has_their_colour_at_that_elevation():
     sky_over_grass = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     sky_over_grass[: HEIGHT // 2, :, 2], sky_over_grass[HEIGHT // 2 :, :, 1] = 255, 255
     ray = directions(shell := far_shell([pointmap(np.eye(4))], [sky_over_grass], Config()))
-    beside = ray[:, 0] / ray[:, 2] > 0.8  # the image ends at 0.5
+    beside = (ray[:, 0] / ray[:, 2] > 0.8) & (ray[:, 2] > 0)  # the image ends at 0.5
     sky, grass = beside & (ray[:, 1] < -0.2), beside & (ray[:, 1] > 0.2)
     assert sky.sum() > 20 and grass.sum() > 20
     assert (shell.rgb[sky, 2] > 0.7).all() and (shell.rgb[sky, 1] < 0.3).all()
@@ -90,20 +91,34 @@ def test_beside_the_images_it_has_their_colour_at_that_elevation():
 def test_each_direction_has_the_colour_of_the_view_that_looks_there():
     green, white = np.zeros((HEIGHT, WIDTH, 3), np.uint8), np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     green[..., 1] = 255
-    shell = far_shell([pointmap(turned(0)), pointmap(turned(180))], [green, white], Config(margin=0.0))
+    shell = far_shell(
+        [pointmap(turned(0)), pointmap(turned(180))], [green, white], Config(margin=0.0, elsewhere_deg=0.0)
+    )
     ahead = directions(shell)[:, 2] > 0
     assert ahead.any() and (~ahead).any()
     torch.testing.assert_close(shell.rgb[ahead], torch.tensor([[0, 1.0, 0]]).expand(ahead.sum(), 3))
     torch.testing.assert_close(shell.rgb[~ahead], torch.ones((~ahead).sum(), 3))
 
 
-@pytest.mark.parametrize("yaw_deg", [0.0, 90.0])
-def test_no_gap_shows_through(yaw_deg):
-    view, white = pointmap(turned(yaw_deg)), np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+@pytest.mark.parametrize("yaw_deg", range(0, 360, 30))
+@pytest.mark.parametrize("pitch_deg", [0, 50, -80])
+def test_no_gap_shows_through_wherever_one_looks(yaw_deg, pitch_deg):
+    view, white = pointmap(np.eye(4)), np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
     shell = far_shell([view], [white], Config())
-    camera = torch.from_numpy(view.T_world_camera).float(), torch.from_numpy(view.K).float()
+    looking = np.eye(4)
+    looking[:3, :3] = Rotation.from_euler("yx", [yaw_deg, pitch_deg], degrees=True).as_matrix()
+    camera = torch.from_numpy(looking).float(), torch.from_numpy(view.K).float()
     image = render_gaussians(shell, Camera(*camera, WIDTH, HEIGHT)).rgb
-    assert image.min() > 0.8
+    assert image is not None and image.min() > 0.8
+
+
+def test_elsewhere_it_has_the_colours_of_all_images_together():
+    shell = far_shell([pointmap(np.eye(4))], [two_colours()], Config())
+    behind = directions(shell)[:, 2] < -0.5
+    assert 50 < behind.sum() < 150  # about 10 degrees apart
+    assert (shell.rgb[behind][:, 1] < 0.01).all()
+    mixed = shell.rgb[behind & (abs(directions(shell)[:, 0]) < 0.1)]
+    assert len(mixed) and (abs(mixed[:, 0] - mixed[:, 2]) < 0.5).all()  # neither red nor blue
 
 
 def test_a_shell_of_spacing_zero_is_left_out():

@@ -39,6 +39,17 @@ def test_only_what_two_photographs_confirm_is_exported(tmp_path, to):
     assert np.allclose(np.sort(back.means[:, 0]), np.sort(expected.means[:, 0]), atol=atol)
 
 
+def test_without_the_background_all_else_is_exported(tmp_path):
+    snapshot = result(tmp_path)
+    back = read_gaussians(export_scene(tmp_path, "ply", tmp_path / "near.ply", Selection(no_background=True)))
+    near = snapshot.gaussians.source_frame != SHELL
+    assert len(back) == near.sum() == 40
+    assert np.allclose(np.sort(back.means[:, 0]), np.sort(snapshot.gaussians.means[near, 0]), atol=1e-6)
+    result(tmp_path / "far", (SHELL,))
+    with pytest.raises(SceneFileError, match="nothing but the far background"):
+        export_scene(tmp_path / "far", "ply", tmp_path / "no.ply", Selection(no_background=True))
+
+
 def test_points_of_colmap_are_selected_too(tmp_path):
     result(tmp_path)
     export_scene(tmp_path, "colmap", tmp_path / "model", SEEN)
