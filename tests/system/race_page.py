@@ -83,6 +83,16 @@ def seeds() -> str:
     return f"differ by {median(apart):.1f} dB in the median, by {max(apart):.1f} at most".replace("0.", ".")
 
 
+def texture() -> str:
+    """What LPIPS in the loss of `quality` does to its LPIPS."""
+    found = margins(ends(), WHOLE[2], "quality")
+    ahead = sum(each.lead >= 0 for each in found)
+    return (
+        f"In LPIPS it is better than the best other in {ahead} of {len(found)} sets, by {_signed(_mean(found), 3)} in "
+        "the mean"
+    )
+
+
 def headline() -> str:
     """The line of the README's table."""
     found = margins(ends(), WHOLE[0])
