@@ -8,17 +8,16 @@ so many times its weight. Its weights are the user's (`splatnode weights`): with
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import torch
 from msgspec import Meta
 from torch import Tensor
 
-from splatnode.recon.networks.lpips import MIN_SIDE, Lpips, load_lpips
+from splatnode.recon.networks.lpips import MIN_SIDE
 from splatnode.recon.optimize.losses.loss import Schedule
-
-NETWORK = "LPIPS AlexNet"
+from splatnode.recon.optimize.losses.perceptual import Distance, LpipsDistance, load_alex
 
 
 class Config(Schedule, frozen=True, forbid_unknown_fields=True):
@@ -36,37 +35,29 @@ class Config(Schedule, frozen=True, forbid_unknown_fields=True):
 class PerceptualLoss:
     """LPIPS of a render against a photograph, where that shows the scene."""
 
-    network: Lpips
+    distance: Distance  # from the photograph
     target: Tensor  # (H, W, 3) the photograph
     shown: Tensor | None  # (H, W, 1) bool: False where it is not compared; None: all of it is
-    features: tuple[Tensor, ...] | None  # of the photograph; None: they are computed each time
 
     def __call__(self, rgb: Tensor) -> Tensor:
         """The distance of a render (H, W, 3), scalar, with gradients."""
-        if self.shown is not None:
-            rgb = torch.where(self.shown, rgb, self.target)
-        return self.network.distance(rgb, self.features or _features(self.network, self.target))
+        return self.distance(rgb if self.shown is None else torch.where(self.shown, rgb, self.target))
 
 
-def load(config: Config, device: torch.device) -> Lpips | None:
-    """The network, on `device`; None where the weight is 0, or no weights of the network are there."""
-    network = load_lpips("alex") if config.weight else None
-    return None if network is None else network.on(device)
+def load(config: Config, device: torch.device) -> LpipsDistance | None:
+    """The measure, on `device`; None where the weight is 0, or no weights of the network are there."""
+    found = load_alex() if config.weight else None
+    return None if found is None else replace(found, network=found.network.on(device))
 
 
 def perceptual_loss(
-    network: Lpips | None, target: Tensor, weights: Tensor | None, keep_features: bool
+    measure: LpipsDistance | None, target: Tensor, weights: Tensor | None, keep_features: bool
 ) -> Callable[[Tensor], Tensor] | None:
     """The loss against `target` (H, W, 3), where `weights` (H, W) are not 0; None where nothing can be computed.
 
-    What the network sees in a photograph takes 40 bytes a pixel while it is kept.
+    What the network sees in a photograph takes about 40 bytes a pixel while it is kept.
     """
-    if network is None or min(target.shape[:2]) < MIN_SIDE:
+    if measure is None or min(target.shape[:2]) < MIN_SIDE:
         return None
-    shown = None if weights is None else (weights > 0)[..., None]
-    return PerceptualLoss(network, target, shown, _features(network, target) if keep_features else None)
-
-
-@torch.no_grad()
-def _features(network: Lpips, image: Tensor) -> tuple[Tensor, ...]:
-    return network.features(image)
+    distance = measure.prepared(target) if keep_features else lambda rgb: measure.prepared(target)(rgb)
+    return PerceptualLoss(distance, target, None if weights is None else (weights > 0)[..., None])

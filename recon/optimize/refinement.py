@@ -154,10 +154,10 @@ class _Fit:
         shown = fitted_pixels(scene.views)
         few = sum(view.width * view.height for view in scene.views) <= _KEPT_PIXELS
         device = gaussians.means.device
-        self._network = perceptual_loss.load(config.perceptual, device)
+        self._measure = perceptual_loss.load(config.perceptual, device)
         self._images = {
             half: [
-                training_image(*each, scale, config.dssim, device, keep=few, network=self._network)
+                training_image(*each, scale, config.dssim, device, keep=few, measure=self._measure)
                 for each in zip(scene.views, shown, strict=True)
             ]
             for half, scale in _SCALES.items()
@@ -264,7 +264,7 @@ class _Fit:
         learnt = self._gaussians.map(lambda tensor: tensor.detach().clone())
         served_by = {} if self._regularisation is None else dict(self._regularisation.served_by)
         if self._config.perceptual.weight:
-            served_by["perceptual"] = perceptual_loss.NETWORK if self._network else "nothing: no weights"
+            served_by["perceptual"] = self._measure.name if self._measure else "nothing: no weights"
         return Scene(views, learnt, self._iterations, served_by=served_by, headroom=self._scene.headroom)
 
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from splatnode.recon.networks.lpips import Lpips
+from splatnode.recon.optimize.losses.perceptual import LpipsDistance
 from splatnode.recon.optimize.perceptual_loss import perceptual_loss
 from splatnode.recon.optimize.photometric_loss import PhotometricLoss
 from splatnode.recon.scene.scene import TrainingView
@@ -63,12 +63,13 @@ def training_image(
     dssim: float,
     device: torch.device = _PROCESSOR,
     keep: bool = True,
-    network: Lpips | None = None,
+    measure: LpipsDistance | None = None,
 ) -> TrainingImage:
     """The photograph of `view` at `scale` of its size, with `dssim` the weight of D-SSIM in its photometric loss.
 
     The photograph lies, and the losses are computed, on `device`: that of the Gaussians which are rendered, where the
-    `network` of the perceptual loss has to be, too. `keep`: whether what the losses compute of the photograph is kept.
+    network of `measure`, for the perceptual loss, has to be, too. `keep`: whether what the losses compute of the
+    photograph is kept.
 
     `shown` (h, w), at the photograph's own size, is False on the black border that undistortion leaves. A pixel of the
     smaller image is compared only if all pixels that it covers are shown.
@@ -82,7 +83,7 @@ def training_image(
         weights = torch.from_numpy(np.floor(share + np.float32(_WHOLLY_SHOWN))).to(device)
     target = torch.tensor(image, device=device).float() / 255.0  # a copy: what is read from a file is read-only
     loss = PhotometricLoss(target, dssim, weights, keep)
-    perceptual = perceptual_loss(network, target, weights, keep)
+    perceptual = perceptual_loss(measure, target, weights, keep)
     if view.exposure is None:
         return TrainingImage(K, width, height, loss, perceptual)
     told = torch.ones_like(target, dtype=torch.bool) if weights is None else (weights > 0)[..., None].expand_as(target)

@@ -68,8 +68,13 @@ class MultiScaleGradient:
 
 def load_perceptual(weights_dir: Path | None = None) -> Perceptual:
     """LPIPS with AlexNet, or the multi-scale gradient where its weights are not there."""
+    return load_alex(weights_dir) or MultiScaleGradient()
+
+
+def load_alex(weights_dir: Path | None = None) -> LpipsDistance | None:
+    """LPIPS with AlexNet; None where its weights are not there."""
     network = load_lpips("alex", weights_dir)
-    return MultiScaleGradient() if network is None else LpipsDistance(network, "LPIPS AlexNet")
+    return None if network is None else LpipsDistance(network, "LPIPS AlexNet")
 
 
 def _pyramid(image: Tensor, scales: int) -> list[Tensor]:

@@ -9,6 +9,7 @@ from msgspec import structs
 
 from splatnode.recon.networks.lpips import Layer, Lpips
 from splatnode.recon.optimize import perceptual_loss
+from splatnode.recon.optimize.losses.perceptual import LpipsDistance
 from splatnode.recon.optimize.perceptual_loss import Config
 from splatnode.recon.optimize.refinement import Config as Refinement
 from splatnode.recon.optimize.refinement import refine
@@ -20,13 +21,11 @@ HEIGHT, WIDTH = 40, 56
 
 
 @pytest.fixture
-def network() -> Lpips:
+def measure() -> LpipsDistance:
     """One layer that sees differences of neighbouring pixels."""
     kernels = torch.randn(4, 3, 3, 3, generator=torch.Generator().manual_seed(0))
-    return Lpips(
-        (Layer(tap=True),),
-        {"net.0.weight": kernels, "net.0.bias": torch.zeros(4), "lin0.weight": torch.ones(1, 4, 1, 1)},
-    )
+    weights = {"net.0.weight": kernels, "net.0.bias": torch.zeros(4), "lin0.weight": torch.ones(1, 4, 1, 1)}
+    return LpipsDistance(Lpips((Layer(tap=True),), weights), "LPIPS AlexNet")
 
 
 @pytest.fixture
@@ -46,10 +45,10 @@ def test_it_counts_in_every_few_steps_as_much_as_in_all():
 
 
 @pytest.mark.parametrize("keep", [True, False])
-def test_only_what_shows_the_scene_is_compared(network, photograph, keep):
+def test_only_what_shows_the_scene_is_compared(measure, photograph, keep):
     shown = np.ones((HEIGHT, WIDTH), bool)
     shown[:9] = False
-    compared = training_image(view_of(photograph), shown, 1.0, 0.2, keep=keep, network=network)
+    compared = training_image(view_of(photograph), shown, 1.0, 0.2, keep=keep, measure=measure)
     assert compared.perceptual is not None
     same = torch.from_numpy(photograph).float() / 255
     hidden = same.clone()
@@ -60,34 +59,34 @@ def test_only_what_shows_the_scene_is_compared(network, photograph, keep):
     assert other.grad is not None and not other.grad[:9].any() and bool(other.grad[9:].any())
 
 
-def test_what_is_left_of_the_exposure_costs_nothing(network, photograph):
+def test_what_is_left_of_the_exposure_costs_nothing(measure, photograph):
     exposed = view_of(photograph, Exposure((2.0, 2.0, 2.0), 0.0, None))
     shown = np.ones((HEIGHT, WIDTH), bool)
     render = 0.8 * torch.from_numpy(photograph).float() / 255
-    found = [training_image(view, shown, 1.0, 0.2, network=network) for view in (exposed, view_of(photograph))]
+    found = [training_image(view, shown, 1.0, 0.2, measure=measure) for view in (exposed, view_of(photograph))]
     with_gain, without = (float(each.perceptual(render)) for each in found if each.perceptual)
     assert with_gain < 0.1 * without
 
 
-def test_a_photograph_that_the_network_would_pool_away_has_none(network):
+def test_a_photograph_that_the_network_would_pool_away_has_none(measure):
     thin = np.zeros((31, 90, 3), np.uint8)
-    assert training_image(view_of(thin), np.ones((31, 90), bool), 1.0, 0.2, network=network).perceptual is None
+    assert training_image(view_of(thin), np.ones((31, 90), bool), 1.0, 0.2, measure=measure).perceptual is None
 
 
-def test_it_changes_a_scene_where_there_is_a_network_and_nothing_where_there_is_none(network, monkeypatch):
+def test_it_changes_a_scene_where_there_is_a_network_and_nothing_where_there_is_none(measure, monkeypatch):
     start = disturbed(photographed())
     refined = Refinement(iterations=6, checkpoints=(), control=None)
     configured = structs.replace(refined, perceptual=Config(weight=0.2, start=0.0, every=2))
 
     def end(config, found):
-        monkeypatch.setattr(perceptual_loss, "load_lpips", lambda name: found)
+        monkeypatch.setattr(perceptual_loss, "load_alex", lambda: found)
         *_, scene = refine(start, config, seed=0)
         return scene
 
-    plain, without, with_it = end(refined, network), end(configured, None), end(configured, network)
+    plain, without, with_it = end(refined, measure), end(configured, None), end(configured, measure)
     assert torch.equal(plain.gaussians.sh, without.gaussians.sh)
     assert not torch.equal(plain.gaussians.sh, with_it.gaussians.sh)
     assert plain.losses[0] == with_it.losses[0]  # which are photometric
     assert plain.served_by == {}
     assert without.served_by == {"perceptual": "nothing: no weights"}
-    assert with_it.served_by == {"perceptual": perceptual_loss.NETWORK}
+    assert with_it.served_by == {"perceptual": measure.name}
