@@ -68,7 +68,7 @@ def _gaussians(config: Config, begun: Scene, scene: Scene) -> Hit | None:
 
 
 def _seconds(config: Config, begun: Scene, scene: Scene, seconds: Mapping[str, float]) -> Hit | None:
-    done, planned = scene.iterations - begun.iterations, config.optimize.iterations
+    done, planned = scene.iterations - begun.iterations, config.optimize.steps
     if config.budget_s is None or done >= planned:
         return None
     gain = _gain(done / planned, EARLIER)

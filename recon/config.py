@@ -12,7 +12,7 @@ from splatnode.capture.process.config import Plugin, merged, typed
 from splatnode.recon.frames import screening
 from splatnode.recon.matching import config as matching
 from splatnode.recon.metric import config as metric
-from splatnode.recon.optimize import dropout, perceptual_loss, refinement
+from splatnode.recon.optimize import dropout, ensemble, perceptual_loss, refinement
 from splatnode.recon.priors import classical
 from splatnode.recon.rasterize.device import Device
 from splatnode.recon.registration import config as registration
@@ -102,20 +102,16 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return initialisation.Config(self.completion, self.seeding, self.background, self.pixelwise, most)
 
 
-# Three tenths as long as the others', for three times as many: long ones let drift what one photograph alone shows
-_SHORT_STEPS = refinement.Rates(means=0.12, quats=6e-3, log_scales=3e-2, logit_opacities=3e-2, sh=9e-3)
-
 PRESETS: dict[str, Config] = {
     "preview": Config(size=384, optimize=refinement.Config(half_resolution_share=0.25, iterations=150)),
     "fast": Config(optimize=refinement.Config(iterations=200)),
     "balanced": Config(),
-    # With LPIPS in the loss where its weights are: for texture
+    # Two scenes and one that agrees with both; with LPIPS in its loss, where its weights are, for texture
     "quality": Config(
         optimize=refinement.Config(
-            iterations=1500,
-            checkpoints=(500,),
-            rates=_SHORT_STEPS,
-            perceptual=perceptual_loss.Config(weight=0.03),
+            checkpoints=(150, 500),
+            ensemble=ensemble.Config(members=2),
+            perceptual=perceptual_loss.Config(weight=0.03, start=0.0, every=3),
         ),
     ),
 }

@@ -131,7 +131,7 @@ def model(
         clock.lap("wait")
 
     def gone_on(done: int) -> None:
-        tell(Step("refining the scene", done, config.optimize.iterations, "step"))
+        tell(Step("refining the scene", done, config.optimize.steps, "step"))
 
     for show in refined(begun, config, config.optimize, clock.deadline(config.budget_s), gone_on):
         clock.lap("optimise")

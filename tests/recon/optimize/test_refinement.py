@@ -11,7 +11,8 @@ import pytest
 import torch
 from msgspec import structs
 
-from splatnode.recon.optimize import dropout, refinement, regularise
+from splatnode.recon.optimize import dropout, fit, refinement, regularise
+from splatnode.recon.optimize.fit import Fit
 from splatnode.recon.optimize.losses import normal
 from splatnode.recon.optimize.losses.loss import LossChoice
 from splatnode.recon.optimize.pseudo_views import PseudoView
@@ -128,7 +129,7 @@ def test_no_iterations_give_the_start(truth):
 
 def test_every_view_takes_its_turn(truth, monkeypatch):
     taken = []
-    monkeypatch.setattr(refinement._Fit, "step", lambda fit, index, progress: taken.append(index))
+    monkeypatch.setattr(Fit, "step", lambda fit, index, progress: taken.append(index))
     last(truth, plain(iterations=9))
     assert [sorted(taken[i : i + 3]) for i in (0, 3, 6)] == [[0, 1, 2]] * 3
 
@@ -138,7 +139,7 @@ def steps_until(deadline: float, truth: Scene, monkeypatch) -> list[float]:
     progress: list[float] = []
     clock = itertools.count()
     monkeypatch.setattr(refinement.time, "monotonic", lambda: float(next(clock)))
-    monkeypatch.setattr(refinement._Fit, "step", lambda fit, index, share: progress.append(share))
+    monkeypatch.setattr(Fit, "step", lambda fit, index, share: progress.append(share))
     assert len(list(refine(truth, plain(iterations=100), seed=0, deadline=deadline))) == 1
     return progress
 
@@ -186,8 +187,8 @@ def test_torch_gets_its_threads_back(truth, wholly):
 
 def test_torch_has_one_thread_while_a_step_computes(truth, monkeypatch):
     threads = []
-    step = refinement._Fit.step
-    monkeypatch.setattr(refinement._Fit, "step", lambda *rest: threads.append(torch.get_num_threads()) or step(*rest))
+    step = Fit.step
+    monkeypatch.setattr(Fit, "step", lambda *rest: threads.append(torch.get_num_threads()) or step(*rest))
     before = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
@@ -229,7 +230,7 @@ class Brighter:
 
 
 def test_further_losses_count_on_training_views_and_pseudo_views(truth, monkeypatch):
-    monkeypatch.setattr(refinement, "Regularisation", Brighter)
+    monkeypatch.setattr(fit, "Regularisation", Brighter)
     start = replace(truth, views=tuple(map(with_pointmap, truth.views)))
     config = plain(iterations=8, half_resolution_share=0.5)
     unpulled = last(start, config)
@@ -248,7 +249,7 @@ def test_a_loss_without_a_point_map_names_the_view(truth):
 
 def test_the_steps_of_cameras_fall_by_a_part_of_their_own(truth):
     def moved(**final: float) -> tuple[float, float]:
-        fit = refinement._Fit(disturbed(truth), plain(rates=Rates(**final)), seed=0)
+        fit = Fit(disturbed(truth), plain(rates=Rates(**final)), seed=0)
         fit.step(1, progress=1.0)
         scene = fit.scene()
         camera = (scene.views[1].T_world_camera - truth.views[1].T_world_camera).abs().max()
