@@ -8,8 +8,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator
 
-import msgspec
-
 from splatnode.capture.process.logs import event
 from splatnode.recon.config import Config
 from splatnode.recon.daemon import membership
@@ -44,12 +42,14 @@ def judge(work: IncrementalReconstruction, forget: Forget, pause: Pause) -> None
 
 
 def refine(work: IncrementalReconstruction, config: Config, pause: Pause) -> Iterator[Shown]:
-    """The scene of all keyframes every STEP iterations, and at the end; it is not shown yet.
+    """The scene of all keyframes at every checkpoint, and at the end; it is not shown yet.
 
     Yields nothing where the verdict forbids a scene. `pause` is called in between, and may raise to abandon the work.
     """
-    steps = msgspec.structs.replace(config.optimize, checkpoints=tuple(range(STEP, config.optimize.iterations, STEP)))
+
+    def gone_on(done: int) -> None:
+        if done % STEP == 0:
+            pause()
+
     work.rebuild(pause)
-    for show in work.refine(work.begun, steps):
-        pause()
-        yield show
+    yield from work.refine(work.begun, config.optimize, gone_on)

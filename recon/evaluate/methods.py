@@ -26,7 +26,7 @@ from splatnode.recon.rasterize.device import Device
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene import pixelwise
 
-# Iterations at which a configuration shows its scene, besides its end; none so early that it would begin otherwise
+# Iterations at which a configuration shows its scene, besides its end
 CHECKPOINTS = (refinement.MIN_SOFT, 150, 500)
 
 # InstantSplat's released settings (2025): a Gaussian a pixel, nothing added or taken away; colours, scales and turns

@@ -25,7 +25,7 @@ from splatnode.recon.scene.scene import Scene, TrainingView
 
 Share = Annotated[float, Meta(ge=0, le=1)]
 Rate = Annotated[float, Meta(ge=0, le=1)]
-MIN_SOFT = 100  # iterations, at the end or a checkpoint, below which a refinement begins with opacities as seeded
+MIN_SOFT = 100  # iterations below which a refinement begins with opacities as seeded
 
 
 class Rates(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -176,8 +176,11 @@ def _as_agreement(config: Config) -> Config:
 
 
 def _soft(scene: Scene, config: Config) -> Scene:
-    """A begun scene with its first opacities, if there are steps enough for them to grow before it is looked at."""
-    if scene.iterations or config.first_opacity is None or min((config.iterations, *config.checkpoints)) < MIN_SOFT:
+    """A begun scene with its first opacities, if there are steps enough for them to grow.
+
+    How often it is looked at meanwhile does not count: that would make another scene of it.
+    """
+    if scene.iterations or config.first_opacity is None or config.iterations < MIN_SOFT:
         return scene
     return replace(scene, gaussians=softened(scene.gaussians, config.first_opacity))
 

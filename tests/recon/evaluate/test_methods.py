@@ -9,7 +9,6 @@ from splatnode.recon.config import PRESETS
 from splatnode.recon.evaluate import ablation
 from splatnode.recon.evaluate.methods import CONFIGS, METHODS, RIVALS, chosen, method, start_of
 from splatnode.recon.optimize import regularise
-from splatnode.recon.optimize.refinement import MIN_SOFT
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.report import build_report
 from tests.support.synthetic import photographs
@@ -22,14 +21,6 @@ def test_every_preset_is_a_method():
         assert msgspec.structs.replace(CONFIGS[name], optimize=same) == config
     with pytest.raises(ValueError, match="no method 'nerf'; there are: .*paper"):
         method("nerf")
-
-
-@pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_begins_as_it_does_for_a_user_although_it_is_looked_at_on_its_way(name):
-    watched, own = CONFIGS[name].optimize, PRESETS[name].optimize
-    assert watched.checkpoints != own.checkpoints
-    earliest = [min((steps.iterations, *steps.checkpoints)) for steps in (watched, own)]
-    assert (earliest[0] >= MIN_SOFT) == (earliest[1] >= MIN_SOFT)
 
 
 def test_the_papers_schedule_and_weights():

@@ -276,6 +276,13 @@ def test_a_begun_scene_starts_soft_and_one_that_goes_on_does_not(truth):
         assert end.gaussians.opacities.tolist() == pytest.approx([0.5] * len(soft))
 
 
+def test_looks_change_nothing(truth):
+    begun = replace(truth, iterations=0)
+    config = plain(iterations=refinement.MIN_SOFT)
+    unseen, watched = last(begun, config), last(begun, structs.replace(config, checkpoints=tuple(range(10, 100, 10))))
+    assert torch.equal(unseen.gaussians.logit_opacities, watched.gaussians.logit_opacities)
+
+
 def test_what_is_as_soft_already_is_left_to_the_bit(truth):
     from_photographs = replace(truth.gaussians, source_frame=torch.zeros_like(truth.gaussians.source_frame))
     soft = refinement.softened(from_photographs, 0.1)
