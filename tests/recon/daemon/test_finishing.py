@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
+import numpy as np
 import pytest
 
-from splatnode.recon.config import PRESETS
+from splatnode.recon.config import PRESETS, Config
 from splatnode.recon.daemon import finishing
+from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.modelling import Shown
 from splatnode.recon.optimize import refinement
+from splatnode.recon.pipeline import reconstruct
+from tests.support.synthetic import photographs
 
 
 @dataclass
@@ -29,6 +33,20 @@ class Work:
         for done in range(1, steps.steps + 1):
             gone_on(done)
         yield Shown()
+
+
+def test_the_scene_is_that_of_an_offline_run_to_the_bit():
+    frames = photographs()[1:4]
+    config = Config(size=160, optimize=refinement.Config(iterations=refinement.MIN_SOFT, checkpoints=()))
+    work = IncrementalReconstruction(config)
+    for frame in frames:
+        work.take(frame)
+    *_, live = finishing.refine(work, config, lambda: None)
+    *_, offline = reconstruct(frames, config)
+    assert live.scene is not None and len(offline.gaussians) > 1000
+    found = live.scene.arrays()
+    for name in ("means", "opacities", "sh"):
+        assert np.array_equal(getattr(found, name), getattr(offline.gaussians, name))
 
 
 @pytest.mark.parametrize("name", PRESETS)
