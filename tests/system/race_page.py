@@ -15,6 +15,7 @@ from tests.bench.quality import race_chart
 
 RAW = Path(__file__).parents[1] / "bench" / "results" / "race.json"
 DIGITS = (1, 3, 3)
+SAME_FOCAL_PCT = 1.0  # by which the errors of the focal length may differ between rows of a case
 LARGEST = "instantsplat-xl+fill"  # the method whose number of Gaussians is told
 
 
@@ -71,6 +72,18 @@ def _beside() -> dict[str, tuple[race_chart.Point, ...]]:
 
 def _signed(value: float, digits: int) -> str:
     return f"{value:+.{digits}f}".replace("-", "−").replace("+0.", "+.").replace("−0.", "−.")
+
+
+def unlike() -> list[str]:
+    """Cases whose rows start from other cameras, as other rounding may find them where photographs hardly suffice."""
+    found = []
+    for case in dict.fromkeys((row.scene, row.views) for row in ends()):
+        here = [row for row in ends() if (row.scene, row.views) == case and row.psnr is not None]
+        focal_pct = [row.focal_error_pct for row in here if row.focal_error_pct is not None]
+        spread = max(focal_pct, default=0.0) - min(focal_pct, default=0.0)
+        if len({row.num_cameras for row in here}) > 1 or spread > SAME_FOCAL_PCT:
+            found.append(f"{case[0]}, {case[1]}")
+    return found
 
 
 def seeds() -> str:

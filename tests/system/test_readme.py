@@ -886,6 +886,10 @@ def test_needles():
     says(*rows, on="docs/clean_scenes.md")
 
 
+def test_all_rows_of_a_case_of_the_race_start_from_the_same_cameras():
+    assert race_page.unlike() == []
+
+
 def test_the_race():
     lines = race_page.lines()
     assert len(lines) >= 14
