@@ -265,15 +265,10 @@ class IncrementalReconstruction:
         self._known = replace(self._known, pointmaps=estimate.pointmaps or self._known.pointmaps, begun=begun)
         self.clock.lap("points")
 
-    def refine(
-        self, scene: Scene | None, steps: refinement.Config, gone_on: Callable[[int], None] = lambda done: None
-    ) -> Iterator[Shown]:
-        """`scene`, if there is one, at every checkpoint of its refinement and at the end. It is not shown yet.
-
-        `gone_on` hears after each step how many are done, and may raise to abandon the work.
-        """
+    def refine(self, scene: Scene | None, steps: refinement.Config, pause: Pause = without_pause) -> Iterator[Shown]:
+        """`scene`, if there is one, at every checkpoint of its refinement and at the end. It is not shown yet."""
         self.clock.lap("wait")
-        for show in refined(scene, self.config, steps, gone_on=gone_on):
+        for show in refined(scene, self.config, steps, gone_on=lambda done: pause()):
             self.clock.lap("optimise")
             yield show
             self.clock.lap("wait")

@@ -5,6 +5,7 @@ Keyframes are screened; in the end all evidence is weighed, and the scene is mad
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Callable, Iterable, Iterator
 
@@ -46,10 +47,11 @@ def refine(work: IncrementalReconstruction, config: Config, pause: Pause) -> Ite
 
     Yields nothing where the verdict forbids a scene. `pause` is called in between, and may raise to abandon the work.
     """
+    steps = itertools.count(1)
 
-    def gone_on(done: int) -> None:
-        if done % STEP == 0:
+    def now_and_then() -> None:
+        if next(steps) % STEP == 0:
             pause()
 
     work.rebuild(pause)
-    yield from work.refine(work.begun, config.optimize, gone_on)
+    yield from work.refine(work.begun, config.optimize, now_and_then)
