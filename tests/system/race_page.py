@@ -105,9 +105,9 @@ def thorough() -> str:
     ratio = exp(sum(log(margin.ours / margin.best) for margin in found[2]) / len(found[2])) - 1
     worse = "worse" if ratio > 0 else "better"
     return (
-        f"`quality`, of one seed, leads the best other by {leads[0]} dB, {leads[1]} in SSIM and {leads[2]} in LPIPS in the "
-        f"mean of {len(found[0])} sets (positive is better), and is no worse in {ahead[0]}, {ahead[1]} and {ahead[2]}; "
-        f"by ratio its LPIPS is {100 * abs(ratio):.0f} % {worse}"
+        f"`quality`, of one seed, leads the best other by {leads[0]} dB, {leads[1]} in SSIM and {leads[2]} in LPIPS in "
+        f"the mean of {len(found[0])} sets (positive is better), and is no worse in {ahead[0]}, {ahead[1]} and "
+        f"{ahead[2]}; by ratio its LPIPS is {100 * abs(ratio):.0f} % {worse}"
     )
 
 
