@@ -894,7 +894,7 @@ def test_the_race():
     lines = race_page.lines()
     assert len(lines) >= 14
     says(*lines, *race_page.against(), race_page.summary(), race_page.seeds(), race_page.thorough())
-    says(race_page.headline(), on="README.md")
+    says(*race_page.headlines(), on="README.md")
 
 
 def test_things_that_move():
