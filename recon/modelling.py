@@ -128,7 +128,9 @@ def refined(
     for later in work:
         give_back_memory()
         verdict = None
-        if later.losses or later.iterations in config.optimize.checkpoints:
+        # Looked at earlier, a scene that started soft has not shown its photographs yet.
+        looked_at = later.iterations >= refinement.MIN_SOFT and later.iterations in config.optimize.checkpoints
+        if later.losses or looked_at:
             watching, verdict = examine(watching, later)
         if verdict is not None:
             best = shown(watching.best.on(_PROCESSOR), config).scene if verdict.publishable else None

@@ -11,7 +11,7 @@ from msgspec.structs import replace as replace_fields
 
 from splatnode.recon.config import Config
 from splatnode.recon.modelling import refined
-from splatnode.recon.optimize import overfitting
+from splatnode.recon.optimize import overfitting, refinement
 from splatnode.recon.optimize.watch import SHORT, examine, watch
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
@@ -103,7 +103,14 @@ def test_a_scene_that_diverged_is_not_published_and_a_short_refinement_is_not_te
 
 def test_the_refinement_ends_with_the_best_scene_and_the_verdict(truth, monkeypatch):
     monkeypatch.setattr(overfitting, "OVERFITTED", 0.0)  # whatever comes is too much
-    steps = plain(iterations=SHORT + 1, checkpoints=(2,))
+    steps = plain(iterations=SHORT + 1, checkpoints=(refinement.MIN_SOFT,), first_opacity=None)
     (only,) = refined(truth, replace_fields(Config(), optimize=steps), steps)
     assert only.verdict is not None and only.verdict.code is Code.OVERFIT
     assert only.scene is not None and torch.equal(only.scene.gaussians.means, truth.gaussians.means)
+
+
+def test_a_scene_that_started_soft_is_not_judged_before_it_shows_its_photographs(truth):
+    steps = plain(iterations=refinement.MIN_SOFT, checkpoints=(2,))
+    first, *_ = refined(truth, replace_fields(Config(), optimize=steps), steps)
+    assert first.verdict is None and first.scene is not None and first.scene.iterations == 2
+    assert first.scene.gaussians.opacities.max() < 0.15  # it is soft
