@@ -128,7 +128,7 @@ def refined(
     for later in work:
         give_back_memory()
         verdict = None
-        # Looked at earlier, a scene that started soft has not shown its photographs yet.
+        # A scene that started soft shows its photographs after so many steps: looked at earlier, it is not judged.
         looked_at = later.iterations >= refinement.MIN_SOFT and later.iterations in config.optimize.checkpoints
         if later.losses or looked_at:
             watching, verdict = examine(watching, later)

@@ -17,7 +17,7 @@ import torch
 from msgspec import Meta
 from torch import Tensor
 
-from splatnode.recon.optimize.pseudo_views import pseudo_views
+from splatnode.recon.optimize import pseudo_views
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.scene.scene import Scene, TrainingView
 
@@ -39,17 +39,9 @@ def seed_of(member: int, seed: int) -> int:
 @torch.no_grad()
 def between(members: Sequence[Scene], config: Config, seed: int) -> list[TrainingView]:
     """Views between the cameras of the first of the members: what they show there in the mean. None of one camera."""
-    views = members[0].views
-    if len(views) < 2:
-        return []
-    found = pseudo_views(
-        [view.T_world_camera.double().numpy() for view in views],
-        [view.K.double().numpy() for view in views],
-        [(view.width, view.height) for view in views],
-        min(config.pseudo_views * len(views), math.ceil(config.iterations / 2)),
-        off_path=config.off_path,
-        rng=np.random.default_rng(seed),
-    )
+    views, rng = members[0].views, np.random.default_rng(seed)
+    count = min(config.pseudo_views * len(views), math.ceil(config.iterations / 2))
+    found = pseudo_views.between(views, count, off_path=config.off_path, rng=rng)
     return [
         TrainingView(
             name=f"between {number}",

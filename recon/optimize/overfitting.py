@@ -17,7 +17,7 @@ import torch
 
 from splatnode.recon.optimize.photometric_loss import PhotometricLoss
 from splatnode.recon.optimize.point_render import PointRender, render_points
-from splatnode.recon.optimize.pseudo_views import PseudoView, pseudo_views
+from splatnode.recon.optimize.pseudo_views import PseudoView, between
 from splatnode.recon.optimize.torch_threads import single_torch_thread
 from splatnode.recon.optimize.training_image import scaled
 from splatnode.recon.priors.pointmap import world_points
@@ -50,18 +50,9 @@ class Expected:
 def expected(scene: Scene) -> tuple[Expected, ...]:
     """What is expected between the training views of `scene`; empty with fewer than two that have a point map."""
     views = [view for view in scene.views if view.pointmap is not None]
-    if len(views) < 2:
-        return ()
-    between = pseudo_views(
-        [view.T_world_camera.double().numpy() for view in views],
-        [view.K.double().numpy() for view in views],
-        [(view.width, view.height) for view in views],
-        _PSEUDO_VIEWS,
-        off_path=_OFF_PATH,
-        rng=np.random.default_rng(0),
-    )
+    found = between(views, _PSEUDO_VIEWS, off_path=_OFF_PATH, rng=np.random.default_rng(0))
     with single_torch_thread():
-        return tuple(_expected(views, view, scene.gaussians.means.device) for view in between)
+        return tuple(_expected(views, view, scene.gaussians.means.device) for view in found)
 
 
 def misfit(expectations: Sequence[Expected], gaussians: Gaussians) -> float:

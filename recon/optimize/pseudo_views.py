@@ -12,6 +12,7 @@ import torch
 from scipy.linalg import expm, logm
 
 from splatnode.recon.rasterize.gaussian_render import Camera
+from splatnode.recon.scene.scene import TrainingView
 
 _SHARES = (0.15, 0.85)  # of the motion between two training views, within which a pseudo view lies
 
@@ -94,3 +95,19 @@ def pseudo_views(
         nearest = start if share < 0.5 else end
         views.append(PseudoView(T_world_camera, Ks[nearest], *sizes[nearest], nearest))
     return views
+
+
+def between(
+    cameras: Sequence[Camera | TrainingView], count: int, *, off_path: float, rng: np.random.Generator
+) -> list[PseudoView]:
+    """`count` pseudo views between these cameras, as `pseudo_views` spreads them; none between fewer than two."""
+    if len(cameras) < 2:
+        return []
+    return pseudo_views(
+        [camera.T_world_camera.double().numpy() for camera in cameras],
+        [camera.K.double().numpy() for camera in cameras],
+        [(camera.width, camera.height) for camera in cameras],
+        count,
+        off_path=off_path,
+        rng=rng,
+    )

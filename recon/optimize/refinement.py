@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -100,15 +99,15 @@ def refine(
         yield from run(scene, config, seed=seed)
         return
     started = time.monotonic()
-    first = yield from run(scene, _as_member(config), seed=seed)
+    # Of LPIPS, which takes long, members do without: the refinement after them has it.
+    alone = msgspec.structs.replace(config, perceptual=perceptual_loss.Config())
+    first = yield from run(scene, alone, seed=seed)
     took = time.monotonic() - started
     if deadline and started + took * config.steps / max(config.iterations, 1) > deadline:
         return
-    members = [first]
-    while len(members) < config.ensemble.members:
-        done = len(members) * config.iterations
-        alike = run(scene, _as_member(config), seed=ensemble.seed_of(len(members), seed), done=done)
-        members.append(deque(alike, maxlen=1)[0])
+    members, unseen = [first], msgspec.structs.replace(alone, checkpoints=())
+    for member in range(1, config.ensemble.members):
+        members += run(scene, unseen, seed=ensemble.seed_of(member, seed), done=member * config.iterations)
     with single_torch_thread():
         beside = ensemble.between(members, config.ensemble, seed)
     done = sum(member.iterations - scene.iterations for member in members)
@@ -154,11 +153,6 @@ def _refined(
     end = replace(fit.scene(), losses=fit.losses())
     yield end
     return end
-
-
-def _as_member(config: Config) -> Config:
-    """Of a scene of an ensemble: LPIPS, which takes long, is left for the refinement after all of them."""
-    return msgspec.structs.replace(config, perceptual=perceptual_loss.Config())
 
 
 def _as_agreement(config: Config) -> Config:

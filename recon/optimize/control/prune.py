@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from splatnode.recon.optimize.control.control import Change, Step
-from splatnode.recon.optimize.pseudo_views import pseudo_views
+from splatnode.recon.optimize.pseudo_views import between
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.scene.background import SHELL
 from splatnode.recon.scene.contrast_masking import visibility
@@ -49,7 +49,9 @@ class Pruning:
             self._due.pop(0)
         gaussians = step.gaussians.map(Tensor.detach)
         cameras = [Camera(T, i.K, i.width, i.height) for T, i in zip(step.Ts_world_camera, step.images, strict=True)]
-        cameras += between(cameras, self._config.between * len(cameras), self._config.off_path, self._rng)
+        count, off_path = self._config.between * len(cameras), self._config.off_path
+        # What is hidden in all photographs shows between them.
+        cameras += [view.camera for view in between(cameras, count, off_path=off_path, rng=self._rng)]
         worth = changes_without(gaussians, cameras, self._config.probes, self._generator)
         worth[gaussians.source_frame == SHELL] = torch.inf  # the far shell is for what no photograph shows
         kept = most_worth(worth, self._config.least_change, step.max_gaussians)
@@ -74,17 +76,6 @@ def most_worth(worth: Tensor, least: float, limit: int | None) -> Tensor:
     if limit is not None and len(kept) > limit:
         kept = worth.topk(limit).indices.sort().values
     return kept
-
-
-def between(cameras: Sequence[Camera], count: int, off_path: float, rng: np.random.Generator) -> list[Camera]:
-    """`count` pseudo views: what is hidden in all photographs shows there. None between fewer than two cameras."""
-    if len(cameras) < 2:
-        return []
-    Ts_world_camera = [camera.T_world_camera.double().numpy() for camera in cameras]
-    Ks = [camera.K.double().numpy() for camera in cameras]
-    sizes = [(camera.width, camera.height) for camera in cameras]
-    views = pseudo_views(Ts_world_camera, Ks, sizes, count, off_path=off_path, rng=rng)
-    return [view.camera for view in views]
 
 
 def changes_without(gaussians: Gaussians, cameras: Sequence[Camera], probes: int, generator: torch.Generator) -> Tensor:

@@ -10,7 +10,8 @@ import torch
 from msgspec import structs
 
 from splatnode.recon.optimize.control.control import ControlChoice, Step
-from splatnode.recon.optimize.control.prune import Config, between, changes_without, load, most_worth
+from splatnode.recon.optimize.control.prune import Config, changes_without, load, most_worth
+from splatnode.recon.optimize.pseudo_views import between
 from splatnode.recon.optimize.refinement import refine
 from splatnode.recon.optimize.training_image import TrainingImage, training_image
 from splatnode.recon.rasterize.gaussian_render import Camera
@@ -85,12 +86,12 @@ def test_what_no_photograph_shows_goes_and_the_far_shell_stays(truth):  # noqa: 
 def test_views_between_lie_near_the_path_and_are_no_photographs(truth):  # noqa: F811
     cameras = cameras_of(truth)
     centres = torch.stack([camera.T_world_camera[:3, 3] for camera in cameras])
-    found = between(cameras, 6, 0.0, np.random.default_rng(0))
+    found = between(cameras, 6, off_path=0.0, rng=np.random.default_rng(0))
     assert len(found) == 6
-    for camera in found:
-        away = (centres - camera.T_world_camera[:3, 3]).norm(dim=1)
+    for view in found:
+        away = (centres - view.camera.T_world_camera[:3, 3]).norm(dim=1)
         assert 0 < away.min() < 0.6 * torch.pdist(centres).max()
-    assert between(cameras[:1], 3, 0.0, np.random.default_rng(0)) == []
+    assert between(cameras[:1], 3, off_path=0.0, rng=np.random.default_rng(0)) == []
 
 
 @pytest.mark.parametrize("limit", [1, 7])
