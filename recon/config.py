@@ -13,6 +13,8 @@ from splatnode.recon.frames import screening
 from splatnode.recon.matching import config as matching
 from splatnode.recon.metric import config as metric
 from splatnode.recon.optimize import dropout, ensemble, perceptual_loss, refinement
+from splatnode.recon.optimize.control import prune
+from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.priors import classical
 from splatnode.recon.rasterize.device import Device
 from splatnode.recon.registration import config as registration
@@ -106,12 +108,14 @@ PRESETS: dict[str, Config] = {
     "preview": Config(size=384, optimize=refinement.Config(half_resolution_share=0.25, iterations=150)),
     "fast": Config(optimize=refinement.Config(iterations=200)),
     "balanced": Config(),
-    # Two scenes and one that agrees with both; with LPIPS in its loss, where its weights are, for texture
+    # Two scenes and one that agrees with both. For texture: two thirds more Gaussians, and LPIPS where its weights are
     "quality": Config(
+        seeding=seeding.Config(max_error=0.0009),
         optimize=refinement.Config(
             checkpoints=(150, 500),
             ensemble=ensemble.Config(members=2),
-            perceptual=perceptual_loss.Config(weight=0.03, start=0.0, every=3),
+            perceptual=perceptual_loss.Config(weight=0.08, start=0.0, every=2),
+            control=ControlChoice("prune", prune.Config(least_change=0.00125)),
         ),
     ),
 }
