@@ -116,15 +116,24 @@ def _configured(config: Config, frames: Sequence[Frame], seed: int) -> Iterator[
 
 def _rival(name: str, frames: Sequence[Frame], seed: int) -> Iterator[Snapshot]:
     """The method of the module of splatnode.recon.evaluate.rivals that is called like it."""
-    return import_module(f"splatnode.recon.evaluate.rivals.{name.replace('-', '_')}").reconstruct(frames, seed)
+    name, _, budget = name.partition("+")
+    module = import_module(f"splatnode.recon.evaluate.rivals.{name.replace('-', '_')}")
+    return module.reconstruct(frames, seed, module.PUBLISHED) if budget else module.reconstruct(frames, seed)
 
 
 RIVALS = ("colmap-3dgs", "colmap-fsgs", "cf-3dgs", "nerfmm", "nope-nerf")  # these make their own cameras
+PUBLISHED = tuple(f"{name}+published" for name in RIVALS[:3])  # with as many iterations as the publications
 METHODS: dict[str, Method] = {
     **{name: partial(_configured, config) for name, config in CONFIGS.items()},
-    **{name: partial(_rival, name) for name in RIVALS},
+    **{name: partial(_rival, name) for name in (*RIVALS, *PUBLISHED)},
 }
-SETS = {"presets": tuple(PRESETS), "rivals": RIVALS, "surrounded": tuple(SURROUNDED), "ablation": ablation.names()}
+SETS = {
+    "presets": tuple(PRESETS),
+    "rivals": RIVALS,
+    "published": PUBLISHED,
+    "surrounded": tuple(SURROUNDED),
+    "ablation": ablation.names(),
+}
 
 
 def method(name: str) -> Method:

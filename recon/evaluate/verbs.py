@@ -21,7 +21,7 @@ def _bench_arguments(parser: argparse.ArgumentParser) -> None:
         type=names,
         default=("balanced",),
         metavar="A,B,C",
-        help="by name, or the sets presets, rivals, ablation (default: balanced)",
+        help="by name, or the sets presets, rivals, published, ablation (default: balanced)",
     )
     parser.add_argument("--checkpoints", type=counts, default=(), metavar="N,N", help="iterations scored on the way")
     parser.add_argument(

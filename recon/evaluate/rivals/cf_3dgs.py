@@ -4,10 +4,9 @@ For each frame Gaussians are made from its depth and fitted to it alone; the rig
 next frame, with all else frozen, is its pose. The scene starts from the first frame and is refined with all frames so
 far after each new one, with adaptive density control.
 
-As published: this order, the losses, and the step sizes of 3DGS. Compact: 60 iterations for a frame alone, 200 for a
-motion, 60 after each frame and 500 at the end, where the publication has several hundred each and grows with the length
-of a film; photographs of 512 pixels; a Gaussian for every ninth pixel. A monocular network's place takes `known_depth`,
-which also gives the focal length.
+As published: this order, the losses, and the step sizes of 3DGS. Compact: photographs of 512 pixels; a Gaussian for
+every ninth pixel; and, but for `PUBLISHED`, 60 iterations for a frame alone, 200 for a motion, 60 after each frame. The
+500 at the end are ours. A monocular network's place takes `known_depth`, which also gives the focal length.
 """
 
 from __future__ import annotations
@@ -49,6 +48,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     opacity: float = 0.5  # of a Gaussian that starts from a pixel
 
 
+PUBLISHED = Config(alone=1000, motion=300, growing=1000)  # as the authors' program has it for a short film
 _MOTION_FINAL = 0.1  # part of the steps' size at their end: the next frame may be far away
 _ALONE = msgspec.structs.replace(colmap_3dgs.OPTIMIZE, checkpoints=(), control=None)
 _TOGETHER = msgspec.structs.replace(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from importlib import import_module
+
 import msgspec
 import pytest
 
 from splatnode.recon.config import PRESETS
 from splatnode.recon.evaluate import ablation
-from splatnode.recon.evaluate.methods import CONFIGS, METHODS, RIVALS, chosen, method, start_of
+from splatnode.recon.evaluate.methods import CONFIGS, METHODS, PUBLISHED, RIVALS, chosen, method, start_of
 from splatnode.recon.optimize import regularise
 from splatnode.recon.pipeline import reconstruct
 from splatnode.recon.result.report import build_report
@@ -36,13 +38,21 @@ def test_the_papers_schedule_and_weights():
 def test_sets_are_spelt_out_once():
     assert chosen(["fast", "presets", "paper"]) == ("fast", *(name for name in PRESETS if name != "fast"), "paper")
     assert chosen(["rivals"]) == RIVALS
-    with pytest.raises(ValueError, match="and the sets presets, rivals, surrounded, ablation"):
+    with pytest.raises(ValueError, match="and the sets presets, rivals, published, surrounded, ablation"):
         chosen(["paper", "instantsplat"])
 
 
 def test_methods_share_a_start_unless_they_look_at_other_sizes_or_find_their_own():
     assert start_of("paper") == start_of("instantsplat-s") == start_of("balanced") != start_of("preview")
-    assert all(start_of(name) is None for name in RIVALS)
+    assert all(start_of(name) is None for name in (*RIVALS, *PUBLISHED))
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_as_published_is_the_same_method_with_another_budget(name, monkeypatch):
+    module = import_module(f"splatnode.recon.evaluate.rivals.{name.partition('+')[0].replace('-', '_')}")
+    monkeypatch.setattr(module, "reconstruct", lambda frames, seed, config=None: iter([(frames, seed, config)]))
+    assert list(method(name)([], 3)) == [([], 3, module.PUBLISHED)]
+    assert list(method(name.partition("+")[0])([], 3)) == [([], 3, None)]
 
 
 def test_a_start_with_surroundings_differs_in_nothing_else():
