@@ -115,14 +115,15 @@ def _configured(config: Config, frames: Sequence[Frame], seed: int) -> Iterator[
 
 
 def _rival(name: str, frames: Sequence[Frame], seed: int) -> Iterator[Snapshot]:
-    """The method of the module of splatnode.recon.evaluate.rivals that is called like it."""
+    """The method of the module of splatnode.recon.evaluate.rivals that is called like it, `+published` or not."""
     name, _, budget = name.partition("+")
     module = import_module(f"splatnode.recon.evaluate.rivals.{name.replace('-', '_')}")
     return module.reconstruct(frames, seed, module.PUBLISHED) if budget else module.reconstruct(frames, seed)
 
 
-RIVALS = ("colmap-3dgs", "colmap-fsgs", "cf-3dgs", "nerfmm", "nope-nerf")  # these make their own cameras
-PUBLISHED = tuple(f"{name}+published" for name in RIVALS[:3])  # with as many iterations as the publications
+_OF_GAUSSIANS = ("colmap-3dgs", "colmap-fsgs", "cf-3dgs")
+RIVALS = (*_OF_GAUSSIANS, "nerfmm", "nope-nerf")  # these make their own cameras
+PUBLISHED = tuple(f"{name}+published" for name in _OF_GAUSSIANS)  # with as many iterations as the publications
 METHODS: dict[str, Method] = {
     **{name: partial(_configured, config) for name, config in CONFIGS.items()},
     **{name: partial(_rival, name) for name in (*RIVALS, *PUBLISHED)},

@@ -35,9 +35,9 @@ _ADAPTIVE = adaptive.Config(min_gradient=5e-4, start=0.05, end=0.95, reset_every
 OPTIMIZE = msgspec.structs.replace(
     colmap_3dgs.OPTIMIZE, regularise=_DEPTH, control=ControlChoice("proximity", proximity.Config(_ADAPTIVE))
 )
-_AS_OFTEN = msgspec.structs.replace(_ADAPTIVE, every=100)
+_EVERY_100 = msgspec.structs.replace(_ADAPTIVE, every=100)
 PUBLISHED = msgspec.structs.replace(  # as long as in the publication
-    OPTIMIZE, iterations=10_000, checkpoints=(), control=ControlChoice("proximity", proximity.Config(_AS_OFTEN))
+    OPTIMIZE, iterations=10_000, checkpoints=(), control=ControlChoice("proximity", proximity.Config(_EVERY_100))
 )
 
 
