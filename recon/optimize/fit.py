@@ -80,7 +80,8 @@ class Fit:
         }
         self._regularisation = _regularisation(scene, config.regularise, seed)
         self._iterations = scene.iterations
-        self._losses: list[Tensor] = []  # photometric, of each step on a view of the scene
+        self._losses = torch.empty(config.iterations, device=device)  # photometric, of each step on a view of the scene
+        self._measured = 0  # of them
 
     def step(self, index: int, progress: float) -> None:
         """One iteration on view `index`, where those beside the scene's come after them.
@@ -101,7 +102,8 @@ class Fit:
         assert render.rgb is not None  # it was asked for
         loss = image.loss(render.rgb)
         if own:
-            self._losses.append(loss.detach())
+            self._losses[self._measured] = loss.detach()
+            self._measured += 1
         weight = self._config.perceptual.in_step(self._done, progress)
         if image.perceptual is not None and weight:
             loss = loss + weight * image.perceptual(render.rgb)
@@ -174,7 +176,7 @@ class Fit:
 
     def losses(self) -> tuple[float, ...]:
         """The photometric one of each step on a view of the scene."""
-        return tuple(torch.stack(self._losses).tolist()) if self._losses else ()
+        return tuple(self._losses[: self._measured].tolist())
 
     def scene(self) -> Scene:
         """What has been learnt so far."""
