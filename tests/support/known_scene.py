@@ -50,6 +50,16 @@ def disturbed(scene: Scene) -> Scene:
     )
 
 
+def many_gaussians() -> Scene:
+    """5000 Gaussians in photographs of noise, 320 x 240: a step's tensors are as large as those of a real scene."""
+    scene, generator = photographed(), torch.Generator().manual_seed(0)
+    drawn = torch.randint(len(scene.gaussians), (5000,), generator=generator)
+    K = torch.tensor([[320.0, 0, 160], [0, 320, 120], [0, 0, 1]])
+    noise = torch.randint(256, (len(scene.views), 240, 320, 3), generator=generator, dtype=torch.uint8).numpy()
+    views = tuple(replace(view, image=image, K=K) for view, image in zip(scene.views, noise, strict=True))
+    return replace(scene, views=views, gaussians=disturbed(scene).gaussians.subset(drawn))
+
+
 def turned(scene: Scene, degrees: float = 0.7, shift: float = 0.02) -> Scene:
     """All cameras but the first held wrongly."""
     twist = torch.tensor([shift, -shift, 0.5 * shift, *np.radians([degrees, -degrees, 0.5 * degrees])]).float()
