@@ -80,13 +80,15 @@ class Fit:
         }
         self._regularisation = _regularisation(scene, config.regularise, seed)
         self._iterations = scene.iterations
-        self._losses = torch.empty(config.iterations, device=device)  # photometric, of each step on a view of the scene
-        self._measured = 0  # of them
+        # Photometric, of each step on a view of the scene. In one block: small tensors that are kept among those of the
+        # steps would split the memory that these give back.
+        self._losses = torch.empty(config.iterations, device=device)
+        self._measured = 0  # losses so far
 
     def step(self, index: int, progress: float) -> None:
         """One iteration on view `index`, where those beside the scene's come after them.
 
-        `progress` in [0, 1] sets resolution and step sizes.
+        `progress` in [0, 1] sets resolution and step sizes. There are at most `config.iterations` steps.
         """
         half = progress < self._config.half_resolution_share
         image = self._images[half][index]

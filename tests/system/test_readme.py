@@ -162,6 +162,18 @@ def test_rivals_as_long_as_published():
         says(f"| {row['scene']} | `{row['method']}` | {psnr} dB | {ssim} | {lpips} | {size} | {minutes} |")
 
 
+def test_what_longer_runs_of_the_rivals_change():
+    changes = {
+        (row["scene"], method): row["psnr"] - ends("bench_rivals", method=method, scene=row["scene"])[0]["psnr"]
+        for row in raw("bench_published")["rows"]
+        for method in [row["method"].removesuffix("+published")]
+    }
+    fsgs = [changes.pop((scene, "colmap-fsgs")) for scene in ("llff_fern", "fountain_p11")]
+    says(f"FSGS gains {part(fsgs[0], 1)} dB on llff_fern by it and loses {part(-fsgs[1], 1)} on fountain_p11")
+    assert len(changes) == 4
+    says(f"3DGS and CF-3DGS lose {-max(changes.values()):.0f} to {-min(changes.values()):.0f} dB")
+
+
 def test_how_the_rivals_are_cut_down():
     from splatnode.recon.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs, nerfmm
     from splatnode.recon.optimize.control import adaptive
