@@ -130,6 +130,7 @@ def test_every_file_says_which_scale_it_has(seen, tmp_path):
         assert report["scale"] == word and report["scene_bytes"] == (out / "scene.ply").stat().st_size
         for name in ("report.json", "manifest.json", "cameras.json", "transforms.json"):
             content = json.loads((out / name).read_text())
+            content = content.get("splatnode", content)
             assert (content["scale"], content["scale_source"]) == (word, snapshot.scale.source), name
             assert content["scale_interval_95"] == (snapshot.scale.interval_95 and [*snapshot.scale.interval_95]), name
         assert decode_scale((out / "cameras.json").read_bytes()) == snapshot.scale

@@ -1,6 +1,7 @@
 """transforms.json: the cameras for nerfstudio and instant-ngp, with OpenGL camera axes (right, up, back).
 
-The images are those at modelled size, expected in images/; the centre of the top-left pixel is at (0.5, 0.5).
+The images are those at modelled size, expected in images/; the centre of the top-left pixel is at (0.5, 0.5). What
+splatnode alone says of the lengths lies apart, for instant-ngp takes `scale` beside `frames` for a number of its own.
 """
 
 from __future__ import annotations
@@ -44,4 +45,4 @@ def encode_nerfstudio(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE
         for camera in cameras
     ]
     meaning = {"stamp_ns": STAMP_MEANING, "bounds": BOUNDS_MEANING}
-    return json_bytes({"camera_model": "OPENCV", **scale.record(), **meaning, "frames": frames})
+    return json_bytes({"camera_model": "OPENCV", **meaning, "splatnode": scale.record(), "frames": frames})

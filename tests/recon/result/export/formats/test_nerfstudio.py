@@ -7,6 +7,7 @@ import json
 import numpy as np
 
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
+from splatnode.recon.result.scale import Scale
 from tests.support.exported import make_camera
 
 
@@ -21,3 +22,9 @@ def test_nerfstudio_cameras_look_along_minus_z():
     assert np.allclose(matrix[:3, 3], camera.T_world_camera[:3, 3])
     assert (frame["fl_x"], frame["fl_y"], frame["cx"], frame["cy"]) == (400, 410, 256, 192)
     assert frame["file_path"] == "images/0002.jpg"
+
+
+def test_nothing_of_ours_has_the_name_of_a_number_of_instant_ngp():
+    content = json.loads(encode_nerfstudio([make_camera(2)], Scale(True, "0.5 m between a.jpg and b.jpg", (0.9, 1.1))))
+    assert not {"scale", "offset", "aabb_scale", "from_na", "up"} & content.keys()  # it refuses a word as a number
+    assert content["splatnode"]["scale"] == "metric" and content["splatnode"]["scale_interval_95"] == [0.9, 1.1]
