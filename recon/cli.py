@@ -82,7 +82,7 @@ def _replay(args: argparse.Namespace, request: Request, config: Config, tell: Te
             tell("--map uses the keyframes that were thinned out, too, and makes a map of many scenes")
     if not args.json and (taken := cost.in_words(given.sizes)) is not None:
         say(taken, error=True)
-    check_baseline(config, [frame.name for frame in given.frames])
+    check_baseline(config, given)
     known = _known_of_metres(args, given)
     needed_bytes = largest_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
     with (
@@ -135,7 +135,7 @@ def _demo(args: argparse.Namespace, tell: Tell) -> int:
         if snapshot.verdict.publishable:
             tell(f"measuring it on {len(split.test)} views that it has not seen")
             write_held_out(capture, place)
-            report = write(held_out=held_out_quality(snapshot, capture, split, config.device, tell))
+            report = write(told={"held_out": held_out_quality(snapshot, capture, split, config.device, tell)})
         if args.json:
             print(json.dumps(report))
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from splatnode.recon.config import Config
 from splatnode.recon.metric.evidence import NOTHING, Evidence, gathered
 from splatnode.recon.metric.metres import in_metres
 from splatnode.recon.pipeline import reconstruct
-from splatnode.recon.replay_source import Source
+from splatnode.recon.replay_source import IMAGES, Source
 from splatnode.recon.result.only_seen import only_seen
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.write import finish
@@ -38,10 +38,12 @@ class Reconstructed:
 
         Raises ResultWriteError, with what was there before intact.
         """
-        told: dict[str, object] = {"photographs": str(self.source.keep(out).resolve())}
+        files = self.source.files() if self.snapshot.verdict.publishable else {}
+        lie_in = self.source.photographs or (out / IMAGES if files else None)
+        told: dict[str, object] = {"photographs": None if lie_in is None else str(lie_in.resolve())}
         if self.source.choice is not None:
             told["selection"] = self.source.choice.record()
-        return finish(self.snapshot, out, seed=self.seed, preset_name=self.preset, **told)
+        return finish(self.snapshot, out, seed=self.seed, preset_name=self.preset, photographs=files, told=told)
 
 
 def shown_to_nobody(_: Snapshot) -> None:
@@ -90,9 +92,15 @@ def run(
     return snapshot
 
 
-def check_baseline(config: Config, names: Sequence[str]) -> None:
-    """Raises ValueError before the work where a measured distance names a photograph that is not there."""
+def check_baseline(config: Config, source: Source) -> None:
+    """Raises ValueError before the work where a measured distance names a photograph that is not used."""
+    names = [frame.name for frame in source.frames]
     missing = [name for baseline in config.metric.baselines for name in baseline[:2] if name not in names]
+    if missing and source.choice is not None:
+        raise ValueError(
+            f"the baseline's photograph {missing[0]!r} is not among those that were chosen: {', '.join(names)}. "
+            f"Measure between two of these, or use all {source.choice.what}s (--every-frame)"
+        )
     if missing:
         raise ValueError(f"the baseline's photograph {missing[0]!r} is not there; there are: {', '.join(names)}")
 

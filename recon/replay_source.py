@@ -16,7 +16,7 @@ import numpy as np
 
 from splatnode.capture import film
 from splatnode.capture.cameras import folder
-from splatnode.capture.choosing import Choice, choose
+from splatnode.capture.choosing import THINNED, Choice, choose
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.given_lens import check_fits, seen_through
 from splatnode.capture.image_file import encode_png
@@ -27,13 +27,13 @@ from splatnode.capture.process.progress import Tell, counted, told_to_nobody
 from splatnode.capture.quality import Limits
 from splatnode.capture.selection import Config
 from splatnode.recon.config import Config as Reconstruction
-from splatnode.recon.result.export import write_files
 
 ALL = 30  # photographs of a folder that are all used; of more, keyframes are chosen
 MOST = 60  # keyframes of a video, or of a folder of more photographs
+EVERY = 300  # frames of a video, where all that are sharp and no copies are asked for
 IMAGES = "images"  # in the result folder: the keyframes of a video
 
-_OF_PHOTOGRAPHS = Config(per_second=1e9)  # which were not taken at any rate
+_OF_PHOTOGRAPHS = Config(per_second=1e9, patience_s=0.0)  # which were not taken at any rate
 
 
 @dataclass(frozen=True)
@@ -64,19 +64,13 @@ class Source:
 
     @property
     def further_bytes(self) -> int:
-        """Bytes that `keep` writes at most."""
+        """Bytes that `files` has at most."""
         return 0 if self.photographs else sum(3 * width * height for width, height in self.sizes)
 
-    def keep(self, out: Path) -> Path:
-        """The folder that the frames lie in; those of a film are written into the result folder `out`.
-
-        Raises ResultWriteError.
-        """
-        if self.photographs:
-            return self.photographs
-        images = {frame.name: encode_png(frame.image) for frame in self.frames if isinstance(frame, Frame)}
-        write_files(out / IMAGES, images)
-        return out / IMAGES
+    def files(self) -> dict[str, bytes]:
+        """The frames as files of the result folder, by their names in it; none where they lie in a folder already."""
+        frames = () if self.photographs else self.frames
+        return {f"{IMAGES}/{each.name}": encode_png(each.image) for each in frames if isinstance(each, Frame)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +176,7 @@ def _unmasked(request: Request, tell: Tell) -> Source:
             raise ValueError("--frames names photographs of a folder; of a video, give --views N or nothing")
         return _chosen(request, None, tell)
     names, there = _names(request), _there(request)
-    if names or request.every_frame or len(there) <= ALL:
+    if names or request.every_frame or len(_readable(there)) <= ALL:
         frames = folder.stream(folder.Config(folder=request.source, names=names or request.listed))
         of = len(names or there)
         return Source(tuple(counted(frames, tell, "reading", of, "photograph")), request.source, None)
@@ -205,6 +199,11 @@ def _check_there(path: Path) -> None:
 def _there(request: Request) -> Sequence[str]:
     """The names of the photographs that there are to choose from."""
     return request.listed or folder.names_in(request.source)
+
+
+def _readable(names: Sequence[str]) -> Sequence[str]:
+    """Without raw files, beside which their cameras put photographs; all where there is nothing else."""
+    return [name for name in names if folder.foreign_file(Path(name)) is None] or names
 
 
 def _stream(path: Path, listed: tuple[str, ...]) -> Iterator[Frame | DroppedFrame]:
@@ -239,10 +238,15 @@ def _selection(request: Request) -> Config:
 
 
 def _chosen(request: Request, photographs: Path | None, tell: Tell) -> Source:
-    """The keyframes of a recording; with --views N so many, evenly spread."""
-    most = max(MOST, request.views or 0)
+    """The keyframes of a recording; with --views N so many, evenly spread: thinning leaves half of the most."""
+    most = EVERY if request.every_frame else max(MOST, 2 * (request.views or 0))
     choice = choose(_looked_through(request, tell), _selection(request), Limits(), most, _what(request))
     frames = choice.keyframes
+    if request.every_frame and THINNED in choice.left_out:
+        raise ValueError(
+            f"{printable_name(request.source.name)!r} has more than {EVERY} frames that are sharp and no copies, which "
+            "is more than one scene takes. Leave --every-frame out to use keyframes, or add --map for a map of all"
+        )
     if request.views:
         if request.views > len(frames):
             raise ValueError(f"{request.views} views are asked for: {choice}; ask for at most as many")
@@ -258,7 +262,7 @@ def _names(request: Request) -> tuple[str, ...]:
         return request.frames
     if not request.views:
         return ()
-    names = _there(request)
+    names = _readable(_there(request))
     return tuple(names[i] for i in _spread(request.views, len(names)))
 
 

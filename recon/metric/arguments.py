@@ -87,6 +87,8 @@ def metric_changes(args: argparse.Namespace) -> dict[str, Any]:
         raise ValueError("--stereo and --stereo-baseline belong together: the right photographs, and how far apart")
     if args.stereo_baseline is not None:
         changes |= _measured("stereo", args.stereo_baseline)
+    if args.poses_sigma is not None and args.poses is None:
+        raise ValueError("--poses-sigma is of --poses FILE, which is not given: how unsure are which poses?")
     if args.poses_sigma is not None:
         changes["poses_sigma_m"], changes["poses_sigma_deg"] = args.poses_sigma
     return changes

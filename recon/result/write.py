@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from splatnode.recon.result.depth_file import DEPTHS, encode_depths
 from splatnode.recon.result.export import viewer_safe, write_result
@@ -13,12 +15,24 @@ from splatnode.recon.result.report import build_report, peak_rss_mb
 from splatnode.recon.result.snapshot import Snapshot
 
 
-def finish(snapshot: Snapshot, out: Path, *, seed: int, preset_name: str, **extra: object) -> dict[str, object]:
-    """Writes the result folder and returns its report. Raises ResultWriteError, with what was there before intact."""
-    report = build_report(snapshot, seed=seed, preset=preset_name, peak_rss_mb=peak_rss_mb()) | extra
+def finish(
+    snapshot: Snapshot,
+    out: Path,
+    *,
+    seed: int,
+    preset_name: str,
+    photographs: Mapping[str, bytes] = MappingProxyType({}),
+    told: Mapping[str, object] = MappingProxyType({}),
+) -> dict[str, object]:
+    """Writes the result folder and returns its report, of which `told` is a part.
+
+    `photographs` are files that a scene has beside it, by their names in the folder. Raises ResultWriteError, with what
+    was there before intact.
+    """
+    report = build_report(snapshot, seed=seed, preset=preset_name, peak_rss_mb=peak_rss_mb()) | dict(told)
     preview = contact_sheet(snapshot) if snapshot.verdict.publishable else None
     source_frame = viewer_safe(snapshot.gaussians).source_frame  # of those that scene.ply holds
-    further = {SOURCES: encode_sources(source_frame)} if snapshot.verdict.publishable else {}
+    further = {SOURCES: encode_sources(source_frame), **photographs} if snapshot.verdict.publishable else {}
     if snapshot.verdict.publishable and snapshot.landmarks is not None:
         further[LANDMARKS] = encode_landmarks(snapshot.landmarks)
     if snapshot.verdict.publishable and snapshot.depths:

@@ -79,7 +79,7 @@ def reconstruct(
     source = with_lens(source, intrinsics)
     flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma)}
     chosen = configured(preset, config, flags, scale, of_pictures=source.photographs is None)
-    check_baseline(chosen, [frame.name for frame in source.frames])
+    check_baseline(chosen, source)
     given = Evidence((), poses_given(poses, images, source.frames), pairs_given(scale, images, source.frames))
     made = reconstructed(source, chosen, preset, only_seen, threads, given, tell=telling)
     return result_of(made.snapshot, made, lenses(source.frames))

@@ -58,6 +58,7 @@ def test_a_dark_photograph_does_not_count(arrays):
     with splatnode.Session(config=QUICK) as session:
         update = session.add(np.zeros_like(arrays[0]), name="dark.png")
         assert not update.taken and update.reason and not update.result.verdict.publishable
+        assert session.add(arrays[0]).taken  # at once
 
 
 def test_a_session_that_is_closed_says_so_and_keeps_its_last_result(arrays):

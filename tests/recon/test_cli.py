@@ -39,6 +39,7 @@ def photographs(tmp_path):
         (["--out", "new", "--stereo", "photographs"], 2, "--stereo and --stereo-baseline belong together"),
         (["--out", "new", "--stereo", "gone", "--stereo-baseline", "75mm"], 2, "'gone' is not there"),
         (["--out", "new", "--poses", "gone.tum"], 2, "gone.tum"),
+        (["--out", "new", "--poses-sigma", "0.1,5"], 2, "--poses-sigma is of --poses"),
         (["--out", "new", "--poses", "photographs"], 2, "must hold images.txt or images.bin"),
         (["--out", "new", "--poses", "photographs/a.png"], 2, "must be a TUM trajectory"),
         (["--out", "new", "--map", "--marker", "100mm"], 2, "does not go with what is about one: --marker"),
@@ -54,6 +55,14 @@ def test_what_cannot_end_well_is_not_begun(photographs, monkeypatch, capsys, arg
     assert said in capsys.readouterr().err
     assert {path.name for path in photographs.parent.iterdir()} == {"photographs"}
     assert {path.name for path in photographs.iterdir()} == {"a.png", "b.png"}
+
+
+def test_a_baseline_of_a_photograph_that_was_not_chosen_says_so(photographs, monkeypatch, capsys):
+    monkeypatch.chdir(photographs.parent)
+    monkeypatch.setattr(replay_source, "ALL", 1)  # so that keyframes are chosen, and b.png is a copy
+    code = command_line.main(["replay", "photographs", "--out", "new", "--baseline", "a.png", "b.png", "0.5"])
+    said = capsys.readouterr().err
+    assert code == 2 and "'b.png' is not among those that were chosen: a.png." in said and "--every-frame" in said
 
 
 def test_so_many_views_of_a_recording_go_by_the_names_that_its_frames_had(photographs, capsys):

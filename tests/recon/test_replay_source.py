@@ -46,11 +46,15 @@ def folder_of(images, folder):
     return folder
 
 
+def framed(images):
+    return [Frame(i, f"{i:03d}.png", i, image, None) for i, image in enumerate(images)]
+
+
 def test_a_folder_of_few_photographs_is_used_whole(walk, tmp_path):
     folder = folder_of(walk[: replay_source.ALL], tmp_path / "few")
     given = source(Request(folder))
     assert len(given.frames) == replay_source.ALL and given.choice is None
-    assert given.keep(tmp_path / "out") == folder and given.further_bytes == 0
+    assert given.photographs == folder and not given.files() and given.further_bytes == 0
 
 
 def test_what_is_no_photograph_is_named_and_the_others_are_used(walk, tmp_path):
@@ -72,20 +76,50 @@ def test_of_a_large_folder_keyframes_are_chosen_unless_all_are_asked_for(walk, t
     folder = folder_of(walk, tmp_path / "many")
     given = source(Request(folder))
     assert given.choice is not None and given.choice.examined == STEPS and len(given.frames) < STEPS
-    assert given.keep(tmp_path / "out") == folder
+    assert given.photographs == folder and not given.files()
     assert len(source(Request(folder, every_frame=True)).frames) == STEPS
     assert [frame.name for frame in source(Request(folder, views=2)).frames] == ["000.png", "035.png"]
 
 
-def test_keyframes_of_a_video_are_kept_beside_the_result(film, tmp_path):
+def test_keyframes_of_a_video_are_files_of_the_result(film):
     given = source(Request(film))
     assert 2 < len(given.frames) < STEPS and given.choice is not None
-    images = given.keep(tmp_path)
-    assert sorted(path.name for path in images.iterdir()) == [frame.name for frame in given.frames]
-    for frame in given.frames:
-        assert isinstance(frame, Frame)
-        assert np.array_equal(decode_image((images / frame.name).read_bytes())[0], frame.image)
-    assert given.further_bytes >= sum(path.stat().st_size for path in images.iterdir())
+    files = given.files()
+    assert list(files) == [f"images/{frame.name}" for frame in given.frames]
+    for frame, file in zip(given.frames, files.values(), strict=True):
+        assert isinstance(frame, Frame) and np.array_equal(decode_image(file)[0], frame.image)
+    assert given.further_bytes >= sum(map(len, files.values()))
+
+
+def test_one_blurred_photograph_takes_no_others_with_it(walk, tmp_path):
+    blurred = [cv2.GaussianBlur(image, (0, 0), 4) if i in (10, 20) else image for i, image in enumerate(walk)]
+    for given in (source(Request(folder_of(blurred, tmp_path / "many"))), at_hand(framed(blurred))):
+        assert given.choice is not None and "blurred" in given.choice.left_out
+        assert not [reason for reason in given.choice.left_out if reason.startswith("between")]
+
+
+def test_every_frame_of_a_video_is_used_or_it_says_that_they_are_too_many(film, monkeypatch):
+    monkeypatch.setattr(replay_source, "MOST", 10)
+    assert len(source(Request(film, every_frame=True)).frames) > 20
+    monkeypatch.setattr(replay_source, "EVERY", 20)
+    with pytest.raises(ValueError, match="'walk.mp4' has more than 20 frames that are .* Leave --every-frame out"):
+        source(Request(film, every_frame=True))
+
+
+def test_as_many_views_can_be_had_as_there_are_keyframes(film, monkeypatch):
+    keyframes = len(recording(Request(film)).choice.names)
+    monkeypatch.setattr(replay_source, "MOST", 4)  # of which thinning would leave 3
+    for views in range(1, keyframes + 1):
+        assert len(source(Request(film, views=views)).frames) == views
+
+
+def test_raw_files_beside_photographs_do_not_count(walk, tmp_path):
+    folder = folder_of(walk[: replay_source.ALL], tmp_path / "raw")
+    for i in range(replay_source.ALL):
+        (folder / f"{i:03d}.nef").write_bytes(b"raw")
+    assert [frame.name for frame in source(Request(folder, views=3)).frames] == ["000.png", "014.png", "029.png"]
+    given = source(Request(folder))
+    assert given.choice is None and sum(isinstance(each, Frame) for each in given.frames) == replay_source.ALL
 
 
 def test_it_says_of_what_the_keyframes_are(walk, film, tmp_path):
@@ -103,7 +137,7 @@ def test_so_many_views_of_a_video_are_spread_evenly(film):
 
 
 def test_frames_at_hand_are_used_as_those_of_a_folder_are(walk, tmp_path):
-    frames = [Frame(i, f"{i:03d}.png", i, image, None) for i, image in enumerate(walk)]
+    frames = framed(walk)
     assert at_hand(frames[: replay_source.ALL]).frames == tuple(frames[: replay_source.ALL])
     chosen, in_folder = at_hand(frames), source(Request(folder_of(walk, tmp_path / "many")))
     assert chosen.choice is not None and in_folder.choice is not None and chosen.choice.names == in_folder.choice.names
@@ -111,7 +145,7 @@ def test_frames_at_hand_are_used_as_those_of_a_folder_are(walk, tmp_path):
     assert [frame.name for frame in at_hand(frames, views=2).frames] == ["000.png", "035.png"]
     with pytest.raises(ValueError, match="37 views are asked for: there are 36 photographs"):
         at_hand(frames, views=37)
-    assert at_hand(frames[:2]).keep(tmp_path / "out") == tmp_path / "out" / "images"
+    assert list(at_hand(frames[:2]).files()) == ["images/000.png", "images/001.png"]
 
 
 def test_names_are_those_of_photographs(film):
@@ -143,7 +177,7 @@ def test_photographs_of_one_folder_are_named_one_by_one(walk, tmp_path):
     assert path == there and listed == ("007.png", "003.png", "011.png")
     given = source(Request(path, listed=listed))
     assert [frame.name for frame in given.frames] == ["003.png", "007.png", "011.png"] and given.choice is None
-    assert given.keep(tmp_path / "out") == there
+    assert given.photographs == there and not given.files()
     assert [frame.name for frame in source(Request(path, views=2, listed=listed)).frames] == ["007.png", "011.png"]
     assert replay_source.asked_for([there / "000.png"]) == (there, ("000.png",))
     every = tuple(f"{i:03d}.png" for i in range(replay_source.ALL + 1))
