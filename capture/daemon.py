@@ -138,10 +138,16 @@ class _Session:
         self._send_preview(frame, decision, state)
 
     def drop(self, dropped: DroppedFrame) -> None:
-        """Tells recon of a frame that the camera could not give."""
+        """Tells recon of a photograph that cannot be used, where half of the spool at least is free for keyframes.
+
+        A live camera's next frame makes up for one that it could not give: these are counted.
+        """
         self.dropped += 1
-        event(log, logging.WARNING, "dropped", name=dropped.name, reason=dropped.reason)
-        self._deliver(dropped)
+        live = is_live(self.config.camera)
+        if not live or is_said(self.dropped):
+            event(log, logging.WARNING, "dropped", name=dropped.name, reason=dropped.reason, number=self.dropped)
+        if not live and self._server.queued < self.config.spool.max_frames // 2:
+            self._deliver(dropped)
 
     def beat(self, reader: Reader) -> None:
         """Sends a heartbeat, when one is due."""

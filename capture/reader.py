@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import queue
 import threading
@@ -84,19 +85,19 @@ class Reader:
 
     @property
     def silent_s(self) -> float:
-        """Seconds since the last frame, or since the start."""
+        """Seconds since the last frame that can be used, or since the start."""
         return time.monotonic() - self._last
 
     def next(self, timeout_s: float) -> Frame | DroppedFrame | None:
         """The next frame; None where none comes in time. Raises what ended the camera for good."""
-        try:
+        item = None
+        with contextlib.suppress(queue.Empty):
             item = self._items.get(timeout=timeout_s)
-        except queue.Empty:
-            if self._live and self.silent_s > self.config.give_up_s:
-                raise CameraUnavailable(f"no frame for {self.silent_s:.0f} s") from None
-            return None
         if isinstance(item, Failure):
             raise item.error
+        if not isinstance(item, Frame) and self._live and self.silent_s > self.config.give_up_s:
+            useless = "" if item is None else f" that can be used; the last: {item.reason}"
+            raise CameraUnavailable(f"no frame for {self.silent_s:.0f} s{useless}")
         return item
 
     def _run(self) -> None:
@@ -117,9 +118,10 @@ class Reader:
         while not self._stop.is_set():
             try:
                 for item in self._numbered(count):
-                    count += isinstance(item, Frame)
-                    self._last, lost_at, pause = time.monotonic(), None, self.config.first_pause_s
-                    self._state, self.why = State.STREAMING, ""
+                    if isinstance(item, Frame):
+                        count += 1
+                        self._last, lost_at, pause = time.monotonic(), None, self.config.first_pause_s
+                        self._state, self.why = State.STREAMING, ""
                     yield item
                 return
             except CameraUnavailable as error:

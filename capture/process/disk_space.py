@@ -1,9 +1,17 @@
-"""Is there room on the disk for what is about to be written?"""
+"""Is there room on the disk for what is about to be written, and was it the disk that failed?"""
 
 from __future__ import annotations
 
+import errno
 import shutil
 from pathlib import Path
+
+_OF_DISK = {errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EROFS}
+
+
+def is_of_disk(error: BaseException) -> bool:
+    """Whether something failed because the disk did not take it, which says nothing of what it was."""
+    return isinstance(error, OSError) and error.errno in _OF_DISK
 
 
 def shortage(folder: Path, needed_bytes: int, what: str) -> str:

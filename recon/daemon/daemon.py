@@ -209,7 +209,7 @@ class Daemon:
                 False, printable(f"{command.name} cannot be removed ({error.strerror}): make room on the disk")
             )
         if here:
-            self._inbox.put(LeftOut(command.name), self._stopping)
+            self._inbox.put_at_once(LeftOut(command.name))
         event(log, logging.INFO, "retracted", frame=command.name, left=",".join(left))
         those = f"{', '.join(left)}, which the camera has left, is built anew without it when no keyframe waits"
         told = [*(["the scene is built anew without it"] if here else []), *([those] if left else [])]

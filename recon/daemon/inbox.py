@@ -63,6 +63,12 @@ class Inbox:
             self._events.append(event)
             self._changed.notify_all()
 
+    def put_at_once(self, event: LeftOut) -> None:
+        """Also where the inbox is full: who gives commands does not wait for the work."""
+        with self._changed:
+            self._events.append(event)
+            self._changed.notify_all()
+
     def get(self, timeout_s: float) -> list[Event]:
         """The next event, after a keyframe with keyframes that follow it, BATCH at most; none if none comes in time."""
         with self._changed:

@@ -87,9 +87,7 @@ class Intake:
                 return
             self.full = ""
             client.acknowledge(received)
-            if stored is None:
-                self._inbox.put(LeftOut(received.frame.name), self._stopping, client.say_ready)
-            else:
+            if stored is not None:  # what the camera could not give is told with the next scene, and disturbs none
                 self._hand_over(client, stored, arrived_s)
             return
 

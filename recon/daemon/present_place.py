@@ -17,6 +17,7 @@ from splatnode.recon.daemon.atlas.atlas import Atlas
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
+from splatnode.recon.daemon.final_result import FinalResult
 from splatnode.recon.daemon.inbox import Arrived
 from splatnode.recon.daemon.output import Output
 from splatnode.recon.daemon.status import State
@@ -46,7 +47,7 @@ class PresentPlace:
         self._config, self._recipe, self._store, self._output = config, recipe, store, output
         self._pause_until = pause
         self._work = IncrementalReconstruction(recipe)
-        self._final: frozenset[str] = frozenset()  # the keyframes whose scene was written as final
+        self._final = FinalResult(store, output)
         self._compared: frozenset[str] = frozenset()  # those of the scene that was compared with the finished ones
         self._exported_s = time.monotonic()
         self._shown: Snapshot | None = None  # last
@@ -61,7 +62,7 @@ class PresentPlace:
         """Goes on where an earlier process was."""
         self._work = found.work
         self.settled = found.final or not found.keyframes
-        self._final = frozenset(self._work.names) if found.final else frozenset()
+        self._final.names = frozenset(self._work.names) if found.final else frozenset()
         if not found.keyframes:
             return
         event(log, logging.INFO, "restored", scene=self._store.scene_id, keyframes=found.keyframes, new=len(found.new))
@@ -171,18 +172,23 @@ class PresentPlace:
         The frames before it belong to the present scene alone, those that are `shared` to both.
         """
         before, kept = self._store.scene_id, self._store.names_before(first).union(shared)
-        if self._final != kept:
+        if self._final.names != kept:
             self._output.save(self._store, self._work, final=False)
             self._export_provisionally(places.State.LEFT, kept)
         else:
             self._output.finished(before)
         self._store.leave_place(first, shared)
-        self._final, self._compared, self._shown = frozenset(), frozenset(), None
+        self._final.names, self._compared, self._shown = frozenset(), frozenset(), None
         return before
 
     def export_provisionally(self) -> None:
         """Writes what is shown, unless it was written as final."""
-        self._export_provisionally(places.State.HERE, self._store.names)
+        if not self.write_refused(at_once=True):
+            self._export_provisionally(places.State.HERE, self._store.names)
+
+    def write_refused(self, at_once: bool = False) -> bool:
+        """Writes the finished scene that the disk did not take; False where there is none, or it was tried just now."""
+        return self._final.write_refused(self._shown, self._work, at_once)
 
     def _export_provisionally(self, state: places.State, names: Collection[str]) -> None:
         """`names` are those of the place's keyframes."""
@@ -227,7 +233,7 @@ class PresentPlace:
         False where there was nothing to compare. Raises Abandoned.
         """
         names = frozenset(self._work.names)
-        if not names or self._final != names or self._compared == names:
+        if not names or self._final.names != names or self._compared == names:
             return False
         state, self.state, self._compared = self.state, State.REFINING, names
         try:
@@ -267,14 +273,11 @@ class PresentPlace:
         self.settled = True
         self._work.show(refined)
         shown = self._work.scene is not None
-        snapshot, kept = self._show(final=shown), sorted(self._store.names)
+        snapshot = self._show(final=shown)
         if shown:
-            exported = self._output.export(snapshot, self._work, self._store, places.State.HERE, kept)
-            # What is kept as final is not exported after a restart.
-            self._output.save(self._store, self._work, final=exported)
-            self._final = frozenset(self._work.names) if exported else frozenset()
+            self._final.write(snapshot, self._work)
         else:
-            self._output.tell(snapshot, places.State.HERE, kept)
+            self._output.tell(snapshot, places.State.HERE, sorted(self._store.names))
         self.state = State.WAITING if not shown else State.LOST if self._strangers() else State.IDLE
         give_back_memory()
 

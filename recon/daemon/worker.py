@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import msgspec
 
+from splatnode.capture.process.disk_space import is_of_disk
 from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon.atlas.atlas import Atlas
@@ -27,9 +28,8 @@ from splatnode.recon.daemon.status import PLACES, PlaceStatus
 log = logging.getLogger(__name__)
 
 IDLE_S = 0.5  # between looks at whether to stop
-FIRST_WAIT_S, LONGEST_WAIT_S = 5.0, 300.0  # after a step for which the memory did not suffice; doubled each time
+FIRST_WAIT_S, LONGEST_WAIT_S = 5.0, 300.0  # after a step for which memory or disk did not suffice; doubled each time
 LADDER_S = 4.0  # in which more matches may be looked for, also on a slow machine: keyframes wait meanwhile
-TRIED_AGAIN = f"{SHORT_OF_MEMORY}. What failed is tried again"
 
 
 class Worker:
@@ -52,7 +52,8 @@ class Worker:
         self._atlas = Atlas(store.directory, self._recipe, self._output.places)
         self._left = LeftPlaces(store, self._recipe, self._output, self._atlas)
         self._quiet_since_s = time.monotonic()  # when what came last was worked in
-        self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory; monotonic
+        self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory or the disk; monotonic
+        self._shortage = ""  # the last one that was told
         self.problem = ""
         self.moved_s = time.monotonic()  # when the work last got on
         self.rests = 0  # how often there was nothing to do
@@ -110,6 +111,9 @@ class Worker:
 
     def _rest(self) -> None:
         """What there is time for while nothing is to be done for the present place."""
+        if self.place.write_refused():
+            self.problem = ""
+            return
         if not (
             self._map()
             or self._left.judge_next(self._meanwhile)
@@ -164,20 +168,24 @@ class Worker:
             raise Abandoned
 
     def _guarded(self, step: Callable[[], object], present: bool = True) -> None:
-        """A step that fails is told, and repeated only where it was for want of memory: what comes next may succeed.
+        """A step that fails is told, and repeated only where memory or the disk did not suffice.
 
         `present`: whether it is for the present place.
         """
         try:
             step()
             if self._wait_s > FIRST_WAIT_S:
-                self.problem, self._wait_s = self.problem.removeprefix(TRIED_AGAIN), FIRST_WAIT_S
+                self.problem = "" if self.problem == self._shortage else self.problem
+                self._wait_s = FIRST_WAIT_S
         except Abandoned:
             pass
         except Exception as error:
             log.exception("a step of the reconstruction failed")
-            short = is_shortage(error)
-            self.problem = TRIED_AGAIN if short else f"{type(error).__name__}: {error}"
+            short = is_shortage(error) or is_of_disk(error)
+            self.problem = f"{type(error).__name__}: {error}"
+            if short:
+                why = SHORT_OF_MEMORY if is_shortage(error) else f"{error}: make room on the disk"
+                self.problem = self._shortage = f"{why}. What failed is tried again"
             if present:
                 self.place.settled = not short
             if short:

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from importlib import import_module
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -20,8 +21,8 @@ import pytest
 from splatnode.capture import selection
 from splatnode.capture.cameras import folder
 from splatnode.capture.config import Camera, CaptureConfig
-from splatnode.capture.daemon import capture
-from splatnode.capture.frame import Frame
+from splatnode.capture.daemon import _Session, capture
+from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.last_run import last_run
 from splatnode.capture.messaging.broadcast import Subscriber
 from splatnode.capture.messaging.keyframe_messages import FrameHeader
@@ -312,3 +313,21 @@ def test_a_capture_without_its_camera_never_says_that_it_started(tmp_path):
     command = [sys.executable, "-m", "splatnode", "capture", str(config)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert done.returncode == 69 and "no camera at" in done.stderr and "event=started" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("live", "waiting", "told"),
+    [(False, 0, True), (False, 99, True), (False, 100, False), (True, 0, False)],
+    ids=["a photograph", "some wait", "many wait", "a live camera's frame"],
+)
+def test_what_the_camera_could_not_give_takes_no_room_of_keyframes(live, waiting, told):
+    offered: list[DroppedFrame] = []
+    session = SimpleNamespace(
+        dropped=0,
+        config=SimpleNamespace(camera=SimpleNamespace(module=SimpleNamespace(LIVE=live)), spool=SpoolConfig()),
+        _server=SimpleNamespace(queued=waiting),
+        _deliver=offered.append,
+    )
+    damaged = DroppedFrame("3.jpg", "the driver says that it is damaged")
+    _Session.drop(session, damaged)
+    assert session.dropped == 1 and offered == ([damaged] if told else [])

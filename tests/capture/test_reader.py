@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import threading
 import time
 from types import SimpleNamespace
@@ -145,6 +146,24 @@ def test_a_silent_camera_is_degraded_and_then_given_up(clock):
         with pytest.raises(CameraUnavailable, match="no frame for 1 s"):
             while True:
                 reader.next(0.05)
+
+
+def test_a_camera_of_damaged_frames_alone_is_degraded_and_then_given_up(clock):
+    def camera():
+        yield frame(0)
+        for index in itertools.count():
+            time.sleep(0.001)
+            yield DroppedFrame(str(index), "the driver says that it is damaged")
+
+    with Reader(camera, live=True, config=QUICK) as reader:
+        assert reader.next(60) is not None
+        wait_for(lambda: isinstance(reader.next(60), DroppedFrame))
+        clock.s += 0.3
+        wait_for(lambda: isinstance(reader.next(60), DroppedFrame) and reader.state is State.DEGRADED)
+        clock.s += 1.1
+        with pytest.raises(CameraUnavailable, match="no frame for 1 s that can be used; the last: the driver says"):
+            while True:
+                reader.next(60)
 
 
 def test_stamps_that_do_not_grow_cost_the_frame():

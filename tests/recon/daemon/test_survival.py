@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging import keys
 from splatnode.capture.messaging.broadcast import Publisher
 from splatnode.capture.messaging.commands import Answer, Seen, ask
@@ -139,6 +139,14 @@ def test_what_cannot_be_used_is_left_out_also_where_the_checkpoint_cannot_be_cha
             node.server.offer(frame(index))
         assert node.events(3) == [LeftOut(f"{index}.png") for index in range(3)]
         assert "3 keyframes that cannot be used, the last: 2.png: for the test" in str(node.problems)
+
+
+def test_what_the_camera_could_not_give_is_remembered_and_disturbs_no_scene(tmp_path, plain):
+    with taking(ipc(tmp_path), tmp_path) as node:
+        node.server.offer(DroppedFrame("blurred.png", "blurred"))
+        node.server.offer(frame(0))
+        (arrived,) = node.events(1)
+        assert arrived.keyframe.name == "0.png" and node.store.dropped == [DroppedFrame("blurred.png", "blurred")]
 
 
 def test_what_there_is_no_memory_for_waits_until_there_is(tmp_path, monkeypatch, plain, impatient):
