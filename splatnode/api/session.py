@@ -31,7 +31,7 @@ from splatnode.recon.pipeline import made_anew
 from splatnode.recon.replay_source import Source
 from splatnode.recon.result.snapshot import Snapshot
 
-_EACH = {"per_second": 1e9, "patience_s": 0.0}  # is examined
+_EACH = 1e9  # frames a second: each is examined
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class Session:
             raise TypeError("a session gets stereo pairs with add(image, right=..., baseline_m=...), not as its scale")
         self._config = configured(preset, config, {"seed": seed}, scale, of_pictures=True)
         self._preset, self._lens, self._threads, self._tell = preset, intrinsics, threads, tell or told_to_nobody
-        self._selector = Selector(Selection(every_frame=every_frame, **_EACH), Limits())
+        self._selector = Selector(Selection(every_frame=every_frame, per_second=_EACH, patience_s=0.0), Limits())
         self._work: IncrementalReconstruction | None = IncrementalReconstruction(self._config)
         self._frames: dict[str, Frame] = {}  # that were taken
         self._given: set[str] = set()
