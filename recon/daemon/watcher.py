@@ -10,21 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.messaging.broadcast import Subscriber
-from splatnode.capture.messaging.network import Network, NotAllowed
-from splatnode.capture.messaging.services import CAPTURE_PREVIEW
-from splatnode.capture.preview import PreviewHeader, decode_preview
+from splatnode.capture.messaging.network import Network
+from splatnode.capture.preview import decode_preview
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.problems import Problems, is_said
 from splatnode.capture.stamp import Stamp
+from splatnode.recon.daemon.previews import Previews
 from splatnode.recon.daemon.tracking import Config, Motion, Tracker, landmarks
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.frames.undistort import without_distortion
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
 log = logging.getLogger(__name__)
-
-RETRY_S = 1.0  # after the connection failed
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,30 +42,29 @@ class Watcher:
         stopping: threading.Event,
     ) -> None:
         """`finished` returns the finished scene, the same object until it changes; None while it is being changed."""
-        self._network, self._config, self._finished = network, config, finished
+        self._config, self._finished = config, finished
         self._problems, self._stopping = problems, stopping
+        self._previews = Previews(network, problems, stopping)
         self.tracked: CameraEstimate | None = None  # the live camera in the finished scene, where it is known
         self.motion: Motion | None = None  # since the scene was finished
 
     def run(self) -> None:
-        """Until the daemon stops. A connection that fails is made anew: the other end may have been put right."""
-        while self._config.every_s > 0 and not self._stopping.is_set():
-            try:
-                with Subscriber(CAPTURE_PREVIEW, self._network, PreviewHeader, queue=4) as previews:
-                    self._watch(previews)
-            except NotAllowed:  # which the keyframes' connection tells, too
-                self._stopping.wait(RETRY_S)
+        """Until the daemon stops."""
+        if self._config.every_s <= 0:
+            return
+        receiving = threading.Thread(target=self._previews.run, name="previews", daemon=True)
+        receiving.start()
+        self._watch()
+        receiving.join()
 
-    def _watch(self, previews: Subscriber) -> None:
-        """Raises NotAllowed."""
+    def _watch(self) -> None:
         watched: Finished | None = None
         tracker = None
         while not self._stopping.wait(self._config.every_s):
             finished = self._finished()
             if finished is not watched:
                 watched, tracker, self.motion, self.tracked = finished, None, None, None
-            message = previews.latest(0)
-            self._problems.count("previews that were refused", previews.refused, previews.why_refused)
+            message = self._previews.take()
             if watched is None or message is None:
                 continue
             try:

@@ -25,7 +25,7 @@ from splatnode.capture.preview import encode_preview
 from splatnode.capture.process.problems import Problems
 from splatnode.capture.status import heartbeats
 from splatnode.recon.config import Config as Reconstruction
-from splatnode.recon.daemon import intake, watcher
+from splatnode.recon.daemon import intake, previews, watcher
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.control import Retract
@@ -105,7 +105,7 @@ def plain(monkeypatch):
 @pytest.fixture
 def impatient(monkeypatch):
     monkeypatch.setattr(intake, "RETRY_S", 0.05)
-    monkeypatch.setattr(watcher, "RETRY_S", 0.05)
+    monkeypatch.setattr(previews, "RETRY_S", 0.05)
 
 
 def test_a_disk_that_fails_for_a_while_costs_nothing(tmp_path, monkeypatch, plain, impatient):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import threading
+import time
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
 
 from splatnode.capture.frame import Frame
-from splatnode.capture.messaging.broadcast import Publisher
+from splatnode.capture.messaging.broadcast import Publisher, Subscriber
 from splatnode.capture.messaging.services import CAPTURE_PREVIEW
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.preview import Config as PreviewConfig
@@ -33,22 +35,70 @@ class Standing:
         return SimpleNamespace(T_world_camera=np.eye(4), K=K), None
 
 
-def test_the_live_camera_has_the_time_of_the_picture_in_which_it_was_found(tmp_path, monkeypatch):
+@contextmanager
+def watching_a_scene(network, monkeypatch, tracker=Standing, problems=None):
+    """A watcher in its thread."""
     monkeypatch.setattr(watcher, "landmarks", lambda *_: None)
-    monkeypatch.setattr(watcher, "Tracker", Standing)
-    network, stopping, numbering = ipc(tmp_path), threading.Event(), Numbering()
+    monkeypatch.setattr(watcher, "Tracker", tracker)
+    stopping = threading.Event()
     finished = Finished(SimpleNamespace(cameras=[SimpleNamespace(width=8, height=6, K=np.eye(3), lens=None)]), [])
-    watching = Watcher(network, Tracking(every_s=0.01), lambda: finished, Problems(), stopping)
+    watching = Watcher(network, Tracking(every_s=0.01), lambda: finished, problems or Problems(), stopping)
     thread = threading.Thread(target=watching.run)
     thread.start()
+    try:
+        yield watching
+    finally:
+        stopping.set()
+        thread.join(30)
+
+
+def sender_of(publisher):
+    """What sends one more preview and returns its number."""
     frame = Frame(0, "0.png", 0, np.zeros((48, 64, 3), np.uint8), None, captured_at=CAPTURED_AT)
-    with Publisher(CAPTURE_PREVIEW, network) as publisher:
+    numbering = Numbering()
 
-        def found():
-            publisher.send(*encode_preview(frame, numbering, PreviewConfig(), state="streaming", taken=True, reason=""))
-            return watching.tracked
+    def send():
+        publisher.send(*encode_preview(frame, numbering, PreviewConfig(), state="streaming", taken=True, reason=""))
+        return numbering.sequence - 1
 
-        tracked = wait_for(found)
-    stopping.set()
-    thread.join(30)
+    return send
+
+
+def test_the_live_camera_has_the_time_of_the_picture_in_which_it_was_found(tmp_path, monkeypatch):
+    network = ipc(tmp_path)
+    with watching_a_scene(network, monkeypatch) as watching, Publisher(CAPTURE_PREVIEW, network) as publisher:
+        send = sender_of(publisher)
+        tracked = wait_for(lambda: (send(), time.sleep(0.01), watching.tracked)[2])
     assert watching.tracked.captured_at == CAPTURED_AT and watching.tracked.name == "live", tracked
+
+
+def test_the_newest_preview_is_tracked_however_long_the_one_before_took(tmp_path, monkeypatch):
+    network, came, examined, go_on = ipc(tmp_path), [], [], threading.Event()
+    count, decode = Subscriber._count, watcher.decode_preview
+
+    def counted(subscriber, header):
+        came.append(header.sequence)
+        count(subscriber, header)
+
+    def decoded(message):
+        examined.append(message.header.sequence)
+        return decode(message)
+
+    class Slow(Standing):
+        def track(self, image, K):
+            assert go_on.wait(60)
+            return super().track(image, K)
+
+    monkeypatch.setattr(Subscriber, "_count", counted)
+    monkeypatch.setattr(watcher, "decode_preview", decoded)
+    with watching_a_scene(network, monkeypatch, Slow), Publisher(CAPTURE_PREVIEW, network) as publisher:
+        send = sender_of(publisher)
+        wait_for(lambda: (send(), time.sleep(0.01), examined)[2])
+        deadline = time.monotonic() + 30
+        for _ in range(20):
+            last = [send() for _ in range(5)][-1]  # fewer than half of what the sender's queue holds: none is lost
+            while last not in came and time.monotonic() < deadline:
+                time.sleep(0.001)
+        go_on.set()
+        wait_for(lambda: len(examined) > 1)
+    assert examined[1] > last - 5  # of the last five, of which some may just be coming
