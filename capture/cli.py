@@ -12,7 +12,7 @@ from dataclasses import asdict
 from importlib import import_module
 
 from splatnode.capture import cameras, daemon
-from splatnode.capture.config import CaptureConfig, is_live, open_stream
+from splatnode.capture.config import CaptureConfig, camera_opener, is_live
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.last_run import last_run
 from splatnode.capture.lens_file import read_lens
@@ -45,7 +45,7 @@ def record(args: argparse.Namespace) -> int:
     config = _config(args)
     with Recorder(args.out) as recorder:
         camera = config.camera
-        with Reader(lambda: open_stream(camera), is_live(camera), config.reader) as reader, telling() as tell:
+        with Reader(camera_opener(camera), is_live(camera), config.reader) as reader, telling() as tell:
             try:
                 for item in counted(_until(reader, args.seconds), tell, "recording", 0, "frame"):
                     recorder.write(item)

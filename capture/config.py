@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -34,13 +35,14 @@ class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     body_mask: Path | None = None
 
 
-def open_stream(camera: Camera, body_mask: Path | None = None) -> Iterator[Frame | DroppedFrame]:
-    """The frames of the camera that is configured, without what `body_mask` hides.
+def camera_opener(camera: Camera, body_mask: Path | None = None) -> Callable[[], Iterator[Frame | DroppedFrame]]:
+    """Opens the camera that is configured, and opens it again after a loss; without what `body_mask` hides.
 
-    Raises CameraUnavailable, when it is opened or later; UnusableMask, FileNotFoundError.
+    What it returns raises CameraUnavailable, when it is called or later; UnusableMask, FileNotFoundError.
     """
-    frames = camera.module.stream(camera.config)
-    return frames if body_mask is None else all_masked(frames, constant(body_mask))
+    remembering = getattr(camera.module, "opener", None)
+    opened = partial(camera.module.stream, camera.config) if remembering is None else remembering(camera.config)
+    return opened if body_mask is None else lambda: all_masked(opened(), constant(body_mask))
 
 
 def is_live(camera: Camera) -> bool:

@@ -7,11 +7,10 @@ import math
 import os
 import time
 from contextlib import ExitStack
-from functools import partial
 
 import cv2
 
-from splatnode.capture.config import CaptureConfig, is_live, open_stream
+from splatnode.capture.config import CaptureConfig, camera_opener, is_live
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.last_run import begin_run, end_run
 from splatnode.capture.messaging.broadcast import Publisher
@@ -55,7 +54,7 @@ def capture(config: CaptureConfig) -> None:
         server = resources.enter_context(KeyframeServer(config.network, Spool(config.spool)))
         session = _Session(config, server, resources)
         camera = config.camera
-        opened = partial(open_stream, camera, config.body_mask)
+        opened = camera_opener(camera, config.body_mask)
         reader = resources.enter_context(Reader(opened, is_live(camera), config.reader))
         resources.callback(manager.stopping)
         begin_run(config.network)

@@ -16,7 +16,7 @@ from splatnode.capture.calibration.models import MODELS, Model
 from splatnode.capture.calibration.other_board import what_is_shown
 from splatnode.capture.calibration.pdf import PAPERS, pdf_of
 from splatnode.capture.calibration.report import lens_file, told
-from splatnode.capture.config import CaptureConfig, is_live, open_stream
+from splatnode.capture.config import CaptureConfig, camera_opener, is_live
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import SUFFIXES
 from splatnode.capture.process.config import load_config, merged, parse_changes, typed
@@ -88,7 +88,7 @@ def _shown(
     camera = config.camera
     gathering = Gathering(board, moving=is_live(camera) or camera.kind == "video")
     tried, drawn = 0, []
-    with Reader(lambda: open_stream(camera, config.body_mask), is_live(camera), config.reader) as reader:
+    with Reader(camera_opener(camera, config.body_mask), is_live(camera), config.reader) as reader:
         for frame in _frames(reader, seconds, tell):
             taken = gathering.take(frame)
             tell(Step("looking for the board", len(gathering.views), 0, "view"))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -12,6 +12,7 @@ import msgspec
 
 from splatnode.capture.cameras.folder import foreign_file, frame_name, image_paths
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
+from splatnode.capture.given_lens import same_aspect
 from splatnode.capture.image_file import (
     MAX_PIXELS,
     MaxPixels,
@@ -24,6 +25,7 @@ from splatnode.capture.name_time import name_time
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.unavailable import CameraUnavailable
 
+REMEMBERED = 100_000  # photographs that were taken and are no longer there: all may be back
 _TEMPORARY_SUFFIXES = {".tmp", ".part", ".partial", ".crdownload", ".filepart"}
 
 
@@ -34,7 +36,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     settle_s: Annotated[float, msgspec.Meta(ge=0)] = 0.4  # a file is whole when it has not changed for so long
     give_up_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0  # a file that is not whole after so long is left out
     max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
-    intrinsics: Intrinsics | None = None  # the lens, of all images, instead of what their EXIF tells
+    # The lens, of all images of its aspect ratio, instead of what their EXIF tells
+    intrinsics: Intrinsics | None = None
 
 
 @dataclass(frozen=True)
@@ -52,26 +55,68 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
 
     Hidden and temporary files are not looked at. Raises CameraUnavailable where the folder is not there, or goes.
     """
-    skipped = set() if config.existing else {path.name for path in _listed(config.folder)}
-    return _frames(config, skipped)
+    return opener(config)()
 
 
-def _frames(config: Config, done: set[str]) -> Iterator[Frame | DroppedFrame]:
-    seen: dict[str, _Seen] = {}
-    frame_id = 0
-    while True:
-        listed = _listed(config.folder)
-        done &= {path.name for path in listed}  # a name that is free again may be given to another photograph
+def opener(config: Config) -> Callable[[], Iterator[Frame | DroppedFrame]]:
+    """What opens the folder, again after each loss: then what came meanwhile is taken, and nothing a second time."""
+    return _Watched(config).stream
+
+
+class _Watched:
+    """The folder, and what needs not be looked at: what was taken from it, and what is not to be."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._opened = False
+        self._done: dict[str, tuple[int, int] | None] = {}  # by name, the longest known first: which file it was
+        self._here: set[str] = set()  # names at the last look
+
+    def stream(self) -> Iterator[Frame | DroppedFrame]:
+        """Raises CameraUnavailable."""
+        if self._opened:
+            self._here = set()  # while it was away, any name may have been given to another photograph
+        elif not self._config.existing:
+            self._done = {path.name: _version(path) for path in _listed(self._config.folder)}
+            self._here = set(self._done)
+        self._opened = True
+        return self._frames()
+
+    def _frames(self) -> Iterator[Frame | DroppedFrame]:
+        seen: dict[str, _Seen] = {}
+        frame_id = 0
+        while True:
+            for path in self._to_look_at():
+                version = _version(path)
+                item = _look(path, seen, self._config, frame_id)
+                if item is not None:
+                    self._done[path.name] = version
+                    seen.pop(path.name, None)
+                    frame_id += isinstance(item, Frame)
+                    yield item
+            time.sleep(self._config.poll_s)
+
+    def _to_look_at(self) -> list[Path]:
+        """A name that was free may be given to another photograph; the same one may be back, with all of its folder."""
+        listed = _listed(self._config.folder)
         for path in listed:
-            if path.name in done:
-                continue
-            item = _look(path, seen, config, frame_id)
-            if item is not None:
-                done.add(path.name)
-                seen.pop(path.name, None)
-                frame_id += isinstance(item, Frame)
-                yield item
-        time.sleep(config.poll_s)
+            if path.name in self._done and path.name not in self._here and _version(path) != self._done[path.name]:
+                del self._done[path.name]
+        self._here = {path.name for path in listed}
+        if len(self._done) > len(self._here) + REMEMBERED:
+            gone = [name for name in self._done if name not in self._here]
+            for name in gone[:-REMEMBERED]:
+                del self._done[name]
+        return [path for path in listed if path.name not in self._done]
+
+
+def _version(path: Path) -> tuple[int, int] | None:
+    """Tells a file from others of its name: size, and nanosecond of its last change; None where it does not tell."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_size, found.st_mtime_ns
 
 
 def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> Frame | DroppedFrame | None:
@@ -93,6 +138,7 @@ def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> 
         seen.pop(path.name, None)
         return None
     except OSError as error:
+        _listed(config.folder)  # raises where it is the folder that has gone
         return DroppedFrame(name, f"cannot be read: {error.strerror}")
     except UnusableImage as error:
         waited = now - seen[path.name].first
@@ -105,8 +151,9 @@ def _decoded(name: str, data: bytes, written_at: Stamp, config: Config, frame_id
         image, intrinsics, captured_at, exposure = decode_photograph(data, config.max_pixels)
     except UnusableImage as error:
         return DroppedFrame(name, str(error))
-    if config.intrinsics is not None:
-        intrinsics = config.intrinsics.resized(image.shape[1], image.shape[0])
+    height, width = image.shape[:2]
+    if config.intrinsics is not None and same_aspect(config.intrinsics, width, height):
+        intrinsics = config.intrinsics.resized(width, height)
     captured_at = captured_at or name_time(name) or written_at
     return framed(frame_id, name, time.monotonic_ns(), image, intrinsics, data, captured_at, exposure=exposure)
 

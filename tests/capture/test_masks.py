@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import folder
-from splatnode.capture.config import CaptureConfig, open_stream
+from splatnode.capture.config import CaptureConfig, camera_opener
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.masks import UnusableMask, all_masked, as_mask, filled, in_files, masked, read_mask
 from splatnode.capture.process.config import load_config
@@ -143,11 +143,11 @@ def test_the_body_mask_of_a_camera_hides_the_same_of_every_frame(tmp_path):
         f"camera: {{kind: synthetic, views: 2, width: 64, height: 48}}\nbody_mask: {tmp_path / 'body.png'}\n"
     )
     config = load_config(tmp_path / "camera.yaml", CaptureConfig)
-    frames = list(open_stream(config.camera, config.body_mask))
+    frames = list(camera_opener(config.camera, config.body_mask)())
     assert [each.name for each in frames] == ["view_000.png", "view_001.png"]
     assert all(np.array_equal(mask_of(each), MASK) for each in frames)
     with pytest.raises(UnusableMask):
-        list(open_stream(config.camera, write(tmp_path / "small.png", MASK[:20])))
+        list(camera_opener(config.camera, write(tmp_path / "small.png", MASK[:20]))())
 
 
 def test_a_frame_takes_no_mask_of_another_kind():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.cameras import building
-from splatnode.capture.config import CaptureConfig, open_stream
+from splatnode.capture.config import CaptureConfig, camera_opener
 from splatnode.capture.diorama.building import view
 from splatnode.capture.diorama.building.interior import interior
 from splatnode.capture.diorama.building.plan import CORRIDOR, ZONES, zones_at
@@ -38,7 +38,7 @@ def tours(room: int) -> list[tuple[int, int]]:
 def test_it_is_a_camera_of_capture_whose_photographs_are_made_when_they_are_asked_for():
     config = typed({"camera": {"kind": "building", "width": 96, "height": 72}}, CaptureConfig)
     assert config.camera.config.keyframes == 1000
-    stream = open_stream(config.camera)
+    stream = camera_opener(config.camera)()
     first, second = next(stream), next(stream)
     assert isinstance(first, Frame) and isinstance(second, Frame)
     assert first.image.shape == (72, 96, 3) and first.intrinsics is None

@@ -12,9 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
+from splatnode.capture.cameras import watched
 from splatnode.capture.cameras.watched import Config, stream
+from splatnode.capture.config import Camera, camera_opener
 from splatnode.capture.exposure_settings import ExposureSettings
-from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.unavailable import CameraUnavailable
 from tests.capture.cameras.test_folder import with_exif
@@ -127,3 +129,57 @@ def test_a_folder_that_is_not_there_or_goes_is_a_lost_camera(tmp_path):
     folder.rmdir()
     with pytest.raises(CameraUnavailable, match="cannot watch"):
         next(frames)
+
+
+@pytest.mark.parametrize("existing", [True, False])
+def test_what_came_while_the_folder_was_away_is_taken_and_nothing_twice(tmp_path, existing):
+    folder, away = tmp_path / "stick", tmp_path / "away"
+    folder.mkdir()
+    (folder / "old.jpg").write_bytes(photograph())
+    opened = camera_opener(Camera("watched", Config(folder, existing, **QUICK)))
+    frames: Any = opened()
+    if existing:
+        assert next(frames).name == "old.jpg"
+    (folder / "new.jpg").write_bytes(photograph(1))
+    assert next(frames).name == "new.jpg"
+    folder.rename(away)
+    with pytest.raises(CameraUnavailable, match="cannot watch"):
+        next(frames)
+    with pytest.raises(CameraUnavailable, match="cannot watch"):
+        next(opened())
+    (away / "came.jpg").write_bytes(photograph(2))
+    (away / "new.jpg").write_bytes(photograph(3, ".png"))  # another of the same name
+    away.rename(folder)
+    again: Any = opened()
+    (folder / "z.jpg").write_bytes(photograph(4))
+    for name in ("came.jpg", "new.jpg", "z.jpg"):
+        assert next(again).name == name
+
+
+def test_photographs_that_are_gone_and_come_back_are_not_taken_again(tmp_path, monkeypatch):
+    """Where nothing is mounted there is a folder, too: an empty one."""
+    names = ["a.jpg", "b.jpg", "c.jpg"]
+    for index, name in enumerate(names):
+        (tmp_path / name).write_bytes(photograph(index))
+    monkeypatch.setattr(watched, "REMEMBERED", 1)
+    frames = watch(tmp_path)
+    assert [next(frames).name for _ in names] == names
+    kept = [((tmp_path / name).read_bytes(), (tmp_path / name).stat().st_mtime_ns) for name in names]
+    for name in names:
+        (tmp_path / name).unlink()
+    (tmp_path / "d.jpg").write_bytes(photograph(3))
+    assert next(frames).name == "d.jpg"
+    for name, (data, changed_ns) in zip(names, kept, strict=True):
+        (tmp_path / name).write_bytes(data)
+        os.utime(tmp_path / name, ns=(0, changed_ns))
+    (tmp_path / "e.jpg").write_bytes(photograph(4))
+    assert [next(frames).name for _ in range(3)] == ["a.jpg", "b.jpg", "e.jpg"]  # one is remembered: the last
+
+
+def test_the_lens_is_of_the_photographs_of_its_aspect_ratio(tmp_path):
+    """A photograph in portrait format was not taken through a lens that is given in landscape format."""
+    lens = Intrinsics(128, 96, 100.0, 100.0, 64.0, 48.0, "calibration")
+    (tmp_path / "a.jpg").write_bytes(photograph())
+    (tmp_path / "b.png").write_bytes(cv2.imencode(".png", np.zeros((64, 48, 3), np.uint8))[1].tobytes())
+    frames = watch(tmp_path, intrinsics=lens)
+    assert next(frames).intrinsics == lens.resized(64, 48) and next(frames).intrinsics is None

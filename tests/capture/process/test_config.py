@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from splatnode.capture.cameras import folder, synthetic
-from splatnode.capture.config import CaptureConfig, open_stream
+from splatnode.capture.config import CaptureConfig, camera_opener
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.process.config import ConfigError, load_config, merged, parse_changes
 
@@ -104,5 +104,5 @@ def test_merging_leaves_its_arguments_alone():
 
 def test_a_configured_camera_streams(tmp_path):
     config = load(tmp_path, SYNTHETIC, "camera={views: 1, width: 32, height: 24}")
-    (frame,) = open_stream(config.camera)
+    (frame,) = camera_opener(config.camera)()
     assert isinstance(frame, Frame) and frame.image.shape == (24, 32, 3)
