@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 
 from splatnode.capture.messaging.broadcast import Subscriber
@@ -9,7 +10,9 @@ from splatnode.capture.messaging.network import Network, NotAllowed
 from splatnode.capture.messaging.services import CAPTURE_PREVIEW
 from splatnode.capture.messaging.wire import Message
 from splatnode.capture.preview import PreviewHeader
-from splatnode.capture.process.problems import Problems
+from splatnode.capture.process.problems import Problems, is_said
+
+log = logging.getLogger(__name__)
 
 READ_S = 0.05  # between reads: a queue that is full keeps the oldest, and this one holds what a second brings
 RETRY_S = 1.0  # after the connection failed
@@ -23,6 +26,7 @@ class Previews:
         self._lock = threading.Lock()
         self._newest: Message[PreviewHeader] | None = None
         self._refused = 0
+        self._unconnected = ""  # why none come
 
     def take(self) -> Message[PreviewHeader] | None:
         """The newest preview, once; None where none has come since. Never waits."""
@@ -38,9 +42,13 @@ class Previews:
                     self._receive(subscriber)
             except NotAllowed:  # which the keyframes' connection tells, too
                 self._stopping.wait(RETRY_S)
+            except Exception as error:  # a key's file, for one, may be written just now
+                self._say_unconnected(error)
+                self._stopping.wait(RETRY_S)
 
     def _receive(self, subscriber: Subscriber) -> None:
         """Raises NotAllowed."""
+        self._unconnected = ""
         before = self._refused
         while not self._stopping.wait(READ_S):
             newest = subscriber.latest(0)
@@ -49,3 +57,12 @@ class Previews:
             if newest is not None:
                 with self._lock:
                     self._newest = newest
+
+    def _say_unconnected(self, error: Exception) -> None:
+        """Once, however long it lasts."""
+        why = f"{type(error).__name__}: {error}"
+        if why == self._unconnected:
+            return
+        self._unconnected = why
+        if is_said(self._problems.add("failures of the previews' connection", why)):
+            log.error("the connection that previews come by failed", exc_info=error)

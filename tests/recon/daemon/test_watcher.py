@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging.broadcast import Publisher, Subscriber
@@ -17,10 +18,10 @@ from splatnode.capture.preview import Config as PreviewConfig
 from splatnode.capture.preview import encode_preview
 from splatnode.capture.process.problems import Problems
 from splatnode.capture.stamp import Clock, Stamp
-from splatnode.recon.daemon import watcher
+from splatnode.recon.daemon import previews, watcher
 from splatnode.recon.daemon.tracking import Config as Tracking
 from splatnode.recon.daemon.watcher import Finished, Watcher
-from tests.capture.messaging.test_sockets import ipc, wait_for
+from tests.capture.messaging.test_sockets import ipc, tcp, wait_for
 
 CAPTURED_AT = Stamp(1_714_989_607_250_000_001, Clock.UTC)
 
@@ -102,3 +103,21 @@ def test_the_newest_preview_is_tracked_however_long_the_one_before_took(tmp_path
         go_on.set()
         wait_for(lambda: len(examined) > 1)
     assert examined[1] > last - 5  # of the last five, of which some may just be coming
+
+
+@pytest.mark.parametrize("damaged", [None, b"half of a ke"])
+def test_a_key_that_is_missing_or_damaged_for_a_while_ends_no_thread(tmp_path, monkeypatch, damaged):
+    monkeypatch.setattr(previews, "RETRY_S", 0.02)
+    network, problems, tries = tcp(tmp_path), Problems(), []
+    monkeypatch.setattr(previews, "Subscriber", lambda *args: (tries.append(args), Subscriber(*args))[1])
+    with Publisher(CAPTURE_PREVIEW, network) as publisher:
+        send, key = sender_of(publisher), network.keys / "secret.key"
+        kept = key.rename(tmp_path / "kept.key")
+        if damaged:
+            key.write_bytes(damaged)
+            key.chmod(0o600)
+        with watching_a_scene(network, monkeypatch, problems=problems) as watching:
+            wait_for(lambda: len(tries) > 3)
+            assert str(problems).startswith("1 failures of the previews' connection, the last: KeyFileError")
+            kept.rename(key)
+            wait_for(lambda: (send(), time.sleep(0.01), watching.tracked)[2])
