@@ -63,9 +63,9 @@ class Turns:
         asking.capacity, asking.message_bytes = request.capacity, request.message_bytes
         asking.outstanding |= {key for pair in request.holding if (key := Key(*pair)) in spooled}
         if self._takes_over(asking, now_s):
-            if self._served is not None and self._served.process != asking.process:
-                self._ended.append(self._served.process)
-            self._served = asking
+            before, self._served = self._served, asking
+            if before is not None and before.process != asking.process:
+                self._succeeded(before, asking)
         return self._served is asking
 
     def heard(self, identity: bytes, now_s: float) -> None:
@@ -87,6 +87,13 @@ class Turns:
         self._connections.pop(identity, None)
         if self.is_served(identity):
             self._served = None
+
+    def _succeeded(self, before: Connection, after: Connection) -> None:
+        """Another process is served now. One with the same checkpoint has ended: if it is a copy, it asks again."""
+        self._ended.append(before.process)
+        if before.recon == after.recon:
+            for identity in [name for name, each in self._connections.items() if each.process == before.process]:
+                self.gone(identity)
 
     def _worth(self, connection: Connection) -> tuple[bool, float]:
         """The least goes where there are too many, so that nobody can keep others out by asking often."""

@@ -41,6 +41,16 @@ def test_a_restarted_one_takes_over_at_once_and_its_predecessor_does_not_come_ba
     assert asked.ready(b"3", ready(A, "2" * 32), (), 0.3)  # the same process by a new connection
 
 
+def test_a_predecessor_is_not_counted_among_those_that_wait_and_a_copy_that_lives_is():
+    asked = Turns()
+    assert asked.ready(b"1", ready(A, "1" * 32), (), 0.0)
+    assert asked.ready(b"1 again", ready(A, "1" * 32), (), 0.5)  # a second connection of the same process
+    assert asked.ready(b"2", ready(A, "2" * 32), (), 1.0) and asked.waiting == 0
+    assert asked.ready(b"3", ready(A, "3" * 32), (), 2.0 + SILENT_S) and asked.waiting == 0  # it took long to start
+    assert not asked.ready(b"2", ready(A, "2" * 32), (), 2.1 + SILENT_S) and asked.waiting == 1
+    assert asked.is_served(b"3")
+
+
 def test_a_crowd_keeps_neither_the_one_that_is_served_out_nor_its_next_process():
     asked = Turns()
     assert asked.ready(b"1", ready(A, "1" * 32), (), 0.0)
