@@ -106,8 +106,10 @@ class Daemon:
         self._intake = Intake(network, config.reconstruction, self._store, self._inbox, self._problems, stopping)
         self._worker = Worker(config, self._store, self._inbox, self._newest.put, stopping)
         self._watcher = Watcher(network, config.tracking, lambda: self._worker.place.finished, self._problems, stopping)
-        self._numbering = Numbering()
-        self._maps = None if maps is None else MapOffer(maps, self._numbering)
+        self._scene_numbers = Numbering()
+        session = self._scene_numbers.session
+        self._status_numbers = Numbering(session)
+        self._maps = None if maps is None else MapOffer(maps, Numbering(session))
         self._sequence = 0  # of the last scene's message
         self._started_s = time.monotonic()
         self._shown: Published | None = None
@@ -178,7 +180,7 @@ class Daemon:
             return
         self._shown = shown
         self._tell_map(NOT_FINAL)  # first: no map of another scene is there when this one comes
-        numbers = self._numbering.next()
+        numbers = self._scene_numbers.next()
         self._sequence = int(numbers["sequence"])
         try:
             header, arrays = to_message(shown.snapshot, shown.scene_id, numbers)
@@ -221,7 +223,7 @@ class Daemon:
         delay_s, delay = worker.delay
         scenes, maps, loops = worker.known
         return ReconStatus(
-            **self._numbering.next(),
+            **self._status_numbers.next(),
             state=State.FULL if intake.full else State.LOADING if worker.loading else worker.place.state,
             uptime_s=time.monotonic() - self._started_s,
             scene_id=self._store.scene_id,

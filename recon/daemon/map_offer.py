@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering, WireError
@@ -19,6 +20,7 @@ class MapOffer:
     """Says what is known of free space, each thing once. For one thread, that which shows scenes."""
 
     def __init__(self, server: StateServer, numbering: Numbering) -> None:
+        """`numbering`: of the maps alone, in the session of the scenes."""
         self._server, self._numbering = server, numbering
         self._told: tuple[str, Mapped | str] | None = None  # scene, and its map or why there is none
 
@@ -33,17 +35,18 @@ class MapOffer:
         if (scene_id, now) == self._told:
             return
         self._told = scene_id, now
+        numbers = self._numbering.next()
         if isinstance(now, Mapped):
-            now = self._sent(now, scene_id, sequence)
+            now = self._sent(now, scene_id, sequence, numbers)
         if now:
-            self._server.publish(no_map(scene_id, now, self._numbering.next()))
+            self._server.publish(no_map(scene_id, now, numbers))
 
-    def _sent(self, mapped: Mapped, scene_id: str, sequence: int) -> str:
+    def _sent(self, mapped: Mapped, scene_id: str, sequence: int, numbers: dict[str, Any]) -> str:
         """Sends a map; why not, where there is none to be sent."""
         if mapped.occupancy is None:
             return mapped.why
         try:
-            self._server.publish(*to_message(mapped.occupancy, scene_id, sequence, self._numbering.next()))
+            self._server.publish(*to_message(mapped.occupancy, scene_id, sequence, numbers))
         except WireError as error:
             log.warning("the map of %s cannot be sent: %s", scene_id, error)
             return f"the map is too large: {error}; choose a larger map.voxel"
