@@ -1,7 +1,8 @@
 """Lenses: which frames share one, and what is known of it before anything is reconstructed.
 
 One camera stores its pictures in several sizes. Frames of one shape have the focal length over their longer side in
-common. A lens is therefore described in the pixels of its largest frame, and smaller frames are scaled to that size.
+common. All lenses are described in the pixels of the largest frame, and smaller frames are scaled to that size: so an
+error of so many pixels means the same in all views.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ class Grouping:
     """Frames grouped by lens."""
 
     lens_of: tuple[int, ...]  # of each frame
-    longer_sides: tuple[int, ...]  # of each lens, pixels: that of its largest frame
+    longer_sides: tuple[int, ...]  # of each lens, pixels: that of the largest frame of all
     scales: tuple[float, ...]  # of each frame: pixels of its lens over its own pixels
 
 
@@ -59,9 +60,8 @@ def group(keyframes: Sequence[Keyframe], across_sizes: bool) -> Grouping:
             first.append(keyframe)
         lens_of.append(lens)
     sides = [longer_side(keyframe.frame) for keyframe in keyframes]
-    longer = [max(side for side, lens in zip(sides, lens_of, strict=True) if lens == g) for g in range(len(first))]
-    scales = (longer[lens] / side for side, lens in zip(sides, lens_of, strict=True))
-    return Grouping(tuple(lens_of), tuple(longer), tuple(scales))
+    largest = max(sides)
+    return Grouping(tuple(lens_of), (largest,) * len(first), tuple(largest / side for side in sides))
 
 
 def _may_share(one: Keyframe, other: Keyframe, across_sizes: bool) -> bool:

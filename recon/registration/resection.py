@@ -7,7 +7,7 @@ of its own, and the one with most inliers among ALL the evidence, points and pai
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -55,7 +55,7 @@ class Resection:
 class Correspondences:
     """2D-3D correspondences: the map's points that a view observes."""
 
-    pixels: Array  # (M, 2) relative to the principal point
+    pixels: Array  # (M, 2) relative to the principal point, without distortion
     points: Array  # (M, 3) world
     tracks: Index  # (M,)
 
@@ -101,7 +101,16 @@ def _correspondences(partial: PartialMap, tracks: Tracks, view: int) -> Correspo
         return Correspondences(np.zeros((0, 2)), np.zeros((0, 3)), np.zeros(0, np.int64))
     position = np.minimum(np.searchsorted(partial.track_of_point, track_of), len(partial.track_of_point) - 1)
     found = partial.track_of_point[position] == track_of
-    return Correspondences(pixels[found], partial.estimate.points[position[found]], track_of[found])
+    straight = _straight(partial.estimate, view, pixels[found])
+    return Correspondences(straight, partial.estimate.points[position[found]], track_of[found])
+
+
+def _straight(estimate: bundle.Problem, view: int, pixels: Array) -> Array:
+    """(M, 2) pixels as a pinhole would show them: a lens that is known to bend lines is taken out."""
+    lens = estimate.lens_of_camera[view]
+    if not (estimate.radials[lens].any() or estimate.shifts[lens].any()):
+        return pixels
+    return bundle.normalise(estimate, np.full(len(pixels), view), pixels) * np.exp(estimate.log_focals[lens])
 
 
 def _proposals(
@@ -170,7 +179,11 @@ def _beside_neighbour(
     estimate = partial.estimate
     focals = np.exp(estimate.log_focals[estimate.lens_of_camera])
     first, second = _pair(view, other)
-    rotation, direction, num_inliers = epipolar.relative_pose(pair, float(focals[first]), float(focals[second]), limit)
+    straight = (_straight(estimate, each, points) for each, points in ((first, pair.points1), (second, pair.points2)))
+    points1, points2 = straight
+    rotation, direction, num_inliers = epipolar.relative_pose(
+        replace(pair, points1=points1, points2=points2), float(focals[first]), float(focals[second]), limit
+    )
     if num_inliers < 2 * config.min_points:  # matches fix a relative pose less well than points do a pose
         return None
     if view == first:  # The relative pose leads from the view to its neighbour: it is inverted.

@@ -41,11 +41,7 @@ def distortion(fit: refit.Fit) -> Distortion:
     num_lenses = len(held.prior.sigmas)
     first = np.tile([FREE_RADIAL, 0.0], (num_lenses, 1))
     free = refit.adjusted(replace(held, prior=replace(held.prior, radial_sigmas=first)))
-    corner = (
-        CORNER
-        * REFERENCE_SIDE
-        * np.array([held.scale[held.problem.lens_of_camera == g].max() for g in range(num_lenses)])
-    )
+    corner = CORNER * REFERENCE_SIDE * held.scale
     further = (free.problem.radials - held.problem.radials)[:, 0] * (corner / np.exp(free.problem.log_focals)) ** 2
     return Distortion(float(np.abs(further).max()), float(free.cost / max(held.cost, refit.MIN_COST)))
 
@@ -61,10 +57,10 @@ def freed(fit: refit.Fit) -> tuple[FreedLens, ...]:
     tried = [refit.adjusted(replace(held, prior=prior, problem=replace(held.problem, log_focals=s))) for s in starts]
     free = tried[int(np.argmin([candidate.cost for candidate in tried]))]  # the first NaN, where there is one
     ratio = float(free.cost / max(held.cost, refit.MIN_COST))
-    registered, found = np.exp(held.problem.log_focals), np.exp(free.problem.log_focals)
+    focals = (fit.told, np.exp(held.problem.log_focals), np.exp(free.problem.log_focals))
+    given, registered, found = ((fit.units * each).tolist() for each in focals)
     return tuple(
-        FreedLens(float(fit.told[g]), bool(fit.prior.sigmas[g] == 0), float(registered[g]), float(found[g]), ratio)
-        for g in np.nonzero(told)[0]
+        FreedLens(given[g], bool(fit.prior.sigmas[g] == 0), registered[g], found[g], ratio) for g in np.nonzero(told)[0]
     )
 
 

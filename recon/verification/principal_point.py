@@ -29,6 +29,5 @@ def freed(fit: refit.Fit) -> refit.Moved | None:
     if not free.any():
         return None
     whole = refit.adjusted(fit)
-    sides = np.array([fit.scale[fit.problem.lens_of_camera == lens].max(initial=1.0) for lens in range(count)])
-    sigmas = np.where(free, FREE_SHIFT * REFERENCE_SIDE * sides, 0.0)
+    sigmas = np.where(free, FREE_SHIFT * REFERENCE_SIDE * max(fit.scale, 1.0), 0.0)
     return refit.moved(whole, refit.adjusted(replace(whole, prior=replace(whole.prior, shift_sigmas=sigmas))))

@@ -32,8 +32,9 @@ class Fit:
     problem: bundle.Problem
     prior: bundle.LensPrior
     loss: bundle.Config
-    scale: Array  # (C,) longer side of each frame's lens over REFERENCE_SIDE
-    told: Array  # (G,) focal length that came with the frames, pixels of the lens; NaN where none did
+    scale: float  # longer side of the largest frame, whose pixels these are, over REFERENCE_SIDE
+    told: Array  # (G,) focal length that came with the frames; NaN where none did
+    units: Array  # (G,) pixels of the largest frame of each lens over those of the largest of all
 
     @property
     def Ts_world_camera(self) -> Array:
@@ -60,8 +61,7 @@ class Fit:
 def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_camera: int) -> Fit:
     """The registration as a bundle of at most about `tracks_per_camera` tracks a camera, the longest first.
 
-    A given focal length is kept, others are almost free. Pixels are those of frames enlarged to the largest of their
-    lens.
+    A given focal length is kept, others are almost free. Pixels are those of frames enlarged to the largest of all.
     """
     cameras = registration.cameras
     position = np.full(len(keyframes), -1)
@@ -71,8 +71,9 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
     observed = chosen[registration.observed_point]
     sides = np.array([longer_side(keyframes[c.index].frame) for c in cameras])
     lenses, lens_of_camera = np.unique([camera.lens for camera in cameras], return_inverse=True)
-    longer_sides = np.array([sides[lens_of_camera == lens].max() for lens in range(len(lenses))])
-    enlarged = longer_sides[lens_of_camera] / sides
+    largest = sides.max()
+    units = np.array([sides[lens_of_camera == lens].max() for lens in range(len(lenses))]) / largest
+    enlarged = largest / sides
     focals, radials, sigmas = np.zeros(len(lenses)), np.zeros((len(lenses), 2)), np.zeros(len(lenses))
     told = np.full(len(lenses), np.nan)
     for camera, lens, by in zip(cameras, lens_of_camera, enlarged, strict=True):
@@ -95,11 +96,11 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
         point_of=np.searchsorted(kept, registration.observed_point[observed]),
         pixels=(enlarged[camera_of, None] * (registration.observed_pixels - principal[camera_of]))[observed],
     )
-    scale = longer_sides[lens_of_camera] / REFERENCE_SIDE
+    scale = float(largest) / REFERENCE_SIDE
     prior = bundle.focal_prior(problem.log_focals, sigmas)
     errors = bundle.reprojection_errors(problem)
-    robust_px = float(np.clip(ROBUST_FACTOR * np.median(errors), *(np.array(ROBUST_PX) * np.median(scale))))
-    return Fit(problem, prior, bundle.Config(robust_px=robust_px), scale, told)
+    robust_px = float(np.clip(ROBUST_FACTOR * np.median(errors), *(np.array(ROBUST_PX) * scale)))
+    return Fit(problem, prior, bundle.Config(robust_px=robust_px), scale, told, units)
 
 
 def adjusted(start: Fit) -> Fit:
@@ -108,9 +109,8 @@ def adjusted(start: Fit) -> Fit:
 
 def noise_px(of: Fit) -> float:
     """The standard deviation of one component of an observation's error, pixels of the lens; never 0."""
-    scale = float(np.median(of.scale))
-    median = float(np.median(bundle.reprojection_errors(of.problem))) / scale
-    return scale * bundle.noise_px(len(of.problem.pixels), len(of.problem.points), median)
+    median = float(np.median(bundle.reprojection_errors(of.problem))) / of.scale
+    return of.scale * bundle.noise_px(len(of.problem.pixels), len(of.problem.points), median)
 
 
 def without_points(start: Fit, left_out: npt.NDArray[np.bool_]) -> Fit:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import cv2
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from splatnode.recon.registration import register
+from splatnode.capture.frame import Frame
+from splatnode.recon.registration import lenses, register
 from splatnode.recon.registration.register import Registration
 from tests.support.synthetic import photographs, renumbered, view_graph
 
@@ -43,3 +46,11 @@ def test_frames_that_were_cropped_have_a_lens_of_their_own():
     assert [camera.lens for camera in cameras] == [cameras[0].lens, cameras[1].lens] * 2 + [cameras[0].lens]
     assert cameras[1].lens != cameras[0].lens
     assert cameras[1].focal == pytest.approx(cameras[0].focal, rel=0.05)
+
+
+def test_an_error_of_so_many_pixels_means_the_same_through_every_lens():
+    sizes = [(3000, 4000), (720, 1280), (2250, 3000)]
+    frames = [Frame(0, "a.png", 0, np.empty((*size, 3), np.uint8), None) for size in sizes]
+    grouping = lenses.group([SimpleNamespace(frame=frame) for frame in frames], across_sizes=True)
+    assert grouping.lens_of == (0, 1, 0) and grouping.longer_sides == (4000, 4000)
+    assert grouping.scales == pytest.approx((1.0, 4000 / 1280, 4000 / 3000))

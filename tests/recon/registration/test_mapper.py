@@ -12,7 +12,7 @@ from splatnode.recon.geometry import align_cameras
 from splatnode.recon.matching import two_view
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import bundle, epipolar, focal, mapper, resection, tracks, triangulation
-from splatnode.recon.registration.mapping_problem import Lens, View
+from splatnode.recon.registration.mapping_problem import Lens, MappingProblem, PartialMap, View
 
 FOCAL = 900.0
 SIZE = (1024, 768)
@@ -228,6 +228,22 @@ def test_a_view_that_shares_a_handful_of_points_is_placed_by_its_pair():
     assert sorted(found.views) == [0, 1, 2]
     rotation_deg, centre = errors(taken, found)
     assert rotation_deg < 1.0 and centre < 0.05
+
+
+@pytest.mark.parametrize("radial", [0.0, -0.25])
+def test_a_view_is_placed_as_well_through_a_lens_that_is_known_to_bend_lines(radial):
+    taken = photographed(num_views=1, radials=(radial, 0.0))
+    (seen,) = np.nonzero(taken.visible[0])
+    points = np.random.default_rng(0).uniform(-1.0, 1.0, (400, 3)) * [2.0, 1.4, 1.2]  # those of `photographed`
+    still, lens = np.zeros((1, 3)), (np.log([FOCAL]), np.array([[radial, 0.0]]), np.zeros((1, 2)))
+    bare = bundle.without_points(np.eye(3)[None], still, np.zeros(1, int), *lens)
+    prior = bundle.focal_prior(lens[0], np.ones(1))
+    partial = PartialMap((), replace(bare, points=points), prior, np.arange(400))
+    observed = tracks.Tracks(np.zeros(len(seen), int), seen, taken.pixels[0][seen], 400)
+    problem = MappingProblem((), (), {}, np.ones(1), observed, observed)
+    found = resection.resect(problem, partial, 0, resection.Config())
+    assert found is not None and found.inlier_ratio > 0.99
+    assert np.linalg.norm(found.rotation.T @ found.translation + taken.Ts_world_camera[0, :3, 3]) < 0.02
 
 
 def test_sampson_errors_are_the_noise_and_infinite_behind(taken, pairs):

@@ -40,7 +40,7 @@ def made_up(noise_px: float = 0.2, depth: float = 1.0, radial: float = 0.0, foca
     seen, pinhole = pixels + rng.normal(0, noise_px, pixels.shape), np.zeros((1, 2))
     problem = replace(exact, pixels=seen, log_focals=np.log([focal]), radials=pinhole)
     prior = bundle.LensPrior(problem.log_focals, np.array([refit.FREE_SIGMA]), np.zeros((1, 2)), np.zeros(1))
-    return refit.Fit(problem, prior, bundle.Config(robust_px=1.0), np.ones(4), np.full(1, np.nan))
+    return refit.Fit(problem, prior, bundle.Config(robust_px=1.0), 1.0, np.full(1, np.nan), np.ones(1))
 
 
 def given(fit: refit.Fit) -> refit.Fit:
