@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike, fspath
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -11,6 +11,7 @@ from typing import Any, TypeAlias
 from splatnode.api.photographs import Images, as_list, frame, names_of
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.right_image import Baseline as Apart
 from splatnode.recon.metric.stereo_pairs import Pair, pairs_of, rights_in
 
 Baseline: TypeAlias = tuple[str | int, str | int, float]  # two photographs and the metres between their cameras
@@ -43,10 +44,13 @@ Scale: TypeAlias = Known | Sequence[Known]
 def metric_changes(scale: Scale, of_pictures: bool) -> dict[str, Any]:
     """What of the configuration's `metric` it sets; `of_pictures`: photographs are named by their places in a list.
 
-    Raises TypeError.
+    Raises TypeError, and ValueError for markers of two kinds.
     """
     changes: dict[str, Any] = {}
     baselines = []
+    markers = {each for each in _known(scale) if isinstance(each, Marker)}
+    if len(markers) > 1:
+        raise ValueError(f"scale can have markers of one size and dictionary alone, got {len(markers)} kinds of Marker")
     for each in _known(scale):
         if isinstance(each, Marker):
             changes |= _of_marker(each)
@@ -65,9 +69,17 @@ def is_stereo(scale: Scale | None) -> bool:
 
 
 def pairs_given(scale: Scale | None, images: Images, frames: Sequence[Frame | DroppedFrame]) -> tuple[Pair, ...]:
-    """The stereo pairs of the frames, in which `images` resulted. Raises TypeError, ValueError, FileNotFoundError."""
+    """The stereo pairs of the frames, in which `images` resulted, of several stereo cameras each with their baseline.
+
+    Raises TypeError, ValueError, FileNotFoundError.
+    """
     stereos = [each for each in _known(scale) if isinstance(each, Stereo)]
-    return tuple(pair for each in stereos for pair in pairs_of(frames, _rights(each.right, images, frames)))
+    several = len(stereos) > 1  # else the configuration's is theirs
+    return tuple(
+        replace(pair, baseline=Apart(each.baseline_m, each.sigma_m)) if several else pair
+        for each in stereos
+        for pair in pairs_of(frames, _rights(each.right, images, frames))
+    )
 
 
 def _rights(right: object, images: Images, frames: Sequence[Frame | DroppedFrame]) -> Iterable[Frame | DroppedFrame]:

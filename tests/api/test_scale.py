@@ -35,6 +35,13 @@ def test_pairs_are_a_folder_or_one_picture_for_each(folder, arrays):
     pairs = pairs_given([splatnode.Stereo(arrays, 0.1)], arrays, listed)
     assert [pair.photograph for pair in pairs] == [frame.name for frame in listed]
     assert pairs_given(splatnode.Marker(0.1), arrays, listed) == ()
+    two = pairs_given([splatnode.Stereo(arrays, 0.1), splatnode.Stereo(folder, 0.5, 0.001)], arrays, listed[:1])
+    assert [pair.baseline and (pair.baseline.metres, pair.baseline.sigma_m) for pair in two] == [
+        (0.1, 0.0003),
+        (0.5, 0.001),
+    ]
+    with pytest.raises(ValueError, match="markers of one size and dictionary alone, got 2 kinds"):
+        metric_changes([splatnode.Marker(0.1), splatnode.Marker(0.1), splatnode.Marker(0.4)], False)
     with pytest.raises(ValueError, match="right must have one picture for each"):
         pairs_given(splatnode.Stereo(arrays[:2], 0.1), arrays, listed)
     with pytest.raises(TypeError, match="a session gets stereo pairs with add"):

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import hmac
-import http.cookies
 import ipaddress
 import os
 import re
 import secrets
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,10 +53,14 @@ class Access:
         """Compared in a time that tells nothing of where they differ."""
         return self.key is not None and hmac.compare_digest((text or "").encode(errors="replace"), self.key.encode())
 
-    def lets_in(self, headers: Mapping[str, str]) -> bool:
-        """Whether a request has the key, in its cookie or as `Authorization: Bearer KEY`; any, where none is needed."""
-        bearer = (headers.get("Authorization") or "").removeprefix("Bearer ")
-        return self.key is None or self.is_key(bearer) or self.is_key(_cookie(headers.get("Cookie"), self.cookie))
+    def lets_in(self, authorization: str | None, cookies: str | None) -> bool:
+        """Whether a request has the key, in its cookie or as `Authorization: Bearer KEY`; any, where none is needed.
+
+        The arguments are the headers of those names.
+        """
+        scheme, _, bearer = (authorization or "").partition(" ")
+        is_told = scheme.lower() == "bearer" and self.is_key(bearer.strip())
+        return self.key is None or is_told or self.is_key(_cookie(cookies, self.cookie))
 
 
 def new_key() -> str:
@@ -87,11 +89,9 @@ def kept_key(path: Path) -> str:
 
 
 def _cookie(header: str | None, name: str) -> str | None:
-    try:
-        morsel = http.cookies.SimpleCookie(header or "").get(name)
-    except http.cookies.CookieError:
-        return None
-    return morsel.value if morsel else None
+    """By itself: browsers send the cookies of all programs on a machine, some of which no standard allows."""
+    parts = (part.partition("=") for part in (header or "").split(";"))
+    return next((value.strip() for found, _, value in parts if found.strip() == name), None)
 
 
 def _is_loopback(host: str) -> bool:

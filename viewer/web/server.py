@@ -121,7 +121,7 @@ class _Request(BaseHTTPRequestHandler):
             )
         if path == "/" and access.is_key(asked.get("key")):
             return self._remember_key()
-        if not access.lets_in(dict(self.headers)):
+        if not access.lets_in(self.headers.get("Authorization"), self.headers.get("Cookie")):
             return self._refuse(
                 HTTPStatus.UNAUTHORIZED,
                 "the key is missing or wrong: open the address that splatnode view --web prints",

@@ -36,12 +36,20 @@ def test_and_by_no_other_name(host):
 
 def test_the_key_may_come_in_a_cookie_or_a_header_and_must_be_right():
     access = Access("0.0.0.0", 8347, KEY)
-    assert access.lets_in({"Cookie": f"other=1; splatnode_8347={KEY}"})
-    assert access.lets_in({"Authorization": f"Bearer {KEY}"})
-    for headers in ({}, {"Cookie": "splatnode_8347=k"}, {"Cookie": f"splatnode_1={KEY}"}, {"Cookie": "=;\x00"},
-                    {"Authorization": "Bearer "}, {"Authorization": f"Bearer {KEY[:-1]}é"}):  # fmt: skip
-        assert not access.lets_in(headers)
+    assert access.lets_in(None, f"other=1; splatnode_8347={KEY}")
+    assert access.lets_in(f"Bearer {KEY}", None) and access.lets_in(f"bearer  {KEY}", None)
+    for cookies in (None, "", "splatnode_8347=k", f"splatnode_1={KEY}", "=;\x00", f"a=splatnode_8347={KEY}"):
+        assert not access.lets_in(None, cookies)
+    for authorization in ("Bearer ", f"Bearer {KEY[:-1]}é", KEY, f"Basic {KEY}"):
+        assert not access.lets_in(authorization, None)
     assert not access.is_key(None) and not Access("127.0.0.1", 1, None).is_key(None)
+
+
+@pytest.mark.parametrize("others", ['prefs={"theme":"dark"}', "a=x y", "name@x=1", "path=/", "é=ü", "lonely"])
+def test_cookies_of_other_programs_have_no_say(others):
+    access = Access("0.0.0.0", 8347, KEY)
+    for cookies in (f"{others}; splatnode_8347={KEY}", f"splatnode_8347={KEY}; {others}"):
+        assert access.lets_in(None, cookies)
 
 
 def test_two_keys_differ_and_a_file_keeps_one_for_this_user_alone(tmp_path):

@@ -14,11 +14,15 @@ from splatnode.recon.result.export.prepare import SH_C0
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.viewer.canvas import BACKGROUND
 from splatnode.viewer.paint import paint_gaussians
+from splatnode.viewer.sources import Finished
 from splatnode.viewer.state import State
 from splatnode.viewer.viewpoint import Viewpoint, at_camera, look_at, orbited, panned, zoomed
+from splatnode.viewer.web.said import said
+from splatnode.viewer.web.stage import Place, newest, serving
 from tests.bench.viewer.drive_web import WINDOW, drive, fact, settle, watched
-from tests.support.chromium import NAMES, chromium
+from tests.support.chromium import NAMES, browser, chromium
 from tests.viewer.test_scene import camera, moment, wall
+from tests.viewer.web.test_server import scene
 
 pytestmark = pytest.mark.skipif(chromium() is None, reason=f"needs a browser: one of {', '.join(NAMES)}")
 
@@ -109,3 +113,26 @@ def start() -> Viewpoint:
     up /= np.linalg.norm(up)
     T = look_at(np.array([0.2, -0.3, -1.0]), np.array([0.1, 0.0, 1.0]), up)
     return Viewpoint(T, 1.7, up, (camera(0.0).K, 100.0, 80.0))
+
+
+def fetched(path: str) -> str:
+    """How often the page has got something of this path, as JavaScript asks for it."""
+    return f"performance.getEntriesByType('resource').filter(e => e.name.includes('{path}')).length"
+
+
+def test_a_page_that_stays_open_shows_what_another_viewer_at_that_address_shows():
+    """Names, ids and version numbers are those of before, and at first the other viewer has nothing to show."""
+    port = 0
+    with browser(*WINDOW) as page:
+        told = 0
+        for number, count in enumerate((15, 24), start=1):
+            with serving(Finished(scene(count)), Place(port=port)) as (server, session):
+                if number == 1:
+                    port = server.server_address[1]
+                    page.open(server.access.url())
+                assert page.wait(f"{fetched('/told')} > {told}") is not None
+                session.receive()
+                server.board.put(said(session), newest(session, None), live=False)
+                assert page.wait(f"{fact('gaussians')} == {len(wall(count))}") is not None
+                assert page.wait(f"{fetched('/thumbnail/')} == {number}") is not None
+                told = page.value(fetched("/told"))

@@ -14,9 +14,8 @@ export async function listen(heard, lost) {
       if (answer.status === 401 || answer.status === 403) lost(await answer.text());
       if (!answer.ok) throw new Error(`status ${answer.status}`);
       const told = await answer.json();
-      const again = told.run !== run;
       ({ run, number } = told);
-      await heard(told, again);
+      await heard(told);
     } catch (error) {
       if (error instanceof TypeError) lost("no connection to splatnode view: trying again");
       await pause(AGAIN_MS);

@@ -38,7 +38,7 @@ const camera = () => shapes?.cameras.find(({ name }) => name === chosen) ?? null
 
 // ---- What is told ----------------------------------------------------------------------------------------------------
 
-async function heard(told, again) {
+async function heard(told) {
   panel.notice = told.shapes || !picture ? "" : told.said.state ?? "";
   panel.say(told.said);
   if (JSON.stringify(tracked) !== JSON.stringify(told.said.tracked ?? [])) {
@@ -46,8 +46,9 @@ async function heard(told, again) {
     panel.offer("tracked", tracked.length > 0);
     linesShown = "";
   }
-  const fresh = again || told.gaussians !== wanted.gaussians;
-  if (told.shapes && (again || shapes?.version !== told.shapes)) await takeShapes(told.shapes);
+  // Another run of the viewer counts its versions anew.
+  const fresh = told.run !== wanted.run || told.gaussians !== wanted.gaussians;
+  if (told.shapes && (shapes?.run !== told.run || shapes.version !== told.shapes)) await takeShapes(told.shapes, told.run);
   if (told.gaussians && fresh) {
     const file = await fetchGaussians(told.gaussians);
     if (file) {
@@ -58,10 +59,15 @@ async function heard(told, again) {
   redraw();
 }
 
-async function takeShapes(version) {
-  const fresh = await fetchShapes(version);
-  if (!fresh) return;
-  if (shapes && shapes.scene !== fresh.scene) [view, chosen, touched] = [null, null, false];
+async function takeShapes(version, run) {
+  const fetched = await fetchShapes(version);
+  if (!fetched) return;
+  // A node's scene stays the same in another run, a result need not; photographs of one name may be others in both.
+  const fresh = { ...fetched, run, scene: fetched.scene || run, album: `${run}\n${fetched.scene}` };
+  if (shapes && shapes.scene !== fresh.scene) {
+    [view, chosen, touched] = [null, null, false];
+    over.removeAttribute("src");
+  }
   shapes = fresh;
   linesShown = "";
   for (const name of ["advice", "uncertainty", "graph"])
@@ -69,7 +75,7 @@ async function takeShapes(version) {
   panel.list(fresh.cameras.map(({ name }) => name));
   if (chosen && !camera()) chosen = null;
   if (!view || (!touched && !chosen)) start();
-  picture?.photographs.fetch(fresh.scene, fresh.cameras, version);
+  picture?.photographs.fetch(fresh.album, fresh.cameras, version);
 }
 
 /** A photographed view, or, where nothing was photographed, all of the scene. */
@@ -168,7 +174,7 @@ function look() {
   if (!now || !shapes) return null;
   const cameras = visibleCameras(now);
   chooseLines(new Set(cameras.map(({ name }) => name)));
-  return { T: now.T, lens: now.lens, shown: panel.shown, scene: shapes.scene, cameras };
+  return { T: now.T, lens: now.lens, shown: panel.shown, album: shapes.album, cameras };
 }
 
 /** Hands the lines that are switched on to the picture, where they are others than before. */

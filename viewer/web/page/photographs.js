@@ -25,7 +25,7 @@ export class Photographs {
   constructor(gl, changed) {
     this.gl = gl;
     this.changed = changed;
-    this.textures = new Map(); // by the scene and the camera's name
+    this.textures = new Map(); // by the album and the camera's name
     this.fetching = false;
     this.program = program(gl, VERTEX, FRAGMENT);
     this.array = gl.createVertexArray();
@@ -34,9 +34,9 @@ export class Photographs {
     gl.bindVertexArray(null);
   }
 
-  /** Fetches those of `cameras` (version `version` of the shapes of `scene`) that are not there yet. */
-  async fetch(scene, cameras, version) {
-    const wanted = cameras.map(({ name, photograph }, index) => ({ key: `${scene}\n${name}`, index, photograph }));
+  /** Fetches those of `cameras` (version `version` of the shapes; `album`: whose names they have) that are not there yet. */
+  async fetch(album, cameras, version) {
+    const wanted = cameras.map(({ name, photograph }, index) => ({ key: `${album}\n${name}`, index, photograph }));
     const keys = new Set(wanted.map(({ key }) => key));
     for (const [key, texture] of this.textures) {
       if (keys.has(key)) continue;
@@ -55,14 +55,14 @@ export class Photographs {
     }
   }
 
-  draw(eye, scene, cameras) {
+  draw(eye, album, cameras) {
     const { gl } = this;
     use(gl, this.program, eye);
     gl.enable(gl.DEPTH_TEST);
     gl.disable(gl.BLEND);
     gl.bindVertexArray(this.array);
     for (const camera of cameras) {
-      const texture = this.textures.get(`${scene}\n${camera.name}`);
+      const texture = this.textures.get(`${album}\n${camera.name}`);
       if (!texture) continue;
       gl.bindTexture(gl.TEXTURE_2D, texture);
       gl.uniform3fv(this.program.uniforms["corners[0]"], camera.corners.flat());

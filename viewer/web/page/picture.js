@@ -15,7 +15,7 @@ const POLL_MS = 4;
 const POINT_PX = 3;
 
 export class Picture {
-  /** `look()` gives what to draw: {T, lens, shown, scene, cameras}, or null; `drawn()` is called after each picture. */
+  /** `look()` gives what to draw: {T, lens, shown, album, cameras}, or null; `drawn()` is called after each picture. */
   constructor(canvas, look, drawn, loaded) {
     const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
     if (!gl) throw new Error("This browser has no WebGL 2, which the picture needs. Another one, or another machine, may.");
@@ -62,7 +62,7 @@ export class Picture {
     this.splats.sort(forward(what.T));
     gl.viewport(0, 0, width, height);
     this.#clear();
-    if (what.shown.photographs && what.shown.cameras) this.photographs.draw(eye, what.scene, what.cameras);
+    if (what.shown.photographs && what.shown.cameras) this.photographs.draw(eye, what.album, what.cameras);
     this.ground.draw(eye, pixels, false);
     this.lines.draw(eye, pixels, false);
     if (what.shown.gaussians) this.splats.draw(eye, what.shown.points ? POINT_PX * pixels : 0);
