@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.geometry import spread
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.viewer.graph import Graph
 
@@ -38,6 +39,25 @@ class Moment:
 
 
 History = tuple[Moment, ...]  # oldest first
+
+_MOST_MOVED = 0.5  # of the spread of the cameras, by which those of a scene that grows may move from moment to moment
+
+
+def same_world(one: Moment, other: Moment) -> bool:
+    """Whether a point of one is at the same place in the other: in one scene and unit, with cameras where they were.
+
+    A scene comes into another world when metres, or poses that were given, become known.
+    """
+    if one.scene_id != other.scene_id or one.snapshot.scale.metric != other.snapshot.scale.metric:
+        return False
+    known = {camera.name: camera.T_world_camera[:3, 3] for camera in other.snapshot.cameras}
+    both = [
+        (camera.T_world_camera[:3, 3], known[camera.name]) for camera in one.snapshot.cameras if camera.name in known
+    ]
+    if len(both) < 2 or one.graph is not None:
+        return True
+    here, there = np.array(both).swapaxes(0, 1)
+    return bool(np.linalg.norm(here - there, axis=1).max() <= _MOST_MOVED * max(spread(here), spread(there)))
 
 
 def remembered(history: History, moment: Moment, memory_bytes: int = MEMORY_BYTES) -> History:

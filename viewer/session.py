@@ -16,7 +16,7 @@ from splatnode.viewer.editing import EditError, Edits, box, box_lines, edited, o
 from splatnode.viewer.ground import Ground, ground, ground_lines
 from splatnode.viewer.legend import legend
 from splatnode.viewer.measuring import measured_shapes, surface_point, with_point
-from splatnode.viewer.moment import MEMORY_BYTES, History, Moment, remembered
+from splatnode.viewer.moment import MEMORY_BYTES, History, Moment, remembered, same_world
 from splatnode.viewer.paint import blended, paint_coarsely, with_shapes
 from splatnode.viewer.shapes import Photograph, Shapes, live_camera, shapes, together
 from splatnode.viewer.sources import Roaming, Source
@@ -41,6 +41,7 @@ class Session:
         self._tracked: CameraEstimate | None = None  # the live camera
         self._touched = False  # whether the person has chosen a viewpoint
         self._from_outside = False  # whether the person has asked to see the whole scene
+        self._world: Moment | None = None  # shown last: the viewpoint, what is measured and the edits are in its world
         self._standing: tuple[Moment, Ground | None] | None = None
         self._coloured: tuple[tuple[object, ...], GaussianArrays] | None = None
         self.paintings = 0  # of the Gaussians, which is what takes the time of a picture
@@ -52,6 +53,7 @@ class Session:
 
     def receive(self) -> bool:
         """Takes what the source has; whether that was something."""
+        self._follow_state()
         view = self.viewpoint()
         if isinstance(self.source, Roaming) and view is not None:
             self.source.look_from(view.T_world_camera[:3, 3], self.state.which_map)
@@ -59,14 +61,24 @@ class Session:
         self._tracked = self.source.tracked
         if moment is None:
             return self._tracked is not before
-        elsewhere = bool(self.history) and self.history[-1].scene_id != moment.scene_id
         self.history = remembered(self.history, moment, self._memory_bytes)
-        if elsewhere:
+        self._come_to(self.moment or moment)
+        return True
+
+    def _follow_state(self) -> None:
+        """Another moment may be shown than before, as the person goes through the history."""
+        moment = self.moment
+        if moment is not None and self._world is not None and not same_world(self._world, moment):
+            self._come_to(moment)
+
+    def _come_to(self, shown: Moment) -> None:
+        """Takes back what was said in another world than that of the moment which is shown now, and its viewpoint."""
+        before, self._world = self._world, shown
+        if before is not None and not same_world(before, shown):
             self._touched = self._from_outside = False
             self.state = replace(self.state, measured=(), edits=())
-        if not self._touched and (self._view is None or moment.snapshot.cameras):
-            self._look(moment)
-        return True
+        if not self._touched and shown is not before and (self._view is None or shown.snapshot.cameras):
+            self._look(shown)
 
     @property
     def tracked(self) -> CameraEstimate | None:
@@ -105,6 +117,7 @@ class Session:
 
     def press(self, key: str) -> None:
         self.state = press(self.state, self.history, key)
+        self._follow_state()
 
     def whole_scene(self) -> None:
         """The viewpoint from which all of the scene is seen."""
@@ -265,7 +278,7 @@ class Session:
 
 def _same_cameras(one: Moment, other: Moment) -> bool:
     names = [[camera.name for camera in moment.snapshot.cameras] for moment in (one, other)]
-    return names[0] == names[1] and one.scene_id == other.scene_id
+    return names[0] == names[1] and same_world(one, other)
 
 
 def _depth_at(photograph: Photograph, view: Viewpoint, x: float, y: float, width: int, height: int) -> float | None:

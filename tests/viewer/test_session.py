@@ -6,8 +6,10 @@ import time
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from splatnode.recon.result.export.selection import Selection
+from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.viewer.analysis import Analyst
 from splatnode.viewer.canvas import project
@@ -129,6 +131,55 @@ def test_a_session_from_the_first_moment_to_a_click():
     assert np.array_equal(session.viewpoint().T_world_camera, first.snapshot.cameras[2].T_world_camera)
     session.whole_scene()
     assert not session.state.follow
+    session.close()
+
+
+def metric(of: Moment, factor: float, along: float = 0.0) -> Moment:
+    """The moment in metres, `factor` of them a unit, in a world that begins so far along x."""
+    to_metres = np.diag([factor, factor, factor, 1.0])
+    cameras = []
+    for each in of.snapshot.cameras:
+        T_world_camera = each.T_world_camera.copy()
+        T_world_camera[:, 3] = to_metres @ T_world_camera[:, 3] + [along, 0.0, 0.0, 0.0]
+        cameras.append(replace(each, T_world_camera=T_world_camera))
+    return replace(of, snapshot=replace(of.snapshot, cameras=tuple(cameras), scale=Scale(True, "a ruler")))
+
+
+@pytest.mark.parametrize(("factor", "along"), [(4.0, 0.0), (1.0, 100.0), (1.0, 0.0)])
+def test_what_was_said_in_another_world_is_taken_back(factor, along):
+    feed = Feed()
+    first, second = moments(2)
+    feed.waiting += [first]
+    session = Session(feed, State())
+    session.receive()
+    session.state = replace(session.state, measured=(np.zeros(3), np.ones(3)), edits=(Selection(only_seen=True),))
+    session.move(orbited(session.viewpoint_to_move(), 0.1, 0.0))
+    chosen = session.viewpoint()
+    feed.waiting += [second]
+    session.receive()
+    assert session.viewpoint() is chosen and len(session.state.measured) == 2 and session.state.edits  # the same world
+    feed.waiting += [metric(second, factor, along)]
+    session.receive()
+    assert session.viewpoint() is not chosen and not session.state.measured and not session.state.edits
+    assert np.array_equal(session.viewpoint().T_world_camera, session.moment.snapshot.cameras[1].T_world_camera)
+    session.close()
+
+
+def test_what_is_held_keeps_its_edits_and_its_viewpoint_until_it_is_let_go():
+    feed = Feed()
+    first, second = moments(2)
+    feed.waiting += [first]
+    session = Session(feed, State())
+    session.receive()
+    session.state = replace(session.state, held=first, edits=(Selection(only_seen=True),))
+    session.move(orbited(session.viewpoint_to_move(), 0.1, 0.0))
+    chosen = session.viewpoint()
+    feed.waiting += [replace(second, scene_id="another")]
+    session.receive()
+    assert session.moment is first and session.viewpoint() is chosen and session.state.edits
+    session.state = replace(session.state, held=None)
+    session.receive()
+    assert session.moment.scene_id == "another" and session.viewpoint() is not chosen and not session.state.edits
     session.close()
 
 
