@@ -14,7 +14,7 @@ from splatnode.viewer.colours import source_colour
 from splatnode.viewer.graph import Graph, edge_lines, node_marks
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.state import State
-from splatnode.viewer.viewpoint import look_at, scene_up
+from splatnode.viewer.viewpoint import look_at, scene_depth, scene_up
 
 Array = npt.NDArray[np.float64]
 Colour = tuple[float, float, float]
@@ -26,7 +26,7 @@ CHAIN_COLOUR: Colour = (0.2, 0.7, 1.0)
 LOOP_COLOUR: Colour = (1.0, 0.25, 0.85)
 RETRACTED_COLOUR: Colour = (0.5, 0.5, 0.5)
 MARK_COLOURS: dict[bool, Colour] = {True: (0.4, 1.0, 0.5), False: (1.0, 0.45, 0.2)}  # by whether a scene is shown
-_FRUSTUM = 0.12  # depth of a frustum in parts of the scene's depth, which is 1
+_FRUSTUM = 0.12  # depth of a frustum in parts of the scene's depth
 _AT_THE_EYE = 2.0  # times the depth of a frustum
 _MIN_SIZE = 0.002  # of its distance from the eye: a smaller ellipsoid would be a dot in the window
 _CORNERS = 24  # of an ellipse
@@ -82,7 +82,7 @@ def shapes(
     A camera right at the `eye` (3,) has no shape: it would fill the window.
     """
     snapshot = moment.snapshot
-    depth = frustum_depth(snapshot.cameras)
+    depth = frustum_depth(moment)
     others = [
         (index, camera)
         for index, camera in enumerate(snapshot.cameras)
@@ -130,14 +130,15 @@ def live_camera(moment: Moment, tracked: CameraEstimate | None) -> CameraEstimat
     return max(moment.snapshot.cameras, key=lambda camera: camera.frame_id, default=None)
 
 
-def frustum_depth(cameras: tuple[CameraEstimate, ...]) -> float:
+def frustum_depth(moment: Moment) -> float:
     """How deep frusta are drawn: visible from afar, but no deeper than half the way to the next camera."""
-    centres = np.array([camera.T_world_camera[:3, 3] for camera in cameras])
+    largest = _FRUSTUM * scene_depth(moment)
+    centres = np.array([camera.T_world_camera[:3, 3] for camera in moment.snapshot.cameras])
     if len(centres) < 2:
-        return _FRUSTUM
+        return largest
     distances = np.linalg.norm(centres[:, None] - centres[None], axis=2)
     nearest = np.median(distances[~np.eye(len(centres), dtype=bool)].reshape(len(centres), -1).min(1))
-    return float(np.clip(_ROOM * nearest, 0.03 * _FRUSTUM, _FRUSTUM))
+    return float(np.clip(_ROOM * nearest, 0.03 * largest, largest))
 
 
 def image_corners(lens: CameraEstimate, T_world_camera: Array, depth: float) -> Array:

@@ -173,6 +173,15 @@ def scene_pivot(moment: Moment) -> Array:
     return centre + (float(np.median(ahead)) if len(ahead) else 1.0) * forward
 
 
+def scene_depth(moment: Moment) -> float:
+    """How far what the cameras see is from their middle; 1, which it is about, where lengths are no metres."""
+    cameras = moment.snapshot.cameras
+    if not moment.snapshot.scale.metric or not cameras:
+        return 1.0
+    middle = np.mean([camera.T_world_camera[:3, 3] for camera in cameras], axis=0)
+    return float(np.linalg.norm(scene_pivot(moment) - middle)) or 1.0
+
+
 def scene_spread(moment: Moment, pivot: Array) -> float:
     """The median distance of the Gaussians from the pivot; 1 where there are none."""
     means = moment.snapshot.gaussians.means

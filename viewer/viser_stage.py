@@ -49,7 +49,7 @@ class Stage:
         """Shows the moment in place of the one before. Where it is another scene, visitors are taken to it."""
         snapshot, server = moment.snapshot, self.server
         self._centres = np.array([camera.T_world_camera[:3, 3] for camera in snapshot.cameras]).reshape(-1, 3)
-        self._depth = frustum_depth(snapshot.cameras)
+        self._depth = frustum_depth(moment)
         with server.atomic():
             before, self._nodes, self._frusta = self._nodes, {}, []
             if len(snapshot.gaussians):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.result.bounds import Bounds, ball
+from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.snapshot import GaussianArrays
 from splatnode.viewer.analysis import analyse
 from splatnode.viewer.canvas import BACKGROUND
@@ -127,8 +128,17 @@ def test_frusta_end_at_the_corners_of_the_image():
     lines = frustum(np.eye(4), corners)
     assert lines.shape == (10, 2, 3) and np.allclose(lines[:4, 0], 0) and np.allclose(lines[:4, 1], corners)
     assert lines[8:, 1, 1].max() < corners[0, 1]  # the roof points up
-    assert frustum_depth((camera(0.0), camera(0.1, frame_id=1))) == pytest.approx(0.05)
-    assert frustum_depth((one,)) == frustum_depth(())
+    assert frustum_depth(moment(wall(3), camera(0.0), camera(0.1, frame_id=1))) == pytest.approx(0.05)
+    assert frustum_depth(moment(wall(3), one)) == frustum_depth(moment(wall(3)))
+
+
+def test_frusta_are_as_large_in_the_picture_in_metres_as_without():
+    def depth(metres: float, **changes: object) -> float:
+        gaussians = wall(3)
+        far = replace(gaussians, means=(metres * gaussians.means).astype(np.float32))
+        return frustum_depth(moment(far, camera(0.0), camera(0.4 * metres, frame_id=1), **changes))
+
+    assert depth(50.0, scale=Scale(True, "a ruler")) == pytest.approx(50.0 * depth(1.0), rel=0.2)
 
 
 def test_the_path_follows_the_frames_and_the_hint_is_a_camera_that_looks_where_it_should():

@@ -115,13 +115,12 @@ def test_a_visitor_is_given_the_cameras_where_they_are_with_their_photographs():
 
 def test_a_frustum_is_as_deep_as_that_of_the_other_viewers():
     """viser's own rule (CameraFrustumVariants.tsx): the pyramid x, y, 1 over the cube root of a third of x y."""
-    cameras = place().snapshot.cameras
     with viser.serving("127.0.0.1", 0) as server:
         stage = Stage(server)
         stage.draw(place())
         frustum = stage._nodes["/cameras/0.png"]
         y = np.tan(frustum.fov / 2.0)
-        assert np.isclose(frustum.scale / np.cbrt(frustum.aspect * y * y / 3.0), frustum_depth(cameras))
+        assert np.isclose(frustum.scale / np.cbrt(frustum.aspect * y * y / 3.0), frustum_depth(place()))
 
 
 @pytest.mark.skipif(chromium() is None, reason=f"needs a browser: one of {', '.join(NAMES)}")
@@ -146,7 +145,7 @@ def test_a_browser_shows_what_the_projects_own_rasteriser_does():
         while visitor.camera.near == 0.01 and time.monotonic() < deadline:
             stage.attend()
             time.sleep(0.1)
-        assert np.isclose(visitor.camera.near, 2.0 * frustum_depth(whole.snapshot.cameras))
+        assert np.isclose(visitor.camera.near, 2.0 * frustum_depth(whole))
         K = np.array([[height / 0.8, 0, width / 2], [0, height / 0.8, height / 2], [0, 0, 1]])  # of the camera's lens
         ours = paint_gaussians(whole.snapshot.gaussians, view.T_world_camera, K, State(), width, height).image
         middle = np.s_[height // 4 : -height // 4, width // 4 : width // 2]

@@ -97,7 +97,7 @@ def _told(content: Content) -> dict[str, Any]:
         "up": start.up.tolist(),
         "pivot": scene_pivot(moment).tolist(),
         "overview": _viewpoint(start),
-        "frustum_depth": frustum_depth(snapshot.cameras),
+        "frustum_depth": frustum_depth(moment),
         "cameras": [
             {
                 "name": printable(camera.name),
@@ -105,7 +105,7 @@ def _told(content: Content) -> dict[str, Any]:
                 "T_world_camera": camera.T_world_camera.ravel().tolist(),
                 "K": camera.K.ravel().tolist(),
                 "size": [camera.width, camera.height],
-                "corners": image_corners(camera, camera.T_world_camera, frustum_depth(snapshot.cameras)).tolist(),
+                "corners": image_corners(camera, camera.T_world_camera, frustum_depth(moment)).tolist(),
                 "photograph": camera.name in snapshot.images,
             }
             for index, camera in enumerate(snapshot.cameras)
