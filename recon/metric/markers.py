@@ -42,7 +42,8 @@ def by_markers(
     """The unit by all markers together, and a sentence for each that says nothing.
 
     `side_m` is the side of the black square and `sigma_m` its standard deviation, metres: all markers have both alike.
-    Where two markers contradict each other, each is a measurement of its own. Raises ValueError for a side of 0.
+    Where two markers contradict each other, each is a measurement of its own, as sure as it is but for the side: an
+    error that all of them share cannot explain what they differ by. Raises ValueError for a side of 0.
     """
     if side_m <= 0:
         raise ValueError(f"the side of a marker must be above 0, got {side_m}")
@@ -55,9 +56,9 @@ def by_markers(
     single = [each for each in told if isinstance(each, Measurement)]
     silent = [each for each in told if isinstance(each, str)]
     agreed = together(single) if single else ""
-    of_side = sigma_m / side_m
-    known = [agreed] if isinstance(agreed, Measurement) else single
-    return [*(replace(each, sigma=math.hypot(each.sigma, of_side)) for each in known), *silent]
+    if not isinstance(agreed, Measurement):
+        return [*single, *silent]
+    return [replace(agreed, sigma=math.hypot(agreed.sigma, sigma_m / side_m)), *silent]
 
 
 def _by_marker(

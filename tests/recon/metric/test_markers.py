@@ -105,19 +105,32 @@ def test_a_marker_that_was_moved_gives_nothing():
     assert isinstance(told, str) and "does not lie still" in told
 
 
+def shrunk(sighting: Sighting, factor: float) -> Sighting:
+    """As if the marker were so many times its size, about its middle in the picture."""
+    pixels = sighting.corners.pixels
+    smaller = pixels.mean(0) + factor * (pixels - pixels.mean(0))
+    return replace(sighting, corners=replace(sighting.corners, pixels=smaller))
+
+
 def test_markers_of_two_sizes_contradict_each_other():
-    smaller = [
-        replace(
-            each,
-            corners=replace(
-                each.corners,
-                pixels=each.corners.pixels.mean(0) + 0.7 * (each.corners.pixels - each.corners.pixels.mean(0)),
-            ),
-        )
-        for each in of({7})
-    ]
-    told = by_markers(views(), [*of({0}), *smaller], 0.1, 0.0)
+    told = by_markers(views(), [*of({0}), *(shrunk(each, 0.7) for each in of({7}))], 0.1, 0.0)
     assert len(told) == 2 and all(isinstance(each, Measurement) for each in told)
+
+
+def test_markers_that_differ_by_more_than_they_may_give_no_metres_whatever_the_ruler_and_others_say():
+    known = replace(ball_snapshot(1), cameras=tuple(cameras()))
+    evidence = Evidence((*of({0}), *(shrunk(each, 0.98) for each in of({7}))))
+    told = in_metres(known, Config(marker_m=0.1), evidence)  # the ruler: half a millimetre, 0.5 %
+    assert not told.scale.metric and told.scale.interval_95 is None
+    assert "marker 0 of 100 mm in 3 photographs, contradicts marker 7 of 100 mm" in (told.scale.source or "")
+    true = [T[:3, 3] for T, _ in synthetic.scene_cameras(PLACE)]
+    apart = float(np.linalg.norm(true[2] - true[0]))
+    for sigma in (0.001, 0.5):
+        between = Config(
+            marker_m=0.1, baseline=Baseline("view_000.png", "view_002.png", 1.01 * apart), baseline_sigma=sigma
+        )
+        torn = in_metres(known, between, evidence)
+        assert not torn.scale.metric and "contradicts" in (torn.scale.source or "")
 
 
 def test_a_scene_gets_metres_from_a_marker_and_a_baseline_20_percent_off_is_refused():
