@@ -47,11 +47,14 @@ def by_stereo(
     """The unit, or a sentence why the pairs do not give it.
 
     `baseline_m` is between the two cameras and `sigma_m` its standard deviation, metres. Rows are compared first.
+    Pairs of which there is no view, or which the landmarks do not know, do not count: the scene that is shown and the
+    newest estimate, whose landmarks they are, need not have the same cameras.
     """
     name = f"stereo pairs with {in_words(baseline_m)} between the cameras"
     if landmarks is None:
         return f"{name} were given, and the scene has no points to compare with"
-    seen = [_compared(views[each.photograph], landmarks, each) for each in pairs if each.photograph in views]
+    pairs = [each for each in pairs if each.photograph in views and each.photograph in landmarks.names]
+    seen = [_compared(views[each.photograph], landmarks, each) for each in pairs]
     seen = [each for each in seen if len(each.depths)]
     count = sum(len(each.depths) for each in seen)
     if count < _LEAST_POINTS:
@@ -71,7 +74,7 @@ def by_stereo(
             "points of both must be the same"
         )
     line = _fitted(nearness, across_px, _SHIFT_SIGMA_PX)
-    of_scene = of_cameras([views[each.photograph] for each in pairs if each.photograph in views])
+    of_scene = of_cameras([views[each.photograph] for each in pairs])
     sigma = math.hypot(line.log_sigma, of_scene, sigma_m / baseline_m)
     return Measurement(baseline_m / line.slope, sigma, f"{len(seen)} {name}")
 

@@ -100,6 +100,27 @@ def test_a_scene_gets_metres_from_its_pairs():
     assert metric.scale.metric and "2 stereo pairs with 150 mm between the cameras" in (metric.scale.source or "")
 
 
+@pytest.mark.parametrize("kept", [1, 0])
+def test_a_pair_that_the_newest_estimate_has_no_camera_of_does_not_count(kept):
+    all_of_it = landmarks()
+    seen = all_of_it.photograph_of < kept
+    fewer = replace(
+        all_of_it,
+        point_of=all_of_it.point_of[seen],
+        photograph_of=all_of_it.photograph_of[seen],
+        names=all_of_it.names[:kept],
+        Ts_world_camera=all_of_it.Ts_world_camera[:kept],
+        rotation_bounds=np.zeros(kept),
+        centre_bounds=np.zeros(kept),
+    )
+    told = by_stereo(known(), fewer, pairs(), BASELINE_M, 0.0)
+    if kept:
+        assert isinstance(told, Measurement) and told.source.startswith("1 stereo pairs")
+        assert told.metres_per_unit == pytest.approx(UNIT, rel=0.005)
+    else:
+        assert isinstance(told, str) and "share 0 points" in told
+
+
 @pytest.mark.parametrize("sigma_m", [0.0003, 100.0])
 def test_a_baseline_that_is_configured_is_as_the_configuration_allows(sigma_m):
     metric = in_metres(snapshot(), Config(stereo_m=150.0, stereo_sigma_m=sigma_m), Evidence(pairs=pairs()))
