@@ -12,13 +12,13 @@ from splatnode.capture.process.progress import waiting
 from splatnode.capture.process.terminal import say
 from splatnode.recon.merging.merge import Merged, merged
 from splatnode.recon.merging.submap import Submap, Submaps, load_submaps
+from splatnode.recon.merging.unit import scale_and_up
 from splatnode.recon.result.coarser import Level, levels
 from splatnode.recon.result.depth_file import DEPTHS, encode_depths
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.formats.ply import encode_ply, most_in_ply
 from splatnode.recon.result.export.prepare import take, viewer_safe
 from splatnode.recon.result.export.staged import json_bytes
-from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.levels_file import LEVELS_FILE, levels_record
 from splatnode.recon.result.pieces import SHELL_PIECE, merged_folder, piece_name
@@ -27,7 +27,6 @@ from splatnode.recon.result.report import build_report, peak_rss_mb
 from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.size import result_bytes
 from splatnode.recon.result.snapshot import Snapshot
-from splatnode.recon.result.stored_snapshot import read_up
 from splatnode.recon.result.up import Up
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.result.whole import Whole, WholeMap, read_whole
@@ -75,7 +74,7 @@ def write_map(whole: Whole, of: WholeMap, found: Submaps, folder: Path, most: in
     given = sum(len(each.gaussians) for each in found.used)
     with result_folder(folder, round((1 + _LEVELS_BYTES) * result_bytes(given if most is None else min(given, most)))):
         one = merged(found.used, most)
-        snapshot = _snapshot(one, found, *_scale_and_up(whole, of))
+        snapshot = _snapshot(one, found, *scale_and_up(whole, of, [each.scene_id for each in found.used]))
         coarse = levels(one.gaussians)
         report = _report(snapshot, one, found, coarse, given)
         write_result(snapshot, folder, report, preview=contact_sheet(snapshot), further=_further(snapshot, one, coarse))
@@ -87,14 +86,6 @@ def most(args: argparse.Namespace, submaps: Sequence[Submap]) -> int | None:
     bases = max(each.gaussians.sh.shape[1] for each in submaps)
     by_size = None if args.max_mb is None else most_in_ply(round(args.max_mb * 1e6), bases)
     return min((limit for limit in (args.max_gaussians, by_size) if limit is not None), default=None)
-
-
-def _scale_and_up(whole: Whole, of: WholeMap) -> tuple[Scale, Up | None]:
-    """Those of the scene that the map is named after, whose world and unit it has."""
-    place = whole.places.get(of.name)
-    if place is None or place.folder is None:
-        return Scale(), None
-    return StoredResult.at(place.folder).scale(), read_up(place.folder)
 
 
 def _snapshot(one: Merged, found: Submaps, scale: Scale, up: Up | None) -> Snapshot:

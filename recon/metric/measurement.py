@@ -10,8 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
+from splatnode.recon.result.scale import TWO_SIDED_95
+
 MAX_DEVIATION = 3.0  # standard deviations by which two sources may differ
-TWO_SIDED_95 = 1.96  # standard deviations
 
 
 @dataclass(frozen=True)

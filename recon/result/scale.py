@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+TWO_SIDED_95 = 1.96  # standard deviations to either side that hold 95 % of a normal distribution
+
 
 @dataclass(frozen=True)
 class Scale:

@@ -7,7 +7,8 @@ are placed by their links.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -30,6 +31,7 @@ Finite = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]
 Factor = Annotated[float, msgspec.Meta(ge=1e-6, le=1e6)]
 Name = Annotated[str, msgspec.Meta(min_length=1, max_length=LONGEST_NAME)]
 Text = Annotated[str, msgspec.Meta(max_length=LONGEST_TEXT)]
+Sigma = Annotated[float, msgspec.Meta(ge=0)]
 Row = tuple[Finite, Finite, Finite]
 Rotation = tuple[Row, Row, Row]
 
@@ -56,6 +58,9 @@ class SceneLink:
     placement: Placement  # of `other` in the world of `scene`
     kind: str  # "chain": the next scene of one walk; "loop": a place that was found again
     retracted: str | None  # why it no longer counts; None: it does
+    # Standard deviations of the placement: of its scale's logarithm, and of its rotation; None: the file does not tell
+    sigma_scale: float | None = None
+    sigma_deg: float | None = None
 
 
 @dataclass(frozen=True)
@@ -120,6 +125,8 @@ class _Link(_Sim3, frozen=True, kw_only=True):
     other: Name
     kind: Text = "chain"
     retracted: Text | None = None
+    sigma_scale: Sigma | None = None
+    sigma_deg: Sigma | None = None
 
 
 class _Pose(_Sim3, frozen=True, kw_only=True):
@@ -162,7 +169,7 @@ def _link(link: _Link, path: Path) -> SceneLink:
     if not is_printable(link.kind) or not is_printable(link.retracted or ""):
         raise SceneFileError(f"{path}: its texts must be printable")
     placement = _placement(link, f"the link {link.scene!a} to {link.other!a}", path)
-    return SceneLink(link.scene, link.other, placement, link.kind, link.retracted)
+    return SceneLink(link.scene, link.other, placement, link.kind, link.retracted, link.sigma_scale, link.sigma_deg)
 
 
 def _posed(poses: Sequence[_Pose], places: Mapping[str, ScenePlace], path: Path) -> dict[str, tuple[str, Placement]]:
@@ -176,25 +183,43 @@ def _posed(poses: Sequence[_Pose], places: Mapping[str, ScenePlace], path: Path)
     }
 
 
-def _chained(places: Mapping[str, ScenePlace], links: Iterable[SceneLink]) -> dict[str, tuple[str, Placement]]:
-    """By scene, the map and the place in it: each further scene is placed by the first link that reaches it."""
-    steps: dict[str, list[tuple[str, Placement]]] = {}
+Beside = Mapping[str, Sequence[SceneLink]]  # by scene, the links of it that count
+
+
+def beside(links: Iterable[SceneLink]) -> Beside:
+    """The links that count, in their order, by both of their scenes."""
+    found: dict[str, list[SceneLink]] = {}
     for link in links:
         if link.retracted is None:
-            steps.setdefault(link.scene, []).append((link.other, link.placement))
-            steps.setdefault(link.other, []).append((link.scene, link.placement.inverse()))
+            found.setdefault(link.scene, []).append(link)
+            found.setdefault(link.other, []).append(link)
+    return found
+
+
+def reached(first: str, links: Beside) -> Iterator[tuple[str, str, SceneLink]]:
+    """How links lead to all other scenes from the first, along the fewest: the scene before, the scene, the link."""
+    known, waiting = {first}, deque([first])
+    while waiting:
+        here = waiting.popleft()
+        for link in links.get(here, ()):
+            there = link.other if link.scene == here else link.scene
+            if there not in known:
+                known.add(there)
+                waiting.append(there)
+                yield here, there, link
+
+
+def _chained(places: Mapping[str, ScenePlace], links: Iterable[SceneLink]) -> dict[str, tuple[str, Placement]]:
+    """By scene, the map and the place in it: each further scene is placed by the first link that reaches it."""
+    those = beside(links)
     placed: dict[str, tuple[str, Placement]] = {}
     for first in places:
         if first in placed:
             continue
         placed[first] = first, IDENTITY
-        waiting = [first]
-        while waiting:
-            here = waiting.pop(0)
-            for there, step in steps.get(here, []):
-                if there not in placed:
-                    placed[there] = first, placed[here][1].after(step)
-                    waiting.append(there)
+        for here, there, link in reached(first, those):
+            step = link.placement if link.scene == here else link.placement.inverse()
+            placed[there] = first, placed[here][1].after(step)
     return placed
 
 
