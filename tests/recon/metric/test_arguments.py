@@ -19,7 +19,16 @@ def test_options_become_the_configuration():
     plain = configured()
     assert plain.marker_m is None and plain.stereo_m is None and plain.baselines == ()
     metric = configured(
-        "--marker", "99.4mm@0.2mm", "--stereo", "r", "--stereo-baseline", "7.5cm", "--poses-sigma", "1,5"
+        "--marker",
+        "99.4mm@0.2mm",
+        "--stereo",
+        "r",
+        "--stereo-baseline",
+        "7.5cm",
+        "--poses",
+        "p",
+        "--poses-sigma",
+        "1,5",
     )
     assert (metric.marker_m, metric.marker_sigma_m) == pytest.approx((0.0994, 0.0002))
     assert (metric.stereo_m, metric.stereo_sigma_m) == pytest.approx((0.075, 0.0003))
