@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import contextlib
+import heapq
+from collections.abc import Container, Iterable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
+from splatnode.capture.lerobot.data_set import UnusableDataSet
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import printable
 from splatnode.recon.batch.answer import Outcome
 
-_ROWS, _SEEN = 10_000, 500  # in memory at a time
+_ROWS, _AT_A_TIME = 10_000, 500  # in memory at a time: of a batch, and of cameras
 _KINDS = {"str": pa.string(), "bool": pa.bool_(), "int": pa.int64(), "float": pa.float64()}
 SCHEMA = pa.schema(
     [(name, _KINDS[str(kind).removesuffix(" | None")]) for name, kind in Outcome.__annotations__.items()]
@@ -34,6 +40,7 @@ _OF_EPISODE = {  # what is known of a camera in an episode; lists are of its key
 }
 _SIDE = pa.schema({"episode_index": pa.int64(), "camera": pa.string(), **_OF_EPISODE})
 _PREFIX = "splatnode"  # of columns in a table of somebody else
+_Seen = tuple[int, str]  # an episode, and the key of a camera
 
 
 def write(path: Path, rows: Iterable[Outcome]) -> None:
@@ -41,23 +48,71 @@ def write(path: Path, rows: Iterable[Outcome]) -> None:
     _write(path, map(msgspec.structs.asdict, rows), SCHEMA, _ROWS)
 
 
-def write_seen(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """A table of what cameras of episodes are known. Raises OSError."""
-    _write(path, rows, _SIDE, _SEEN)
+def write_seen(source: Path, target: Path, rows: Iterable[Mapping[str, Any]], anew: Container[_Seen]) -> None:
+    """A table of what cameras of episodes are known: `rows`, and those of `source`, if it is there, but of `anew`.
+
+    `anew` are the episodes and cameras of `rows`. Both are in the order of these, and so is `target`. Raises
+    UnusableDataSet where `source` is no such table, OSError.
+    """
+    kept = (row for row in _earlier(source) if _of(row) not in anew) if source.exists() else ()
+    _write(target, heapq.merge(kept, rows, key=_of), _SIDE, _AT_A_TIME)
+
+
+def _of(row: Mapping[str, Any]) -> _Seen:
+    return row["episode_index"], row["camera"]
+
+
+@contextlib.contextmanager
+def _reading(said: str) -> Iterator[None]:
+    """What fails in here is raised as UnusableDataSet. pyarrow says of damaged bytes, too, that they are an OSError."""
+    with foreign(UnusableDataSet, said):
+        try:
+            yield
+        except OSError as error:
+            if error.errno is not None:
+                raise
+            raise ValueError(str(error)) from error
+
+
+def _earlier(file: Path) -> Iterator[dict[str, Any]]:
+    """The rows of a table that `write_seen` wrote, some at a time. Raises UnusableDataSet where it is none, OSError."""
+    shown = printable(str(file))
+    must = f"{shown!r} must be a table of cameras that splatnode wrote, for others to be added"
+    with _reading(f"{must}; move it away, or mend it"), pq.ParquetFile(file) as table:
+        names = set(table.schema_arrow.names)
+        if others := sorted(names - set(_SIDE.names)):
+            raise UnusableDataSet(f"{must}; it has other columns ({printable(', '.join(others), 200)}): move it away")
+        if missing := sorted({"episode_index", "camera"} - names):
+            raise UnusableDataSet(f"{must}; it has no column {missing[0]}: move it away")
+        for some in table.iter_batches(_AT_A_TIME):
+            if some.column("episode_index").null_count or some.column("camera").null_count:
+                raise UnusableDataSet(f"{must}; it has rows of no episode or no camera: move it away")
+            columns = {name: some.column(name).cast(_SIDE.field(name).type) for name in names}
+            yield from pa.table(columns).to_pylist()
 
 
 def write_with_columns(source: Path, target: Path, by_camera: Mapping[str, Mapping[int, Mapping[str, Any]]]) -> None:
-    """A table of episodes with further columns, splatnode/CAMERA/..., in place of earlier ones; all others as they are.
+    """A table of episodes with further columns, splatnode/CAMERA/..., for the cameras and episodes of `by_camera`.
 
-    What is not known of an episode is null. Raises OSError and pyarrow's errors.
+    All other columns stay, and so does what earlier ones of these names have of other episodes. What is not known of
+    an episode is null. Raises UnusableDataSet where `source` cannot be read or has other columns of these names,
+    OSError.
     """
-    table = pq.read_table(source)
-    table = table.select([name for name in table.column_names if not name.startswith(f"{_PREFIX}/")])
-    episodes = table.column("episode_index").to_pylist()
+    with _reading(repr(printable(str(source)))):
+        table = pq.read_table(source)
+        episodes = table.column("episode_index").to_pylist()
     for camera, known in by_camera.items():
+        is_known = pa.array([episode in known for episode in episodes], pa.bool_())
         for name, kind in _OF_EPISODE.items():
-            values = [known[episode][name] if episode in known else None for episode in episodes]
-            table = table.append_column(f"{_PREFIX}/{camera}/{name}", pa.array(values, kind))
+            title = f"{_PREFIX}/{camera}/{name}"
+            values = pa.array([known[episode][name] if episode in known else None for episode in episodes], kind)
+            if title in table.column_names:
+                with _reading(f"{printable(str(source))!r}: the column {printable(title)}"):
+                    before = table.column(title).cast(kind)
+                merged = pc.call_function("if_else", [is_known, values, before])
+                table = table.set_column(table.column_names.index(title), title, merged)
+            else:
+                table = table.append_column(title, values)
     pq.write_table(table, target, compression="snappy")
 
 

@@ -44,8 +44,9 @@ class WrittenBack:
 def write_back(rows: Iterable[Outcome], out: Path, in_place: bool) -> Iterator[WrittenBack]:
     """Writes the cameras of `rows`, whose results lie in `out`; one after the other, what becomes of each file.
 
-    `in_place` adds columns to the tables of a data set, and topics to an MCAP file. Recordings of neither are left. A
-    process that is killed leaves each file as it was or whole, and hidden files, which the next call removes.
+    `in_place` adds columns to the tables of a data set, and topics to an MCAP file. Recordings of neither are left.
+    What was written before of other episodes, cameras and topics stays. A process that is killed leaves each file as it
+    was or whole, and hidden files, which the next call removes.
     """
     found: defaultdict[Path, list[tuple[str, Outcome]]] = defaultdict(list)
     for row in rows:
@@ -100,9 +101,11 @@ def _into_data_set(folder: Path, parts: Sequence[tuple[str, Outcome]], out: Path
             with replacing(file) as temporary:
                 pyarrow.write_with_columns(file, temporary, by_key)
         return f"{len(parts)} recordings are columns splatnode/CAMERA/... in {len(files)} tables of {folder}"
-    with replacing(folder / TABLE) as temporary:
-        pyarrow.write_seen(temporary, ({"episode_index": n, "camera": key, **values} for n, key, values in seen))
-    return f"{len(parts)} recordings are rows of {folder / TABLE}"
+    table = folder / TABLE
+    rows = ({"episode_index": episode, "camera": key, **values} for episode, key, values in seen)
+    with replacing(table) as temporary:
+        pyarrow.write_seen(table, temporary, rows, anew={(episode, key) for episode, key, _ in numbered})
+    return f"{len(parts)} recordings are rows of {table}"
 
 
 def _seen(row: Outcome, out: Path, rate: float) -> dict[str, Any]:
@@ -135,15 +138,15 @@ def _with_log(file: Path, parts: Sequence[tuple[str, Outcome]], out: Path, in_pl
         schemas |= {names["pose"]: "PoseInFrame", names["calibration"]: "CameraCalibration", names["verdict"]: "Log"}
         told += _of_topic(file, topic, row, out, names)
     told.sort(key=lambda each: each[1])
-    if in_place:
-        with replacing(file) as temporary:
-            mcap.write_with_messages(file, temporary, told, schemas)
-            shutil.copymode(file, temporary)
-        return f"{len(parts)} topics of {file} have cameras in topics of that file"
-    target = file.with_name(file.stem + OWN_SUFFIX)
+    target = file if in_place else file.with_name(file.stem + OWN_SUFFIX)
     with replacing(target) as temporary:
-        temporary.write_bytes(mcap.encoded(told, schemas))
-    return f"{len(parts)} topics of {file} have cameras in {target}"
+        if target.exists():
+            mcap.write_with_messages(target, temporary, told, schemas)
+            shutil.copymode(target, temporary)
+        else:
+            temporary.write_bytes(mcap.encoded(told, schemas))
+    where = "topics of that file" if in_place else str(target)
+    return f"{len(parts)} topics of {file} have cameras in {where}"
 
 
 def _of_topic(file: Path, topic: str, row: Outcome, out: Path, names: Mapping[str, str]) -> Iterator[Message]:
