@@ -19,6 +19,7 @@ from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.video_process import MAX_VIDEO_PIXELS
 
 _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes behind it
+_OFF = 0.75  # of a frame: a time may be off by less where the video's rate is not quite the data set's
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -30,7 +31,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
-    """The episode's frames, numbered and timed from its own beginning.
+    """The episode's frames, numbered and timed from its own beginning, also where one before them cannot be decoded.
 
     Raises UnusableDataSet, FileNotFoundError and ValueError where they cannot be had.
     """
@@ -46,13 +47,17 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
 
 
 def _frames(frames: Iterator[Frame | DroppedFrame], found: Film) -> Iterator[Frame | DroppedFrame]:
+    """Each has the number by which the data set knows its time; where it says no rate, that after the one before."""
     stem = printable_name(f"episode_{found.episode:06d}_{found.key}", _LONGEST_STEM)
-    begins_ns = math.inf
+    index, begins_ns = -1, math.inf
     for each in frames:
         if isinstance(each, DroppedFrame):
             yield replace(each, name=f"{stem}_rest")
             continue
-        begins_ns = min(begins_ns, each.stamp_ns)
+        place = each.stamp_ns / 1e9 * found.rate - round(found.from_s * found.rate)
+        index = max(index + 1, math.ceil(place - _OFF))
+        if math.isinf(begins_ns):
+            begins_ns = each.stamp_ns - (round(index / found.rate * 1e9) if found.rate else 0)
         stamp_ns = each.stamp_ns - round(begins_ns)
-        item = renamed(each, each.frame_id, f"{stem}_{each.frame_id:06d}.png", stamp_ns)
+        item = renamed(each, index, f"{stem}_{index:06d}.png", stamp_ns)
         yield replace(item, captured_at=Stamp(stamp_ns, Clock.RECORDING)) if isinstance(item, Frame) else item

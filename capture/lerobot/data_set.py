@@ -19,6 +19,7 @@ from splatnode.capture.process.records import record_in
 VERSION = "v3.0"
 INFO, EPISODES = Path("meta", "info.json"), Path("meta", "episodes")
 _MOST_BYTES = 10_000_000  # of info.json
+_MOST_RATE = 1000  # frames a second, as of a video
 _NUMBER = "episode_index"  # the column
 _NAMED = "episode_"  # before an episode's number, in the name of a part
 
@@ -61,6 +62,7 @@ class Film:
     video: Path
     from_s: float  # in the video
     to_s: float
+    rate: float  # frames a second of the data set, by which it numbers them; 0: it does not say
 
 
 def is_data_set(folder: Path) -> bool:
@@ -113,7 +115,8 @@ def film(folder: Path, part: str) -> Film:
     chunk, file, from_s, to_s = (row.get(name) for name in wanted)
     if chunk is None or file is None or from_s is None or to_s is None or to_s <= from_s:
         raise UnusableDataSet(f"{shown}: episode {number} has no images of {printable(key)}")
-    return Film(number, key, folder / _video(info, key, int(chunk), int(file)), float(from_s), float(to_s))
+    video = folder / _video(info, key, int(chunk), int(file))
+    return Film(number, key, video, float(from_s), float(to_s), info.fps if 0 < info.fps <= _MOST_RATE else 0.0)
 
 
 def episode_and_camera(folder: Path, info: Info, part: str) -> tuple[int, str]:

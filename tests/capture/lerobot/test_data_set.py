@@ -103,6 +103,39 @@ def test_what_lerobot_encodes_is_decoded(tmp_path, codec, monkeypatch):
             frames(folder, f"1/{WRIST}")
 
 
+def numbered(found: list[Any]) -> list[tuple[int, float]]:
+    """The number of each frame, in its name, and its seconds."""
+    assert all(frame.name == f"episode_000001_{TOP}_{frame.frame_id:06d}.png" for frame in found)
+    return [(frame.frame_id, frame.stamp_ns / 1e9) for frame in found]
+
+
+@pytest.mark.parametrize(("lost", "left"), [((1,), [0, 2]), ((0,), [1, 2]), ((0, 1), [2])])
+def test_after_frames_that_cannot_be_decoded_the_numbers_are_the_data_sets(copy, lost, left):
+    av = pytest.importorskip("av", reason="needs PyAV")
+    video = copy / "videos" / TOP / "chunk-000" / "file-000.mp4"
+    with av.open(str(video)) as container:
+        packets = [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+    data = bytearray(video.read_bytes())
+    for pos, size in (packets[4 + index] for index in lost):  # the second episode begins with the fifth frame
+        data[pos : pos + size] = bytes(size)
+    video.write_bytes(data)
+    found = frames(copy, f"1/{TOP}")
+    assert numbered(found) == [(index, index / 10) for index in left]
+    assert np.allclose(reds(found), [80 + 20 * index for index in left], atol=6)
+
+
+@pytest.mark.parametrize("rate", [9.99, 10.01, 10.0, 0.0, 1e300, 5.0])
+def test_a_whole_episode_is_numbered_without_gaps_where_the_rates_differ(tmp_path, monkeypatch, rate):
+    """`rate` is the data set's; the video's, of 10, rounds times to whole frames of its own."""
+    folder = write(tmp_path / "set", [{TOP: levels(0)}, {TOP: levels(0, 0)}], fps=rate)
+    beside = rate if 9 < rate < 11 else 10.0
+    places = [1 + round(index / beside * 10) for index in range(2000)]
+    image = levels(0)[0]
+    decoded = [video_process.VideoFrame(place, 10.0, image) for place in places]
+    monkeypatch.setattr("splatnode.capture.cameras.video.decoded", lambda *_: iter(decoded))
+    assert [number for number, _ in numbered(frames(folder, f"1/{TOP}"))] == list(range(2000))
+
+
 def test_another_version_is_refused_by_its_name(copy):
     info = json.loads((copy / "meta" / "info.json").read_text())
     (copy / "meta" / "info.json").write_text(json.dumps({**info, "codebase_version": "v2.1"}))
