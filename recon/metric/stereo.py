@@ -74,7 +74,7 @@ def by_stereo(
             "points of both must be the same"
         )
     line = _fitted(nearness, across_px, _SHIFT_SIGMA_PX)
-    of_scene = of_cameras([views[each.photograph] for each in pairs])
+    of_scene = of_cameras(list(views.values()))  # all fix the depths of the points, whichever have a partner
     sigma = math.hypot(line.log_sigma, of_scene, sigma_m / baseline_m)
     return Measurement(baseline_m / line.slope, sigma, f"{len(seen)} {name}")
 

@@ -87,6 +87,23 @@ def test_the_scale_is_what_the_baseline_says_within_half_a_percent(stated):
     assert abs(np.log(told.metres_per_unit / (stated * UNIT))) < 1.96 * told.sigma < 0.02
 
 
+def test_how_well_the_scene_is_known_counts_once_whichever_cameras_have_a_partner():
+    """Cameras that stand in one place say as much together as each alone, and a rough scene is rough for one pair."""
+    of_scene = {name: replace(view, bound=0.02) for name, view in known().items()}
+    (first, one), (second, other) = of_scene.items()
+    T_beside = one.T_world_camera.copy()
+    T_beside[:3, 3] += 1e-3
+    beside = replace(one, T_world_camera=T_beside)
+    alone, both = (by_stereo(of_scene, landmarks(), pairs()[:count], BASELINE_M, 0.0) for count in (1, 2))
+    assert isinstance(alone, Measurement) and isinstance(both, Measurement)
+    apart = float(np.linalg.norm(one.centre - other.centre))
+    least = 0.02 * 2**0.5 / 1.96 / apart
+    assert least < alone.sigma < 1.2 * least and both.sigma <= alone.sigma
+    crowded = {first: one, "beside": beside, second: other}
+    told = by_stereo(crowded, landmarks(), pairs()[:1], BASELINE_M, 0.0)
+    assert isinstance(told, Measurement) and told.sigma == pytest.approx(alone.sigma, rel=0.1)
+
+
 def snapshot() -> Snapshot:
     cameras = tuple(
         CameraEstimate(name, index, view.T_world_camera, np.diag([1.0, 1.0, 1.0]), 320, 240)
