@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.geometry import spread
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.viewer.graph import Graph
 
@@ -57,7 +56,8 @@ def same_world(one: Moment, other: Moment) -> bool:
     if len(both) < 2 or one.graph is not None:
         return True
     here, there = np.array(both).swapaxes(0, 1)
-    return bool(np.linalg.norm(here - there, axis=1).max() <= _MOST_MOVED * max(spread(here), spread(there)))
+    spread = max(float(np.linalg.norm(each.std(axis=0))) for each in (here, there))  # RMS distance from their mean
+    return bool(np.linalg.norm(here - there, axis=1).max() <= _MOST_MOVED * spread)
 
 
 def remembered(history: History, moment: Moment, memory_bytes: int = MEMORY_BYTES) -> History:
