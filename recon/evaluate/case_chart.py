@@ -30,7 +30,10 @@ def cases(ends: Sequence[Row]) -> Figure:
             for each in (each for each in found if _name(each) in names):
                 colour = AHEAD if each.lead >= 0 else BEHIND
                 face = "none" if hollow else colour
-                chart.scatter(each.lead, names.index(_name(each)), s=34, edgecolors=colour, facecolors=face, zorder=3)
+                at = names.index(_name(each))
+                chart.scatter(each.lead, at, s=34, edgecolors=colour, facecolors=face, zorder=3)
+                if each.error is not None and not hollow:
+                    chart.errorbar(each.lead, at, xerr=each.error, color=colour, linewidth=1.2, capsize=3, zorder=2)
         chart.axvline(0.0, color=INK, linewidth=1.0)
         chart.set_title(f"{whole[0].measure.name}: lead over the best other", fontsize=10)
         plain(chart)
@@ -38,7 +41,7 @@ def cases(ends: Sequence[Row]) -> Figure:
     axes[0].invert_yaxis()
     figure.suptitle(
         f"{OURS} against the best other method, case by case (right of the line: ours is better; filled: whole held-out"
-        " photographs, hollow: what training photographs show of them)",
+        " photographs, hollow: what training photographs show of them; bars: standard error of both's seeds)",
         x=0.01,
         ha="left",
         color=INK,

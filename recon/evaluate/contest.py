@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import sqrt
+from statistics import variance
 
 from splatnode.recon.config import PRESETS
 from splatnode.recon.evaluate.ablation import is_variant
@@ -36,6 +38,7 @@ class Margin:
     ours: float
     best: float
     by: str
+    error: float | None = None  # standard error of `lead`, as seeds have it; None: one of the two has a single seed
 
     @property
     def lead(self) -> float:
@@ -48,17 +51,25 @@ def margins(ends: Sequence[Row], measure: Measure, ours: str = OURS) -> list[Mar
     found = []
     for scene, views in dict.fromkeys((row.scene, row.views) for row in ends):
         here = [row for row in ends if (row.scene, row.views) == (scene, views)]
-        means = {
-            method: mean([measure.value(row) for row in here if row.method == method])
+        values = {
+            method: [value for row in here if row.method == method and (value := measure.value(row)) is not None]
             for method in dict.fromkeys(row.method for row in here)
         }
+        means = {method: mean(found) for method, found in values.items()}
         others = {m: v for m, v in means.items() if v is not None and m not in PRESETS and not is_variant(m)}
         mine = means.get(ours)
         if mine is None or not others:
             continue
         by = (max if measure.higher_is_better else min)(others, key=lambda method: others[method])
-        found.append(Margin(scene, views, measure, mine, others[by], by))
+        found.append(Margin(scene, views, measure, mine, others[by], by, _error(values[ours], values[by])))
     return found
+
+
+def _error(ours: Sequence[float], others: Sequence[float]) -> float | None:
+    """Seeds of one method have nothing to do with those of another, so the variances of the means add up."""
+    if min(len(ours), len(others)) < 2:
+        return None
+    return sqrt(sum(variance(values) / len(values) for values in (ours, others)))
 
 
 def case_tables(ends: Sequence[Row]) -> list[Table]:

@@ -935,7 +935,8 @@ def test_all_rows_of_a_case_of_the_race_start_from_the_same_cameras():
 def test_the_race():
     lines = race_page.lines()
     assert len(lines) >= 14
-    says(*lines, *race_page.against(), race_page.summary(), race_page.seeds(), race_page.thorough())
+    says(*lines, *race_page.against(), race_page.summary(), race_page.thorough())
+    says(race_page.seeds(), race_page.certain(), race_page.quick())
     says(*race_page.headlines(), on="README.md")
 
 

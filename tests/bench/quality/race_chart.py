@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from statistics import mean, median, stdev
+from math import sqrt
+from statistics import mean, median, variance
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -29,8 +30,8 @@ class Point:
     sets: int
     time: float | None  # over ours; None: nowhere measured
     size: float  # number of Gaussians, over ours
-    lead: float  # of the measure over ours, positive where it is better
-    spread: float | None  # standard deviation of `lead` between seeds; None: of one seed
+    lead: float  # of the measure over ours, positive where it is better; means over seeds are compared
+    spread: float | None  # standard deviation of `lead` were all sets of one seed; None: no set has several
 
 
 _Set = tuple[str, int]  # scene, number of photographs
@@ -63,14 +64,15 @@ def beside(ends: Sequence[Row], measure: Measure, took: Mapping[str, float]) -> 
         if measure.value(row) is not None:
             by_method.setdefault(row.method, {}).setdefault((row.scene, row.views), []).append(row)
     ours = by_method.get(OURS, {})
+    sign = 1.0 if measure.higher_is_better else -1.0
     found = []
     for method, theirs in by_method.items():
         common = {each: rows for each, rows in theirs.items() if each in ours}
         if not common:
             continue
         size = mean(_size(rows) / _size(ours[each]) for each, rows in common.items())
-        leads = _leads(common, ours, measure)
-        spread = stdev(leads) if len(leads) > 1 else None
+        leads = [sign * (_mean(measure, rows) - _mean(measure, ours[each])) for each, rows in common.items()]
+        spread = _spread(measure, common.values())
         found.append(Point(method, len(common), took.get(method), size, mean(leads), spread))
     return found
 
@@ -79,16 +81,14 @@ def _size(rows: Sequence[Row]) -> float:
     return mean(row.num_gaussians or 0 for row in rows)
 
 
-def _leads(theirs: Mapping[_Set, Sequence[Row]], ours: Mapping[_Set, Sequence[Row]], measure: Measure) -> list[float]:
-    """For each seed that all sets have: the mean over them of how much better than our mean over seeds."""
-    sign = 1.0 if measure.higher_is_better else -1.0
-    seeds = set.intersection(*({row.seed for row in rows} for rows in theirs.values()))
-    means = {each: mean(_value(measure, row) for row in ours[each]) for each in theirs}
-    return [
-        sign
-        * mean(_value(measure, row) - means[each] for each, rows in theirs.items() for row in rows if row.seed == s)
-        for s in sorted(seeds)
-    ]
+def _mean(measure: Measure, rows: Sequence[Row]) -> float:
+    return mean(_value(measure, row) for row in rows)
+
+
+def _spread(measure: Measure, sets: Collection[Sequence[Row]]) -> float | None:
+    """Of a mean over sets; a set of one seed counts as varying like the others in the mean."""
+    several = [variance(_value(measure, row) for row in rows) for rows in sets if len(rows) > 1]
+    return sqrt(mean(several) / len(sets)) if several else None
 
 
 def _value(measure: Measure, row: Row) -> float:
@@ -116,7 +116,7 @@ def draw(ends: Sequence[Row]) -> bytes:
     _legend(figure, recipes)
     figure.suptitle(
         f"The race: every method beside {OURS}, in the mean of the sets that both have; up and left is better\n"
-        "Area: number of Gaussians. Bars: standard deviation between three seeds, where a method has them",
+        "Area: number of Gaussians. Bars: standard deviation between seeds of the mean, where a method has several",
         x=0.01,
         ha="left",
         color=INK,

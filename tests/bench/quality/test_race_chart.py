@@ -45,9 +45,16 @@ ROWS = [
 def test_a_point_is_over_the_sets_that_both_have():
     ours, theirs = race_chart.points(ROWS, 6, PSNR)
     assert (ours.method, ours.sets, ours.time, ours.size, ours.lead) == ("balanced", 2, 1.0, 1.0, 0.0)
-    assert ours.spread == pytest.approx(1.0)  # of the means of seeds 0, 1, 2: -1, 0, 1
+    assert ours.spread == pytest.approx(0.5**0.5)  # each of the two sets has 1.0
     assert (theirs.method, theirs.sets, theirs.time, theirs.size) == ("xl", 1, 4.0, 9.0)
     assert theirs.lead == pytest.approx(-0.5) and theirs.spread is None
+
+
+def test_a_set_of_one_seed_counts_as_varying_like_the_others():
+    more = [row("xl", "fox", 22.5, seed=1), row("xl", "fern", 25.0)]
+    theirs = race_chart.points([*ROWS, *more], 6, PSNR)[1]
+    assert theirs.lead == pytest.approx(0.25)  # of 21.5 beside 21, and 25 beside 25
+    assert theirs.spread == pytest.approx(1.0)  # the variance is 2 on fox, and the mean is over two sets
 
 
 def test_less_is_better_where_it_is():

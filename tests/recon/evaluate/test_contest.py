@@ -45,6 +45,15 @@ def test_the_best_other_is_chosen_by_the_measure():
     assert (perceptual.by, perceptual.lead) == ("instantsplat-xl", pytest.approx(-0.02))
 
 
+def test_the_error_of_a_lead_is_that_of_both():
+    (one,) = margins(ROWS, WHOLE[0])
+    (both,) = margins([*ROWS, row("paper", 25.5, seed=1)], WHOLE[0])
+    assert one.error is None  # the best other has one seed
+    assert both.lead == pytest.approx(0.5) and both.error == pytest.approx(
+        0.5**0.5
+    )  # variances of .5, of two seeds each
+
+
 def test_regions_are_compared_where_they_were_measured():
     (shown,) = margins(ROWS, SHOWN[0])
     assert shown.ours == pytest.approx(26.5) and shown.best == pytest.approx(25.5)
@@ -61,5 +70,5 @@ def test_the_table_says_what_is_lost():
 
 def test_the_chart_of_the_cases_is_a_picture():
     case_chart = pytest.importorskip("splatnode.recon.evaluate.case_chart", reason="matplotlib is not installed")
-    assert case_chart.draw(ROWS)["cases.png"].startswith(b"\x89PNG")
+    assert case_chart.draw([*ROWS, row("paper", 25.5, seed=1)])["cases.png"].startswith(b"\x89PNG")
     assert case_chart.draw([r for r in ROWS if r.method == "fast"]) == {}
