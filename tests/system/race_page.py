@@ -66,9 +66,9 @@ def certain() -> str:
     ]
     beyond = sum(abs(lead) > 2 * error for lead, error in known[0])
     return (
-        f"The standard error that seeds leave in these means is {errors[0]} dB, {errors[1]} and {errors[2]}; in "
-        f"{beyond} of the {len(known[0])} cases whose best other has several seeds, too, the lead or the loss in PSNR is "
-        "more than two of its standard errors."
+        f"The standard error that seeds leave in these means is {errors[0]} dB, {errors[1]} and {errors[2]}; "
+        f"in {beyond} of the {len(known[0])} cases whose best other has several seeds, too, the lead or the loss in "
+        "PSNR is more than two of its standard errors."
     )
 
 
@@ -123,10 +123,10 @@ def seeds() -> str:
         f"{median(each):.1f} dB in the median, {max(each):.1f} at most".replace("0.", ".") for each in apart.values()
     ]
     return (
-        f"Of `balanced` it is the mean of three seeds; of MCMC and of a Gaussian a pixel, with our background, of three "
-        f"on {three} sets, of two on {len(others) // 2 - three} and of one on goldcape at 12; the others have one "
-        f"(`race.json`). From seed to seed `balanced` differs by {between[0]}; MCMC by {between[1]}; a Gaussian a pixel "
-        f"by {between[2]}"
+        f"Of `balanced` it is the mean of three seeds; of MCMC and of a Gaussian a pixel, with our background, of "
+        f"three on {three} sets, of two on {len(others) // 2 - three} and of one on goldcape at 12; the others have "
+        f"one (`race.json`). From seed to seed `balanced` differs by {between[0]}; MCMC by {between[1]}; a Gaussian a "
+        f"pixel by {between[2]}"
     )
 
 
