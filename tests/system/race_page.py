@@ -138,8 +138,8 @@ def quick() -> str:
     times = [point.time for method in ("fast", *SEEDED[1:], LARGEST) if (point := beside[method][0]).time]
     mcmc, pixel, largest = (f"{each / times[0]:.1f}" for each in times[1:])
     return (
-        f"Beside the best other in each case, `fast`, of one seed, has {leads[0]} dB, {leads[1]} in SSIM and {leads[2]} "
-        f"in LPIPS in the mean (positive is better). MCMC takes {mcmc} times its time, a Gaussian a pixel {pixel}, "
+        f"Beside the best other in each case, `fast`, of one seed, has {leads[0]} dB, {leads[1]} in SSIM and "
+        f"{leads[2]} in LPIPS in the mean (positive is better). MCMC takes {mcmc} times its time, a Gaussian a pixel {pixel}, "
         f"InstantSplat-XL {largest}"
     )
 
