@@ -139,8 +139,8 @@ def quick() -> str:
     mcmc, pixel, largest = (f"{each / times[0]:.1f}" for each in times[1:])
     return (
         f"Beside the best other in each case, `fast`, of one seed, has {leads[0]} dB, {leads[1]} in SSIM and "
-        f"{leads[2]} in LPIPS in the mean (positive is better). MCMC takes {mcmc} times its time, a Gaussian a pixel {pixel}, "
-        f"InstantSplat-XL {largest}"
+        f"{leads[2]} in LPIPS in the mean (positive is better). MCMC takes {mcmc} times its time, a Gaussian a pixel "
+        f"{pixel}, InstantSplat-XL {largest}"
     )
 
 
