@@ -49,11 +49,13 @@ def same_world(one: Moment, other: Moment) -> bool:
     """
     if one.scene_id != other.scene_id or one.snapshot.scale.metric != other.snapshot.scale.metric:
         return False
+    if one.graph is not None:
+        return True  # a map stays where it is
     known = {camera.name: camera.T_world_camera[:3, 3] for camera in other.snapshot.cameras}
     both = [
         (camera.T_world_camera[:3, 3], known[camera.name]) for camera in one.snapshot.cameras if camera.name in known
     ]
-    if len(both) < 2 or one.graph is not None:
+    if len(both) < 2:
         return True
     here, there = np.array(both).swapaxes(0, 1)
     spread = max(float(np.linalg.norm(each.std(axis=0))) for each in (here, there))  # RMS distance from their mean

@@ -68,7 +68,8 @@ class Session:
     def _follow_state(self) -> None:
         """Another moment may be shown than before, as the person goes through the history."""
         moment = self.moment
-        if moment is not None and self._world is not None and not same_world(self._world, moment):
+        before = self._world
+        if moment is not None and before is not None and moment is not before and not same_world(before, moment):
             self._come_to(moment)
 
     def _come_to(self, shown: Moment) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -173,6 +174,7 @@ def scene_pivot(moment: Moment) -> Array:
     return centre + (float(np.median(ahead)) if len(ahead) else 1.0) * forward
 
 
+@lru_cache(maxsize=1)  # of the moment that is shown: all its pictures ask for it
 def scene_depth(moment: Moment) -> float:
     """How far what the cameras see is from their middle; 1, which it is about, where lengths are no metres."""
     cameras = moment.snapshot.cameras

@@ -175,20 +175,21 @@ class Worker:
         try:
             step()
             if self._wait_s > FIRST_WAIT_S:
-                self.problem = "" if self.problem == self._shortage else self.problem
                 self._wait_s = FIRST_WAIT_S
+                if self.problem == self._shortage:
+                    self.problem = ""
         except Abandoned:
             pass
         except Exception as error:
             log.exception("a step of the reconstruction failed")
-            short = is_shortage(error) or is_of_disk(error)
+            short = is_shortage(error)
+            again = short or is_of_disk(error)
             self.problem = f"{type(error).__name__}: {error}"
-            if short:
-                why = SHORT_OF_MEMORY if is_shortage(error) else f"{error}: make room on the disk"
-                self.problem = self._shortage = f"{why}. What failed is tried again"
             if present:
-                self.place.settled = not short
-            if short:
+                self.place.settled = not again
+            if again:
+                why = SHORT_OF_MEMORY if short else f"{error}: make room on the disk"
+                self.problem = self._shortage = f"{why}. What failed is tried again"
                 self._not_before_s = time.monotonic() + self._wait_s
                 self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
 

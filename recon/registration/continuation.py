@@ -57,7 +57,7 @@ def _grouping(keyframes: Sequence[Keyframe], start: Sequence[RegisteredCamera]) 
         grouping = lenses.group(keyframes, across_sizes)
         lens_of = {(grouping.lens_of[camera.index], camera.lens) for camera in start}
         if len(lens_of) == len({now for now, _ in lens_of}) == len({then for _, then in lens_of}):
-            return grouping if len(lens_of) == len(grouping.longer_sides) else None
+            return grouping if len(lens_of) == len(set(grouping.lens_of)) else None
     return None
 
 

@@ -42,8 +42,8 @@ class Grouping:
     """Frames grouped by lens."""
 
     lens_of: tuple[int, ...]  # of each frame
-    longer_sides: tuple[int, ...]  # of each lens, pixels: that of the largest frame of all
-    scales: tuple[float, ...]  # of each frame: pixels of its lens over its own pixels
+    longer_side: int  # of the largest frame, in whose pixels all lenses are described
+    scales: tuple[float, ...]  # of each frame: these pixels over its own
 
 
 def group(keyframes: Sequence[Keyframe], across_sizes: bool) -> Grouping:
@@ -61,7 +61,7 @@ def group(keyframes: Sequence[Keyframe], across_sizes: bool) -> Grouping:
         lens_of.append(lens)
     sides = [longer_side(keyframe.frame) for keyframe in keyframes]
     largest = max(sides)
-    return Grouping(tuple(lens_of), (largest,) * len(first), tuple(largest / side for side in sides))
+    return Grouping(tuple(lens_of), largest, tuple(largest / side for side in sides))
 
 
 def _may_share(one: Keyframe, other: Keyframe, across_sizes: bool) -> bool:
@@ -87,7 +87,7 @@ def candidates(
 ) -> list[Lens]:
     """For each lens, the focal length that came with its frames, else those that the pairs of its frames vote for."""
     found = []
-    for lens, side in enumerate(grouping.longer_sides):
+    for lens in range(max(grouping.lens_of) + 1):
         members = [i for i, member in enumerate(grouping.lens_of) if member == lens]
         given = keyframes[members[0]].frame.intrinsics
         if given is not None:
@@ -97,7 +97,7 @@ def candidates(
             continue
         inside = [pair for key, pair in pairs.items() if key[0] in members and key[1] in members]
         ratios = focal.vote(inside, _NUM_CANDIDATES)
-        found.append(Lens(tuple(ratio * side for ratio in ratios), config.voted_sigma))
+        found.append(Lens(tuple(ratio * grouping.longer_side for ratio in ratios), config.voted_sigma))
     return found
 
 
@@ -128,7 +128,7 @@ def sizes_disagree(
         log_focals=prior.log_focals[lens_of],
         sigmas=sigmas,
         radial_sigmas=prior.radial_sigmas[lens_of],
-        shift_sigmas=config.free_shift_sigma * np.array(grouping.longer_sides)[lens_of] * (sigmas > 0),
+        shift_sigmas=np.where(sigmas > 0, config.free_shift_sigma * grouping.longer_side, 0.0),
     )
     focals = bundle.adjust(apart, free, loss, fixed_camera).log_focals
     observed = np.bincount(kind_of[estimate.camera_of], minlength=len(kinds)) > 0

@@ -126,7 +126,7 @@ def views_of(keyframes: Sequence[Keyframe], grouping: Grouping) -> list[View]:
         View(
             points=grouping.scales[i] * (keyframe.features.points - principal_point(keyframe.frame)),
             lens=grouping.lens_of[i],
-            longer_side=grouping.longer_sides[grouping.lens_of[i]],
+            longer_side=grouping.longer_side,
         )
         for i, keyframe in enumerate(keyframes)
     ]

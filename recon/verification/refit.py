@@ -108,7 +108,7 @@ def adjusted(start: Fit) -> Fit:
 
 
 def noise_px(of: Fit) -> float:
-    """The standard deviation of one component of an observation's error, pixels of the lens; never 0."""
+    """The standard deviation of one component of an observation's error, pixels of the largest frame; never 0."""
     median = float(np.median(bundle.reprojection_errors(of.problem))) / of.scale
     return of.scale * bundle.noise_px(len(of.problem.pixels), len(of.problem.points), median)
 

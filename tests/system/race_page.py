@@ -43,10 +43,7 @@ def summary() -> str:
     """What is lost, then what is won."""
     whole, shown = ([margins(ends(), measure) for measure in measures] for measures in (WHOLE, SHOWN))
     lost = [_lost(each, digits) for each, digits in zip(whole, DIGITS, strict=True)]
-    means, seen = (
-        [_signed(_mean(each), digits) for each, digits in zip(found, (2, 3, 3), strict=True)]
-        for found in (whole, shown)
-    )
+    means, seen = _leads(whole), _leads(shown)
     sizes = _beside()[LARGEST][0].size
     return (
         f"Of {len(whole[0])} cases that were published, `{OURS}` is behind the best other in PSNR in {lost[0]}, "
@@ -86,6 +83,11 @@ def _beside() -> dict[str, tuple[race_chart.Point, ...]]:
     """By other method: it beside ours, in each measure."""
     by_measure = (race_chart.beside(ends(), measure, race_chart.times(ends())) for measure in WHOLE)
     return {each[0].method: each for each in zip(*by_measure, strict=True) if each[0].method != OURS}
+
+
+def _leads(found: Sequence[Sequence[Margin]]) -> list[str]:
+    """The mean lead in PSNR, SSIM and LPIPS."""
+    return [_signed(_mean(each), digits) for each, digits in zip(found, (2, 3, 3), strict=True)]
 
 
 def _signed(value: float, digits: int) -> str:
@@ -132,8 +134,7 @@ def seeds() -> str:
 
 def quick() -> str:
     """What `fast` wins and loses beside the best other."""
-    found = [margins(ends(), measure, "fast") for measure in WHOLE]
-    leads = [_signed(_mean(each), digits) for each, digits in zip(found, (2, 3, 3), strict=True)]
+    leads = _leads([margins(ends(), measure, "fast") for measure in WHOLE])
     beside = _beside()
     times = [point.time for method in ("fast", *SEEDED[1:], LARGEST) if (point := beside[method][0]).time]
     mcmc, pixel, largest = (f"{each / times[0]:.1f}" for each in times[1:])
@@ -147,7 +148,7 @@ def quick() -> str:
 def thorough() -> str:
     """What `quality` wins and loses beside the best other."""
     found = [margins(ends(), measure, "quality") for measure in WHOLE]
-    leads = [_signed(_mean(each), digits) for each, digits in zip(found, (2, 3, 3), strict=True)]
+    leads = _leads(found)
     ahead = [sum(margin.lead >= 0 for margin in each) for each in found]
     ratio = exp(sum(log(margin.ours / margin.best) for margin in found[2]) / len(found[2])) - 1
     percent = round(100 * abs(ratio))

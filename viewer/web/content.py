@@ -91,13 +91,14 @@ def _told(content: Content) -> dict[str, Any]:
     moment = content.moment
     snapshot = moment.snapshot
     start = overview(moment, (content.advice.arrow if content.advice else None) or ())
+    depth = frustum_depth(moment)
     return {
         "scene": moment.scene_id,
         "num_gaussians": len(snapshot.gaussians),
         "up": start.up.tolist(),
         "pivot": scene_pivot(moment).tolist(),
         "overview": _viewpoint(start),
-        "frustum_depth": frustum_depth(moment),
+        "frustum_depth": depth,
         "cameras": [
             {
                 "name": printable(camera.name),
@@ -105,7 +106,7 @@ def _told(content: Content) -> dict[str, Any]:
                 "T_world_camera": camera.T_world_camera.ravel().tolist(),
                 "K": camera.K.ravel().tolist(),
                 "size": [camera.width, camera.height],
-                "corners": image_corners(camera, camera.T_world_camera, frustum_depth(moment)).tolist(),
+                "corners": image_corners(camera, camera.T_world_camera, depth).tolist(),
                 "photograph": camera.name in snapshot.images,
             }
             for index, camera in enumerate(snapshot.cameras)
