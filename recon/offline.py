@@ -40,10 +40,18 @@ class Reconstructed:
         """
         files = self.source.files() if self.snapshot.verdict.publishable else {}
         lie_in = self.source.photographs or (out / IMAGES if files else None)
-        told: dict[str, object] = {"photographs": None if lie_in is None else str(lie_in.resolve())}
+        told: dict[str, object] = {"photographs": None if lie_in is None else _in_json(lie_in.resolve())}
         if self.source.choice is not None:
             told["selection"] = self.source.choice.record()
         return finish(self.snapshot, out, seed=self.seed, preset_name=self.preset, photographs=files, told=told)
+
+
+def _in_json(folder: Path) -> str | None:
+    """The folder's path; None where it is no text, as Linux allows, which no JSON file can hold."""
+    try:
+        return folder.as_posix().encode().decode()
+    except UnicodeEncodeError:
+        return None
 
 
 def shown_to_nobody(_: Snapshot) -> None:
@@ -102,7 +110,10 @@ def check_baseline(config: Config, source: Source) -> None:
             f"Measure between two of these, or use all {source.choice.what}s (--every-frame)"
         )
     if missing:
-        raise ValueError(f"the baseline's photograph {missing[0]!r} is not there; there are: {', '.join(names)}")
+        raise ValueError(
+            f"the baseline's photograph {missing[0]!r} is not among those that are used: {', '.join(names)}. "
+            "Measure between two of these, or have it used, too"
+        )
 
 
 def with_looks(config: Config, every: int) -> Config:

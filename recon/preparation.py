@@ -8,9 +8,9 @@ from dataclasses import replace
 import msgspec
 
 from splatnode.capture.frame import Frame
+from splatnode.capture.lenses.undistort import undistorted
 from splatnode.recon.config import Config
 from splatnode.recon.frames.keyframe import Features, Keyframe, modelled_image
-from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.matching import features
 from splatnode.recon.priors.prior import Prior
 from splatnode.recon.rasterize.device import chosen, in_words

@@ -99,7 +99,7 @@ def time_line(state: State, history: History) -> str:
 def feed_line(age_s: float | None, final: bool) -> str:
     """How the connection is; `age_s` is None for a result on disk, infinite before anything came."""
     if age_s is None:
-        return "a finished result"
+        return "a finished result" if final else "a result that was not final"
     if age_s == float("inf"):
         return "waiting for splatnode recon: nothing has come yet"
     if final:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.lenses.undistort import without_distortion
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.preview import decode_preview
 from splatnode.capture.process.logs import event
@@ -18,7 +19,6 @@ from splatnode.capture.stamp import Stamp
 from splatnode.recon.daemon.previews import Previews
 from splatnode.recon.daemon.tracking import Config, Motion, Tracker, landmarks
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.frames.undistort import without_distortion
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 
 log = logging.getLogger(__name__)

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.recon.frames.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistorted
 from splatnode.recon.result.snapshot import CameraEstimate
 
 Image = npt.NDArray[np.uint8]

@@ -1,1 +1,1 @@
-"""Single frames: keyframes with their features, screening, given distortion removed, black borders."""
+"""Single frames: keyframes with their features, screening, black borders."""

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.lenses.undistort import undistorted
 from splatnode.recon.frames.keyframe import Features, longer_side, principal_point
-from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.geometry import spread
 from splatnode.recon.locating import candidates, checks, claims, posing
 from splatnode.recon.locating.camera_model import CameraModel, Lens

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from splatnode.capture.calibration.board import DICTIONARIES
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.recon.frames.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistorted
 from splatnode.recon.metric.marker_fit import Corners, fitted
 
 _LEAST_SIDE_PX = 12.0  # of a marker: two pixels a bit

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from splatnode.capture.process.printable import LONGEST_TEXT
 from splatnode.recon.geometry import Similarity
 from splatnode.recon.metric.config import Config
 from splatnode.recon.metric.distances import by_distance
@@ -22,8 +23,11 @@ from splatnode.recon.metric.views import views_of
 from splatnode.recon.networks.depth_anything import load_metric
 from splatnode.recon.result.bounds_in_words import rounded_up
 from splatnode.recon.result.placement import Placement
-from splatnode.recon.result.scale import Scale
+from splatnode.recon.result.scale import Scale, sentences
 from splatnode.recon.result.snapshot import Snapshot
+
+# Of the scene's size: a grid as coarse as its coordinates may be. A render then has 40 dB against the same elsewhere.
+MOST_STEP = 1e-3
 
 
 def in_metres(snapshot: Snapshot, config: Config, evidence: Evidence = NOTHING) -> Snapshot:
@@ -44,11 +48,12 @@ def _in_metres(snapshot: Snapshot, config: Config, evidence: Evidence) -> Snapsh
         return snapshot
     measurements = [each for each in said if isinstance(each, Measurement)]
     silent = [each for each in said if isinstance(each, str)]
-    agreed = together(measurements) if measurements else "; ".join(silent)
+    agreed = together(measurements) if measurements else sentences(silent)
     if isinstance(agreed, str):
         return replace(snapshot, scale=Scale(False, agreed))
     low, high = agreed.interval_95
-    source = "; ".join([f"{agreed.source}, known to {rounded_up(100 * (high - 1.0))} %", *silent])
+    known = sentences([each.source for each in measurements], LONGEST_TEXT // 2)
+    source = sentences([f"{known}, known to {rounded_up(100 * (high - 1.0))} %", *silent])
     unit = agreed.metres_per_unit
     to_metres = Similarity(unit, np.eye(3), np.zeros(3)) if aligned is None else aligned.placed(unit)
     metric = _placed(snapshot, to_metres)
@@ -70,6 +75,8 @@ def _said(snapshot: Snapshot, config: Config, evidence: Evidence) -> tuple[list[
         sigmas = Sigmas(config.poses_sigma_m, config.poses_sigma_deg, config.poses_drift)
         own = {name: (pose.sigma_m, pose.sigma_deg) for name, pose in tracked.items()}
         found = by_poses(views_of(snapshot), poses, sigmas, own)
+        if isinstance(found, Aligned) and (offset := _too_far(snapshot, found)):
+            found = offset
         aligned = None if isinstance(found, str) else found
         said += [found] if isinstance(found, str) else [found.unit, *found.told]
     said += by_motions(views_of(snapshot), evidence.motions, config.motions_shared)
@@ -78,6 +85,26 @@ def _said(snapshot: Snapshot, config: Config, evidence: Evidence) -> tuple[list[
     if config.network:
         said.append(_by_the_network(snapshot, config.network_sigma))
     return said, aligned
+
+
+def _too_far(snapshot: Snapshot, aligned: Aligned) -> str:
+    """Why the world of the poses cannot be the scene's: its origin is too far away, as in a map of a country.
+
+    Empty where it can. A coordinate of a Gaussian has 24 bits: so far out the scene would stand on a coarse grid.
+    """
+    to_world = aligned.placed(aligned.unit.metres_per_unit)
+    farthest = float(np.abs(to_world(aligned.centre)).max())
+    means = snapshot.gaussians.means
+    if not len(means):
+        return ""
+    size = aligned.unit.metres_per_unit * float(np.median(np.linalg.norm(means - aligned.centre, axis=1)))
+    step = float(np.spacing(np.float32(farthest)))
+    if step <= MOST_STEP * size:
+        return ""
+    return (
+        f"the given poses lie {farthest:.3g} m from their origin, where 32-bit numbers are {step:.2g} m apart: too "
+        "coarse for this scene. Subtract one position, as the first, from all of them"
+    )
 
 
 def _rigs(config: Config, evidence: Evidence) -> dict[tuple[float, float], list[Pair]]:

@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, reduced
+from splatnode.capture.lenses.undistort import undistorted
 from splatnode.capture.right_image import Baseline, grey, partners
-from splatnode.recon.frames.undistort import undistorted
 
 Grey = npt.NDArray[np.uint8]  # (H, W)
 

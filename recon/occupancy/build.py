@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +17,7 @@ from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import SURE
 
 UNSURE_DEG = 3.0  # standard deviation of up by gravity, beyond which the floor tells it better
+MOST_SAMPLED = 4_000_000  # surface points by which the map is laid out and its floor found; about 80 photographs
 LEAST_KNOWN = 0.01  # of the pixels: with fewer confirmed depths there is no map
 
 
@@ -40,8 +41,7 @@ def occupancy_map(
     a second, and may raise to abandon the work. Raises NoMap, and ValueError for arguments that cannot be used.
     """
     seen = _sights(snapshot)
-    points = np.concatenate([sight.points for sight in seen]).astype(np.float64)
-    unit = float(np.median(np.concatenate([sight.depth[sight.depth > 0] for sight in seen])))
+    points, unit = _sample(seen)
     told, how = _up(snapshot) if up is None else (up, "given")
     frame = upright([camera.T_world_camera for camera in snapshot.cameras], points, told, unit, how)
     T = frame.T_world_map
@@ -51,9 +51,15 @@ def occupancy_map(
     for sight in seen:
         states[passed(sight, layout, T, pause)] = State.FREE
     pause()
-    ends = np.concatenate([blurred(sight) for sight in seen])
-    states[surfaces(_in_map(ends, T), layout)] = State.OCCUPIED
+    states[surfaces((_in_map(blurred(sight), T) for sight in seen), layout)] = State.OCCUPIED
     return OccupancyMap(states, layout.voxel, layout.origin, frame, snapshot.scale)
+
+
+def _sample(seen: Sequence[Sight]) -> tuple[npt.NDArray[np.float64], float]:
+    """World points (M, 3) of what was seen, all or evenly MOST_SAMPLED of them, and their median depth."""
+    each = -(-sum(int(np.count_nonzero(sight.depth)) for sight in seen) // MOST_SAMPLED)
+    depths = np.concatenate([sight.depth[sight.depth > 0][::each] for sight in seen])
+    return np.concatenate([sight.points[::each] for sight in seen]), float(np.median(depths))
 
 
 def _up(snapshot: Snapshot) -> tuple[npt.NDArray[np.float64] | None, str]:

@@ -12,11 +12,10 @@ from splatnode.capture.process.progress import waiting
 from splatnode.capture.process.terminal import say
 from splatnode.recon.occupancy.build import occupancy_map
 from splatnode.recon.result.depth_file import read_depths
+from splatnode.recon.result.export.manifest import MAPS
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.stored_snapshot import read_result
 from splatnode.recon.result.whole import is_whole
-
-FOLDER = "occupancy"  # in the result's, where no other is given
 
 
 def map_result(args: argparse.Namespace) -> int:
@@ -24,7 +23,7 @@ def map_result(args: argparse.Namespace) -> int:
     snapshot = read_to_map(args.result)
     with waiting("looking through the place"):
         made = occupancy_map(snapshot, args.voxel, None if args.up is None else np.array(args.up))
-        written = made.save(args.out or args.result / FOLDER, args.band)
+        written = made.save(args.out or args.result / MAPS, args.band)
     x, y, z = made.states.shape
     shares = ", ".join(f"{100 * share:.1f} % {name.replace('_', ' ')}" for name, share in made.shares.items())
     say(f"{x} x {y} x {z} voxels of {made.voxel:.3g}, {made.scale.sentence}: {shares}")

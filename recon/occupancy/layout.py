@@ -37,6 +37,7 @@ def laid_out(points: Array, centres: Array, unit: float, metric: bool, voxel: fl
     low, high = (np.percentile(points, percent, axis=0) for percent in (_OUTLIERS, 100.0 - _OUTLIERS))
     low, high = np.minimum(low, centres.min(0)), np.maximum(high, centres.max(0))
     if voxel is not None:
+        voxel = float(voxel)  # files write it as Python does: NumPy's own numbers look otherwise
         if not (np.isfinite(voxel) and voxel > 0):
             raise ValueError(f"a voxel must have a side above 0, got {voxel!r}")
         if _count(low, high, voxel) > MOST_VOXELS or (high - low).max() / voxel > LONGEST_SIDE:

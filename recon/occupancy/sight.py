@@ -26,14 +26,14 @@ class Sight:
     error: float = DEPTH_ERROR  # of a depth, relative: its own, and what the camera's bounds let it be off
 
     @property
-    def points(self) -> Float32:
+    def points(self) -> npt.NDArray[np.float64]:
         """(M, 3) world points of the pixels with a depth."""
         rows, columns = np.nonzero(self.depth)
         z = self.depth[rows, columns]
         x = (columns + 0.5 - self.K[0, 2]) / self.K[0, 0] * z
         y = (rows + 0.5 - self.K[1, 2]) / self.K[1, 1] * z
         in_camera = np.stack([x, y, z], 1)
-        return (in_camera @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]).astype(np.float32)
+        return in_camera @ self.T_world_camera[:3, :3].T + self.T_world_camera[:3, 3]
 
 
 def sights(cameras: Sequence[CameraEstimate], depths: Mapping[str, npt.NDArray[np.float16]]) -> list[Sight]:

@@ -16,8 +16,8 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import opencv
+from splatnode.capture.lenses.undistort import undistorted
 from splatnode.recon.frames.keyframe import Features, Keyframe, modelled_image, modelled_mask
-from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.geometry import distortion
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.lenses import LEAST_SHIFT

@@ -52,8 +52,6 @@ def read_result(place: Path) -> tuple[Snapshot, list[Path]]:
     report = report or _Report(Verdict(Code.OK, "A scene from a file, without a report.", "", publishable=True))
     gaussians = _gaussians(scene) if scene.is_file() else GaussianArrays.empty()
     cameras = read_cameras(folder / "cameras.json") if (folder / "cameras.json").is_file() else ()
-    beside = [folder / "images", folder / "capture" / "images"]
-    reported = [] if report.photographs is None else [Path(report.photographs)]
     snapshot = Snapshot(
         sequence=0,
         verdict=report.verdict,
@@ -63,12 +61,22 @@ def read_result(place: Path) -> tuple[Snapshot, list[Path]]:
         dropped=report.frames_dropped,
         iterations=report.iterations,
         seconds=report.seconds,
-        final=True,
+        final=not report.verdict.provisional,
         scale=StoredResult(scene).scale(),
         up=report.up,
         scenes=tuple(each.scene for each in report.scenes),
     )
-    return snapshot, reported + beside
+    return snapshot, _folders(folder, report)
+
+
+def photograph_folders(folder: Path) -> list[Path]:
+    """Where the photographs of the result in `folder` may be. Raises SceneFileError, OSError."""
+    return _folders(folder, _report(folder / "report.json"))
+
+
+def _folders(folder: Path, report: _Report | None) -> list[Path]:
+    reported = [] if report is None or report.photographs is None else [Path(report.photographs)]
+    return [*reported, folder / "images", folder / "capture" / "images"]
 
 
 def _gaussians(scene: Path) -> GaussianArrays:
@@ -100,7 +108,7 @@ class _Report(msgspec.Struct, frozen=True):
     scenes: tuple[_Scene, ...] = ()
 
     def texts(self) -> list[str]:
-        """All that it says, which is shown."""
+        """All that it says, which is shown; where its photographs lie is not."""
         verdict = self.verdict
         dropped = [text for frame in self.frames_dropped for text in (frame.name, frame.reason)]
         return [
@@ -110,7 +118,6 @@ class _Report(msgspec.Struct, frozen=True):
             *dropped,
             *self.seconds,
             *(each.scene for each in self.scenes),
-            self.photographs or "",
             self.up.source if self.up else "",
         ]
 

@@ -153,7 +153,7 @@ def test_a_result_can_be_pickled(result, tmp_path):
         ({"views": 1.5}, ValueError, "views must be a whole number"),
         ({"views": 9}, ValueError, "9 views are asked for: there are 2 photographs"),
         ({"scale": (0, 1)}, TypeError, "scale must be two photographs and the metres"),
-        ({"scale": (0, 7, 0.5)}, ValueError, "photograph '0007.png' is not there; there are: 0000.png, 0001.png"),
+        ({"scale": (0, 7, 0.5)}, ValueError, "photograph '0007.png' is not among those that are used: 0000.png"),
         ({"scale": (0.5, 1, 0.5)}, TypeError, "name photographs by their files, or pictures by their places"),
         ({"intrinsics": np.eye(4)}, TypeError, r"Intrinsics or a matrix K \(3, 3\), got \(4, 4\)"),
         ({"intrinsics": np.zeros((3, 3))}, ValueError, "focal lengths above 0"),

@@ -102,6 +102,20 @@ def test_what_was_saved_can_be_loaded_and_saved_again(result, tmp_path):
     assert sorted(path.name for path in (saved / "images").iterdir()) == [camera.name for camera in result.cameras]
 
 
+@pytest.mark.parametrize("name", ["\u00c9t\u00e9\u00a02024", "\u0639\u06a9\u0633\u200c\u0647\u0627", "\udcff"])
+def test_a_result_whose_photographs_lie_under_any_name_can_be_read(result, tmp_path, name):
+    again = splatnode.load(result.save(tmp_path / name))
+    assert again.verdict == result.verdict and len(again.cameras) == len(result.cameras)
+
+
+def test_a_draft_of_a_node_is_not_final_when_it_is_read(result, tmp_path):
+    saved = result.save(tmp_path / "a")
+    report = json.loads((saved / "report.json").read_text())
+    report["verdict"]["provisional"] = True
+    (saved / "report.json").write_text(json.dumps(report))
+    assert not splatnode.load(saved).final
+
+
 def test_a_refusal_replaces_what_a_scene_left(result, arrays, tmp_path):
     saved = result.save(tmp_path / "a")
     splatnode.reconstruct(arrays[:1]).save(saved)

@@ -14,13 +14,13 @@ from splatnode.capture.cameras.folder import Config, stream
 from splatnode.capture.exif import exif_exposure, read_tags
 from splatnode.capture.exposure_settings import ExposureSettings, as_told
 from splatnode.capture.frame import Frame, Intrinsics, renamed
+from splatnode.capture.lenses.undistort import undistorted
 from splatnode.capture.masks import masked
 from splatnode.capture.messaging.keyframe_messages import FrameHeader, received, to_message
 from splatnode.capture.messaging.spool import Key
 from splatnode.capture.messaging.wire import Limits, Numbering, WireError, decode, encode
 from splatnode.capture.recording import INDEX, Recorder, read
 from splatnode.recon.daemon.checkpoint.stored_frame import file_name, read_frame, write_frame
-from splatnode.recon.frames.undistort import undistorted
 from tests.capture.cameras.test_folder import encoded, tiff, with_exif
 
 TOLD = ExposureSettings(0.008, 400.0, 2.0)

@@ -9,8 +9,8 @@ import numpy as np
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.lenses.undistort import without_distortion
 from splatnode.recon.config import overlaid, preset
-from splatnode.recon.frames.undistort import without_distortion
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.offline import run
 from splatnode.recon.result.preview import render_rgb

@@ -34,7 +34,7 @@ def photographs(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (["--out", "new", "--baseline", "a.png", "c.png", "0.5"], 2, "'c.png' is not there; there are: a.png, b.png"),
+        (["--out", "new", "--baseline", "a.png", "c.png", "0.5"], 2, "'c.png' is not among those that are used: a.png"),
         (["--out", "new", "--baseline", "a.png", "b.png", "far"], 2, "a distance in metres, got 'far'"),
         (["--out", "new", "--stereo", "photographs"], 2, "--stereo and --stereo-baseline belong together"),
         (["--out", "new", "--stereo", "gone", "--stereo-baseline", "75mm"], 2, "'gone' is not there"),

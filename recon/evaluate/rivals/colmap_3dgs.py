@@ -16,11 +16,11 @@ import numpy as np
 import torch
 
 from splatnode.capture.frame import Frame
+from splatnode.capture.lenses.undistort import undistorted
 from splatnode.recon.clock import Clock
 from splatnode.recon.evaluate.rivals import outcome
 from splatnode.recon.evaluate.rivals.colmap import Model, RegisteredFrame, sparse_model
 from splatnode.recon.frames.keyframe import modelled_image
-from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.optimize import dropout, refinement
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import ControlChoice

@@ -8,11 +8,11 @@ from dataclasses import replace
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Intrinsics
+from splatnode.capture.lenses.wide_pinhole import wide_pinhole
 from splatnode.recon.evaluate.stability import warps
 from splatnode.recon.evaluate.stability.case import Case, accepted, either, refused, row
 from splatnode.recon.evaluate.stability.places import Photo, Sampler
 from splatnode.recon.evaluate.truth import TrueCamera
-from splatnode.recon.frames.wide_pinhole import wide_pinhole
 from splatnode.recon.result.verdict import Code
 
 _SIDES = 640, 480  # pixels, of photographs through a fisheye

@@ -108,7 +108,7 @@ class _Camera(msgspec.Struct, frozen=True):
 class _File(msgspec.Struct, frozen=True):
     cameras: Annotated[tuple[_Camera, ...], msgspec.Meta(max_length=MAX_CAMERAS)]
     scale: Text | None = None
-    scale_source: Text | None = None
+    scale_source: str | None = None
     scale_interval_95: tuple[Low, High] | None = None
 
 
@@ -128,7 +128,8 @@ def decode_scale(data: bytes, name: str = "cameras.json") -> Scale:
     """The scale that a cameras.json of ours states. Raises SceneFileError."""
     with foreign(SceneFileError, name):
         parsed = _parsed(data, name)
-        return Scale(parsed.scale == "metric", parsed.scale_source, parsed.scale_interval_95)
+        source = parsed.scale_source and printable(parsed.scale_source)
+        return Scale(parsed.scale == "metric", source, parsed.scale_interval_95)
 
 
 def _parsed(data: bytes, name: str) -> _File:
@@ -138,7 +139,7 @@ def _parsed(data: bytes, name: str) -> _File:
         parsed = record_in(data, _File)
     except msgspec.MsgspecError as error:
         raise SceneFileError(f"{name} is not a cameras.json of splatnode, or is damaged: {error}") from error
-    if not is_printable(parsed.scale_source or ""):
+    if not (parsed.scale_source or "").isprintable():
         raise SceneFileError(f"{name}: scale_source must be printable text")
     return parsed
 

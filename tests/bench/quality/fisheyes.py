@@ -20,13 +20,13 @@ from pathlib import Path
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
+from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.lenses.wide_pinhole import wide_pinhole
 from splatnode.recon.config import preset
 from splatnode.recon.evaluate.perceptual import Networks
 from splatnode.recon.evaluate.protocol import Settings
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.truth import load_scene
-from splatnode.recon.frames.undistort import undistorted
-from splatnode.recon.frames.wide_pinhole import wide_pinhole
 from splatnode.recon.offline import run
 from splatnode.recon.result.export.cameras import encode_cameras
 from splatnode.recon.result.export.staged import write_file, write_files

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.lenses.undistort import undistorted
 from splatnode.recon.evaluate.metrics import psnr
 from splatnode.recon.evaluate.protocol import Run, evaluate
 from splatnode.recon.evaluate.same_lens import mean_intrinsics
@@ -22,7 +23,6 @@ from splatnode.recon.evaluate.stability.warps import distorted
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.frames import border
-from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.rasterize.cpu import rasterize
 from splatnode.recon.result.export import write_result
 from splatnode.recon.result.export.cameras import encode_cameras

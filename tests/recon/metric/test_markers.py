@@ -12,7 +12,7 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.lenses.lens import project
-from splatnode.recon.frames.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistorted
 from splatnode.recon.metric.config import Baseline, Config
 from splatnode.recon.metric.evidence import Evidence, gathered
 from splatnode.recon.metric.marker_detection import Sighting, sightings

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -25,6 +26,7 @@ from splatnode.recon.result.export.formats.ply import decode as decode_ply
 from splatnode.recon.result.rendering import render_arrays
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
+from splatnode.recon.result.stored_snapshot import read_result
 from splatnode.recon.result.write import finish
 from tests.recon.result.test_preview import snapshot as ball_snapshot
 
@@ -120,6 +122,26 @@ def test_a_distance_that_says_nothing_does_not_take_the_metres_of_another(seen):
     lost = (Baseline("a.jpg", "z.jpg", 2.0),)
     told = in_metres(seen, Config(baseline=Baseline("a.jpg", "b.jpg", 2.0), further_baselines=lost))
     assert told.scale.metric and "z.jpg is not among" in (told.scale.source or "")
+
+
+def test_many_sources_are_told_as_far_as_files_have_room(seen, tmp_path):
+    lost = tuple(Baseline("a.jpg", f"a photograph that is not there, number {i}.jpg", 2.0) for i in range(30))
+    metric = in_metres(seen, Config(baseline=Baseline("a.jpg", "b.jpg", 2.0), further_baselines=lost))
+    told = metric.scale.source or ""
+    assert told.startswith("2 m between a.jpg and b.jpg, known to 2.5 %; ") and re.search(r"; and \d+ more$", told)
+    finish(metric, tmp_path, seed=0, preset_name="fast")
+    assert read_result(tmp_path)[0].scale == metric.scale
+    silent = in_metres(seen, Config(baseline=lost[0], further_baselines=lost[1:]))
+    assert not silent.scale.metric and len(silent.scale.source or "") <= 1000
+    agreeing = tuple(Baseline("a.jpg", "b.jpg", 2.0) for _ in range(60))
+    known = in_metres(seen, Config(baseline=agreeing[0], further_baselines=agreeing[1:])).scale.source or ""
+    assert len(known) <= 1000 and "more, known to" in known
+
+
+def test_a_longer_sentence_of_an_earlier_version_is_cut(seen, tmp_path):
+    finish(seen, tmp_path, seed=0, preset_name="fast")
+    cameras = json.loads((tmp_path / "cameras.json").read_text()) | {"scale_source": "x" * 2000}
+    assert decode_scale(json.dumps(cameras).encode()).source == "x" * 999 + "…"
 
 
 def test_every_file_says_which_scale_it_has(seen, tmp_path):

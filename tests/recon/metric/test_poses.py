@@ -86,6 +86,20 @@ def test_poses_that_came_with_photographs_count_and_those_that_are_given_replace
     assert gathered(frames, Config()).tracked == {NAMES[0]: tracked[NAMES[0]]}
 
 
+def test_poses_of_a_country_s_map_are_not_the_world_and_the_scene_says_why():
+    """So far from its origin coordinates of 32 bits are half a metre apart."""
+    here = {name: T.copy() for name, T in zip(NAMES, TRUE, strict=True)}
+    for T in here.values():
+        T[:3, 3] += [448_262.0, 5_411_932.0, 320.0]
+    told = in_metres(scene(), Config(), Evidence(poses=here))
+    assert not told.scale.metric and "Subtract one position" in (told.scale.source or "")
+    np.testing.assert_array_equal(told.gaussians.means, scene().gaussians.means)
+    first = here[NAMES[0]][:3, 3].copy()
+    for T in here.values():
+        T[:3, 3] -= first
+    assert in_metres(scene(), Config(), Evidence(poses=here)).scale.metric
+
+
 def test_odometry_that_drifts_by_2_percent_gives_metres_within_2_percent():
     held = 0
     for seed in range(40):

@@ -13,7 +13,7 @@ import pytest
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
-from splatnode.recon.frames.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistorted
 from splatnode.recon.metric.config import Config
 from splatnode.recon.metric.evidence import Evidence, gathered
 from splatnode.recon.metric.measurement import Measurement

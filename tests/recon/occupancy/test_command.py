@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from splatnode import command_line
+from splatnode.recon.occupancy.build import occupancy_map
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.result.write import finish
 from tests.support.exported import make_snapshot
 from tests.support.occupied import room_snapshot
 
-ALWAYS = {"occupancy.npz", "occupancy.bt", "collision.ply", "collision.glb"}
+ALWAYS = {"occupancy.npz", "occupancy.bt", "collision.ply", "collision.glb", "map.json"}
 
 
 @pytest.fixture(scope="module")
@@ -53,6 +54,24 @@ def test_of_a_result_that_is_not_sure_there_is_none(tmp_path, capsys, snapshot, 
     finish(snapshot, tmp_path, seed=0, preset_name="fast")
     assert command_line.main(["map", str(tmp_path)]) == code
     assert said in capsys.readouterr().err and not (tmp_path / "occupancy").exists()
+
+
+def test_a_map_of_an_earlier_band_or_result_does_not_stay(tmp_path, capsys):
+    finish(room_snapshot(), tmp_path, seed=0, preset_name="fast")
+    folder = tmp_path / "occupancy"
+    assert command_line.main(["map", str(tmp_path), "--band", "0.1", "0.5"]) == 0
+    assert command_line.main(["map", str(tmp_path), "--voxel", "0.1"]) == 0
+    assert {path.name for path in folder.iterdir()} == ALWAYS
+    (folder / "mine.txt").write_text("somebody else's")
+    (folder / "collision.ply").write_text("changed by hand")
+    finish(make_snapshot(Code.NO_OVERLAP, False), tmp_path, seed=0, preset_name="fast")
+    assert {path.name for path in folder.iterdir()} == {"mine.txt", "collision.ply"}
+
+
+def test_a_voxel_of_numpy_is_written_as_a_number(tmp_path):
+    occupancy_map(room_snapshot(), np.float64(0.05)).save(tmp_path, (0.1, 0.5))
+    assert "resolution: 0.05\n" in (tmp_path / "map.yaml").read_text()
+    assert b"\nres 0.05\n" in (tmp_path / "occupancy.bt").read_bytes()
 
 
 @pytest.mark.parametrize("arguments", [["--band", "0.5", "0.1"], ["--band", "-9", "0.1"], ["--voxel", "1e-6"]])

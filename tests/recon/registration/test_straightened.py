@@ -9,8 +9,8 @@ import pytest
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import opencv
+from splatnode.capture.lenses.undistort import undistorted
 from splatnode.recon.frames.keyframe import Features, Keyframe
-from splatnode.recon.frames.undistort import undistorted
 from splatnode.recon.matching import config as matching
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.register import Registration

@@ -75,7 +75,7 @@ def _text(
         for image in images
         for line in (f"{image.image_id} {number_row(image.motion)} {image.camera_id} {image.name}", "")
     ]
-    point_lines = [f"{i} {x:.6g} {y:.6g} {z:.6g} {r} {g} {b} 0" for i, x, y, z, r, g, b in points]
+    point_lines = [f"{i} {x:.9g} {y:.9g} {z:.9g} {r} {g} {b} 0" for i, x, y, z, r, g, b in points]
     return {
         "cameras.txt": text_file("CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]", camera_lines, scale),
         "images.txt": text_file("IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", image_lines, scale),

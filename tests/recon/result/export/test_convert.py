@@ -32,7 +32,7 @@ def test_result_is_exported_as_cameras(tmp_path):
 def test_export_of_what_is_not_there(tmp_path):
     with pytest.raises(FileNotFoundError, match="splatnode replay"):
         export_scene(tmp_path, "ply", tmp_path / "x.ply")
-    with pytest.raises(ValueError, match="one of colmap, mcap, nerfstudio"):
+    with pytest.raises(ValueError, match="one of colmap, dataset, mcap, nerfstudio"):
         export_scene(tmp_path, "obj", tmp_path / "x.obj")
     (tmp_path / "scene.txt").write_text("text")
     with pytest.raises(SceneFileError, match="must end with"):

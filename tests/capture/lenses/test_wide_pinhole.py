@@ -7,8 +7,8 @@ import pytest
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses.lens import project, unproject
-from splatnode.recon.frames.undistort import undistorted
-from splatnode.recon.frames.wide_pinhole import MOST_DEG
+from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.lenses.wide_pinhole import MOST_DEG
 
 WIDTH, HEIGHT = 640, 480
 

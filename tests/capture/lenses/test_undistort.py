@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import Frame, Intrinsics
-from splatnode.recon.frames.undistort import undistorted
+from splatnode.capture.lenses.undistort import undistorted
 
 WIDTH, HEIGHT = 320, 240
 

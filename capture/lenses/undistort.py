@@ -11,9 +11,9 @@ import numpy.typing as npt
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import opencv
 from splatnode.capture.lenses.lens import project
+from splatnode.capture.lenses.wide_pinhole import wide_pinhole
 from splatnode.capture.masks import Mask, filled
 from splatnode.capture.right_image import RightImage, grey
-from splatnode.recon.frames.wide_pinhole import wide_pinhole
 
 Array = npt.NDArray[np.float64]
 

@@ -1,0 +1,76 @@
+"""A data set for trainers on a GPU, nerfstudio and those that read COLMAP's folders: photographs, cameras, points.
+
+The photographs are in full size, upright, without the distortion of their lens; cameras are those of these photographs.
+Trainers take `transforms.json`, or `sparse/0` with the Gaussians' centres as points to begin with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.capture.image_file import UnusableImage, decode_photograph, encode_png, read_image_file
+from splatnode.capture.lenses.undistort import without_distortion
+from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.export.formats.colmap import encode_colmap
+from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
+from splatnode.recon.result.export.stored import StoredResult
+from splatnode.recon.result.snapshot import CameraEstimate
+from splatnode.recon.result.stored_snapshot import photograph_folders
+
+DEFAULT_NAME = "dataset"
+
+_JPEG = (".jpg", ".jpeg")
+_JPEG_QUALITY = 95
+_ROUNDED = 1.0  # pixels of the modelled photograph's sides, by which rounding changes their ratio
+
+
+def export(result: StoredResult) -> dict[str, bytes]:
+    """images/, transforms.json and sparse/0/. Raises SceneFileError where a photograph is not to be had any more."""
+    folders = photograph_folders(result.scene.parent)
+    files, cameras = {}, []
+    for camera in result.cameras():
+        image = _photograph(camera, folders)
+        name = camera.name if camera.name.lower().endswith((".png", *_JPEG)) else f"{camera.name}.png"
+        files[f"images/{name}"] = _encoded(image, name)
+        cameras.append(_of_full_size(replace(camera, name=name), *image.shape[1::-1]))
+    scale = result.scale()
+    model = encode_colmap(cameras, result.gaussians(), scale)
+    files |= {f"sparse/0/{name}": data for name, data in model.items()}
+    return files | {"transforms.json": encode_nerfstudio(cameras, scale)}
+
+
+def _photograph(camera: CameraEstimate, folders: Sequence[Path]) -> npt.NDArray[np.uint8]:
+    """(H, W, 3) in full size, upright, without the distortion of its lens. Raises SceneFileError."""
+    path = next((folder / camera.name for folder in folders if (folder / camera.name).is_file()), None)
+    if path is None:
+        places = " or ".join(str(folder) for folder in folders)
+        raise SceneFileError(f"the photograph {camera.name} is not in {places} any more: put it back there")
+    try:
+        image = without_distortion(decode_photograph(read_image_file(path))[0], camera.lens)
+    except (UnusableImage, ValueError) as error:
+        raise SceneFileError(f"{path}: {error}") from error
+    height, width = image.shape[:2]
+    if abs(width * camera.height - height * camera.width) > _ROUNDED * max(width, height):
+        raise SceneFileError(
+            f"{path} has {width} x {height} pixels, which is not the shape of the photograph that the scene was made "
+            f"of ({camera.width} x {camera.height} as it was modelled): it is another one"
+        )
+    return image
+
+
+def _of_full_size(camera: CameraEstimate, width: int, height: int) -> CameraEstimate:
+    """The camera for its photograph of this many pixels, which has no distortion any more."""
+    K = np.diag([width / camera.width, height / camera.height, 1.0]) @ camera.K
+    return replace(camera, K=K, width=width, height=height, lens=None)
+
+
+def _encoded(image: npt.NDArray[np.uint8], name: str) -> bytes:
+    if not name.lower().endswith(_JPEG):
+        return encode_png(image)
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()

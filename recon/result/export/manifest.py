@@ -1,0 +1,57 @@
+"""The list of the files that were written together, by which they are known again and removed together."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+
+import msgspec
+
+from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import is_printable
+from splatnode.capture.process.records import record_in
+from splatnode.recon.result.export.error import SceneFileError
+from splatnode.recon.result.export.limits import read_json_file
+
+MANIFEST = "manifest.json"  # of a result
+OF_A_MAP = "map.json"  # of a map of free space
+MAPS = "occupancy"  # the folder in a result's own that its map is in, where nobody names another
+
+
+class _Entry(msgspec.Struct, frozen=True):
+    sha256: str
+
+
+class _Manifest(msgspec.Struct, frozen=True):
+    files: dict[str, _Entry]
+
+
+def entries(files: Mapping[str, bytes]) -> dict[str, dict[str, object]]:
+    """What a manifest says of each of the files."""
+    return {name: {"bytes": len(data), "sha256": sha256(data)} for name, data in files.items()}
+
+
+def digests(path: Path) -> dict[str, str]:
+    """SHA-256 by file of what the manifest `path` lists; empty where there is none that can be read."""
+    with contextlib.suppress(OSError, SceneFileError), foreign(SceneFileError):
+        manifest = record_in(read_json_file(path), _Manifest)
+        return {name: entry.sha256 for name, entry in manifest.files.items() if is_printable(name)}
+    return {}
+
+
+def maps_of(folder: Path) -> dict[str, str]:
+    """SHA-256 by file of the maps that were made of the result in `folder`, and of their manifests."""
+    found = {}
+    for manifest in (OF_A_MAP, f"{MAPS}/{OF_A_MAP}"):
+        within = manifest.removesuffix(OF_A_MAP)
+        listed = {f"{within}{name}": digest for name, digest in digests(folder / manifest).items()}
+        with contextlib.suppress(OSError):
+            listed |= {manifest: sha256((folder / manifest).read_bytes())} if listed else {}
+        found |= listed
+    return found
+
+
+def sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
