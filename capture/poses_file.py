@@ -123,6 +123,10 @@ def read_poses(path: Path) -> Trajectory:
             raise PosesFileError(f"{path} must hold images.txt or images.bin of a COLMAP model; give that folder")
         path = there[0]
     where = str(path)
+    if not path.exists():
+        raise PosesFileError(
+            f"{where} is not there; give a TUM trajectory, nerfstudio's transforms.json, or a COLMAP model's folder"
+        )
     with foreign(PosesFileError, where):
         data = read_bounded(path, _MAX_BYTES, PosesFileError, where)
         try:

@@ -6,6 +6,7 @@ A film is a video, an image topic of an MCAP file, or an episode of a LeRobot da
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -184,6 +185,8 @@ def _unmasked(request: Request, tell: Tell) -> Source:
 
 
 def _check_there(path: Path) -> None:
+    if not path.exists() and re.match(r"[a-z]+:/+", str(path)):
+        raise ValueError(f"{str(path)!r} is an address; nothing is fetched: download it first and give the file")
     if not path.exists() and not film.is_film(path):
         raise FileNotFoundError(
             f"{str(path)!r} is not there; give a folder that holds photographs, a video, or an MCAP file"

@@ -33,6 +33,7 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
     _add_masks(parser)
     parser.add_argument(
         "--intrinsics",
+        "--calibration",
         type=Path,
         metavar="FILE",
         help="the lens of all photographs: YAML as a camera's configuration has it, COLMAP's cameras.txt, or Kalibr's "
@@ -55,10 +56,19 @@ def add_way(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
     add = parser.add_argument
     return (
         add("--config", type=Path, metavar="FILE", help="YAML with what differs from the defaults"),
-        add("--preset", metavar="P", help="a named set of parameters (default: balanced)"),
-        add("--prior", metavar="K", help="what gives poses and first points (default: classical)"),
+        add("--preset", metavar="P", help="preview, fast, balanced or quality: from quick to good (default: balanced)"),
+        add(
+            "--prior",
+            metavar="K",
+            help="what matches photographs: docs/architecture.md (default: classical)",
+        ),
         add_device(parser),
-        add("--size", type=positive, metavar="PIXELS", help="longer side as modelled (default: 512)"),
+        add(
+            "--size",
+            type=positive,
+            metavar="PIXELS",
+            help="longer side of photographs as modelled (default: 512)",
+        ),
         add(
             "--budget-s",
             type=seconds,
@@ -79,8 +89,13 @@ def add_way(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
             "bound)",
         ),
         add_marker(parser),
-        add("--max-gaussians", type=positive, metavar="N", help="and with at most so many Gaussians"),
-        add("--max-mb", type=megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes"),
+        add("--max-gaussians", type=positive, metavar="N", help="the best scene with at most so many Gaussians"),
+        add(
+            "--max-mb",
+            type=megabytes,
+            metavar="MB",
+            help="the best scene of at most so many 10^6 bytes",
+        ),
         add("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)"),
         add_only_seen(parser),
     )

@@ -9,7 +9,7 @@ def add_device(parser: argparse.ArgumentParser) -> argparse.Action:
     return parser.add_argument(
         "--device",
         choices=("cpu", "cuda", "auto"),
-        help="that Gaussians are refined on (default: cpu; auto: a GPU where one can be used)",
+        help="where Gaussians are refined (default: cpu; auto: a GPU where one can be used)",
     )
 
 

@@ -41,7 +41,12 @@ def _demo_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _recon_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", type=Path, nargs="?", metavar="CONFIG", help="YAML: what differs from the defaults")
-    parser.add_argument("--checkpoint", type=Path, metavar="DIR", help="what a killed daemon goes on from")
+    parser.add_argument(
+        "--checkpoint",
+        type=Path,
+        metavar="DIR",
+        help="where it keeps what it goes on from when it is started again; another folder begins with nothing",
+    )
     parser.add_argument("--out", type=Path, metavar="DIR", help="where finished scenes go (default: out)")
     add_marker(parser)
 
@@ -97,7 +102,14 @@ def _audit_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_lens(parser: argparse.ArgumentParser) -> None:
     lens = parser.add_mutually_exclusive_group()
-    lens.add_argument("--calibration", type=Path, metavar="FILE", help="YAML with their lens: width, height, fx, ...")
+    lens.add_argument(
+        "--intrinsics",
+        "--calibration",
+        dest="calibration",
+        type=Path,
+        metavar="FILE",
+        help="their lens: YAML with width, height, fx, ..., COLMAP's cameras.txt, or Kalibr's camchain",
+    )
     lens.add_argument("--fov", type=angle, metavar="DEGREES", help="their angle of view, across the longer side")
 
 
@@ -117,7 +129,7 @@ def _merge_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("folder", type=Path, metavar="OUT_FOLDER", help="that a node writes its scenes into")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where the merged scenes go (default: OUT_FOLDER)")
     parser.add_argument("--max-gaussians", type=positive, metavar="N", help="at most so many Gaussians in each")
-    parser.add_argument("--max-mb", type=megabytes, metavar="MB", help="and of this size of scene.ply, in 10^6 bytes")
+    parser.add_argument("--max-mb", type=megabytes, metavar="MB", help="a scene.ply of at most so many 10^6 bytes")
     add_json(parser)
 
 

@@ -27,6 +27,11 @@ from splatnode.capture.process.records import record_of
 
 T = TypeVar("T")
 
+OF_VERBS = {  # keys by which a file is known that was given to another verb
+    "camera": "splatnode capture",
+    "reconstruction": "splatnode recon",
+}
+
 
 @dataclass(frozen=True)
 class Plugin:
@@ -131,13 +136,25 @@ def _checked(raw: Any, schema: Any, where: str) -> Any:
     if not _has_fields(schema):
         return raw
     types = typing.get_type_hints(schema)
-    unknown = [str(key) for key in raw if key not in types]
+    unknown = sorted((str(key) for key in raw if key not in types), key=lambda key: key not in OF_VERBS)
     if unknown:
-        raise ConfigError(f"{_join(where, printable(unknown[0]))}: unknown key; allowed here: {', '.join(types)}")
+        elsewhere = _elsewhere(unknown[0], types, where)
+        raise ConfigError(
+            f"{_join(where, printable(unknown[0]))}: unknown key{elsewhere}; allowed here: {', '.join(types)}"
+        )
     missing = [name for name in _required(schema) if name not in raw]
     if missing:
         raise ConfigError(f"{_join(where, missing[0])}: missing; it has no default")
     return {key: _checked(value, _struct_in(types[key]), _join(where, key)) for key, value in raw.items()}
+
+
+def _elsewhere(key: str, types: Mapping[str, Any], where: str) -> str:
+    """Where a key that is none of these belongs, if one of them has it, or another verb."""
+    for name, annotation in types.items():
+        struct = _struct_in(annotation)
+        if _has_fields(struct) and key in typing.get_type_hints(struct):
+            return f", which belongs under {_join(where, name)}"
+    return f", which is of the configuration of {OF_VERBS[key]}" if key in OF_VERBS and not where else ""
 
 
 def _of_kind(kind: object, raw: Any) -> Any:

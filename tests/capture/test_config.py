@@ -23,13 +23,33 @@ def test_there_is_one_for_each_way_to_begin():
 
 def test_those_of_the_reconstruction_can_be_read():
     configs = ROOT / "configs"
-    assert load_config(configs / "small_robot.yaml", Reconstruction).max_gaussians == 20000
+    assert load_config(configs / "small_scene.yaml", Reconstruction).max_gaussians == 20000
     assert load_config(configs / "recon.yaml", Daemon) == Daemon()  # it shows the defaults
+    network = load_config(configs / "remote_recon.yaml", Daemon).network
+    assert network == load_config(configs / "remote.yaml", CaptureConfig).network
     assert {path.name for path in configs.glob("*.yaml")} == {
         *(path.name for path in CAMERAS),
         "recon.yaml",
-        "small_robot.yaml",
+        "remote_recon.yaml",
+        "small_scene.yaml",
     }
+
+
+@pytest.mark.parametrize(
+    ("name", "schema", "said"),
+    [
+        ("webcam.yaml", Daemon, "camera: unknown key, which is of the configuration of splatnode capture; allowed"),
+        (
+            "recon.yaml",
+            Reconstruction,
+            "reconstruction: unknown key, which is of the configuration of splatnode recon",
+        ),
+        ("small_scene.yaml", Daemon, "size: unknown key, which belongs under reconstruction; allowed here"),
+    ],
+)
+def test_one_that_is_of_another_verb_is_told(name, schema, said):
+    with pytest.raises(ConfigError, match=said):
+        load_config(ROOT / "configs" / name, schema)
 
 
 @pytest.mark.parametrize("path", CAMERAS, ids=lambda path: path.name)

@@ -38,7 +38,7 @@ def photographs(tmp_path):
         (["--out", "new", "--baseline", "a.png", "b.png", "far"], 2, "a distance in metres, got 'far'"),
         (["--out", "new", "--stereo", "photographs"], 2, "--stereo and --stereo-baseline belong together"),
         (["--out", "new", "--stereo", "gone", "--stereo-baseline", "75mm"], 2, "'gone' is not there"),
-        (["--out", "new", "--poses", "gone.tum"], 2, "gone.tum"),
+        (["--out", "new", "--poses", "gone.tum"], 2, "gone.tum is not there; give a TUM"),
         (["--out", "new", "--poses-sigma", "0.1,5"], 2, "--poses-sigma is of --poses"),
         (["--out", "new", "--poses", "photographs"], 2, "must hold images.txt or images.bin"),
         (["--out", "new", "--poses", "photographs/a.png"], 2, "must be a TUM trajectory"),

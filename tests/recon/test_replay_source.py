@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -159,6 +160,8 @@ def test_a_file_that_is_no_video_is_told(tmp_path):
         source(Request(tmp_path / "notes.txt"))
     with pytest.raises(FileNotFoundError, match="nothing.mp4' is not there; give a folder .* a video, or an MCAP file"):
         source(Request(tmp_path / "nothing.mp4"))
+    with pytest.raises(ValueError, match="is an address; nothing is fetched: download it first"):
+        source(Request(Path("https://a.site/film.mp4")))
 
 
 def test_a_folder_into_which_results_were_written_is_the_same_recording(walk, film, tmp_path):
