@@ -6,6 +6,7 @@ import itertools
 import logging
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -23,7 +24,7 @@ from splatnode.recon.evaluate.report import report_files
 from splatnode.recon.evaluate.schedule import Need, Planned, ended
 from splatnode.recon.evaluate.splits import Split, load_split
 from splatnode.recon.evaluate.timing import check_same_cores, had_alone
-from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.evaluate.truth import EvaluationScene, check_named_apart, load_scene
 from splatnode.recon.jobs.call import Answer, Work
 from splatnode.recon.jobs.calls import Engine, one_at_a_time, work_folder
 from splatnode.recon.jobs.child import Limits
@@ -72,7 +73,7 @@ def run_bench(
     the reports. Cameras and points that several methods start from are found once for each set of photographs and seed;
     their seconds count in each method's total. A run that fails, or exceeds its time or memory, becomes a row with the
     verdict "FAILED" and the reason. Seconds are those of runs that had their cores alone. Raises ValueError or
-    FileNotFoundError for a scene or split that is not there, or for an `out_dir` that holds runs that were scored
+    FileNotFoundError for a scene or split that is not there or not told from another one, or for an `out_dir` that holds runs that were scored
     otherwise or had another number of cores, before anything is run.
     """
     engine = engine or one_at_a_time()
@@ -105,13 +106,24 @@ _JOURNAL = "bench.jsonl"
 
 
 def _sets(plan: Plan) -> list[_Set]:
-    """Scenes with absolute paths: other machines see them, too, not this process's folder."""
+    """Scenes with absolute paths: other machines see them, too, not this process's folder.
+
+    Raises ValueError where two scenes have one name, or two splits of a scene as many training views.
+    """
+    check_named_apart(plan.scenes)
     folders = [Path(os.path.abspath(folder)) for folder in plan.scenes]
     scenes = [(load_scene(folder), folder) for folder in folders]
-    return [
+    sets = [
         (scene, load_split(folder, list(scene.cameras), views))
         for (scene, folder), views in itertools.product(scenes, plan.views)
     ]
+    for (name, count), splits in Counter((scene.name, len(split.train)) for scene, split in sets).items():
+        if splits > 1:
+            raise ValueError(
+                f"{name} has {splits} splits with {count} training views, of the numbers of views "
+                f"{', '.join(map(str, plan.views))}: runs are told apart by them, so give numbers that differ"
+            )
+    return sets
 
 
 def _check_resumable(known: Bench, scoring: Scoring, engine: Engine, out_dir: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -72,6 +73,18 @@ def load_scene(folder: Path) -> EvaluationScene:
             masks = data / "masks" if (data / "masks").is_dir() else None
             return EvaluationScene(place.name, paths, known, masks)
     raise FileNotFoundError(f"{data} must hold the true cameras as one of {', '.join(sources)}; there is none")
+
+
+def check_named_apart(folders: Sequence[Path]) -> None:
+    """Raises ValueError where two of the folders hold scenes of one name, or are one: by it what is found is kept."""
+    known: dict[str, tuple[Path, Path]] = {}
+    for folder in folders:
+        place = scene_folder(Path(os.path.abspath(folder)))
+        if place.name in known:
+            other, before = known[place.name]
+            why = "are one scene" if before == place else f"are both called {place.name!r}, which tells scenes apart"
+            raise ValueError(f"the scenes {str(other)!r} and {str(folder)!r} {why}: leave out one, or rename it")
+        known[place.name] = folder, place
 
 
 def scene_folder(folder: Path) -> Path:

@@ -276,6 +276,23 @@ def test_scene_that_is_not_there_stops_the_bench_before_it_starts(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_sets_that_rows_could_not_tell_apart_stop_the_bench_before_it_starts(scene_folder, tmp_path):
+    other = tmp_path / "other" / scene_folder.name
+    shutil.copytree(scene_folder, other)
+    for twice, said in ((other, "are both called 'blobs'"), (scene_folder / "24_views" / "..", "are one scene")):
+        with pytest.raises(ValueError, match=said) as error:
+            bench(Plan((scene_folder, twice), (3,), ("exact",)), tmp_path / "out")
+        assert str(scene_folder) in str(error.value) and str(twice) in str(error.value)
+    with pytest.raises(ValueError, match="are one scene"):
+        bench(Plan((scene_folder, scene_folder), (3,), ("exact",)), tmp_path / "out")
+    (other.parent / "splits.json").write_text(
+        json.dumps({"blobs": {"train3": ["00.png"], "train4": ["04.png"], "test": ["01.png"]}})
+    )
+    with pytest.raises(ValueError, match="blobs has 2 splits with 1 training views"):
+        bench(Plan((other,), (3, 4), ("exact",)), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 def test_command_line():
     parse = build_parser().parse_args
     args = parse(["bench", "a", "--cores", "2", "--ray", "--max-memory", "900", "--timeout-s", "5", "--out", "o"])
