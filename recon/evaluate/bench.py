@@ -73,8 +73,8 @@ def run_bench(
     the reports. Cameras and points that several methods start from are found once for each set of photographs and seed;
     their seconds count in each method's total. A run that fails, or exceeds its time or memory, becomes a row with the
     verdict "FAILED" and the reason. Seconds are those of runs that had their cores alone. Raises ValueError or
-    FileNotFoundError for a scene or split that is not there or not told from another one, or for an `out_dir` that holds runs that were scored
-    otherwise or had another number of cores, before anything is run.
+    FileNotFoundError for a scene or split that is not there or not told from another one, or for an `out_dir` that
+    holds runs that were scored otherwise or had another number of cores, before anything is run.
     """
     engine = engine or one_at_a_time()
     sets = _sets(plan)

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from splatnode.capture.cameras.folder import frame_name
 from splatnode.capture.frame import Frame
-from splatnode.capture.image_file import SUFFIXES, UnusableImage, decode_photograph, read_image_file
+from splatnode.capture.image_file import SUFFIXES, UnusableImage, decode_photograph, read_image_file, upright_size
 from splatnode.capture.masks import all_masked, in_files
 from splatnode.recon.evaluate.json_file import EvaluationFileError
 from splatnode.recon.evaluate.true_cameras import TrueCamera, read_true_cameras
@@ -30,12 +30,14 @@ class EvaluationScene:
     masks: Path | None = None  # a folder; None: all of every image is used
 
     def image(self, name: str) -> npt.NDArray[np.uint8]:
-        """(H, W, 3) RGB. Raises EvaluationFileError where the file is not an image, OSError."""
+        """(H, W, 3) RGB. Raises EvaluationFileError where it is no image, or none of its true camera; OSError."""
         path = self.paths[name]
         try:
-            return decode_photograph(read_image_file(path))[0]
+            image = decode_photograph(read_image_file(path))[0]
         except UnusableImage as error:
             raise EvaluationFileError(f"{path} must be an image: {error}") from error
+        _check_size(path, self.cameras.get(name), (image.shape[1], image.shape[0]))
+        return image
 
     def frames(self, names: Sequence[str]) -> list[Frame]:
         """What a reconstruction gets: images in the given order, and nothing known about the camera."""
@@ -58,7 +60,7 @@ def load_scene(folder: Path) -> EvaluationScene:
     have all that in a folder 24_views of the scene's, which is found from either. Images must be undistorted. What a
     folder masks/ hides of them (black; white is used) is neither reconstructed nor scored. Raises
     FileNotFoundError where a part is missing, EvaluationFileError or SceneFileError (both ValueErrors, which name the
-    file) where it cannot be what it should be.
+    file) where it cannot be what it should be, or a photograph has another shape than its true camera's pictures.
     """
     place = scene_folder(folder)
     data = place / _CHOSEN if (place / _CHOSEN).is_dir() else place
@@ -70,9 +72,25 @@ def load_scene(folder: Path) -> EvaluationScene:
         if (data / source).exists():
             cameras = read_true_cameras(data / source)
             known = {name: cameras[path.name] for name, path in paths.items() if path.name in cameras}
+            for name, camera in known.items():
+                _check_size(paths[name], camera, _size(paths[name]))
             masks = data / "masks" if (data / "masks").is_dir() else None
             return EvaluationScene(place.name, paths, known, masks)
     raise FileNotFoundError(f"{data} must hold the true cameras as one of {', '.join(sources)}; there is none")
+
+
+def _size(path: Path) -> tuple[int, int] | None:
+    """Width and height of a photograph; None where its file does not tell: what is wrong with it, `image` says."""
+    try:
+        return upright_size(read_image_file(path))
+    except UnusableImage:
+        return None
+
+
+def _check_size(path: Path, camera: TrueCamera | None, size: tuple[int, int] | None) -> None:
+    problem = camera.size_problem(*size) if camera and size else ""
+    if problem:
+        raise EvaluationFileError(f"{path}: {problem}")
 
 
 def check_named_apart(folders: Sequence[Path]) -> None:
