@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 import shutil
 import time
@@ -64,6 +65,8 @@ def reconstruct(frames: Sequence[Frame], method: str, seed: int, start: Start | 
     for iterations in (0, 100, 200, 300):
         final = iterations == 300
         seconds = {"poses": -1.0 if start is None else start.seconds}
+        if method == "odd" and final:
+            seconds["poses"] = math.nan
         yield replace(
             perfect_snapshot(), verdict=verdict, iterations=iterations, final=final, sequence=seed, seconds=seconds
         )
@@ -144,6 +147,19 @@ def test_a_run_that_hangs_costs_only_itself(scene_folder, tmp_path):
     with engine(1, None) as on:
         (row,) = bench(Plan((scene_folder,), (3,), ("hangs",), timeout_s=1.0), tmp_path, on=on)
     assert (row.verdict, row.error) == ("FAILED", "took longer than the 1 s that --timeout-s allows")
+
+
+def test_a_number_that_is_not_finite_costs_only_its_run(scene_folder, tmp_path, alone):
+    plan = Plan((scene_folder,), (3,), ("odd", "exact"), checkpoints=(150,))
+    rows = bench(plan, tmp_path)
+    assert [(row.method, row.checkpoint, row.verdict) for row in rows] == [
+        ("odd", 150, "OK"),
+        ("odd", None, "FAILED"),
+        ("exact", 150, "OK"),
+        ("exact", None, "OK"),
+    ]
+    assert rows[1].error == "seconds is not finite at the end"
+    assert json.loads((tmp_path / "bench.json").read_text())["rows"][1]["psnr"] is None
 
 
 def test_an_interrupted_benchmark_goes_on(scene_folder, tmp_path, alone):

@@ -17,6 +17,7 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.evaluate.metrics import psnr
 from splatnode.recon.evaluate.protocol import Run, evaluate
 from splatnode.recon.evaluate.same_lens import mean_intrinsics
+from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.stability.places import Photo
 from splatnode.recon.evaluate.stability.warps import distorted
 from splatnode.recon.evaluate.test_pose import find_test_pose
@@ -57,11 +58,13 @@ def scene_folder(tmp_path_factory) -> Path:
     return folder
 
 
-def score(snapshot: Snapshot, folder: Path, found: dict[str, np.ndarray] | None = None, **settings):
+def score(
+    snapshot: Snapshot, folder: Path, found: dict[str, np.ndarray] | None = None, split: Split = SPLIT, **settings
+):
     return evaluate(
         snapshot,
         load_scene(folder),
-        SPLIT,
+        split,
         RUN,
         rasterize=rasterize,
         networks=NO_NETWORKS,
@@ -216,6 +219,25 @@ def test_what_masks_hide_is_neither_given_nor_scored(scene_folder, tmp_path):
     truth = torch.from_numpy(load_scene(scene_folder).image(name)).float() / 255
     spoilt = torch.where(used[..., None], truth, 1 - truth)
     assert psnr(spoilt, truth, used) == 100.0 and psnr(spoilt, truth) < 20.0
+
+
+def masked_scene(folder: Path, masks: dict[str, np.ndarray]) -> Path:
+    """The scene of blobs in `folder` with these masks (H, W) by the name of the photograph, True where it is used."""
+    write_scene(folder)
+    (folder / "masks").mkdir()
+    for name, mask in masks.items():
+        cv2.imwrite(str(folder / "masks" / name), np.where(mask, 255, 0).astype(np.uint8))
+    return folder
+
+
+def test_a_view_of_which_a_mask_leaves_no_whole_pixel_is_left_out(scene_folder, tmp_path):
+    chequered = np.indices((HEIGHT, WIDTH)).sum(0) % 2 == 0  # half of it is used, and of no pixel of 48 all
+    folder = masked_scene(tmp_path / "blobs", {SPLIT.test[0]: chequered})
+    row = score(perfect_snapshot(), folder, longer_side=48)
+    alone = score(perfect_snapshot(), folder, split=replace(SPLIT, test=SPLIT.test[1:]), longer_side=48)
+    assert row.psnr == pytest.approx(alone.psnr, abs=0.5) and row.psnr > 30  # one photograph tells of no rim
+    none = score(perfect_snapshot(), folder, split=replace(SPLIT, test=SPLIT.test[:1]), longer_side=48)
+    assert (none.psnr, none.psnr_with_rim, none.verdict) == (None, None, "OK")
 
 
 def test_refused_scene_is_not_scored_but_its_cameras_are(scene_folder):
