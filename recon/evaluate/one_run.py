@@ -13,7 +13,7 @@ from splatnode.recon.config import Config
 from splatnode.recon.evaluate.appearance import Rasterize
 from splatnode.recon.evaluate.moments import Moment, run_to_its_end
 from splatnode.recon.evaluate.perceptual import Networks
-from splatnode.recon.evaluate.protocol import STAGES, Poses, Row, Run, Settings, evaluate, ignore_render
+from splatnode.recon.evaluate.protocol import FAILED, STAGES, Poses, Row, Run, Settings, evaluate, ignore_render
 from splatnode.recon.evaluate.regions import Counts
 from splatnode.recon.evaluate.renders import Renders
 from splatnode.recon.evaluate.shown import counts_of, surfaces
@@ -146,7 +146,7 @@ def failed_row(job: Job, error: str) -> Row:
         final=True,
         seconds={**dict.fromkeys(STAGES), "total": None},
         peak_rss_mb=None,
-        verdict="FAILED",
+        verdict=FAILED,
         error=error,
     )
 

@@ -27,6 +27,7 @@ from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.scene.vignetting import light_at
 
 STAGES = ("poses", "points", "optimise")
+FAILED = "FAILED"  # in place of a verdict's code
 _FIRST_RATE, _CONTINUED_RATE = 3e-3, 5e-4  # learning rates of the test-pose search, in radians and parts of the depth
 
 
@@ -87,7 +88,7 @@ class Row:
     num_cameras: int | None = None  # of the training views, those with an estimated pose
     scene_bytes: int | None = None
     regions: Mapping[str, RegionScore] = field(default_factory=dict)  # by regions.REGIONS; empty: not measured
-    verdict: str  # a verdict's code; "FAILED" where the run ended without a result
+    verdict: str  # a verdict's code; FAILED where the run ended without a result
     error: str | None = None  # why it did
 
 
