@@ -189,8 +189,9 @@ def _score_test_views(
     by the similarity that aligns the training cameras; or from between its neighbours, if `settings` says so. No view
     can be scored with fewer than two of them. Photographs are compared where they show the scene: a black rim that
     undistortion left is cut off, for the search too, and what a mask hides counts as well rendered in SSIM and LPIPS,
-    and not at all in PSNR and in the scores by region. A distortion that was taken out of the training photographs is
-    taken out of these, too. Where their vignetting was taken out, renders get it. A view that a mask hides is left out.
+    and not at all in the search, in PSNR and in the scores by region. A distortion that was taken out of the training
+    photographs is taken out of these, too. Where their vignetting was taken out, renders get it. A view of which masks
+    leave nothing is left out.
     """
     if appearance is None or len(estimated) < 2:
         return []
@@ -216,7 +217,10 @@ def _score_test_views(
         if settings.best_gain:
             begun = appearance.render(start, K, truth.shape[1], truth.shape[0])
             target = target / best_gains(target, begun, used[rows, columns])
-        aligned = find_test_pose(appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate)
+        seen = None if used[rows, columns].all() else used[rows, columns]
+        aligned = find_test_pose(
+            appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate, used=seen
+        )
         T_world_camera = aligned.T_world_camera
         found.setdefault(name, T_world_camera)
         with_rim = light * appearance.render(T_world_camera, whole_K, width, height)

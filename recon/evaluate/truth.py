@@ -40,15 +40,25 @@ class EvaluationScene:
         return image
 
     def frames(self, names: Sequence[str]) -> list[Frame]:
-        """What a reconstruction gets: images in the given order, and nothing known about the camera."""
+        """What a reconstruction gets: images in the given order, and nothing known about the camera.
+
+        Without those of which a mask leaves hardly anything. Raises as `image`, and UnusableMask.
+        """
         found = [Frame(i, name, i, self.image(name), None) for i, name in enumerate(names)]
         if self.masks is None:
             return found
         return [each for each in all_masked(found, in_files(self.masks)) if isinstance(each, Frame)]
 
     def masked_image(self, name: str) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.bool_]]:
-        """(H, W, 3) RGB, filled where it is not used, and (H, W) where it is. Raises as `image`, and UnusableMask."""
-        (frame,) = self.frames([name]) or (Frame(0, name, 0, self.image(name), None),)
+        """(H, W, 3) RGB, filled where it is not used, and (H, W) where it is: nowhere, where hardly anything is.
+
+        Raises as `image`, and UnusableMask.
+        """
+        found = self.frames([name])
+        if not found:
+            image = self.image(name)
+            return image, np.zeros(image.shape[:2], bool)
+        (frame,) = found
         return frame.image, np.ones(frame.image.shape[:2], bool) if frame.mask is None else frame.mask
 
 

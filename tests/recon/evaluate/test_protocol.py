@@ -240,6 +240,30 @@ def test_a_view_of_which_a_mask_leaves_no_whole_pixel_is_left_out(scene_folder, 
     assert (none.psnr, none.psnr_with_rim, none.verdict) == (None, None, "OK")
 
 
+def test_a_view_of_which_a_mask_leaves_hardly_anything_is_left_out(scene_folder, tmp_path):
+    sliver = np.zeros((HEIGHT, WIDTH), bool)
+    sliver[:2] = True  # 3 %
+    folder = masked_scene(tmp_path / "blobs", {SPLIT.test[0]: sliver})
+    image, used = load_scene(folder).masked_image(SPLIT.test[0])
+    assert image.shape == (HEIGHT, WIDTH, 3) and not used.any()
+    assert score(perfect_snapshot(), folder, split=replace(SPLIT, test=SPLIT.test[:1])).psnr is None
+    assert score(perfect_snapshot(), folder).psnr > 40
+
+
+def test_what_a_mask_hides_does_not_move_the_pose_that_is_searched(scene_folder, tmp_path, monkeypatch):
+    half = np.zeros((HEIGHT, WIDTH), bool)
+    half[:, : WIDTH // 2] = True
+    folder, asked = masked_scene(tmp_path / "blobs", {SPLIT.test[0]: half}), []
+
+    def noted(*scene_and_view, used, **steps):
+        asked.append(used)
+        return find_test_pose(*scene_and_view, used=used, **steps)
+
+    monkeypatch.setattr("splatnode.recon.evaluate.protocol.find_test_pose", noted)
+    assert score(perfect_snapshot(), folder).psnr > 50
+    assert 0.4 < asked[0].float().mean() < 0.6 and not asked[0][:, -1].any() and asked[1] is None
+
+
 def test_refused_scene_is_not_scored_but_its_cameras_are(scene_folder):
     refused = replace(perfect_snapshot(), verdict=Verdict(Code.NO_PARALLAX, "No.", "Move."))
     row = score(refused, scene_folder)

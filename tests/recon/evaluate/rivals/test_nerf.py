@@ -103,6 +103,31 @@ def test_a_pose_is_found_through_the_rays():
     assert look.depth(np.eye(4)) == pytest.approx(1.5, rel=0.1)
 
 
+def test_only_pixels_that_are_used_are_compared():
+    look = FieldAppearance(Painted())
+    image, T = look.render(np.eye(4), K.double().numpy(), 32, 24), torch.eye(4)
+    used = torch.zeros(24, 32, dtype=torch.bool)
+    used[3:5, 7:9] = True
+    image[~used] = 0.0
+    assert float(look.difference(image, T, K)) > 0.1 and float(look.difference(image, T, K, used)) < 1e-5
+
+
+def test_colours_that_are_not_used_do_not_count():
+    images = [torch.full((12, 16, 3), 0.25)] * 2
+    spoilt = [image.clone() for image in images]
+    for image in spoilt:
+        image[:, 8:] = 1.0
+    used = (torch.arange(16) < 8).expand(12, 16)
+    config = fit.Config(iterations=60, checkpoints=(), rays=64)
+    looks = []
+    for masks in ([used, used], [None, None]):
+        (learnt,) = fit.learn(spoilt, masks, Focal(1.0), config, seed=0)
+        looks.append(
+            FieldAppearance(learnt.field).render(np.eye(4), np.array([[16.0, 0, 8], [0, 16, 6], [0, 0, 1]]), 16, 12)
+        )
+    assert float(looks[0][:, 10:].mean()) < 0.5 < float(looks[1][:, 10:].mean())
+
+
 def test_nerfmm_learns_a_place_and_its_cameras():
     config = fit.Config(iterations=80, checkpoints=(10,), rays=128)
     snapshots = list(nerfmm.reconstruct(list(photographs()[:3]), 0, config))
