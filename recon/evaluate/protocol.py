@@ -17,7 +17,7 @@ from splatnode.recon.evaluate.held_out import held_out
 from splatnode.recon.evaluate.metrics import best_gains, psnr, ssim
 from splatnode.recon.evaluate.perceptual import Networks
 from splatnode.recon.evaluate.regions import UNKNOWN, Counts, ErrorMaps, RegionScore, error_maps, region_scores
-from splatnode.recon.evaluate.same_lens import mean_intrinsics, of_one_lens
+from splatnode.recon.evaluate.same_lens import counts_seen_by, mean_intrinsics, of_one_lens
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.start_pose import between_neighbours
 from splatnode.recon.evaluate.test_pose import find_test_pose
@@ -128,10 +128,9 @@ def evaluate(
     appearance = appearance_of(snapshot, rasterize)
     found = {} if found is None else found
     cameras = of_one_lens(snapshot.cameras)
-    counts = {} if shown is None or (cameras and cameras[0].lens) else shown  # they are of the photographs as they are
     falloff = snapshot.falloffs.get(cameras[0].name, 0.0) if cameras else 0.0
     seen = appearance, cameras, estimated, falloff
-    views = _score_test_views(*seen, scene, split, networks, settings, show, found, counts)
+    views = _score_test_views(*seen, scene, split, networks, settings, show, found, shown or {})
     return Row(
         scene=scene.name,
         views=len(split.train),
@@ -228,7 +227,8 @@ def _score_test_views(
             with_rim = with_rim * best_gains(truth, with_rim[rows, columns], used[rows, columns])
         with_rim = with_rim.clamp(0.0, 1.0)
         show(name, truth, with_rim[rows, columns])
-        scores.append(_view_score(with_rim, whole, used, view.shown, networks, counts.get(name)))
+        known = counts_seen_by(cameras[0].lens, counts[name]) if name in counts else None
+        scores.append(_view_score(with_rim, whole, used, view.shown, networks, known))
     return scores
 
 

@@ -103,7 +103,15 @@ def view(registered: RegisteredFrame) -> TrainingView:
     K = frame.intrinsics.resized(image.shape[1], image.shape[0]).K
     T_world_camera = torch.from_numpy(registered.T_world_camera).float()
     mask = None if registered.frame.mask is None or frame.mask is None else modelled_mask(frame.mask, *image.shape[:2])
-    return TrainingView(frame.name, frame.frame_id, image, T_world_camera, torch.from_numpy(K).float(), mask=mask)
+    return TrainingView(
+        frame.name,
+        frame.frame_id,
+        image,
+        T_world_camera,
+        torch.from_numpy(K).float(),
+        mask=mask,
+        lens=registered.intrinsics if any(registered.intrinsics.distortion) else None,
+    )
 
 
 def in_parts_of_extent(config: refinement.Config, scene: Scene) -> refinement.Config:

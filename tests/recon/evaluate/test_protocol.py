@@ -16,7 +16,8 @@ import torch
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.evaluate.metrics import psnr
 from splatnode.recon.evaluate.protocol import Run, evaluate
-from splatnode.recon.evaluate.same_lens import mean_intrinsics
+from splatnode.recon.evaluate.regions import UNKNOWN
+from splatnode.recon.evaluate.same_lens import counts_seen_by, mean_intrinsics, seen_by
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.stability.places import Photo
 from splatnode.recon.evaluate.stability.warps import distorted
@@ -59,7 +60,12 @@ def scene_folder(tmp_path_factory) -> Path:
 
 
 def score(
-    snapshot: Snapshot, folder: Path, found: dict[str, np.ndarray] | None = None, split: Split = SPLIT, **settings
+    snapshot: Snapshot,
+    folder: Path,
+    found: dict[str, np.ndarray] | None = None,
+    split: Split = SPLIT,
+    shown: dict[str, np.ndarray] | None = None,
+    **settings,
 ):
     return evaluate(
         snapshot,
@@ -70,6 +76,7 @@ def score(
         networks=NO_NETWORKS,
         settings=replace(QUICK, **settings),
         found=found,
+        shown=shown,
     )
 
 
@@ -141,6 +148,31 @@ def test_an_estimated_distortion_is_taken_out_of_held_out_photographs_too(scene_
     other = score(replace(snapshot, cameras=as_they_are), tmp_path / "blobs")
     assert row.psnr > 32.0 and row.psnr > other.psnr + 5.0
     assert row.focal_error_pct == pytest.approx(100.0 * (focal / 90.0 - 1.0))  # of the photographs as they were taken
+    shown = {name: np.full((HEIGHT, WIDTH), 2, np.uint8) for name in SPLIT.test}
+    for counts in shown.values():
+        counts[:, :24] = 0
+    regions = score(replace(snapshot, cameras=straight), tmp_path / "blobs", shown=shown).regions
+    assert regions["two"].psnr > 32.0 and regions["one"].share_pct == 0.0
+    assert 98.0 < regions["two"].share_pct + regions["none"].share_pct < 100.0  # what the lens mixes is neither
+
+
+def test_what_the_lens_mixes_is_unknown():
+    lens = Intrinsics(WIDTH, HEIGHT, 90.0, 90.0, 48.0, 36.0, "estimated", (-0.3, 0.0, 0.0, 0.0))
+    counts = np.full((HEIGHT, WIDTH), 2, np.uint8)
+    counts[:, :20] = 1
+    straight = counts_seen_by(lens, counts)
+    mixed = (straight == UNKNOWN).sum(1)
+    assert set(np.unique(straight)) == {1, 2, UNKNOWN} and mixed.min() >= 1 and mixed.max() <= 3
+    assert counts_seen_by(None, counts) is counts
+    assert counts_seen_by(replace(lens, model="fisheye"), counts) is None
+
+
+def test_what_a_lens_cuts_off_is_no_mask():
+    lens = Intrinsics(WIDTH, HEIGHT, 90.0, 90.0, 48.0, 36.0, "estimated", (0.05, 0.0, 0.0, 0.0), "fisheye")
+    cut = np.ones((HEIGHT, WIDTH), bool)
+    cut[0, 0] = False
+    image, used = seen_by(lens, np.zeros((HEIGHT, WIDTH, 3), np.uint8), cut)
+    assert used.all() and used.shape == image.shape[:2]
 
 
 def test_perfect_reconstruction_scores_perfectly(scene_folder):

@@ -89,6 +89,13 @@ def test_3dgs_starts_from_colmap_s_points(model):
     assert rates.means == pytest.approx(1.6e-4 * 1.1 * spread, rel=1e-5)
 
 
+def test_colmap_s_rivals_tell_the_lens_whose_distortion_they_took_out(model):
+    for each in model.registered:
+        view = colmap_3dgs.view(each)
+        assert any(each.intrinsics.distortion) and view.lens == each.intrinsics
+        assert colmap_3dgs.view(replace(each, intrinsics=replace(each.intrinsics, distortion=()))).lens is None
+
+
 def half_of(frame: Frame) -> np.ndarray:
     return np.tile(np.arange(frame.width) < frame.width // 2, (frame.height, 1))
 
