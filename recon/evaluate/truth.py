@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.cameras.folder import frame_name
+from splatnode.capture.cameras.folder import frame_name, image_paths
 from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import SUFFIXES, UnusableImage, decode_photograph, read_image_file, upright_size
 from splatnode.capture.masks import all_masked, in_files
+from splatnode.capture.process.printable import printable
 from splatnode.recon.evaluate.json_file import EvaluationFileError
 from splatnode.recon.evaluate.true_cameras import TrueCamera, read_true_cameras
 
@@ -65,16 +66,19 @@ class EvaluationScene:
 def load_scene(folder: Path) -> EvaluationScene:
     """The scene in `folder`: images/ and one of cameras.json, transforms.json or sparse/0, in this order.
 
+    Images are in natural order (frame_2 before frame_10); hidden files are none.
     cameras.json is ours ("cameras": T_world_camera) or that of recorded data sets ("images": R, t); transforms.json is
     nerfstudio's; sparse/0 is a COLMAP model, text or binary. Tanks and Temples and MVImgNet as InstantSplat gives them
     have all that in a folder 24_views of the scene's, which is found from either. Images must be undistorted. What a
     folder masks/ hides of them (black; white is used) is neither reconstructed nor scored. Raises
     FileNotFoundError where a part is missing, EvaluationFileError or SceneFileError (both ValueErrors, which name the
-    file) where it cannot be what it should be, or a photograph has another shape than its true camera's pictures.
+    file) where it cannot be what it should be, where all cameras are of other photographs, or a photograph has another
+    shape than its true camera's pictures.
     """
     place = scene_folder(folder)
     data = place / _CHOSEN if (place / _CHOSEN).is_dir() else place
-    paths = {frame_name(path): path for path in sorted((data / "images").glob("*")) if path.suffix.lower() in SUFFIXES}
+    photographs = image_paths(data / "images") if (data / "images").is_dir() else []
+    paths = {frame_name(path): path for path in photographs if path.suffix.lower() in SUFFIXES}
     if not paths:
         raise FileNotFoundError(f"{data / 'images'} must hold the scene's images; there are none")
     sources = ("cameras.json", "transforms.json", "sparse/0")
@@ -82,6 +86,11 @@ def load_scene(folder: Path) -> EvaluationScene:
         if (data / source).exists():
             cameras = read_true_cameras(data / source)
             known = {name: cameras[path.name] for name, path in paths.items() if path.name in cameras}
+            if cameras and not known:
+                example = f"such as {printable(min(cameras), 100)}, there is {next(iter(paths))}"
+                raise EvaluationFileError(
+                    f"no photograph in {data / 'images'} has a camera in {data / source}, {example}"
+                )
             for name, camera in known.items():
                 _check_size(paths[name], camera, _size(paths[name]))
             masks = data / "masks" if (data / "masks").is_dir() else None
