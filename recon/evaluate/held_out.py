@@ -23,6 +23,12 @@ class HeldOut:
     used: Tensor  # (H, W) False where a mask hides it
     shown: tuple[slice, slice]  # rows and columns without a black rim
 
+    @property
+    def compared(self) -> Tensor | None:
+        """(h, w) which pixels count of what is shown; None: all."""
+        used = self.used[self.shown]
+        return None if used.all() else used
+
 
 def held_out(scene: EvaluationScene, split: Split, lens: Intrinsics | None, longer_side: int) -> Iterator[HeldOut]:
     """The test views with a true camera, without the distortion of `lens`; none of which a mask hides all."""

@@ -216,11 +216,9 @@ def _score_test_views(
         if settings.best_gain:
             begun = appearance.render(start, K, truth.shape[1], truth.shape[0])
             target = target / best_gains(target, begun, used[rows, columns])
-        seen = None if used[rows, columns].all() else used[rows, columns]
-        aligned = find_test_pose(
-            appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate, used=seen
-        )
-        T_world_camera = aligned.T_world_camera
+        T_world_camera = find_test_pose(
+            appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate, used=view.compared
+        ).T_world_camera
         found.setdefault(name, T_world_camera)
         with_rim = light * appearance.render(T_world_camera, whole_K, width, height)
         if settings.best_gain:
