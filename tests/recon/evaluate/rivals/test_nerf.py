@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from torch import nn
 
 from splatnode.recon.evaluate.appearance import FieldSnapshot
 from splatnode.recon.evaluate.rivals import nerfmm, nope_nerf
+from splatnode.recon.evaluate.rivals.known_depth import FrameWithDepth
 from splatnode.recon.evaluate.rivals.nerf import fit
 from splatnode.recon.evaluate.rivals.nerf.appearance import FieldAppearance, spread_pixels
 from splatnode.recon.evaluate.rivals.nerf.cameras import Cameras, Focal
@@ -126,6 +128,19 @@ def test_colours_that_are_not_used_do_not_count():
             FieldAppearance(learnt.field).render(np.eye(4), np.array([[16.0, 0, 8], [0, 16, 6], [0, 0, 1]]), 16, 12)
         )
     assert float(looks[0][:, 10:].mean()) < 0.5 < float(looks[1][:, 10:].mean())
+
+
+def test_both_rivals_with_rays_pass_masks_on(monkeypatch):
+    frames = list(photographs()[:3])
+    half = np.tile(np.arange(frames[0].width) < frames[0].width // 2, (frames[0].height, 1))
+    frames[1], given = replace(frames[1], mask=half), []
+    monkeypatch.setattr(fit, "learn", lambda images, used, *rest, **named: given.extend(used) or iter(()))
+    with pytest.raises(AssertionError):  # without an end there is no last snapshot
+        list(nerfmm.reconstruct(frames, 0))
+    assert [used is None for used in given] == [True, False, True] and 0.4 < given[1].float().mean() < 0.6
+    depth = np.ones(half.shape, np.float32)
+    view = nope_nerf._view_with_depth(FrameWithDepth("a", 0, frames[1].image, depth, np.eye(3), half))
+    assert view.used is not None and view.used.shape == view.depth.shape and 0.4 < view.used.float().mean() < 0.6
 
 
 def test_nerfmm_learns_a_place_and_its_cameras():
