@@ -20,6 +20,7 @@ from splatnode.capture.exif_time import exif_time
 from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import Intrinsics
 from splatnode.capture.image_header import UnusableImage, read_header
+from splatnode.capture.orientation import ON_ITS_SIDE, ORIENTATION
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.stamp import Stamp
@@ -67,6 +68,15 @@ def check_whole(data: bytes) -> None:
         heif_file.check_whole(data)
     else:
         read_header(data)
+
+
+def upright_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that an image file is decoded to; None where only decoding it tells. Raises UnusableImage."""
+    if heif_file.is_heif(data):
+        return None
+    header = read_header(data)
+    turned = (exif.first(exif.read_tags(header.exif), ORIENTATION) or 1) in ON_ITS_SIDE
+    return (header.height, header.width) if turned else (header.width, header.height)
 
 
 def decode_image(data: bytes, max_pixels: int = MAX_PIXELS) -> DecodedImage:

@@ -10,6 +10,7 @@ ORIENTATION = 0x0112  # of EXIF
 _TURNS = {
     1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (3, True), 6: (3, False), 7: (1, True), 8: (1, False),
 }  # fmt: skip
+ON_ITS_SIDE = tuple(orientation for orientation, (quarters, _) in _TURNS.items() if quarters % 2)
 
 
 def upright(image: npt.NDArray, orientation: int) -> npt.NDArray:

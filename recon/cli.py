@@ -205,7 +205,7 @@ def _benched(args: argparse.Namespace) -> Bench:
     with opened(args.cores, args.ray) as engine:
         return run_bench(
             plan,
-            Entrants(partial(methods.by_name, device=wanted), methods.start_of),
+            Entrants(partial(methods.by_name, device=wanted), methods.start_of, on.type),
             args.out,
             scoring=scoring,
             command=shlex.join(["splatnode", *sys.argv[1:]]),

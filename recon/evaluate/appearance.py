@@ -38,8 +38,11 @@ class Appearance(Protocol):
         """The median depth of what a camera has before it."""
         ...
 
-    def difference(self, image: Tensor, T_world_camera: Tensor, K: Tensor) -> Tensor:
-        """Mean absolute difference to `image` (H, W, 3), scalar, differentiable with respect to the pose (4, 4)."""
+    def difference(self, image: Tensor, T_world_camera: Tensor, K: Tensor, used: Tensor | None = None) -> Tensor:
+        """Mean absolute difference to `image` (H, W, 3), scalar, differentiable with respect to the pose (4, 4).
+
+        Where `used` (H, W) says so, which it does somewhere; None: everywhere.
+        """
         ...
 
     def render(self, T_world_camera: Array, K: Array, width: int, height: int) -> Tensor:
@@ -86,12 +89,13 @@ class Splats:
         ahead = z[z > 0]
         return float(np.median(ahead)) if len(ahead) else 1.0
 
-    def difference(self, image: Tensor, T_world_camera: Tensor, K: Tensor) -> Tensor:
+    def difference(self, image: Tensor, T_world_camera: Tensor, K: Tensor, used: Tensor | None = None) -> Tensor:
         height, width = image.shape[:2]
         rgb = self._rasterize(*self._tensors, T_world_camera, K, width, height, channels=("rgb",)).rgb
         if rgb is None:
             raise ValueError("the rasteriser was asked for the channel rgb and gave none")
-        return (rgb - image).abs().mean()
+        off = (rgb - image).abs()
+        return (off if used is None else off[used]).mean()
 
     def render(self, T_world_camera: Array, K: Array, width: int, height: int) -> Tensor:
         return torch.from_numpy(render_arrays(self._gaussians, T_world_camera, K, width, height).rgb)

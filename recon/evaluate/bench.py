@@ -6,6 +6,7 @@ import itertools
 import logging
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -17,13 +18,13 @@ from splatnode.capture.process.records import record_of
 from splatnode.recon.config import Config
 from splatnode.recon.evaluate.kept import Kept
 from splatnode.recon.evaluate.one_run import Done, Job, Reconstruct, Scoring, done, failed_row, seen, timed_start
-from splatnode.recon.evaluate.protocol import Row
-from splatnode.recon.evaluate.records import Bench, bench_files, read_bench, run_of, this_machine
+from splatnode.recon.evaluate.protocol import FAILED, Row
+from splatnode.recon.evaluate.records import Bench, bench_files, read_bench, run_of, set_name, this_machine
 from splatnode.recon.evaluate.report import report_files
 from splatnode.recon.evaluate.schedule import Need, Planned, ended
 from splatnode.recon.evaluate.splits import Split, load_split
 from splatnode.recon.evaluate.timing import check_same_cores, had_alone
-from splatnode.recon.evaluate.truth import EvaluationScene, load_scene
+from splatnode.recon.evaluate.truth import EvaluationScene, check_named_apart, load_scene
 from splatnode.recon.jobs.call import Answer, Work
 from splatnode.recon.jobs.calls import Engine, one_at_a_time, work_folder
 from splatnode.recon.jobs.child import Limits
@@ -53,6 +54,7 @@ class Entrants:
 
     reconstruct: Reconstruct
     start_of: Callable[[str], Config | None]
+    device: str = "cpu"  # on which they compute, and their scenes are scored, for the record
 
 
 def run_bench(
@@ -65,23 +67,24 @@ def run_bench(
     resume: bool = False,
     engine: Engine | None = None,
 ) -> Bench:
-    """Runs the plan and returns all that `out_dir` then holds; with `resume`, runs that it holds are not run again.
+    """Runs the plan and returns all that `out_dir` then holds; with `resume`, of runs that it holds what failed alone.
 
     `engine` says where runs are made and how many at a time; None: here, one at a time, on all cores. What came to an
     end is on the disk at once, in a journal beside bench.json, which is rewritten every few seconds, with bench.csv and
     the reports. Cameras and points that several methods start from are found once for each set of photographs and seed;
     their seconds count in each method's total. A run that fails, or exceeds its time or memory, becomes a row with the
     verdict "FAILED" and the reason. Seconds are those of runs that had their cores alone. Raises ValueError or
-    FileNotFoundError for a scene or split that is not there, or for an `out_dir` that holds runs that were scored
-    otherwise or had another number of cores, before anything is run.
+    FileNotFoundError for a scene or split that is not there or not told from another one, or for an `out_dir` that
+    holds runs that were made or scored otherwise or had another number of cores, before anything is run.
     """
     engine = engine or one_at_a_time()
     sets = _sets(plan)
     known = read_bench(out_dir / "bench.json") if resume and (out_dir / "bench.json").exists() else None
+    planned = set(_order(sets, plan))
+    before = _begun(plan, entrants, sets, scoring, command)
     if known is not None:
-        _check_resumable(known, scoring, engine, out_dir)
-        command = known.command if command in known.command else f"{known.command}; {command}"
-    before = Bench(() if known is None else known.rows, scoring.settings, this_machine(), command)
+        _check_resumable(known, before, engine, out_dir)
+        before = _continued(known, before, planned)
     present, found = before.done(), dict[_Key, list[Row]]()
     with result_folder(out_dir), work_folder(out_dir) as folder:
         write_files(out_dir, bench_files(before))  # how the runs of the journal are scored
@@ -89,8 +92,9 @@ def run_bench(
             (out_dir / _JOURNAL).unlink(missing_ok=True)
         with Kept(out_dir / _JOURNAL, lambda: _write(out_dir, _with(before, found, sets, plan))) as kept:
             for rows in (record_of(record, list[Row]) for record in kept.left()):
-                if run_of(rows[-1]) not in present:
-                    found[run_of(rows[-1])] = rows
+                key, failed = run_of(rows[-1]), rows[-1].verdict == FAILED
+                if key not in present and not (failed and key in planned):
+                    found[key] = rows
             todo = _todo(plan, entrants, sets, scoring, present | found.keys())
             runs = ended(todo, engine, Limits(plan.max_memory_mb, plan.timeout_s), folder)
             for rows in _told(_rows(runs, out_dir), len(todo)):
@@ -105,21 +109,59 @@ _JOURNAL = "bench.jsonl"
 
 
 def _sets(plan: Plan) -> list[_Set]:
-    """Scenes with absolute paths: other machines see them, too, not this process's folder."""
+    """Scenes with absolute paths: other machines see them, too, not this process's folder.
+
+    Raises ValueError where two scenes have one name, or two splits of a scene as many training views.
+    """
+    check_named_apart(plan.scenes)
     folders = [Path(os.path.abspath(folder)) for folder in plan.scenes]
     scenes = [(load_scene(folder), folder) for folder in folders]
-    return [
+    sets = [
         (scene, load_split(folder, list(scene.cameras), views))
         for (scene, folder), views in itertools.product(scenes, plan.views)
     ]
+    for (name, count), splits in Counter((scene.name, len(split.train)) for scene, split in sets).items():
+        if splits > 1:
+            raise ValueError(
+                f"{name} has {splits} splits with {count} training views, of the numbers of views "
+                f"{', '.join(map(str, plan.views))}: runs are told apart by them, so give numbers that differ"
+            )
+    return sets
 
 
-def _check_resumable(known: Bench, scoring: Scoring, engine: Engine, out_dir: Path) -> None:
-    if known.settings != scoring.settings:
+def _begun(plan: Plan, entrants: Entrants, sets: Sequence[_Set], scoring: Scoring, command: str) -> Bench:
+    """The plan, of which nothing has run."""
+    splits = {set_name(scene.name, len(split.train)): split for scene, split in sets}
+    checkpoints = tuple(sorted(set(plan.checkpoints)))
+    made = scoring.by_region, checkpoints, entrants.device, splits
+    return Bench((), scoring.settings, this_machine(), command, *made)
+
+
+def _check_resumable(known: Bench, now: Bench, engine: Engine, out_dir: Path) -> None:
+    if known.settings != now.settings:
         raise ValueError(f"{out_dir} holds views that were scored with {known.settings}: resume into another folder")
+    for name in ("by_region", "checkpoints", "device"):
+        before, wanted = getattr(known, name), getattr(now, name)
+        if before is not None and before != wanted:
+            raise ValueError(f"{out_dir} holds runs with {name} {before}, now {wanted}: resume into another folder")
+    for name, split in now.splits.items():
+        if known.splits.get(name, split) != split:
+            raise ValueError(f"{out_dir} holds runs of {name}, with another split: resume into another folder")
     before = known.machine.get("threads")  # which each run had, before a row said so itself
     cores = [row.cores or before for row in known.rows if row.seconds.get("total") is not None]
     check_same_cores([each for each in cores if each], engine.cores_each, out_dir)
+
+
+def _continued(known: Bench, now: Bench, planned: set[_Key]) -> Bench:
+    """What is `known`, with what the plan adds, and without the runs of the plan that failed: they are run again."""
+    again = (known.ended() - known.done()) & planned
+    return msgspec.structs.replace(
+        known,
+        rows=tuple(row for row in known.rows if run_of(row) not in again),
+        machine=now.machine,
+        command=known.command if now.command in known.command else f"{known.command}; {now.command}",
+        splits=known.splits | now.splits,
+    )
 
 
 def _todo(plan: Plan, entrants: Entrants, sets: Sequence[_Set], scoring: Scoring, finished: set[_Key]) -> list[Planned]:
@@ -176,12 +218,16 @@ def _told(runs: Iterator[list[Row]], total: int) -> Iterator[list[Row]]:
         logger.info("bench %d/%d, about %.0f min left: %s", number, total, left / 60, run_line(rows[-1]))
 
 
-def _with(before: Bench, found: dict[_Key, list[Row]], sets: Sequence[_Set], plan: Plan) -> Bench:
-    """With the rows that were found since, in the order of the plan, whichever came to its end first."""
-    order = [
+def _order(sets: Sequence[_Set], plan: Plan) -> list[_Key]:
+    return [
         (scene.name, len(split.train), method, seed)
         for (scene, split), seed, method in itertools.product(sets, plan.seeds, plan.methods)
     ]
+
+
+def _with(before: Bench, found: dict[_Key, list[Row]], sets: Sequence[_Set], plan: Plan) -> Bench:
+    """With the rows that were found since, in the order of the plan, whichever came to its end first."""
+    order = _order(sets, plan)
     planned = set(order)
     listed = [*(key for key in found if key not in planned), *(key for key in order if key in found)]
     return msgspec.structs.replace(before, rows=(*before.rows, *(row for key in listed for row in found[key])))

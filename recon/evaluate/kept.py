@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,18 +27,21 @@ class Kept:
         self._unwritten, self._next_s = 0, time.monotonic() + WRITE_EVERY_S
 
     def left(self) -> list[Any]:
-        """The records that a killed process has left, to be asked for before any is added. Half a line is dropped."""
+        """The records that a killed process has left, to be asked for before any is added.
+
+        Half a line is dropped, and so is a record with a number that is not finite, which `write` could not write.
+        """
         self._file.seek(0)
         content = self._file.read()
         end = content.rfind(b"\n") + 1
         self._file.truncate(end)
-        records = [json.loads(line) for line in content[:end].splitlines()]
+        records = list(_records(content[:end].splitlines()))
         self._unwritten = len(records)
         return records
 
     def add(self, record: Any) -> None:
-        """`record` is of JSON. Whoever calls has put it where `write` finds it."""
-        self._file.write(f"{json.dumps(record)}\n".encode())
+        """`record` is of JSON. Whoever calls has put it where `write` finds it. Raises ValueError for NaN, infinity."""
+        self._file.write(f"{json.dumps(record, allow_nan=False)}\n".encode())
         self._file.flush()
         os.fsync(self._file.fileno())
         self._unwritten += 1
@@ -62,3 +65,12 @@ class Kept:
         self._file.truncate(0)
         self._unwritten, ended_s = 0, time.monotonic()
         self._next_s = ended_s + max(WRITE_EVERY_S, _SHARE * (ended_s - began_s))
+
+
+def _records(lines: Iterable[bytes]) -> Iterator[Any]:
+    """The records of the lines but those with NaN or an infinity, which Python reads and JSON does not have."""
+    for line in lines:
+        odd: list[str] = []
+        record = json.loads(line, parse_constant=odd.append)
+        if not odd:
+            yield record

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 from splatnode.capture.frame import Frame
@@ -12,7 +13,7 @@ from splatnode.recon.config import Config
 from splatnode.recon.evaluate.appearance import Rasterize
 from splatnode.recon.evaluate.moments import Moment, run_to_its_end
 from splatnode.recon.evaluate.perceptual import Networks
-from splatnode.recon.evaluate.protocol import STAGES, Poses, Row, Run, Settings, evaluate, ignore_render
+from splatnode.recon.evaluate.protocol import FAILED, STAGES, Poses, Row, Run, Settings, evaluate, ignore_render
 from splatnode.recon.evaluate.regions import Counts
 from splatnode.recon.evaluate.renders import Renders
 from splatnode.recon.evaluate.shown import counts_of, surfaces
@@ -112,7 +113,27 @@ def done(job: Job, start: bytes | None, shown: bytes | None) -> Done:
             shown=counts,
         )
         rows.insert(0, _timed(row, job, moment, begun))
-    return Done(rows if outcome.error is None else [*rows, failed_row(job, outcome.error)], renders.files)
+    rows = rows if outcome.error is None else [*rows, failed_row(job, outcome.error)]
+    return Done(_finite(rows, job), renders.files)
+
+
+def _finite(rows: Sequence[Row], job: Job) -> list[Row]:
+    """The rows; up to the first one with a number that is not finite, as of a run that broke off there, if there is."""
+    for index, row in enumerate(rows):
+        if measure := _not_finite(row):
+            when = "the end" if row.checkpoint is None else f"iteration {row.iterations}"
+            return [*rows[:index], failed_row(job, f"{measure} is not finite at {when}")]
+    return list(rows)
+
+
+def _not_finite(row: Row) -> str:
+    """The first of the row's measures that no JSON file can hold; empty where there is none."""
+    for name, value in asdict(row).items():
+        try:
+            json.dumps(value, allow_nan=False)
+        except ValueError:
+            return name
+    return ""
 
 
 def failed_row(job: Job, error: str) -> Row:
@@ -125,7 +146,7 @@ def failed_row(job: Job, error: str) -> Row:
         final=True,
         seconds={**dict.fromkeys(STAGES), "total": None},
         peak_rss_mb=None,
-        verdict="FAILED",
+        verdict=FAILED,
         error=error,
     )
 

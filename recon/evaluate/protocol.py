@@ -13,21 +13,21 @@ from torch import Tensor
 
 from splatnode.recon.evaluate.appearance import Appearance, Rasterize, appearance_of
 from splatnode.recon.evaluate.camera_errors import CameraErrors, camera_errors
+from splatnode.recon.evaluate.held_out import held_out
 from splatnode.recon.evaluate.metrics import best_gains, psnr, ssim
 from splatnode.recon.evaluate.perceptual import Networks
 from splatnode.recon.evaluate.regions import UNKNOWN, Counts, ErrorMaps, RegionScore, error_maps, region_scores
-from splatnode.recon.evaluate.same_lens import mean_intrinsics, of_one_lens, seen_by
+from splatnode.recon.evaluate.same_lens import counts_seen_by, mean_intrinsics, of_one_lens
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.start_pose import between_neighbours
 from splatnode.recon.evaluate.test_pose import find_test_pose
 from splatnode.recon.evaluate.truth import EvaluationScene
-from splatnode.recon.frames import border
-from splatnode.recon.frames.keyframe import modelled_image, modelled_mask
 from splatnode.recon.geometry import align_cameras
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
 from splatnode.recon.scene.vignetting import light_at
 
 STAGES = ("poses", "points", "optimise")
+FAILED = "FAILED"  # in place of a verdict's code
 _FIRST_RATE, _CONTINUED_RATE = 3e-3, 5e-4  # learning rates of the test-pose search, in radians and parts of the depth
 
 
@@ -88,7 +88,7 @@ class Row:
     num_cameras: int | None = None  # of the training views, those with an estimated pose
     scene_bytes: int | None = None
     regions: Mapping[str, RegionScore] = field(default_factory=dict)  # by regions.REGIONS; empty: not measured
-    verdict: str  # a verdict's code; "FAILED" where the run ended without a result
+    verdict: str  # a verdict's code; FAILED where the run ended without a result
     error: str | None = None  # why it did
 
 
@@ -128,10 +128,9 @@ def evaluate(
     appearance = appearance_of(snapshot, rasterize)
     found = {} if found is None else found
     cameras = of_one_lens(snapshot.cameras)
-    counts = {} if shown is None or (cameras and cameras[0].lens) else shown  # they are of the photographs as they are
     falloff = snapshot.falloffs.get(cameras[0].name, 0.0) if cameras else 0.0
     seen = appearance, cameras, estimated, falloff
-    views = _score_test_views(*seen, scene, split, networks, settings, show, found, counts)
+    views = _score_test_views(*seen, scene, split, networks, settings, show, found, shown or {})
     return Row(
         scene=scene.name,
         views=len(split.train),
@@ -189,24 +188,22 @@ def _score_test_views(
     by the similarity that aligns the training cameras; or from between its neighbours, if `settings` says so. No view
     can be scored with fewer than two of them. Photographs are compared where they show the scene: a black rim that
     undistortion left is cut off, for the search too, and what a mask hides counts as well rendered in SSIM and LPIPS,
-    and not at all in PSNR and in the scores by region. A distortion that was taken out of the training photographs is
-    taken out of these, too. Where their vignetting was taken out, renders get it.
+    and not at all in the search, in PSNR and in the scores by region. A distortion that was taken out of the training
+    photographs is taken out of these, too. Where their vignetting was taken out, renders get it. A view of which masks
+    leave nothing is left out.
     """
     if appearance is None or len(estimated) < 2:
         return []
     true = [scene.cameras[camera.name].T_world_camera for camera in estimated]
     true_to_estimated = align_cameras(np.stack(true), np.stack([camera.T_world_camera for camera in estimated]))
-    names = [name for name in split.test if name in scene.cameras]
-    given = [seen_by(cameras[0].lens, *scene.masked_image(name)) for name in names]
-    photographs = [modelled_image(image, settings.longer_side) for image, _ in given]
-    rims = border.valid_masks(photographs)
     scores = []
-    for name, photograph, shown, (_, mask) in zip(names, photographs, rims, given, strict=True):
-        whole = torch.from_numpy(photograph).float() / 255.0
-        whole_K = mean_intrinsics(cameras, photograph.shape[1], photograph.shape[0])
-        rows, columns = border.valid_rectangle(shown)
+    for view in held_out(scene, split, cameras[0].lens, settings.longer_side):
+        name, whole, used = view.name, view.photograph, view.used
+        rows, columns = view.shown
+        height, width = whole.shape[:2]
+        whole_K = mean_intrinsics(cameras, width, height)
         truth = whole[rows, columns]
-        light = torch.from_numpy(light_at(falloff, photograph.shape[1], photograph.shape[0]))[..., None]
+        light = torch.from_numpy(light_at(falloff, width, height))[..., None]
         K = whole_K - np.array([[0.0, 0.0, columns.start], [0.0, 0.0, rows.start], [0.0, 0.0, 0.0]])
         if name in found:
             start, steps, levels, rate = found[name], settings.continued_steps, 1, _CONTINUED_RATE
@@ -215,20 +212,21 @@ def _score_test_views(
             if settings.start == "interpolated":
                 start = between_neighbours(name, list(scene.paths), {c.name: c.T_world_camera for c in estimated})
             steps, levels, rate = settings.alignment_steps, settings.alignment_levels, _FIRST_RATE
-        used = torch.from_numpy(modelled_mask(mask, *photograph.shape[:2]))
         target = (truth / light[rows, columns]).clamp(0.0, 1.0)
         if settings.best_gain:
             begun = appearance.render(start, K, truth.shape[1], truth.shape[0])
             target = target / best_gains(target, begun, used[rows, columns])
-        aligned = find_test_pose(appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate)
-        T_world_camera = aligned.T_world_camera
+        T_world_camera = find_test_pose(
+            appearance, target, start, K, steps=steps, levels=levels, learning_rate=rate, used=view.compared
+        ).T_world_camera
         found.setdefault(name, T_world_camera)
-        with_rim = light * appearance.render(T_world_camera, whole_K, photograph.shape[1], photograph.shape[0])
+        with_rim = light * appearance.render(T_world_camera, whole_K, width, height)
         if settings.best_gain:
             with_rim = with_rim * best_gains(truth, with_rim[rows, columns], used[rows, columns])
         with_rim = with_rim.clamp(0.0, 1.0)
         show(name, truth, with_rim[rows, columns])
-        scores.append(_view_score(with_rim, whole, used, (rows, columns), networks, counts.get(name)))
+        known = counts_seen_by(cameras[0].lens, counts[name]) if name in counts else None
+        scores.append(_view_score(with_rim, whole, used, view.shown, networks, known))
     return scores
 
 

@@ -13,7 +13,8 @@ from typing import Any
 import msgspec
 
 from splatnode.recon.evaluate.json_file import read_json
-from splatnode.recon.evaluate.protocol import Row, Settings
+from splatnode.recon.evaluate.protocol import FAILED, Row, Settings
+from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.timing import processor
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.report import versions
@@ -24,14 +25,27 @@ class Bench(msgspec.Struct, frozen=True):
     settings: Settings
     machine: dict[str, Any]
     command: str
+    # How runs are made, the same for all; None in files of older versions, which did not say so
+    by_region: bool | None = None
+    checkpoints: tuple[int, ...] | None = None
+    device: str | None = None
+    splits: dict[str, Split] = {}  # by `set_name`
+
+    def ended(self) -> set[tuple[str, int, str, int]]:
+        """The runs (scene, views, method, seed) that have come to their end, or failed."""
+        return {run_of(row) for row in self.rows if row.final}
 
     def done(self) -> set[tuple[str, int, str, int]]:
-        """The runs (scene, views, method, seed) that have come to their end."""
-        return {run_of(row) for row in self.rows if row.final}
+        """Those that need not be run again: they have not failed."""
+        return {run_of(row) for row in self.rows if row.final and row.verdict != FAILED}
 
 
 def run_of(row: Row) -> tuple[str, int, str, int]:
     return row.scene, row.views, row.method, row.seed
+
+
+def set_name(scene: str, views: int) -> str:
+    return f"{scene}, {views} views"
 
 
 def read_bench(path: Path) -> Bench:
@@ -47,11 +61,16 @@ def merged(benches: Sequence[Bench]) -> Bench:
     if len({bench.settings for bench in benches}) != 1:
         settings = [dataclasses.asdict(bench.settings) for bench in benches]
         raise ValueError(f"benchmarks can be put together if their views were scored alike, got settings {settings}")
-    last = {run: number for number, bench in enumerate(benches) for run in bench.done()}
+    last = {run: number for number, bench in enumerate(benches) for run in bench.ended()}
     rows = tuple(row for number, bench in enumerate(benches) for row in bench.rows if last.get(run_of(row)) == number)
     machine = {key: value for bench in benches for key, value in bench.machine.items()}
     commands = dict.fromkeys(bench.command for bench in benches)
-    return Bench(rows, benches[0].settings, machine, "; ".join(commands))
+    common: dict[str, Any] = {}
+    for name in ("by_region", "checkpoints", "device"):
+        told = {getattr(bench, name) for bench in benches}
+        common[name] = told.pop() if len(told) == 1 else None
+    splits = {key: split for bench in benches for key, split in bench.splits.items()}
+    return Bench(rows, benches[0].settings, machine, "; ".join(commands), **common, splits=splits)
 
 
 def bench_files(bench: Bench) -> dict[str, bytes]:
@@ -62,6 +81,10 @@ def bench_files(bench: Bench) -> dict[str, bytes]:
         "settings": dataclasses.asdict(bench.settings),
         "machine": bench.machine,
         "command": bench.command,
+        "by_region": bench.by_region,
+        "checkpoints": bench.checkpoints,
+        "device": bench.device,
+        "splits": {key: dataclasses.asdict(split) for key, split in bench.splits.items()},
     }
     return {"bench.json": json_bytes(content), "bench.csv": _csv(rows)}
 

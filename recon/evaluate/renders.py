@@ -36,7 +36,12 @@ class Renders:
 
 
 def kept(out_dir: Path, row: Row) -> dict[str, Path]:
-    """The render of each kept test view, by the view's name, for the run that `row` ends; none if nothing was kept."""
+    """The render of each kept test view, by the view's name, for the run that `row` ends; none if nothing was kept.
+
+    Nor are there any of a run that was not scored: what lies there is of an earlier run.
+    """
+    if row.psnr is None:
+        return {}
     found = (out_dir / FOLDER / f"{row.scene}-{row.views}").glob(f"*/{row.method}-{row.seed}.jpg")
     return {path.parent.name: path for path in sorted(found)}
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses.undistort import undistorted
+from splatnode.recon.evaluate.regions import UNKNOWN, Counts
 from splatnode.recon.result.snapshot import CameraEstimate
 
 Image = npt.NDArray[np.uint8]
@@ -29,7 +30,22 @@ def seen_by(lens: Intrinsics | None, image: Image, mask: Mask) -> tuple[Image, M
     if lens is None:
         return image, mask
     frame = undistorted(Frame(0, "photograph", 0, image, lens, mask=mask))
-    return frame.image, mask if frame.mask is None else frame.mask
+    return frame.image, np.ones(frame.image.shape[:2], bool) if frame.mask is None else frame.mask
+
+
+def counts_seen_by(lens: Intrinsics | None, counts: Counts) -> Counts | None:
+    """How many photographs show each pixel (H, W) of a photograph, without the distortion of `lens`.
+
+    UNKNOWN where pixels that differ in it are mixed. None for a fisheye, whose picture gets another shape.
+    """
+    if lens is None:
+        return counts
+    if lens.model == "fisheye":
+        return None
+    blank, straight = np.zeros((*counts.shape, 3), np.uint8), np.full_like(counts, UNKNOWN)
+    for count in np.unique(counts):
+        straight[seen_by(lens, blank, counts == count)[1]] = count
+    return straight
 
 
 def mean_intrinsics(cameras: Sequence[CameraEstimate], width: int, height: int) -> npt.NDArray[np.float64]:

@@ -18,9 +18,10 @@ import numpy.typing as npt
 from splatnode.recon.evaluate.regions import UNKNOWN, Counts
 from splatnode.recon.evaluate.true_cameras import TrueCamera
 from splatnode.recon.evaluate.truth import EvaluationScene
-from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.frames.keyframe import modelled_image, modelled_mask
 from splatnode.recon.geometry import project, to_camera
 from splatnode.recon.priors import stereo
+from splatnode.recon.priors.consistency import DepthMap
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8]
@@ -58,7 +59,11 @@ class Surface:
 
 def surfaces(scene: EvaluationScene, longer_side: int) -> dict[str, Surface]:
     """The surfaces that the photographs with a true camera see, at `longer_side` pixels, by name."""
-    images = {name: modelled_image(scene.image(name), longer_side) for name in scene.cameras}
+    given = {name: scene.masked_image(name) for name in scene.cameras}
+    images = {name: modelled_image(image, longer_side) for name, (image, _) in given.items()}
+    used = {
+        name: None if mask.all() else modelled_mask(mask, *images[name].shape[:2]) for name, (_, mask) in given.items()
+    }
     ranges = _depth_ranges(images, scene.cameras)
     views = {
         name: stereo.StereoView(image, _K(scene.cameras[name], image), scene.cameras[name].T_world_camera, ranges[name])
@@ -67,9 +72,15 @@ def surfaces(scene: EvaluationScene, longer_side: int) -> dict[str, Surface]:
     }
     maps = stereo.depth_maps(list(views.values()), stereo.Config())
     return {
-        name: Surface(view.T_world_camera, view.K, _closed(each.depth * (each.num_consistent >= _AGREEING)))
+        name: Surface(view.T_world_camera, view.K, _closed(_known(each, used[name])), used[name])
         for (name, view), each in zip(views.items(), maps, strict=True)
     }
+
+
+def _known(found: DepthMap, used: Mask | None) -> npt.NDArray[np.float32]:
+    """(h, w) the depth that another photograph confirms, of what is used; 0 elsewhere."""
+    sure = found.num_consistent >= _AGREEING
+    return found.depth * (sure if used is None else sure & used)
 
 
 def shown_counts(view: Surface, training: Sequence[Surface]) -> Counts:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from splatnode.capture.process.printable import printable
 from splatnode.recon.evaluate.json_file import read_json
 from splatnode.recon.evaluate.truth import scene_folder
 
@@ -24,18 +26,39 @@ def load_split(folder: Path, names: Sequence[str], views: int) -> Split:
     """The split of the scene in `folder` for `views` training images.
 
     It is that of the splits.json beside the scene's folder where that lists the scene, else the paper's of `names`.
+    Raises ValueError, which names the scene, where there is no such split, where it lists photographs that are not
+    among `names`, and where it lists one twice: what trains must not test.
     """
     place = scene_folder(folder)
     listed = place.parent / "splits.json"
     splits: dict[str, dict[str, list[str]]] = {}
     if listed.is_file():
         splits = read_json(listed, dict[str, dict[str, list[str]]], "lists of photographs by scene and split")
+    if not names:
+        raise ValueError(f"{place.name} must have photographs with a true camera, there are none")
     if place.name not in splits:
-        return paper_split(names, views)
+        try:
+            return paper_split(names, views)
+        except ValueError as error:
+            raise ValueError(f"{place.name}: {error}") from error
     split = splits[place.name]
     if not {f"train{views}", "test"} <= split.keys():
         raise ValueError(f"{listed} must list train{views} and test for {place.name}, has {sorted(split)}")
-    return Split(tuple(split[f"train{views}"]), tuple(split["test"]))
+    found = Split(tuple(split[f"train{views}"]), tuple(split["test"]))
+    _check(found, names, f"{listed}, train{views} and test of {place.name}")
+    return found
+
+
+def _check(split: Split, names: Sequence[str], where: str) -> None:
+    listed = (*split.train, *split.test)
+    if absent := sorted(set(listed) - set(names)):
+        raise ValueError(f"{where} must be of photographs with a true camera; these are not: {_told(absent)}")
+    if twice := sorted(name for name, times in Counter(listed).items() if times > 1):
+        raise ValueError(f"{where} must list each photograph once; these are there twice: {_told(twice)}")
+
+
+def _told(names: Sequence[str]) -> str:
+    return ", ".join(printable(name, 100) for name in names[:5]) + (" and more" if len(names) > 5 else "")
 
 
 def paper_split(names: Sequence[str], views: int) -> Split:

@@ -35,6 +35,7 @@ def find_test_pose(
     levels: int = 1,
     learning_rate: float = 0.003,
     final: float = 0.01,  # the share of it that is left of the learning rate at the end
+    used: Tensor | None = None,  # (H, W) where the image is compared; None: everywhere
 ) -> FoundPose:
     """Equation 18: the pose from which the frozen scene looks most like the image, in mean absolute difference.
 
@@ -55,8 +56,8 @@ def find_test_pose(
     T, best_T, best_loss = start, start, math.inf
     for step in range(steps):
         level = step * levels // steps
-        reduced, reduced_K = _reduced(image, K, 2 ** (levels - 1 - level))
-        loss, gradient = _loss_and_gradient(scene, reduced, T, reduced_K)
+        reduced = _reduced(image, K, used, 2 ** (levels - 1 - level))
+        loss, gradient = _loss_and_gradient(scene, T, *reduced)
         if level == levels - 1 and loss < best_loss:
             best_T, best_loss = T, loss
         slope = twist_gradient(T, gradient) * units
@@ -67,25 +68,35 @@ def find_test_pose(
         # The moments live in the camera's own frame, which turns with it: each step is a twist at the current pose.
         T = T @ exp_se3(-rate * unbiased[0] / (unbiased[1].sqrt() + _EPSILON) * units)
     for candidate in (T, start):
-        loss, _ = _loss_and_gradient(scene, image, candidate, torch.from_numpy(K))
+        loss, _ = _loss_and_gradient(scene, candidate, image, torch.from_numpy(K), used)
         if loss < best_loss:
             best_T, best_loss = candidate, loss
     return FoundPose(best_T.numpy(), best_loss)
 
 
-def _loss_and_gradient(scene: Appearance, image: Tensor, T_world_camera: Tensor, K: Tensor) -> tuple[float, Tensor]:
+def _loss_and_gradient(
+    scene: Appearance, T_world_camera: Tensor, image: Tensor, K: Tensor, used: Tensor | None
+) -> tuple[float, Tensor]:
     """The mean absolute difference, and its gradient (4, 4) with respect to the pose alone."""
     T = T_world_camera.to(image).requires_grad_()
-    loss = scene.difference(image, T, K.to(image))
+    loss = scene.difference(image, T, K.to(image), used)
     (gradient,) = torch.autograd.grad(loss, T)
     return float(loss.detach()), gradient.double()
 
 
-def _reduced(image: Tensor, K: Array, factor: int) -> tuple[Tensor, Tensor]:
-    """The image area-resampled by 1 / `factor`, and its K."""
+def _reduced(image: Tensor, K: Array, used: Tensor | None, factor: int) -> tuple[Tensor, Tensor, Tensor | None]:
+    """The image area-resampled by 1 / `factor`, its K, and where it is compared."""
     height, width = image.shape[:2]
     size = max(1, round(height / factor)), max(1, round(width / factor))
     ratios = torch.tensor([size[1] / width, size[0] / height, 1.0], dtype=torch.float64)
     if size != (height, width):
         image = functional.interpolate(image.permute(2, 0, 1)[None], size=size, mode="area")[0].permute(1, 2, 0)
-    return image, torch.from_numpy(K) * ratios[:, None]
+        used = None if used is None else _reduced_mask(used, size)
+    return image, torch.from_numpy(K) * ratios[:, None], used
+
+
+def _reduced_mask(used: Tensor, size: tuple[int, int]) -> Tensor:
+    """Pixels of which all is used; where there are none, those of which anything is."""
+    share = functional.interpolate(used.float()[None, None], size=size, mode="area")[0, 0]
+    whole = share > 0.999
+    return whole if whole.any() else share > 0

@@ -35,6 +35,14 @@ class TrueCamera:
     width: int
     height: int
 
+    def size_problem(self, width: int, height: int) -> str:
+        """Why no photograph of this size is the camera's, resized; empty where one may be. Sides may be rounded."""
+        off = abs(self.width * height - self.height * width)
+        if off <= max(self.width, self.height, width, height):
+            return ""
+        declared = f"declared {self.width} x {self.height}"
+        return f"{declared}, the photograph is {width} x {height} (after its EXIF orientation)"
+
     def K_for(self, width: int, height: int) -> npt.NDArray[np.float64]:
         """K of the image resized to `width` x `height`."""
         return self.K * np.array([width / self.width, height / self.height, 1.0])[:, None]

@@ -41,7 +41,9 @@ def _bench_arguments(parser: argparse.ArgumentParser) -> None:
     _add_engine(parser, "runs", "a run", 3600.0)
     add_device(parser)
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
-    parser.add_argument("--resume", action="store_true", help="go on: runs that --out holds are not run again")
+    parser.add_argument(
+        "--resume", action="store_true", help="go on: of the runs that --out holds, those that failed are run again"
+    )
     parser.add_argument(
         "--redraw", type=Path, nargs="+", metavar="BENCH.json", help="measure nothing: tables and charts of these"
     )

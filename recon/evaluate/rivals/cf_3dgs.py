@@ -97,6 +97,7 @@ def _next_pose(
         levels=3,
         learning_rate=config.motion_rate,
         final=_MOTION_FINAL,
+        used=None if following.mask is None else torch.from_numpy(following.mask),
     )
     return aligned.T_world_camera
 
@@ -104,11 +105,12 @@ def _next_pose(
 class _Alone(Splats):
     """Gaussians of a single frame: another one is compared with them where they are, and not beside its border."""
 
-    def difference(self, image: Tensor, T_world_camera: Tensor, K: Tensor) -> Tensor:
+    def difference(self, image: Tensor, T_world_camera: Tensor, K: Tensor, used: Tensor | None = None) -> Tensor:
         height, width = image.shape[:2]
         render = self._rasterize(*self._tensors, T_world_camera, K, width, height, channels=("rgb", "alpha"))
         assert render.rgb is not None and render.alpha is not None  # they were asked for
         covered = (render.alpha.detach() > 0.5)[..., None]
+        covered = covered if used is None else covered & used[..., None]
         return ((render.rgb - image).abs() * covered).sum() / (3 * covered.sum().clamp_min(1))
 
 
@@ -123,13 +125,16 @@ def _refined(scene: Scene, config: refinement.Config, iterations: int, seed: int
 
 def _view(frame: FrameWithDepth, T_world_camera: np.ndarray) -> TrainingView:
     T, K = torch.from_numpy(T_world_camera).float(), torch.from_numpy(frame.K).float()
-    return TrainingView(frame.name, frame.frame_id, frame.image, T, K)
+    return TrainingView(frame.name, frame.frame_id, frame.image, T, K, mask=frame.mask)
 
 
 def _from_depth(frame: FrameWithDepth, T_world_camera: np.ndarray, config: Config) -> Gaussians:
-    """A Gaussian for every `stride`-th pixel of every such row."""
+    """A Gaussian for every `stride`-th pixel of every such row that is used."""
     chosen = slice(config.stride // 2, None, config.stride), slice(config.stride // 2, None, config.stride)
     points = world_points(frame.depth, T_world_camera, frame.K)[chosen].reshape(-1, 3)
     rgb = (frame.image[chosen].reshape(-1, 3) / 255.0).astype(np.float32)
+    if frame.mask is not None:
+        used = frame.mask[chosen].reshape(-1)
+        points, rgb = points[used], rgb[used]
     source_frame = np.full(len(points), frame.frame_id, np.int32)
     return gaussians_at(np.ascontiguousarray(points), rgb, source_frame, config.opacity)

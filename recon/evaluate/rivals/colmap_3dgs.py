@@ -20,7 +20,7 @@ from splatnode.capture.lenses.undistort import undistorted
 from splatnode.recon.clock import Clock
 from splatnode.recon.evaluate.rivals import outcome
 from splatnode.recon.evaluate.rivals.colmap import Model, RegisteredFrame, sparse_model
-from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.frames.keyframe import modelled_image, modelled_mask
 from splatnode.recon.optimize import dropout, refinement
 from splatnode.recon.optimize.control import adaptive
 from splatnode.recon.optimize.control.control import ControlChoice
@@ -96,13 +96,22 @@ def begin(model: Model, _seed: int) -> Scene:
 
 
 def view(registered: RegisteredFrame) -> TrainingView:
-    """A registered frame without its lens' distortion, at modelled size."""
+    """A registered frame without its lens' distortion, at modelled size; what its mask hides is not fitted."""
     frame = undistorted(replace(registered.frame, intrinsics=registered.intrinsics))
     assert frame.intrinsics is not None  # COLMAP's
     image = modelled_image(frame.image, SIZE)
     K = frame.intrinsics.resized(image.shape[1], image.shape[0]).K
     T_world_camera = torch.from_numpy(registered.T_world_camera).float()
-    return TrainingView(frame.name, frame.frame_id, image, T_world_camera, torch.from_numpy(K).float())
+    mask = None if registered.frame.mask is None or frame.mask is None else modelled_mask(frame.mask, *image.shape[:2])
+    return TrainingView(
+        frame.name,
+        frame.frame_id,
+        image,
+        T_world_camera,
+        torch.from_numpy(K).float(),
+        mask=mask,
+        lens=registered.intrinsics if any(registered.intrinsics.distortion) else None,
+    )
 
 
 def in_parts_of_extent(config: refinement.Config, scene: Scene) -> refinement.Config:

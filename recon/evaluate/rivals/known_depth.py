@@ -34,6 +34,7 @@ class FrameWithDepth:
     image: npt.NDArray[np.uint8]  # (h, w, 3) RGB at modelled size
     depth: npt.NDArray[np.float32]  # (h, w) z, everywhere
     K: npt.NDArray[np.float64]  # (3, 3)
+    mask: npt.NDArray[np.bool_] | None = None  # (h, w) False: not used; None: all is
 
 
 def optimised(
@@ -60,9 +61,15 @@ def frames_with_depth(frames: Sequence[Frame], seed: int) -> tuple[FrameWithDept
     if begun is None:
         return ()
     views = sorted(begun.views, key=lambda view: view.frame_id)
+    masked = {frame.name for frame in frames if frame.mask is not None}  # what views see through a rival is not told
     return tuple(
         FrameWithDepth(
-            view.name, view.frame_id, view.image, _everywhere(view.pointmap, view.image), view.K.double().numpy()
+            view.name,
+            view.frame_id,
+            view.image,
+            _everywhere(view.pointmap, view.image),
+            view.K.double().numpy(),
+            view.mask if view.name in masked else None,
         )
         for view in views
         if view.pointmap is not None

@@ -19,7 +19,7 @@ from splatnode.recon.evaluate.rivals import outcome
 from splatnode.recon.evaluate.rivals.nerf import fit
 from splatnode.recon.evaluate.rivals.nerf.appearance import snapshot_of_field
 from splatnode.recon.evaluate.rivals.nerf.cameras import Focal
-from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.frames.keyframe import modelled_image, modelled_mask
 from splatnode.recon.result.snapshot import Snapshot
 
 SIZE = 256  # longer side of the photographs, pixels
@@ -33,5 +33,9 @@ def reconstruct(frames: Sequence[Frame], seed: int, config: fit.Config = OPTIMIZ
         yield outcome.refused(frames, clock)
         return
     images = [torch.from_numpy(modelled_image(frame.image, SIZE)).float() / 255.0 for frame in frames]
-    learnt = fit.learn(images, Focal(1.0), config, seed=seed)
+    used = [
+        None if frame.mask is None else torch.from_numpy(modelled_mask(frame.mask, *image.shape[:2]))
+        for frame, image in zip(frames, images, strict=True)
+    ]
+    learnt = fit.learn(images, used, Focal(1.0), config, seed=seed)
     yield from outcome.numbered((snapshot_of_field(frames, frames, each) for each in learnt), clock)

@@ -23,7 +23,7 @@ from splatnode.recon.evaluate.rivals.nerf import fit
 from splatnode.recon.evaluate.rivals.nerf.appearance import snapshot_of_field, spread_pixels
 from splatnode.recon.evaluate.rivals.nerf.cameras import Focal
 from splatnode.recon.evaluate.rivals.nerfmm import OPTIMIZE, SIZE
-from splatnode.recon.frames.keyframe import modelled_image
+from splatnode.recon.frames.keyframe import modelled_image, modelled_mask
 from splatnode.recon.result.snapshot import Snapshot
 
 _DEPTH, _CLOUD, _SURFACE = 0.04, 1.0, 1.0  # weights
@@ -45,7 +45,13 @@ def _learnt(
     focal = Focal(float(np.mean([frame.K[0, 0] / max(frame.image.shape) for frame in known]))).requires_grad_(False)
     terms = ExtraLosses(views, focal)
     learnt = fit.learn(
-        [view.image for view in views], focal, config, seed=seed, further=terms, beside=(terms.scales, terms.offsets)
+        [view.image for view in views],
+        [view.used for view in views],
+        focal,
+        config,
+        seed=seed,
+        further=terms,
+        beside=(terms.scales, terms.offsets),
     )
     yield from (snapshot_of_field(frames, registered, each) for each in learnt)
 
@@ -54,14 +60,15 @@ def _learnt(
 class ViewWithDepth:
     image: Tensor  # (h, w, 3)
     depth: Tensor  # (h, w), whose median is 1
+    used: Tensor | None = None  # (h, w) where its colours count; None: everywhere
 
 
 def _view_with_depth(frame: FrameWithDepth) -> ViewWithDepth:
     image = modelled_image(frame.image, SIZE)
     depth = cv2.resize(frame.depth, (image.shape[1], image.shape[0]), interpolation=cv2.INTER_NEAREST)
-    return ViewWithDepth(
-        torch.from_numpy(image).float() / 255.0, torch.from_numpy(depth / np.float32(np.median(depth))).float()
-    )
+    used = None if frame.mask is None else torch.from_numpy(modelled_mask(frame.mask, *image.shape[:2]))
+    depth = torch.from_numpy(depth / np.float32(np.median(depth))).float()
+    return ViewWithDepth(torch.from_numpy(image).float() / 255.0, depth, used)
 
 
 class ExtraLosses:

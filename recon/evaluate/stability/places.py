@@ -15,7 +15,7 @@ import numpy.typing as npt
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.evaluate.demo import write_capture
-from splatnode.recon.evaluate.truth import EvaluationScene, TrueCamera, load_scene
+from splatnode.recon.evaluate.truth import EvaluationScene, TrueCamera, check_named_apart, load_scene
 from splatnode.recon.geometry import angles_deg
 
 T = TypeVar("T")
@@ -207,8 +207,9 @@ def load_places(scenes: Sequence[Path], out: Path) -> Places:
 def loaded_places(scenes: Sequence[Path], out: Path) -> list[Place]:
     """The scenes in their folders; without any, the built-in place in `out`/places.
 
-    Raises ValueError where a scene has too few photographs with true cameras.
+    Raises ValueError where a scene has too few photographs with true cameras, or two have one name.
     """
+    check_named_apart(scenes)
     return [_recorded(folder) for folder in scenes] or [built_in(out, seed) for seed in _BUILT_IN_SEEDS]
 
 

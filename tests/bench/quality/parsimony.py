@@ -25,6 +25,7 @@ from splatnode.recon.optimize.control import prune, relocate
 from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.result.export.formats.spz import encode_spz
 from splatnode.recon.result.export.prepare import viewer_safe
+from splatnode.recon.result.export.staged import json_bytes, write_file
 from splatnode.recon.result.report import peak_rss_mb
 from splatnode.recon.scene import pixelwise
 from tests.bench.quality import race_cases
@@ -123,7 +124,7 @@ def fill(case: Case, rows: list[Row], folders: Folders, scoring: Scoring, out: P
 def write(rows: list[Row], settings: Settings, out: Path) -> None:
     records = [asdict(row) for row in rows]
     content = {"summary": summary(records), "settings": asdict(settings), "iterations": ITERATIONS, "rows": records}
-    out.write_text(json.dumps(content, indent=1) + "\n")
+    write_file(out, json_bytes(content))
 
 
 def main() -> None:

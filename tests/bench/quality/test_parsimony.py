@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
+import os
+
 import pytest
 
-from tests.bench.quality.parsimony import configurations
+from splatnode.recon.evaluate.protocol import Settings
+from tests.bench.quality.parsimony import configurations, write
 from tests.bench.quality.parsimony_chart import (
     PIXEL,
     RIVAL,
@@ -51,6 +55,14 @@ def test_half_is_worse_where_two_measures_are_and_twice_is_better_beyond_a_margi
     assert all(twice_is_better(methods(chosen, beyond)).values())
     told = summary([chosen, row("x0.5", 50, 24.0, 0.7, 0.2), beyond, row(SELF, 100, 20.0, views=3)])
     assert (told["sized"], told["half_is_worse"], told["twice_is_better"]["lpips"]) == (1, 1, 1)
+
+
+def test_a_file_is_replaced_whole(tmp_path):
+    out, before = tmp_path / "parsimony.json", tmp_path / "before"
+    out.write_text("before")
+    os.link(out, before)
+    write([], Settings(), out)
+    assert before.read_text() == "before" and json.loads(out.read_text())["rows"] == []
 
 
 def test_the_summary_takes_means_over_cases():

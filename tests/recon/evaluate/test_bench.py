@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 import shutil
 import time
@@ -64,6 +65,8 @@ def reconstruct(frames: Sequence[Frame], method: str, seed: int, start: Start | 
     for iterations in (0, 100, 200, 300):
         final = iterations == 300
         seconds = {"poses": -1.0 if start is None else start.seconds}
+        if method == "odd" and final:
+            seconds["poses"] = math.nan
         yield replace(
             perfect_snapshot(), verdict=verdict, iterations=iterations, final=final, sequence=seed, seconds=seconds
         )
@@ -88,9 +91,10 @@ def bench(
     shared: str = "",
     on: Engine | None = None,
     by_region: bool = False,
+    device: str = "cpu",
 ) -> list[Row]:
     """Methods whose names begin with `shared`, if it is given, start from the same cameras and points."""
-    entrants = Entrants(reconstruct, shared_by(shared))
+    entrants = Entrants(reconstruct, shared_by(shared), device)
     scoring = Scoring(rasterize, no_networks, settings, by_region)
     on = on or in_this_process()
     return list(run_bench(plan, entrants, out, scoring=scoring, command="bench", resume=resume, engine=on).rows)
@@ -146,6 +150,19 @@ def test_a_run_that_hangs_costs_only_itself(scene_folder, tmp_path):
     assert (row.verdict, row.error) == ("FAILED", "took longer than the 1 s that --timeout-s allows")
 
 
+def test_a_number_that_is_not_finite_costs_only_its_run(scene_folder, tmp_path, alone):
+    plan = Plan((scene_folder,), (3,), ("odd", "exact"), checkpoints=(150,))
+    rows = bench(plan, tmp_path)
+    assert [(row.method, row.checkpoint, row.verdict) for row in rows] == [
+        ("odd", 150, "OK"),
+        ("odd", None, "FAILED"),
+        ("exact", 150, "OK"),
+        ("exact", None, "OK"),
+    ]
+    assert rows[1].error == "seconds is not finite at the end"
+    assert json.loads((tmp_path / "bench.json").read_text())["rows"][1]["psnr"] is None
+
+
 def test_an_interrupted_benchmark_goes_on(scene_folder, tmp_path, alone):
     plan = Plan((scene_folder,), (3,), ("exact",))
     first = bench(plan, tmp_path)
@@ -162,6 +179,60 @@ def test_an_interrupted_benchmark_goes_on(scene_folder, tmp_path, alone):
     with pytest.raises(ValueError, match="now each would have 99 cores, and their seconds would be mixed"):
         bench(plan, tmp_path, resume=True, on=in_this_process(cores_each=99))
     assert bench(plan, tmp_path) != first  # without it everything is measured
+
+
+def test_what_failed_is_run_again_when_a_benchmark_goes_on(scene_folder, tmp_path, monkeypatch, alone):
+    plan = Plan((scene_folder,), (3,), ("shared", "exact", "broken"), checkpoints=(150,))
+
+    def fail(frames: object, config: object) -> Start:
+        raise RuntimeError("no memory was left")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("splatnode.recon.evaluate.one_run.find_start", fail)
+        first = bench(plan, tmp_path, shared="shared")
+    ends = [("shared", None, "FAILED"), ("exact", 150, "OK"), ("exact", None, "OK"), ("broken", None, "FAILED")]
+    assert [(row.method, row.checkpoint, row.verdict) for row in first] == ends
+    other = bench(replace(plan, methods=("exact",)), tmp_path, resume=True, on=nothing_is_left(first[1].cores))
+    assert other == first  # what failed is not of this plan
+    shutil.copytree(tmp_path, tmp_path / "killed")
+    content = json.loads((tmp_path / "killed" / "bench.json").read_text())
+    journal = [[row] for row in content["rows"] if row["method"] == "broken"]
+    (tmp_path / "killed" / "bench.json").write_text(json.dumps(content | {"rows": []}))
+    (tmp_path / "killed" / "bench.jsonl").write_text("".join(f"{json.dumps(rows)}\n" for rows in journal))
+    for out in (tmp_path, tmp_path / "killed"):
+        rows = bench(replace(plan, methods=("shared", "exact")), out, shared="shared", resume=True)
+        verdicts = {(row.method, row.checkpoint, row.verdict) for row in rows}
+        assert verdicts == {
+            ("broken", None, "FAILED"),
+            *((name, at, "OK") for name in ("shared", "exact") for at in (150, None)),
+        }
+        assert len(rows) == 5
+
+
+def test_a_benchmark_goes_on_as_it_began(scene_folder, tmp_path, alone):
+    here = tmp_path / scene_folder.name
+    shutil.copytree(scene_folder, here)
+    shutil.copy(scene_folder.parent / "splits.json", tmp_path)
+    plan, out = Plan((here,), (3,), ("refuses",), checkpoints=(300, 150)), tmp_path / "out"
+    first = bench(plan, out)
+    content = json.loads((out / "bench.json").read_text())
+    assert (content["by_region"], content["checkpoints"], content["device"]) == (False, [150, 300], "cpu")
+    with pytest.raises(ValueError, match="holds runs with by_region False, now True"):
+        bench(plan, out, resume=True, by_region=True)
+    with pytest.raises(ValueError, match=r"holds runs with checkpoints \(150, 300\), now \(150,\)"):
+        bench(replace(plan, checkpoints=(150,)), out, resume=True)
+    with pytest.raises(ValueError, match="holds runs with device cpu, now cuda"):
+        bench(plan, out, resume=True, device="cuda")
+    splits = json.loads((tmp_path / "splits.json").read_text())
+    splits["blobs"]["train3"][0] = "02.png"
+    (tmp_path / "splits.json").write_text(json.dumps(splits))
+    with pytest.raises(ValueError, match="holds runs of blobs, 3 views, with another split"):
+        bench(plan, out, resume=True)
+    assert json.loads((out / "bench.json").read_text()) == content
+    for name in ("by_region", "checkpoints", "device", "splits"):
+        del content[name]  # an older version did not say so
+    (out / "bench.json").write_text(json.dumps(content))
+    assert bench(plan, out, resume=True, on=nothing_is_left(first[0].cores)) == first
 
 
 def nothing_is_left(cores: int) -> Engine:
@@ -273,6 +344,23 @@ def test_bench_of_refusals_is_a_result_without_renders(scene_folder, tmp_path):
 def test_scene_that_is_not_there_stops_the_bench_before_it_starts(tmp_path):
     with pytest.raises(FileNotFoundError, match="must hold the scene's images"):
         bench(Plan((tmp_path / "absent",), (3,), ("exact",)), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_sets_that_rows_could_not_tell_apart_stop_the_bench_before_it_starts(scene_folder, tmp_path):
+    other = tmp_path / "other" / scene_folder.name
+    shutil.copytree(scene_folder, other)
+    for twice, said in ((other, "are both called 'blobs'"), (scene_folder / "24_views" / "..", "are one scene")):
+        with pytest.raises(ValueError, match=said) as error:
+            bench(Plan((scene_folder, twice), (3,), ("exact",)), tmp_path / "out")
+        assert str(scene_folder) in str(error.value) and str(twice) in str(error.value)
+    with pytest.raises(ValueError, match="are one scene"):
+        bench(Plan((scene_folder, scene_folder), (3,), ("exact",)), tmp_path / "out")
+    (other.parent / "splits.json").write_text(
+        json.dumps({"blobs": {"train3": ["00.png"], "train4": ["04.png"], "test": ["01.png"]}})
+    )
+    with pytest.raises(ValueError, match="blobs has 2 splits with 1 training views"):
+        bench(Plan((other,), (3, 4), ("exact",)), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from splatnode.recon.evaluate import kept
@@ -23,6 +25,15 @@ def test_what_a_killed_process_left_is_found(tmp_path):
         goes_on.add(known[-1])
         assert [*map(len, journal.read_bytes().splitlines())] == [10, 10, 10] and not written
     assert written == [known] and not journal.exists()
+
+
+def test_a_number_that_the_whole_cannot_hold_is_not_kept(tmp_path):
+    journal = tmp_path / "journal"
+    with pytest.raises(ValueError, match="JSON"):
+        Kept(journal, lambda: None).add({"run": math.nan})
+    assert journal.read_bytes() == b""
+    journal.write_bytes(b'{"run": 1}\n{"run": NaN}\n{"run": [-Infinity]}\n')  # of an older version
+    assert Kept(journal, lambda: None).left() == [{"run": 1}]
 
 
 def test_the_whole_is_written_now_and_then(tmp_path, monkeypatch):

@@ -17,7 +17,9 @@ from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses.undistort import undistorted
 from splatnode.recon.evaluate.metrics import psnr
 from splatnode.recon.evaluate.protocol import Run, evaluate
-from splatnode.recon.evaluate.same_lens import mean_intrinsics
+from splatnode.recon.evaluate.regions import UNKNOWN
+from splatnode.recon.evaluate.same_lens import counts_seen_by, mean_intrinsics, seen_by
+from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.evaluate.stability.places import Photo
 from splatnode.recon.evaluate.stability.warps import distorted
 from splatnode.recon.evaluate.test_pose import find_test_pose
@@ -57,16 +59,24 @@ def scene_folder(tmp_path_factory) -> Path:
     return folder
 
 
-def score(snapshot: Snapshot, folder: Path, found: dict[str, np.ndarray] | None = None, **settings):
+def score(
+    snapshot: Snapshot,
+    folder: Path,
+    found: dict[str, np.ndarray] | None = None,
+    split: Split = SPLIT,
+    shown: dict[str, np.ndarray] | None = None,
+    **settings,
+):
     return evaluate(
         snapshot,
         load_scene(folder),
-        SPLIT,
+        split,
         RUN,
         rasterize=rasterize,
         networks=NO_NETWORKS,
         settings=replace(QUICK, **settings),
         found=found,
+        shown=shown,
     )
 
 
@@ -138,6 +148,31 @@ def test_an_estimated_distortion_is_taken_out_of_held_out_photographs_too(scene_
     other = score(replace(snapshot, cameras=as_they_are), tmp_path / "blobs")
     assert row.psnr > 32.0 and row.psnr > other.psnr + 5.0
     assert row.focal_error_pct == pytest.approx(100.0 * (focal / 90.0 - 1.0))  # of the photographs as they were taken
+    shown = {name: np.full((HEIGHT, WIDTH), 2, np.uint8) for name in SPLIT.test}
+    for counts in shown.values():
+        counts[:, :24] = 0
+    regions = score(replace(snapshot, cameras=straight), tmp_path / "blobs", shown=shown).regions
+    assert regions["two"].psnr > 32.0 and regions["one"].share_pct == 0.0
+    assert 98.0 < regions["two"].share_pct + regions["none"].share_pct < 100.0  # what the lens mixes is neither
+
+
+def test_what_the_lens_mixes_is_unknown():
+    lens = Intrinsics(WIDTH, HEIGHT, 90.0, 90.0, 48.0, 36.0, "estimated", (-0.3, 0.0, 0.0, 0.0))
+    counts = np.full((HEIGHT, WIDTH), 2, np.uint8)
+    counts[:, :20] = 1
+    straight = counts_seen_by(lens, counts)
+    mixed = (straight == UNKNOWN).sum(1)
+    assert set(np.unique(straight)) == {1, 2, UNKNOWN} and mixed.min() >= 1 and mixed.max() <= 3
+    assert counts_seen_by(None, counts) is counts
+    assert counts_seen_by(replace(lens, model="fisheye"), counts) is None
+
+
+def test_what_a_lens_cuts_off_is_no_mask():
+    lens = Intrinsics(WIDTH, HEIGHT, 90.0, 90.0, 48.0, 36.0, "estimated", (0.05, 0.0, 0.0, 0.0), "fisheye")
+    cut = np.ones((HEIGHT, WIDTH), bool)
+    cut[0, 0] = False
+    image, used = seen_by(lens, np.zeros((HEIGHT, WIDTH, 3), np.uint8), cut)
+    assert used.all() and used.shape == image.shape[:2]
 
 
 def test_perfect_reconstruction_scores_perfectly(scene_folder):
@@ -216,6 +251,49 @@ def test_what_masks_hide_is_neither_given_nor_scored(scene_folder, tmp_path):
     truth = torch.from_numpy(load_scene(scene_folder).image(name)).float() / 255
     spoilt = torch.where(used[..., None], truth, 1 - truth)
     assert psnr(spoilt, truth, used) == 100.0 and psnr(spoilt, truth) < 20.0
+
+
+def masked_scene(folder: Path, masks: dict[str, np.ndarray]) -> Path:
+    """The scene of blobs in `folder` with these masks (H, W) by the name of the photograph, True where it is used."""
+    write_scene(folder)
+    (folder / "masks").mkdir()
+    for name, mask in masks.items():
+        cv2.imwrite(str(folder / "masks" / name), np.where(mask, 255, 0).astype(np.uint8))
+    return folder
+
+
+def test_a_view_of_which_a_mask_leaves_no_whole_pixel_is_left_out(scene_folder, tmp_path):
+    chequered = np.indices((HEIGHT, WIDTH)).sum(0) % 2 == 0  # half of it is used, and of no pixel of 48 all
+    folder = masked_scene(tmp_path / "blobs", {SPLIT.test[0]: chequered})
+    row = score(perfect_snapshot(), folder, longer_side=48)
+    alone = score(perfect_snapshot(), folder, split=replace(SPLIT, test=SPLIT.test[1:]), longer_side=48)
+    assert row.psnr == pytest.approx(alone.psnr, abs=0.5) and row.psnr > 30  # one photograph tells of no rim
+    none = score(perfect_snapshot(), folder, split=replace(SPLIT, test=SPLIT.test[:1]), longer_side=48)
+    assert (none.psnr, none.psnr_with_rim, none.verdict) == (None, None, "OK")
+
+
+def test_a_view_of_which_a_mask_leaves_hardly_anything_is_left_out(scene_folder, tmp_path):
+    sliver = np.zeros((HEIGHT, WIDTH), bool)
+    sliver[:2] = True  # 3 %
+    folder = masked_scene(tmp_path / "blobs", {SPLIT.test[0]: sliver})
+    image, used = load_scene(folder).masked_image(SPLIT.test[0])
+    assert image.shape == (HEIGHT, WIDTH, 3) and not used.any()
+    assert score(perfect_snapshot(), folder, split=replace(SPLIT, test=SPLIT.test[:1])).psnr is None
+    assert score(perfect_snapshot(), folder).psnr > 40
+
+
+def test_what_a_mask_hides_does_not_move_the_pose_that_is_searched(scene_folder, tmp_path, monkeypatch):
+    half = np.zeros((HEIGHT, WIDTH), bool)
+    half[:, : WIDTH // 2] = True
+    folder, asked = masked_scene(tmp_path / "blobs", {SPLIT.test[0]: half}), []
+
+    def noted(*scene_and_view, used, **steps):
+        asked.append(used)
+        return find_test_pose(*scene_and_view, used=used, **steps)
+
+    monkeypatch.setattr("splatnode.recon.evaluate.protocol.find_test_pose", noted)
+    assert score(perfect_snapshot(), folder).psnr > 50
+    assert 0.4 < asked[0].float().mean() < 0.6 and not asked[0][:, -1].any() and asked[1] is None
 
 
 def test_refused_scene_is_not_scored_but_its_cameras_are(scene_folder):

@@ -79,7 +79,7 @@ def test_the_built_in_place_is_known_by_its_photographs(tmp_path):
         paths[frame.name].write_bytes(encode_png(frame.image))
         cameras[frame.name] = TrueCamera(T_world_camera, K, SMALL.width, SMALL.height)
     found = surfaces(EvaluationScene("built-in", paths, cameras), 320)
-    assert set(found) == set(paths)
+    assert set(found) == set(paths) and all(each.used is None for each in found.values())
     for index, surface in enumerate(found.values()):
         depth, known = synthetic.depth_map(SMALL, true[index]), surface.depth > 0
         off = np.abs(surface.depth[known] / depth[known] - 1)
@@ -87,3 +87,24 @@ def test_the_built_in_place_is_known_by_its_photographs(tmp_path):
     views = list(found.values())
     counts = shown_counts(views[2], [views[1], views[3]])
     assert (counts == 2).mean() > 0.5  # neighbours show most of it
+
+
+def test_what_a_mask_hides_shows_nothing(tmp_path):
+    frames, true = photographs()[:4], synthetic.scene_cameras(SMALL)
+    paths = {frame.name: tmp_path / f"{frame.name}.png" for frame in frames}
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for frame in frames:
+        paths[frame.name].write_bytes(encode_png(frame.image))
+    hidden = np.full(frames[1].image.shape, 255, np.uint8)
+    hidden[:, : SMALL.width // 2] = 0
+    (masks / f"{frames[1].name}.png").write_bytes(encode_png(hidden))
+    cameras = {
+        f.name: TrueCamera(*camera, SMALL.width, SMALL.height) for f, camera in zip(frames, true[:4], strict=True)
+    }
+    found = surfaces(EvaluationScene("built-in", paths, cameras, masks), 320)
+    surface = found[frames[1].name]
+    middle = surface.depth.shape[1] // 2
+    assert surface.used is not None and not surface.used[:, :middle].any() and surface.used[:, middle:].all()
+    assert (surface.depth[:, : middle - 20] == 0).all() and (surface.depth[:, middle:] > 0).mean() > 0.5
+    assert all(found[frame.name].used is None for frame in (frames[0], *frames[2:]))

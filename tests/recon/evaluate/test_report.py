@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from html.parser import HTMLParser
 from urllib.parse import unquote_to_bytes
 
@@ -64,3 +65,14 @@ def test_a_hostile_name_is_text(tmp_path, name):
 def test_names_that_a_page_can_show_stay_as_they_are(tmp_path):
     page = report_files(Bench((row("Küche 3", "ours"),), Settings(), {}, "bench"), tmp_path)
     assert "<td>Küche 3</td>" in page["report.html"].decode() and "| Küche 3 |" in page["report.md"].decode()
+
+
+def test_renders_of_an_earlier_run_are_not_shown_beside_a_refusal(tmp_path):
+    for method in ("ours", "theirs"):
+        view = tmp_path / FOLDER / "a-3" / "view"
+        view.mkdir(parents=True, exist_ok=True)
+        for picture in (PHOTOGRAPH, f"{method}-0.jpg"):
+            (view / picture).write_bytes(b"")
+    rows = row("a", "ours"), replace(row("a", "theirs"), psnr=None, ssim=None, verdict="NO_OVERLAP")
+    page = Page(report_files(Bench(rows, Settings(), {}, "bench"), tmp_path)["report.html"].decode())
+    assert page.sources == [f"{FOLDER}/a-3/view/{PHOTOGRAPH}", f"{FOLDER}/a-3/view/ours-0.jpg"]

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
+from splatnode.recon.evaluate.json_file import EvaluationFileError
 from splatnode.recon.evaluate.splits import Split, load_split, paper_split
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.result.export.formats.colmap import encode_colmap
@@ -47,6 +48,38 @@ def test_listed_split_wins_over_the_paper_s(tmp_path):
     with pytest.raises(ValueError, match="must list train6 and test for garden, has"):
         load_split(tmp_path / "garden", NAMES, 6)
     assert load_split(tmp_path / "elsewhere", NAMES, 2) == paper_split(NAMES, 2)
+
+
+@pytest.mark.parametrize(
+    ("listed", "said"),
+    [
+        ({"train3": ["00.png", "01.png", "9.png"], "test": ["03.png"]}, r"photographs with a true camera; .*: 9\.png"),
+        ({"train3": ["00.png"], "test": ["02.png", "00.png"]}, r"each photograph once; these are there twice: 00\.png"),
+        ({"train3": ["00.png", "00.png"], "test": ["02.png"]}, r"each photograph once; these are there twice: 00\.png"),
+    ],
+)
+def test_a_split_of_photographs_that_are_not_there_or_train_and_test_is_refused(listed, said, tmp_path):
+    (tmp_path / "splits.json").write_text(json.dumps({"garden": listed}))
+    with pytest.raises(ValueError, match=rf"splits\.json, train3 and test of garden must .*{said}"):
+        load_split(tmp_path / "garden", NAMES, 3)
+
+
+def test_a_scene_that_has_not_enough_photographs_is_named(tmp_path):
+    with pytest.raises(ValueError, match="garden: views must be 1 to 4 for 8 images, got 6"):
+        load_split(tmp_path / "garden", NAMES, 6)
+    with pytest.raises(ValueError, match="garden must have photographs with a true camera"):
+        load_split(tmp_path / "garden", [], 3)
+
+
+def test_photographs_are_in_the_order_of_their_numbers(tmp_path):
+    names = ["frame_1.png", "frame_2.png", "frame_10.png"]
+    write_images(tmp_path / "images", [*names, ".hidden.png"])
+    (tmp_path / "images" / "folder.png").mkdir()
+    (tmp_path / "transforms.json").write_bytes(encode_nerfstudio(cameras(names)))
+    assert list(load_scene(tmp_path).paths) == list(load_scene(tmp_path).cameras) == names
+    (tmp_path / "transforms.json").write_bytes(encode_nerfstudio(cameras(["other.png"])))
+    with pytest.raises(EvaluationFileError, match=r"no photograph in .*images has a camera in .*transforms\.json"):
+        load_scene(tmp_path)
 
 
 def write_images(folder: Path, names: Sequence[str]) -> None:

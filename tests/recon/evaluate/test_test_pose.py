@@ -48,6 +48,19 @@ def test_test_pose_is_found_again(levels, steps):
     assert np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
 
 
+@pytest.mark.parametrize("levels", [1, 3])
+def test_what_is_not_used_does_not_move_the_pose(levels):
+    gaussians, true = make_wall(), motion(5, 0.05)
+    image = torch.from_numpy(render_rgb(gaussians, true, K, WIDTH, HEIGHT))
+    image[:, 50:] = torch.from_numpy(render_rgb(gaussians, true @ motion(9, 0.03), K, WIDTH, HEIGHT))[:, 50:]
+    used = (torch.arange(WIDTH) < 50).expand(HEIGHT, WIDTH)
+    start, off = true @ motion(6, 0.01), []
+    for mask in (used, None):
+        found = find_test_pose(Splats(gaussians, rasterize), image, start, K, steps=200, levels=levels, used=mask)
+        off.append(float(np.linalg.norm(found.T_world_camera[:3, 3] - true[:3, 3])))
+    assert off[0] < 0.005 < off[1]
+
+
 def test_search_never_ends_worse_than_it_started():
     gaussians = make_wall()
     image = torch.from_numpy(render_rgb(gaussians, np.eye(4), K, WIDTH, HEIGHT))

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 import tempfile
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -12,7 +14,7 @@ from splatnode.capture.image_file import encode_png
 from splatnode.recon.evaluate.json_file import EvaluationFileError
 from splatnode.recon.evaluate.records import read_bench
 from splatnode.recon.evaluate.splits import load_split
-from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.evaluate.truth import EvaluationScene, TrueCamera, load_scene
 from tests.support.crafted import Crafted
 from tests.support.crafted.bounded import MARGIN, readings
 from tests.support.crafted.images import HUGE, jpeg
@@ -56,12 +58,44 @@ def test_a_model_is_read_as_pycolmap_reads_it(model, tmp_path):
 
 
 def test_a_photograph_that_is_none_is_named(tmp_path):
-    files = {"images/a.jpg": jpeg(HUGE, HUGE), **{f"sparse/0/{name}": data for name, data in MODEL.items()}}
+    files = {"images/a.jpg": jpeg(HUGE, HUGE * 4 // 5), **{f"sparse/0/{name}": data for name, data in MODEL.items()}}
     scene = load_scene(write(tmp_path, files))
-    with pytest.raises(EvaluationFileError, match=r"a\.jpg must be an image: 50000 x 50000: more than"):
+    with pytest.raises(EvaluationFileError, match=r"a\.jpg must be an image: 50000 x 40000: more than"):
         scene.image("a.jpg")
     (tmp_path / "images" / "a.jpg").write_bytes(encode_png(np.full((2, 3, 3), (1, 2, 3), np.uint8)))
     assert scene.image("a.jpg").tolist() == [[[1, 2, 3]] * 3] * 2
+
+
+def turned(image: np.ndarray, orientation: int) -> bytes:
+    """A JPEG with an EXIF orientation."""
+    tiff = b"II*\0" + struct.pack("<IHHHIII", 8, 1, 274, 3, 1, orientation, 0)
+    part = b"Exif\0\0" + tiff
+    data = cv2.imencode(".jpg", image)[1].tobytes()
+    return data[:2] + b"\xff\xe1" + struct.pack(">H", len(part) + 2) + part + data[2:]
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_a_photograph_that_its_true_camera_did_not_take_is_refused(orientation, tmp_path):
+    model = {f"sparse/0/{name}": data for name, data in MODEL.items()}  # 100 x 80
+    photograph = turned(np.zeros((80, 100, 3), np.uint8), orientation)
+    folder = write(tmp_path, {"images/a.jpg": photograph, **model})
+    if orientation != 6:
+        assert load_scene(folder).image("a.jpg").shape == (80, 100, 3)
+        return
+    said = r"a\.jpg: declared 100 x 80, the photograph is 80 x 100 \(after its EXIF orientation\)"
+    with pytest.raises(EvaluationFileError, match=said):
+        load_scene(folder)
+    camera = TrueCamera(np.eye(4), np.eye(3), 100, 80)
+    with pytest.raises(EvaluationFileError, match=said):  # as of a file of which only decoding tells the size
+        EvaluationScene("a", {"a.jpg": folder / "images" / "a.jpg"}, {"a.jpg": camera}).image("a.jpg")
+
+
+def test_a_photograph_may_be_resized_and_its_sides_rounded():
+    for width, height in ((100, 80), (50, 40), (3, 2), (33, 26), (33, 27), (1000, 800), (1004, 800), (1000, 790)):
+        assert not TrueCamera(np.eye(4), np.eye(3), 100, 80).size_problem(width, height)
+    for width, height in ((80, 100), (3, 4), (100, 78), (1000, 780), (33, 33)):
+        assert TrueCamera(np.eye(4), np.eye(3), 100, 80).size_problem(width, height)
+    assert not TrueCamera(np.eye(4), np.eye(3), 5187, 3361).size_problem(648, 420)
 
 
 @pytest.mark.parametrize("content", [b"[" * 100_000, b"[]", b'{"scene": 3}', b'{"scene": {"train3": "a"}}', b"\xff"])

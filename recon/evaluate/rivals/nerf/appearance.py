@@ -44,9 +44,9 @@ class FieldAppearance:
                 ).depth.median()
             )
 
-    def difference(self, image: Tensor, T_world_camera: Tensor, K: Tensor) -> Tensor:
-        """On the same pixels whenever it is asked, evenly spread over the image."""
-        pixels = spread_pixels(image.shape[1], image.shape[0])
+    def difference(self, image: Tensor, T_world_camera: Tensor, K: Tensor, used: Tensor | None = None) -> Tensor:
+        """On the same pixels whenever it is asked, evenly spread over the image, or over what is `used` of it."""
+        pixels = spread_pixels(image.shape[1], image.shape[0]) if used is None else _spread_over(used)
         columns, rows = pixels.long().unbind(1)
         return (render_rays(self._field, T_world_camera, K, pixels).rgb - image[rows, columns]).abs().mean()
 
@@ -64,6 +64,14 @@ def spread_pixels(width: int, height: int, count: int = COMPARED_PIXELS) -> Tens
     plastic = 1.32471795724474602596
     shares = torch.arange(1, count + 1)[:, None] * torch.tensor([1 / plastic, 1 / plastic**2]) % 1.0
     return (shares * torch.tensor([width, height])).floor() + 0.5
+
+
+def _spread_over(used: Tensor) -> Tensor:
+    """(M, 2) centres of pixels among those of `used` (H, W): the additive sequence of the golden ratio."""
+    rows, columns = torch.nonzero(used, as_tuple=True)
+    shares = torch.arange(1, COMPARED_PIXELS + 1) * 0.61803398874989484820 % 1.0
+    chosen = (shares * len(rows)).long()
+    return torch.stack([columns[chosen], rows[chosen]], 1) + 0.5
 
 
 def snapshot_of_field(frames: Sequence[Frame], registered: Sequence[Frame], learnt: Learnt) -> FieldSnapshot:

@@ -49,6 +49,7 @@ class Step:
 
 def learn(
     images: Sequence[Tensor],  # (h, w, 3) in [0, 1]
+    used: Sequence[Tensor | None],  # (h, w) where the colours of each count; None: everywhere
     focal: Focal,
     config: Config,
     *,
@@ -83,7 +84,7 @@ def learn(
         pixels = pixels.floor() + 0.5
         rays = render_rays(field, cameras.T_world_camera(view), focal.K(width, height), pixels, draws)
         columns, rows = pixels.long().unbind(1)
-        loss = (rays.rgb - images[view][rows, columns]).square().mean()
+        loss = _colours((rays.rgb - images[view][rows, columns]).square(), used[view], rows, columns)
         if further is not None:
             loss = loss + further(Step(view, pixels, rays, cameras, progress))
         adam.zero_grad()
@@ -92,6 +93,14 @@ def learn(
         if iteration + 1 in config.checkpoints and iteration + 1 < config.iterations:
             yield _learnt(field, cameras, focal, iteration + 1)
     yield _learnt(field, cameras, focal, config.iterations)
+
+
+def _colours(squares: Tensor, used: Tensor | None, rows: Tensor, columns: Tensor) -> Tensor:
+    """The mean of the squared differences (M, 3) of the pixels that are used."""
+    if used is None:
+        return squares.mean()
+    counted = used[rows, columns]
+    return (squares.mean(1) * counted).sum() / counted.sum().clamp_min(1)
 
 
 def _learnt(field: Field, cameras: Cameras, focal: Focal, iterations: int) -> Learnt:

@@ -55,24 +55,26 @@ def run_windows(plan: Plan, places: Sequence[Place], out: Path, command: str, en
     What came to an end is on the disk at once, in a journal beside the file, which is rewritten every few seconds. A
     window that fails, or exceeds its time or memory, becomes a row with the verdict "FAILED" and the reason. Seconds
     are those of windows that had their cores alone. Raises ValueError where the file is of windows with another number
-    of cores.
+    of cores, or where splatnode was told the lens of its windows and now is not, or the other way round.
     """
-    rows = {row.key: row for row in _resumed(out / FILE, engine.cores_each)}
+    rows = {row.key: row for row in _resumed(out, plan, engine.cores_each)}
     jobs = _jobs(plan, places)
     whole = partial(_write, out / FILE, plan, rows, [job.key for job in jobs], command)
-    with result_folder(out), work_folder(out) as folder, Kept(out / _JOURNAL, whole) as kept:
-        left = (record_of(record, Row) for record in kept.left())
-        rows |= {row.key: row for row in left}
-        todo = [job for job in jobs if job.key not in rows or not _is_done(rows[job.key], plan)]
-        for number, row in enumerate(_results(plan, todo, engine, folder), start=len(jobs) - len(todo) + 1):
-            rows[row.key] = row
-            kept.add(asdict(row))
-            logger.info(
-                f"windows {number}/{len(jobs)}: {row.scene}, {row.count} at stride {row.stride} from {row.start}, "
-                f"{row.method}: {row.verdict}, {row.found.value}"
-            )
-        if not todo:
-            whole()  # it tells of this command, too
+    with result_folder(out), work_folder(out) as folder:
+        if not (out / FILE).exists():
+            whole()  # whether the windows of the journal had their lens given
+        with Kept(out / _JOURNAL, whole) as kept:
+            rows |= {row.key: row for row in (record_of(record, Row) for record in kept.left())}
+            todo = [job for job in jobs if job.key not in rows or not _is_done(rows[job.key], plan)]
+            for number, row in enumerate(_results(plan, todo, engine, folder), start=len(jobs) - len(todo) + 1):
+                rows[row.key] = row
+                kept.add(asdict(row))
+                logger.info(
+                    f"windows {number}/{len(jobs)}: {row.scene}, {row.count} at stride {row.stride} from {row.start}, "
+                    f"{row.method}: {row.verdict}, {row.found.value}"
+                )
+            if not todo:
+                whole()  # it tells of this command, too
     return _ordered(rows, [job.key for job in jobs])
 
 
@@ -117,6 +119,7 @@ def _work(plan: Plan, job: Job, known: Pieces) -> Work:
 class _Rows(msgspec.Struct, frozen=True):
     rows: list[Row]
     machine: dict[str, Any] = {}
+    given_lens: bool = False
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -124,8 +127,13 @@ def read_rows(path: Path) -> list[Row]:
     return _read(path).rows
 
 
-def _resumed(path: Path, cores_each: int) -> list[Row]:
+def _resumed(out: Path, plan: Plan, cores_each: int) -> list[Row]:
+    path = out / FILE
     content = _read(path)
+    begun = content.rows or (path.exists() and (out / _JOURNAL).exists())
+    if begun and content.given_lens != plan.given_lens:
+        told = "with --given-lens" if content.given_lens else "without --given-lens"
+        raise ValueError(f"{path} holds windows {told}: give another folder with --out DIR")
     before = content.machine.get("threads")  # which each window had, before a row said so itself
     known = [row.cores or before for row in content.rows if row.seconds is not None]
     check_same_cores([cores for cores in known if cores], cores_each, path)

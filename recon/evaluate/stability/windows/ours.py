@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 
 from splatnode.capture.frame import Frame
 from splatnode.recon.config import Config
@@ -44,16 +45,16 @@ def answered(
 
 
 def frames_of(place: Place, window: Window, given_lens: bool = False) -> list[Frame]:
-    """The photographs; their ids are their positions in the scene.
+    """The photographs without what masks hide; their ids are their positions in the scene.
 
     Nothing is known about the camera, or with `given_lens` its true intrinsics.
     """
     frames = []
-    for name in window.names:
-        index, image = place.names.index(name), place.scene.image(name)
-        camera = place.scene.cameras[name] if given_lens else None
-        intrinsics = None if camera is None else camera.intrinsics_for(image.shape[1], image.shape[0])
-        frames.append(Frame(index, name, index, image, intrinsics))
+    for frame in place.scene.frames(window.names):
+        index = place.names.index(frame.name)
+        camera = place.scene.cameras[frame.name] if given_lens else None
+        intrinsics = None if camera is None else camera.intrinsics_for(frame.width, frame.height)
+        frames.append(replace(frame, frame_id=index, stamp_ns=index, intrinsics=intrinsics))
     return frames
 
 

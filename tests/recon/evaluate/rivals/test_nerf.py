@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from torch import nn
 
 from splatnode.recon.evaluate.appearance import FieldSnapshot
 from splatnode.recon.evaluate.rivals import nerfmm, nope_nerf
+from splatnode.recon.evaluate.rivals.known_depth import FrameWithDepth
 from splatnode.recon.evaluate.rivals.nerf import fit
 from splatnode.recon.evaluate.rivals.nerf.appearance import FieldAppearance, spread_pixels
 from splatnode.recon.evaluate.rivals.nerf.cameras import Cameras, Focal
@@ -101,6 +103,44 @@ def test_a_pose_is_found_through_the_rays():
     aligned = find_test_pose(look, image, start, intrinsics, steps=60)
     assert aligned.loss < 0.2 * before
     assert look.depth(np.eye(4)) == pytest.approx(1.5, rel=0.1)
+
+
+def test_only_pixels_that_are_used_are_compared():
+    look = FieldAppearance(Painted())
+    image, T = look.render(np.eye(4), K.double().numpy(), 32, 24), torch.eye(4)
+    used = torch.zeros(24, 32, dtype=torch.bool)
+    used[3:5, 7:9] = True
+    image[~used] = 0.0
+    assert float(look.difference(image, T, K)) > 0.1 and float(look.difference(image, T, K, used)) < 1e-5
+
+
+def test_colours_that_are_not_used_do_not_count():
+    images = [torch.full((12, 16, 3), 0.25)] * 2
+    spoilt = [image.clone() for image in images]
+    for image in spoilt:
+        image[:, 8:] = 1.0
+    used = (torch.arange(16) < 8).expand(12, 16)
+    config = fit.Config(iterations=60, checkpoints=(), rays=64)
+    looks = []
+    for masks in ([used, used], [None, None]):
+        (learnt,) = fit.learn(spoilt, masks, Focal(1.0), config, seed=0)
+        looks.append(
+            FieldAppearance(learnt.field).render(np.eye(4), np.array([[16.0, 0, 8], [0, 16, 6], [0, 0, 1]]), 16, 12)
+        )
+    assert float(looks[0][:, 10:].mean()) < 0.5 < float(looks[1][:, 10:].mean())
+
+
+def test_both_rivals_with_rays_pass_masks_on(monkeypatch):
+    frames = list(photographs()[:3])
+    half = np.tile(np.arange(frames[0].width) < frames[0].width // 2, (frames[0].height, 1))
+    frames[1], given = replace(frames[1], mask=half), []
+    monkeypatch.setattr(fit, "learn", lambda images, used, *rest, **named: given.extend(used) or iter(()))
+    with pytest.raises(AssertionError):  # without an end there is no last snapshot
+        list(nerfmm.reconstruct(frames, 0))
+    assert [used is None for used in given] == [True, False, True] and 0.4 < given[1].float().mean() < 0.6
+    depth = np.ones(half.shape, np.float32)
+    view = nope_nerf._view_with_depth(FrameWithDepth("a", 0, frames[1].image, depth, np.eye(3), half))
+    assert view.used is not None and view.used.shape == view.depth.shape and 0.4 < view.used.float().mean() < 0.6
 
 
 def test_nerfmm_learns_a_place_and_its_cameras():

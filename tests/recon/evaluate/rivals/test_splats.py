@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -14,7 +15,7 @@ pytest.importorskip("pycolmap", reason="stock COLMAP needs pycolmap (pip install
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import Frame
 from splatnode.recon.evaluate.metrics import psnr
-from splatnode.recon.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs
+from splatnode.recon.evaluate.rivals import cf_3dgs, colmap_3dgs, colmap_fsgs, known_depth
 from splatnode.recon.evaluate.rivals.colmap import sparse_model
 from splatnode.recon.frames.keyframe import modelled_image
 from splatnode.recon.optimize import refinement
@@ -86,6 +87,35 @@ def test_3dgs_starts_from_colmap_s_points(model):
     centres = np.stack([each.T_world_camera[:3, 3] for each in model.registered])
     spread = np.linalg.norm(centres - centres.mean(0), axis=1).max()
     assert rates.means == pytest.approx(1.6e-4 * 1.1 * spread, rel=1e-5)
+
+
+def test_colmap_s_rivals_tell_the_lens_whose_distortion_they_took_out(model):
+    for each in model.registered:
+        view = colmap_3dgs.view(each)
+        assert any(each.intrinsics.distortion) and view.lens == each.intrinsics
+        assert colmap_3dgs.view(replace(each, intrinsics=replace(each.intrinsics, distortion=()))).lens is None
+
+
+def half_of(frame: Frame) -> np.ndarray:
+    return np.tile(np.arange(frame.width) < frame.width // 2, (frame.height, 1))
+
+
+def test_what_a_mask_hides_is_not_fitted_by_colmap_s_rivals(model):
+    for each in model.registered:
+        assert colmap_3dgs.view(each).mask is None
+        view = colmap_3dgs.view(replace(each, frame=replace(each.frame, mask=half_of(each.frame))))
+        assert view.mask is not None and view.mask.shape == view.image.shape[:2] and 0.4 < view.mask.mean() < 0.6
+
+
+def test_what_a_mask_hides_is_neither_a_start_nor_fitted_by_cf_3dgs(frames):
+    masked = [replace(frame, mask=half_of(frame)) if i == 1 else frame for i, frame in enumerate(frames)]
+    known = known_depth.frames_with_depth(masked, 0)
+    assert [each.mask is None for each in known] == [True, False, True]
+    frame, T = known[1], np.eye(4)
+    assert cf_3dgs._view(frame, T).mask is frame.mask
+    config = cf_3dgs.Config()
+    some, all_of_it = (cf_3dgs._from_depth(each, T, config) for each in (frame, replace(frame, mask=None)))
+    assert 0.4 < len(some) / len(all_of_it) < 0.6
 
 
 def test_fsgs_knows_the_depth_of_colmap_s_points(model):

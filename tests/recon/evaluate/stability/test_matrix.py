@@ -13,6 +13,7 @@ from splatnode.recon.evaluate.stability.places import (
     Sampler,
     far_apart,
     load_places,
+    loaded_places,
     motion,
     neighbours,
     parallel,
@@ -73,6 +74,11 @@ def test_views_far_apart(places):
 def test_a_folder_that_is_no_scene_is_a_clear_error(tmp_path):
     with pytest.raises(FileNotFoundError, match="must hold the scene's images"):
         load_places([tmp_path], tmp_path)
+
+
+def test_two_scenes_of_one_name_are_a_clear_error(tmp_path):
+    with pytest.raises(ValueError, match="a/room' and '.*b/room' are both called 'room'"):
+        loaded_places([tmp_path / "a" / "room", tmp_path / "b" / "room"], tmp_path)
 
 
 def test_every_number_has_a_row_and_every_row_a_name_of_its_own():

@@ -10,6 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from splatnode.capture.cameras import synthetic
+from splatnode.capture.image_file import encode_png
 from splatnode.recon import estimation
 from splatnode.recon.config import Config
 from splatnode.recon.evaluate.demo import write_capture
@@ -64,6 +65,23 @@ def test_what_is_known_of_a_scene_changes_no_answer(place):
             np.testing.assert_array_equal(one.K, other.K)
             assert one.bounds == other.bounds
     assert any(answer.verdict.publishable for answer in found), "else nothing was compared"
+
+
+def test_masks_hide_what_they_hide_in_windows_too(place, tmp_path):
+    each = window(place, 1, 2, 2)
+    hidden = np.full((PLACE.height, PLACE.width, 3), 255, np.uint8)
+    hidden[:100] = 0
+    (tmp_path / f"{each.names[1]}.png").write_bytes(encode_png(hidden))
+    scene = dataclasses.replace(place.scene, masks=tmp_path)
+    plain, frames = ours.frames_of(place, each, True), ours.frames_of(Place(scene, place.names), each, True)
+    assert [(frame.frame_id, frame.stamp_ns, frame.intrinsics is None) for frame in frames] == [
+        (1, 1, False),
+        (3, 3, False),
+    ]
+    assert_same(plain[0], frames[0])
+    assert frames[1].mask is not None and frames[1].mask.mean() == pytest.approx(140 / 240)
+    assert np.array_equal(frames[1].image[100:], plain[1].image[100:])
+    assert not np.array_equal(frames[1].image[:100], plain[1].image[:100])
 
 
 def assert_same(one: object, other: object) -> None:

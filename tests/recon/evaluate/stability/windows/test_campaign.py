@@ -132,6 +132,28 @@ def test_what_is_on_the_disk_is_not_run_again(tmp_path, monkeypatch):
         read_rows(tmp_path / "windows.json")
 
 
+def test_windows_with_a_given_lens_and_without_are_not_mixed(tmp_path, monkeypatch):
+    places, on = three_places(tmp_path).walked[:1], in_this_process()
+    monkeypatch.setattr(campaign.ours, "answered", first_broken)
+    plan, as_it_works = Plan(("splatnode",), per_kind=1, counts=(3,)), []
+
+    def noted(take, limits, folder):
+        as_it_works.append((tmp_path / "windows.json").read_bytes())
+        yield from on.answers(take, limits, folder)
+
+    rows = run_windows(plan, places, tmp_path, "command", replace(on, answers=noted))
+    assert json.loads(as_it_works[0])["given_lens"] is False, "the file says of what the journal is"
+    before = (tmp_path / "windows.json").read_bytes()
+    with pytest.raises(ValueError, match=r"windows\.json holds windows without --given-lens"):
+        run_windows(replace(plan, given_lens=True), places, tmp_path, "command", on)
+    assert (tmp_path / "windows.json").read_bytes() == before
+    (tmp_path / "windows.json").write_bytes(as_it_works[0])  # as a killed process leaves it: all is in the journal
+    (tmp_path / "windows.jsonl").write_text(f"{json.dumps(json.loads(before)['rows'][1])}\n")
+    with pytest.raises(ValueError, match="without --given-lens"):
+        run_windows(replace(plan, given_lens=True), places, tmp_path, "command", on)
+    assert run_windows(plan, places, tmp_path, "command", on)[1] == rows[1]
+
+
 def befallen(place, window, config, fresh, given_lens, known):
     """What befalls a window is told by its stride: 1 raises, 2 ends its process, 3 hangs."""
     if window.stride == 1:
