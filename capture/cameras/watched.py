@@ -22,6 +22,7 @@ from splatnode.capture.image_file import (
     read_image_file,
 )
 from splatnode.capture.name_time import name_time
+from splatnode.capture.nothing_new import NothingNew
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.unavailable import CameraUnavailable
 
@@ -55,11 +56,14 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
 
     Hidden and temporary files are not looked at. Raises CameraUnavailable where the folder is not there, or goes.
     """
-    return opener(config)()
+    return (item for item in opener(config)() if not isinstance(item, NothingNew))
 
 
-def opener(config: Config) -> Callable[[], Iterator[Frame | DroppedFrame]]:
-    """What opens the folder, again after each loss: then what came meanwhile is taken, and nothing a second time."""
+def opener(config: Config) -> Callable[[], Iterator[Frame | DroppedFrame | NothingNew]]:
+    """What opens the folder, again after each loss: then what came meanwhile is taken, and nothing a second time.
+
+    Each look at the folder ends with NothingNew.
+    """
     return _Watched(config).stream
 
 
@@ -72,7 +76,7 @@ class _Watched:
         self._done: dict[str, tuple[int, int] | None] = {}  # by name, the longest known first: which file it was
         self._here: set[str] = set()  # names at the last look
 
-    def stream(self) -> Iterator[Frame | DroppedFrame]:
+    def stream(self) -> Iterator[Frame | DroppedFrame | NothingNew]:
         """Raises CameraUnavailable."""
         if self._opened:
             self._here = set()  # while it was away, any name may have been given to another photograph
@@ -82,7 +86,7 @@ class _Watched:
         self._opened = True
         return self._frames()
 
-    def _frames(self) -> Iterator[Frame | DroppedFrame]:
+    def _frames(self) -> Iterator[Frame | DroppedFrame | NothingNew]:
         seen: dict[str, _Seen] = {}
         frame_id = 0
         while True:
@@ -94,6 +98,7 @@ class _Watched:
                     seen.pop(path.name, None)
                     frame_id += isinstance(item, Frame)
                     yield item
+            yield NothingNew()
             time.sleep(self._config.poll_s)
 
     def _to_look_at(self) -> list[Path]:
