@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import threading
 import time
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -104,6 +106,40 @@ def test_a_file_that_never_becomes_whole_is_named(tmp_path, monkeypatch):
     dropped = next(frames)
     assert isinstance(dropped, DroppedFrame) and dropped.name == "half.jpg"
     assert "truncated" in dropped.reason and "after 0 s" in dropped.reason and 0.4 <= now[0] < 0.5
+
+
+@pytest.mark.parametrize(
+    ("fails", "error"),
+    [("read", errno.EACCES), ("read", errno.EBUSY), ("read", errno.EIO), ("stat", errno.EIO), ("stat", errno.ESTALE)],
+)
+def test_a_file_that_cannot_be_read_for_a_moment_is_waited_for(tmp_path, monkeypatch, error, fails):
+    """As until the one who put it there changes its mode, or a network share answers again."""
+    failing(monkeypatch, error, fails, times={"a.jpg": 5, "never.jpg": 10**9})
+    for name in ("a.jpg", "never.jpg"):
+        (tmp_path / name).write_bytes(photograph())
+    frames = watch(tmp_path)
+    assert next(frames).name == "a.jpg"
+    dropped = next(frames)
+    assert isinstance(dropped, DroppedFrame) and dropped.name == "never.jpg"
+    assert dropped.reason == f"cannot be read: {os.strerror(error)}, after 0 s"
+
+
+def failing(monkeypatch, error, fails, times):
+    """Looks at the files of these names (`fails`: stat or read) fail so often."""
+
+    def flaky(look):
+        def looked(path, *args, **kwargs):
+            if times.get(path.name, 0) > 0:
+                times[path.name] -= 1
+                raise OSError(error, os.strerror(error), str(path))
+            return look(path, *args, **kwargs)
+
+        return looked
+
+    if fails == "stat":
+        monkeypatch.setattr(Path, "stat", flaky(Path.stat))
+    else:
+        monkeypatch.setattr(watched, "read_image_file", flaky(watched.read_image_file))
 
 
 def test_temporary_and_hidden_files_are_not_looked_at(tmp_path):
