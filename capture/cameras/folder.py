@@ -209,8 +209,8 @@ def frame_name(path: Path) -> str:
 def image_paths(folder: Path) -> list[Path]:
     """The photographs that lie in `folder` itself, by their suffix, in natural order; hidden files are not for us.
 
-    Nor are folders, pipes and devices, which could be waited for for ever. A link to nothing is, and what the disk or the
-    network share does not tell of now: it will be named.
+    Nor are folders, pipes and devices, which could be waited for for ever. A link to nothing is, and what the disk or
+    the network share does not tell of now: it will be named.
     """
     if not folder.is_dir():
         found = "is a file, not" if folder.exists() else "is not there; give"
