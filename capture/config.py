@@ -10,9 +10,10 @@ import msgspec
 
 from splatnode.capture import preview, reader, selection
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.masks import all_masked, constant
+from splatnode.capture.masks import Find, all_masked, constant
 from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.network import Network
+from splatnode.capture.nothing_new import NothingNew
 from splatnode.capture.process.config import Plugin
 from splatnode.capture.quality import Limits
 
@@ -35,14 +36,26 @@ class CaptureConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     body_mask: Path | None = None
 
 
-def camera_opener(camera: Camera, body_mask: Path | None = None) -> Callable[[], Iterator[Frame | DroppedFrame]]:
+def camera_opener(
+    camera: Camera, body_mask: Path | None = None
+) -> Callable[[], Iterator[Frame | DroppedFrame | NothingNew]]:
     """Opens the camera that is configured, and opens it again after a loss; without what `body_mask` hides.
 
     What it returns raises CameraUnavailable, when it is called or later; UnusableMask, FileNotFoundError.
     """
     remembering = getattr(camera.module, "opener", None)
     opened = partial(camera.module.stream, camera.config) if remembering is None else remembering(camera.config)
-    return opened if body_mask is None else lambda: all_masked(opened(), constant(body_mask))
+    return opened if body_mask is None else lambda: _masked(opened(), constant(body_mask))
+
+
+def _masked(
+    items: Iterator[Frame | DroppedFrame | NothingNew], find: Find
+) -> Iterator[Frame | DroppedFrame | NothingNew]:
+    for item in items:
+        if isinstance(item, NothingNew):
+            yield item
+        else:
+            yield from all_masked([item], find)
 
 
 def is_live(camera: Camera) -> bool:

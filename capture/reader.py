@@ -15,6 +15,7 @@ from typing import Annotated
 import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.nothing_new import NothingNew
 from splatnode.capture.unavailable import CameraUnavailable
 
 log = logging.getLogger(__name__)
@@ -51,7 +52,9 @@ class Failure:
 class Reader:
     """Frames of one session, numbered through all losses. Close it, or use it as a context manager."""
 
-    def __init__(self, open_camera: Callable[[], Iterator[Frame | DroppedFrame]], live: bool, config: Config) -> None:
+    def __init__(
+        self, open_camera: Callable[[], Iterator[Frame | DroppedFrame | NothingNew]], live: bool, config: Config
+    ) -> None:
         self.config = config
         self.why = ""  # of a degraded state
         self.skipped = 0  # frames of a live camera that a newer one replaced before they were read
@@ -114,26 +117,30 @@ class Reader:
 
         Raises CameraUnavailable where it was never there, or is lost for too long.
         """
-        count, pause, lost_at = 0, self.config.first_pause_s, None
+        count, pause, lost_at, was_there = 0, self.config.first_pause_s, None, False
         while not self._stop.is_set():
             try:
                 for item in self._numbered(count):
+                    if not isinstance(item, DroppedFrame):
+                        pause, lost_at, was_there, self.why = self.config.first_pause_s, None, True, ""
                     if isinstance(item, Frame):
                         count += 1
-                        self._last, lost_at, pause = time.monotonic(), None, self.config.first_pause_s
-                        self._state, self.why = State.STREAMING, ""
+                        self._last, self._state = time.monotonic(), State.STREAMING
+                    elif isinstance(item, NothingNew):
+                        self._state = State.STREAMING if count else State.STARTING
+                        continue
                     yield item
                 return
             except CameraUnavailable as error:
                 lost_at = lost_at or time.monotonic()
-                if count == 0 or time.monotonic() - lost_at > self.config.give_up_s:
+                if not was_there or time.monotonic() - lost_at > self.config.give_up_s:
                     raise
                 self._state, self.why = State.DEGRADED, str(error)
                 log.warning("camera lost: %s; opening it again in %.0f s", error, pause)
                 self._stop.wait(pause)
                 pause = min(2 * pause, self.config.longest_pause_s)
 
-    def _numbered(self, count: int) -> Iterator[Frame | DroppedFrame]:
+    def _numbered(self, count: int) -> Iterator[Frame | DroppedFrame | NothingNew]:
         """The camera's frames from one opening to its loss. A frame whose stamp does not grow is dropped."""
         newest_ns = -1
         stream = self._open_camera()
@@ -141,7 +148,7 @@ class Reader:
             for item in stream:
                 if self._stop.is_set():
                     return
-                if isinstance(item, DroppedFrame):
+                if not isinstance(item, Frame):
                     yield item
                 elif item.stamp_ns <= newest_ns:
                     yield DroppedFrame(item.name, f"its time stamp is {newest_ns - item.stamp_ns} ns before the last")

@@ -209,15 +209,25 @@ def frame_name(path: Path) -> str:
 def image_paths(folder: Path) -> list[Path]:
     """The photographs that lie in `folder` itself, by their suffix, in natural order; hidden files are not for us.
 
-    Nor are folders, pipes and devices, which could be waited for for ever. A link to nothing is: it will be named.
+    Nor are folders, pipes and devices, which could be waited for for ever. A link to nothing is, and what the disk or
+    the network share does not tell of now: it will be named.
     """
     if not folder.is_dir():
         found = "is a file, not" if folder.exists() else "is not there; give"
         raise FileNotFoundError(f"{str(folder)!r} {found} a folder that holds JPEG or PNG photographs")
     suffixes = SUFFIXES | FOREIGN_SUFFIXES
     visible = [path for path in folder.iterdir() if not path.name.startswith(".")]
-    chosen = [path for path in visible if path.suffix.lower() in suffixes and (path.is_file() or not path.exists())]
+    chosen = [path for path in visible if path.suffix.lower() in suffixes and _may_be_file(path)]
     return sorted(chosen, key=natural_order)
+
+
+def _may_be_file(path: Path) -> bool:
+    try:
+        return path.is_file() or not path.exists()
+    except PermissionError:  # the folder itself may not be entered
+        raise
+    except OSError:
+        return True
 
 
 def names_in(folder: Path) -> list[str]:

@@ -22,6 +22,7 @@ from splatnode.capture.image_file import (
     read_image_file,
 )
 from splatnode.capture.name_time import name_time
+from splatnode.capture.nothing_new import NothingNew
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.unavailable import CameraUnavailable
 
@@ -34,7 +35,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     existing: bool = True  # whether what lies there at the start is taken, too
     poll_s: Annotated[float, msgspec.Meta(gt=0)] = 0.2  # between looks at the folder
     settle_s: Annotated[float, msgspec.Meta(ge=0)] = 0.4  # a file is whole when it has not changed for so long
-    give_up_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0  # a file that is not whole after so long is left out
+    # A file that is not whole, or cannot be read, after so long is left out
+    give_up_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0
     max_pixels: MaxPixels = MAX_PIXELS  # larger images are left out
     # The lens, of all images of its aspect ratio, instead of what their EXIF tells
     intrinsics: Intrinsics | None = None
@@ -44,7 +46,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class _Seen:
     """A file as it was when it last changed."""
 
-    size: int
+    size: int  # -1: it could not be asked
     changed_ns: int
     since: float  # monotonic
     first: float
@@ -55,11 +57,14 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
 
     Hidden and temporary files are not looked at. Raises CameraUnavailable where the folder is not there, or goes.
     """
-    return opener(config)()
+    return (item for item in opener(config)() if not isinstance(item, NothingNew))
 
 
-def opener(config: Config) -> Callable[[], Iterator[Frame | DroppedFrame]]:
-    """What opens the folder, again after each loss: then what came meanwhile is taken, and nothing a second time."""
+def opener(config: Config) -> Callable[[], Iterator[Frame | DroppedFrame | NothingNew]]:
+    """What opens the folder, again after each loss: then what came meanwhile is taken, and nothing a second time.
+
+    Each look at the folder ends with NothingNew.
+    """
     return _Watched(config).stream
 
 
@@ -72,7 +77,7 @@ class _Watched:
         self._done: dict[str, tuple[int, int] | None] = {}  # by name, the longest known first: which file it was
         self._here: set[str] = set()  # names at the last look
 
-    def stream(self) -> Iterator[Frame | DroppedFrame]:
+    def stream(self) -> Iterator[Frame | DroppedFrame | NothingNew]:
         """Raises CameraUnavailable."""
         if self._opened:
             self._here = set()  # while it was away, any name may have been given to another photograph
@@ -82,7 +87,7 @@ class _Watched:
         self._opened = True
         return self._frames()
 
-    def _frames(self) -> Iterator[Frame | DroppedFrame]:
+    def _frames(self) -> Iterator[Frame | DroppedFrame | NothingNew]:
         seen: dict[str, _Seen] = {}
         frame_id = 0
         while True:
@@ -94,6 +99,7 @@ class _Watched:
                     seen.pop(path.name, None)
                     frame_id += isinstance(item, Frame)
                     yield item
+            yield NothingNew()
             time.sleep(self._config.poll_s)
 
     def _to_look_at(self) -> list[Path]:
@@ -123,9 +129,9 @@ def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> 
     """The photograph; None while it is being written, or where it has gone."""
     if (unreadable := foreign_file(path)) is not None:
         return unreadable
-    name = frame_name(path)
+    name, now = frame_name(path), time.monotonic()
     try:
-        found, now = path.stat(), time.monotonic()
+        found = path.stat()
         before = seen.get(path.name)
         if before is None or (before.size, before.changed_ns) != (found.st_size, found.st_mtime_ns):
             seen[path.name] = _Seen(found.st_size, found.st_mtime_ns, now, before.first if before else now)
@@ -137,13 +143,18 @@ def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> 
     except FileNotFoundError:
         seen.pop(path.name, None)
         return None
-    except OSError as error:
+    except OSError as error:  # often for a moment: its mode is still to be changed, a share answers late
         _listed(config.folder)  # raises where it is the folder that has gone
-        return DroppedFrame(name, f"cannot be read: {error.strerror}")
+        first = seen.setdefault(path.name, _Seen(-1, -1, now, now)).first
+        return _given_up(name, f"cannot be read: {error.strerror}", now - first, config)
     except UnusableImage as error:
-        waited = now - seen[path.name].first
-        return None if waited < config.give_up_s else DroppedFrame(name, f"{error}, after {waited:.0f} s")
+        return _given_up(name, str(error), now - seen[path.name].first, config)
     return _decoded(name, data, Stamp(max(0, found.st_mtime_ns), Clock.FILE), config, frame_id)
+
+
+def _given_up(name: str, why: str, waited_s: float, config: Config) -> DroppedFrame | None:
+    """None while it may still become whole, or readable."""
+    return None if waited_s < config.give_up_s else DroppedFrame(name, f"{why}, after {waited_s:.0f} s")
 
 
 def _decoded(name: str, data: bytes, written_at: Stamp, config: Config, frame_id: int) -> Frame | DroppedFrame:

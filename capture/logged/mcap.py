@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import io
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
@@ -115,7 +115,7 @@ def _of_topics(stream: IO[bytes], wanted: Collection[str], known: _Known) -> Ite
         if chunk.chunk_start_offset >= num_bytes:  # a place that cannot be sought would be an error of the disk's
             raise UnusableLog(f"its index leads to byte {chunk.chunk_start_offset}, it has {num_bytes}")
         stream.seek(chunk.chunk_start_offset)
-        yield from _unpacked(next(_reader(stream, skip_magic=True).records))
+        yield from unpacked(next(_reader(stream, skip_magic=True).records))
 
 
 def _summary(stream: IO[bytes]) -> Any:
@@ -133,10 +133,10 @@ def _summary(stream: IO[bytes]) -> Any:
 def _records(stream: IO[bytes]) -> Iterator[Any]:
     stream.seek(0)
     for record in _reader(stream).records:
-        yield from _unpacked(record)
+        yield from unpacked(record)
 
 
-def _unpacked(record: Any) -> Iterator[Any]:
+def unpacked(record: Any) -> Iterator[Any]:
     """What a chunk holds; any other record itself. Raises UnusableLog where it would take too much memory."""
     from mcap.records import Chunk
     from mcap.stream_reader import breakup_chunk
@@ -146,7 +146,27 @@ def _unpacked(record: Any) -> Iterator[Any]:
         return
     if record.uncompressed_size > _MOST_BYTES:
         raise UnusableLog(f"a chunk must have at most {_MOST_BYTES} bytes, it has {record.uncompressed_size}")
-    yield from breakup_chunk(record, validate_crc=True)
+    yield from breakup_chunk(_decompressed(record), validate_crc=True)
+
+
+def _decompressed(chunk: Any) -> Any:
+    """The chunk as one that is not compressed: no more of it is decompressed than it says that it holds."""
+    told, is_whole = chunk.uncompressed_size, True
+    if chunk.compression == "lz4":
+        import lz4.frame
+
+        decompressor = lz4.frame.LZ4FrameDecompressor()
+        data = decompressor.decompress(chunk.data, max_length=told + 1)
+        is_whole = decompressor.eof
+    elif chunk.compression == "zstd":
+        import zstandard
+
+        data = zstandard.ZstdDecompressor().stream_reader(io.BytesIO(chunk.data)).read(told + 1)
+    else:  # none, or one that mcap does not know and names
+        return chunk
+    if len(data) != told or not is_whole:
+        raise UnusableLog(f"a chunk says that it holds {told} bytes, and holds more or fewer")
+    return replace(chunk, compression="", data=data)
 
 
 def _reader(stream: IO[bytes], skip_magic: bool = False) -> Any:

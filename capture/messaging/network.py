@@ -2,8 +2,10 @@
 
 ZeroMQ behaves as follows (measured), hence this file. A second bind on an ipc path succeeds and takes it over: a lock
 prevents it. A send without a receiver blocks for ever: no send waits. A pending message keeps a process from ending:
-LINGER is 0. A plain tcp socket gives the application raw bytes from anybody: there is no tcp without CURVE. The number
-of parts of a message is not bounded: a peer that is let in could fill the memory, which the services' MemoryMax limits.
+LINGER is 0. The answer to a heartbeat cannot overtake a part that is on its way: what takes longer than their time-out
+would never arrive, so that there are none, and the kernel notices a dead link. A plain tcp socket gives the application
+raw bytes from anybody: there is no tcp without CURVE. The number of parts of a message is not bounded: a peer that is
+let in could fill the memory, which the services' MemoryMax limits.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ _ZAP_DOMAIN = "splatnode"
 _MAX_FAILED_HANDSHAKES = 5  # in a row; one may fail because the other process was just ending
 _RECONNECT_MS, _MAX_RECONNECT_MS = 100, 1000  # pause before connecting again, doubled up to the second
 _HANDSHAKE_MS = 5000  # a connection whose handshake takes longer is closed
-_HEARTBEAT_MS, _HEARTBEAT_TIMEOUT_MS = 1000, 4000  # over tcp: a dead link is noticed, on both ends
+_DEAD_LINK_S = 10  # without a sign of the other machine, after which a tcp connection is given up, on both ends
+_PROBES = 4  # of an idle connection in that time, after a first while of the same length
 _FILES, _THREADS = 32, 3  # of which an endpoint has need: two threads of libzmq, one that knows whom to let in
 _LONGEST_IPC_PATH = 107  # sun_path, see unix(7)
 
@@ -175,7 +178,7 @@ class Endpoint:
         socket.reconnect_ivl, socket.reconnect_ivl_max = _RECONNECT_MS, _MAX_RECONNECT_MS
         socket.handshake_ivl = _HANDSHAKE_MS
         if self.network.tcp is not None:
-            socket.heartbeat_ivl, socket.heartbeat_timeout = _HEARTBEAT_MS, _HEARTBEAT_TIMEOUT_MS
+            _notice_dead_links(socket)
         return socket
 
 
@@ -200,6 +203,16 @@ class _Link:
             self._failures = 0 if event == zmq.EVENT_HANDSHAKE_SUCCEEDED else self._failures + 1
         if self._failures >= _MAX_FAILED_HANDSHAKES:
             raise NotAllowed(f"{self._address} does not have the key that server.key in network.keys expects of it")
+
+
+def _notice_dead_links(socket: zmq.Socket) -> None:
+    """Leaves it to the kernel: a message may take as long as a slow link needs, and a peer that hangs stays connected.
+
+    Each pattern minds those itself, as over ipc: by requests that no longer come, by the age of what came.
+    """
+    socket.tcp_maxrt = 1000 * _DEAD_LINK_S  # TCP_USER_TIMEOUT: for data that nobody confirms
+    socket.tcp_keepalive, socket.tcp_keepalive_cnt = 1, _PROBES
+    socket.tcp_keepalive_idle = socket.tcp_keepalive_intvl = max(1, _DEAD_LINK_S // (_PROBES + 1))
 
 
 def runtime_directory(network: Network) -> Path:

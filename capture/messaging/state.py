@@ -1,7 +1,7 @@
 """A state of which the newest counts, such as the scene for viewers: published, and sent to whoever asks.
 
 It is published whenever it changes. A client that has just subscribed, or has received nothing for a while, asks for it
-and says which one it has; the reply is the newest state, or nothing where the client has it.
+and says which one it has; the reply is the newest state, or nothing where the client has it, or it is on its way there.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from splatnode.capture.messaging.wire import Message, Part, WireError, decode, e
 ASK_EVERY_S = 1.0  # without a state
 MAX_REQUESTS = 1000  # that one call of `serve` reads
 MAX_MESSAGES = 8  # that are read at once; more than both queues hold
+MOST_CLIENTS = 256  # of which it is known what is on its way to them
 ENDED_SESSIONS = 16  # of senders, whose late messages are known to be old
 
 
@@ -41,8 +42,10 @@ class StateServer(Endpoint):
     def __init__(self, service: Service, network: Network) -> None:
         super().__init__(network, offers=service)
         self._newest: tuple[tuple[str, int], list[Part]] | None = None
+        self._sent: dict[bytes, tuple[str, int]] = {}  # to each connection last; it arrives, or the connection ends
         self._publisher = self._bind(service, zmq.PUB, queue=4)
         self._router = self._bind(service.requests, zmq.ROUTER, queue=2)
+        self._router.router_mandatory = True  # what is not sent is said
 
     def publish(self, header: Any, arrays: Sequence[npt.NDArray] = ()) -> None:
         """Sends a state (its header is a wire.Header) and keeps it. The arrays must not be written to afterwards.
@@ -74,9 +77,19 @@ class StateServer(Endpoint):
             except WireError as error:
                 self._refuse("a request", error)
         for identity, want in wanted.items():
-            if self._newest is not None and self._newest[0] != (want.session, want.sequence):
-                with contextlib.suppress(zmq.Again):  # the client has not read the last reply yet
-                    self._router.send_multipart([identity, *self._newest[1]], zmq.NOBLOCK, copy=False)
+            self._reply(identity, want)
+
+    def _reply(self, identity: bytes, want: Want) -> None:
+        """Sends the newest state, once over a connection: over a slow link one asks again while it is arriving."""
+        if self._newest is None or self._newest[0] in ((want.session, want.sequence), self._sent.get(identity)):
+            return
+        try:
+            self._router.send_multipart([identity, *self._newest[1]], zmq.NOBLOCK, copy=False)
+        except zmq.ZMQError:  # the client has not read the last reply yet, or has gone
+            return
+        self._sent[identity] = self._newest[0]
+        while len(self._sent) > MOST_CLIENTS:
+            del self._sent[next(iter(self._sent))]
 
 
 class StateClient(Endpoint):

@@ -21,33 +21,39 @@ class ServiceManager:
         timeout_s = int(usec) / 1e6 if re.fullmatch("[0-9]{1,18}", usec) else 0.0
         self._every_s = WATCHDOG_SHARE * timeout_s if timeout_s else 1.0
         self._next = 0.0
-        self._is_ready = False
+        self._is_ready = self._knows_ready = False
 
     @property
     def is_ready(self) -> bool:
         return self._is_ready
 
     def ready(self) -> None:
-        """Only the first call sends."""
+        """Only the first call sends; `alive` goes on with that until it has gone out."""
         if not self._is_ready:
             self._is_ready = True
-            self._notify("READY=1")
+            self._knows_ready = self._notify("READY=1")
 
     def alive(self, status: str) -> None:
         """`status` is shown by systemctl status."""
-        if time.monotonic() >= self._next:
+        if self._is_ready and not self._knows_ready:
+            self._knows_ready = self._notify("READY=1")
+        # A line break would begin another assignment.
+        if time.monotonic() >= self._next and self._notify(f"WATCHDOG=1\nSTATUS={printable(status)}"):
             self._next = time.monotonic() + self._every_s
-            self._notify(f"WATCHDOG=1\nSTATUS={printable(status)}")  # a line break would begin another assignment
 
     def stopping(self) -> None:
         self._notify("STOPPING=1")
 
-    def _notify(self, message: str) -> None:
+    def _notify(self, message: str) -> bool:
+        """False where it is worth another time: the manager is busy, or this process has no descriptor to spare."""
         if not self._address:
-            return
+            return True
         address = f"\0{self._address[1:]}" if self._address.startswith("@") else self._address
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as link:
-            try:
+        try:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as link:
                 link.sendto(message.encode(), address)
-            except OSError:
-                self._address = ""  # a manager that does not listen is none
+        except (FileNotFoundError, ConnectionRefusedError):
+            self._address = ""  # a manager that does not listen is none
+        except OSError:
+            return False
+        return True

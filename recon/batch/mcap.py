@@ -12,7 +12,7 @@ from mcap.records import Message as Record
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from splatnode.capture.logged.mcap import UnusableLog
+from splatnode.capture.logged.mcap import UnusableLog, unpacked
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import printable
 from splatnode.recon.result.export.foxglove import Message, add_messages, written
@@ -96,8 +96,8 @@ def _contents(stream: IO[bytes], left_out: Collection[str]) -> Iterator[tuple]:
 
 def _records(stream: IO[bytes]) -> Iterator[Any]:
     """Up to the end of the data; what follows is an index."""
-    for record in StreamReader(stream).records:
+    for record in StreamReader(stream, emit_chunks=True).records:
         if isinstance(record, DataEnd):
             return
-        yield record
+        yield from unpacked(record)
     raise UnusableLog("it ends before the end of its data")

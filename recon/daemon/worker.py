@@ -146,8 +146,11 @@ class Worker:
         return True
 
     def _take_in(self, arrived: list[Arrived]) -> None:
+        """A keyframe that was retracted while it was prepared comes after the word of that, and is not taken in."""
         self.problem = ""
-        self.place.take_in(arrived)
+        stored = [each for each in arrived if self._store.holds(each.keyframe.frame)]
+        if stored or not arrived:
+            self.place.take_in(stored)
 
     def _meanwhile(self) -> None:
         """While the scene of a place that was left is finished, the present one goes on.

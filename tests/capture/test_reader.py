@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.nothing_new import NothingNew
 from splatnode.capture.reader import Config, Reader, State
 from splatnode.capture.unavailable import CameraUnavailable
 from tests.capture.messaging.test_sockets import wait_for
@@ -99,6 +100,33 @@ def test_a_lost_camera_comes_back_under_new_numbers():
     assert len(openings) == 5 and reader.why == ""
     pauses = np.diff(openings)
     assert pauses[1] > 0.015 and pauses[2] > 0.035  # 0.01, 0.02, 0.04
+
+
+def test_a_loss_is_over_once_the_camera_is_there_though_it_has_no_frame(clock):
+    """A watched folder that is back may get no photograph for days."""
+    lost, back = threading.Event(), threading.Event()
+
+    def camera():
+        if lost.is_set():
+            raise CameraUnavailable("cannot watch the folder")
+        while not lost.is_set():
+            back.set()
+            yield NothingNew()
+            time.sleep(0.001)
+        raise CameraUnavailable("cannot watch the folder")
+
+    def is_lost_and_back():
+        lost.set()
+        wait_for(lambda: reader.state is State.DEGRADED and "cannot watch" in reader.why)
+        back.clear()
+        lost.clear()
+        wait_for(lambda: back.is_set() and reader.state is State.STARTING and not reader.why)
+        assert reader.next(0) is None
+
+    with Reader(camera, live=False, config=QUICK) as reader:
+        for _ in range(3):  # longer altogether than it may be lost at once
+            is_lost_and_back()
+            clock.s += 0.8
 
 
 def test_while_it_is_lost_it_says_so(clock):

@@ -1,4 +1,7 @@
-"""Keyframes over a real link between two network namespaces that is slow, lossy and cut: each arrives once."""
+"""Keyframes over a real link between two network namespaces that is slow, lossy and cut: each arrives once.
+
+A connection over a link that is cut is given up on both ends, whether data is on its way or nothing is said over it.
+"""
 
 from __future__ import annotations
 
@@ -14,22 +17,32 @@ import pytest
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.messaging import keys
+from splatnode.capture.messaging import network as network_module
+from splatnode.capture.messaging.broadcast import Publisher
 from splatnode.capture.messaging.keyframes import KeyframeServer
 from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES, CAPTURE_PREVIEW
 from splatnode.capture.messaging.spool import Config, Spool
 from tests.conftest import ROOT
 
 HERE, THERE = "10.213.7.1", "10.213.7.2"
 FRAMES = 20
+ESTABLISHED = "01"  # in /proc/net/tcp
 IMAGE = np.random.default_rng(0).integers(0, 256, (240, 320, 3)).astype(np.uint8)
 
-RECON = """
+DEAD_LINK_S = 3
+
+RECON = f"""
 import sys, pathlib
+from splatnode.capture.messaging import network
+from splatnode.capture.messaging.broadcast import Subscriber
 from splatnode.capture.messaging.keyframes import KeyframeClient
-from splatnode.capture.messaging.network import Network
+from splatnode.capture.messaging.services import CAPTURE_PREVIEW
+from splatnode.capture.messaging.wire import Header
+network._DEAD_LINK_S = {DEAD_LINK_S}
 folder = pathlib.Path(sys.argv[1])
-network = Network(directory=folder / "there", tcp=sys.argv[2], keys=folder / "laptop")
-with KeyframeClient(network) as client:
+network = network.Network(directory=folder / "there", tcp=sys.argv[2], keys=folder / "laptop")
+with KeyframeClient(network) as client, Subscriber(CAPTURE_PREVIEW, network, Header):
     while True:
         if (received := client.receive(1.0)) is not None:
             print(received.sequence, flush=True)
@@ -39,6 +52,11 @@ with KeyframeClient(network) as client:
 
 def sh(*command):
     return subprocess.run(command, capture_output=True, text=True)
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch):
+    monkeypatch.setattr(network_module, "_DEAD_LINK_S", DEAD_LINK_S)
 
 
 @pytest.fixture
@@ -89,24 +107,60 @@ def serve(server, until, seconds):
     assert until()
 
 
+def connections(name=None):
+    """How many connections of the port of keyframes, and of that of previews, the kernel holds, here or in `name`."""
+    there = ("ip", "netns", "exec", name) if name else ()
+    found = sh(*there, "cat", "/proc/net/tcp").stdout.splitlines()[1:]
+    ends = [(local.split(":")[1], other.split(":")[1]) for _, local, other, state, *_ in map(str.split, found)
+            if state == ESTABLISHED]  # fmt: skip
+    first = Network().first_port
+    ports = (f"{first + service.tcp_port:04X}" for service in (CAPTURE_KEYFRAMES, CAPTURE_PREVIEW))
+    return [sum(port in pair for pair in ends) for port in ports]
+
+
 @pytest.mark.netns
-def test_a_link_that_is_cut_loses_and_doubles_nothing(tmp_path, link):
+@pytest.mark.parametrize("end", ["here", "there"])
+def test_a_link_that_is_cut_loses_and_doubles_nothing(tmp_path, link, end):
     name, cable = link
     network = networks(tmp_path)
-    with KeyframeServer(network, Spool(Config(tmp_path / "state"))) as server, recon(tmp_path, name) as process:
+    cut = ("ip", "link", "set", cable) if end == "here" else ("ip", "-n", name, "link", "set", f"sb{os.getpid()}"[:15])
+    with (
+        KeyframeServer(network, Spool(Config(tmp_path / "state"))) as server,
+        Publisher(CAPTURE_PREVIEW, network),
+        recon(tmp_path, name) as process,
+    ):
         for index in range(FRAMES // 2):
             server.offer(Frame(index, f"{index}.png", index, IMAGE, None))
-        serve(server, lambda: server.acknowledged >= 3, 20)
-        sh("ip", "link", "set", cable, "down")
+        serve(server, lambda: server.acknowledged >= 3 and connections() == connections(name) == [1, 1], 20)
+        sh(*cut, "down")
         for index in range(FRAMES // 2, FRAMES):
             server.offer(Frame(index, f"{index}.png", index, IMAGE, None))
-        waited = time.monotonic() + 6  # longer than it takes to give the connection up
-        serve(server, lambda: time.monotonic() > waited, 10)
+        serve(server, lambda: connections() == connections(name) == [0, 0], 3 * DEAD_LINK_S)
         assert server.queued > 0
-        sh("ip", "link", "set", cable, "up")
+        sh(*cut, "up")
         serve(server, lambda: server.queued == 0, 30)
         process.kill()
         assert [int(line) for line in process.communicate()[0].splitlines()] == list(range(FRAMES))
+
+
+@pytest.mark.netns
+def test_a_frame_that_takes_longer_than_a_dead_link_arrives_at_once(tmp_path, link):
+    name, cable = link
+    made = sh("tc", "qdisc", "add", "dev", cable, "root", "tbf", "rate", "300kbit", "burst", "16kb", "latency", "1s")
+    if made.returncode != 0:
+        pytest.skip(f"needs the kernel's tbf: {made.stderr.strip()}")
+    with (
+        KeyframeServer(networks(tmp_path), Spool(Config(tmp_path / "state"))) as server,
+        recon(tmp_path, name) as process,
+    ):
+        server.offer(Frame(0, "0.png", 0, IMAGE, None))
+        began = time.monotonic()
+        serve(server, lambda: server.queued == 0, 20)
+        assert time.monotonic() - began > DEAD_LINK_S + 1
+        process.kill()
+        assert process.communicate()[0].split() == ["0"]
+        sent = sh("tc", "-s", "qdisc", "show", "dev", cable).stdout.split("Sent ")[1].split()[0]
+        assert int(sent) < 1.3 * IMAGE.nbytes
 
 
 @pytest.mark.netns

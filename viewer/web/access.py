@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
-import os
 import re
 import secrets
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatnode.capture.process.private import NotPrivate, create_own, read_own
+from splatnode.capture.process.durable import write_whole
+from splatnode.capture.process.private import NotPrivate, read_own
 
 LOOPBACK = "127.0.0.1"
 _KEY = re.compile(r"[A-Za-z0-9_-]{32,128}")
@@ -68,24 +68,30 @@ def new_key() -> str:
 
 
 def kept_key(path: Path) -> str:
-    """The key in the file; a new one, which the file gets, where there is none.
+    """The key in the file; a new one, which the file gets, where there is none, or where it was cut to nothing.
 
-    Raises NotPrivate where others may read the file, ValueError for one that holds no key, OSError.
+    Raises NotPrivate where others may read the file, ValueError for one that holds something else, OSError.
     """
-    try:
-        descriptor = create_own(path)
-    except FileExistsError:
-        text = read_own(path, _LARGEST, only_ours=True).decode(errors="replace").strip()
-        if path.lstat().st_mode & _OTHERS:
-            raise NotPrivate(f"others may read {path}. Run: chmod 600 {path}") from None
-        if not _KEY.fullmatch(text):
-            raise ValueError(
-                f"{path} must hold 32 to 128 letters, digits, - or _; remove it to get a new key"
-            ) from None
-        return text
-    with os.fdopen(descriptor, "w") as file:
-        file.write((key := new_key()) + "\n")
+    text = _text(path)
+    if not text:
+        write_whole(path, [f"{new_key()}\n".encode()])
+        text = _text(path)
+    key = text.decode(errors="replace").strip()
+    if not _KEY.fullmatch(key):
+        raise ValueError(f"{path} must hold 32 to 128 letters, digits, - or _; remove it to get a new key")
     return key
+
+
+def _text(path: Path) -> bytes:
+    """What this user's file holds; nothing where it is not there."""
+    try:
+        text = read_own(path, _LARGEST, only_ours=True)
+        mode = path.lstat().st_mode
+    except FileNotFoundError:
+        return b""
+    if mode & _OTHERS:
+        raise NotPrivate(f"others may read {path}. Run: chmod 600 {path}")
+    return text
 
 
 def _cookie(header: str | None, name: str) -> str | None:

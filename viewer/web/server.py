@@ -74,10 +74,14 @@ class Server(ThreadingHTTPServer):
         threading.Thread(target=partial(self.serve_forever, 0.1), name="web", daemon=True).start()
 
     def process_request(self, request, client_address) -> None:
-        if self._free.acquire(blocking=False):
-            super().process_request(request, client_address)
-        else:
+        if not self._free.acquire(blocking=False):
             self.shutdown_request(request)
+            return
+        try:
+            super().process_request(request, client_address)
+        except BaseException:  # no thread could be started, which would have given it back
+            self._free.release()
+            raise
 
     def process_request_thread(self, request, client_address) -> None:
         try:

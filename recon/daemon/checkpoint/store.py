@@ -28,7 +28,7 @@ from typing import Any
 
 import msgspec
 
-from splatnode.capture.frame import DroppedFrame
+from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.wire import Message
 from splatnode.capture.process.durable import remove_leftovers
@@ -100,7 +100,12 @@ class Store:
 
     def names_before(self, number: int) -> set[str]:
         """Of the stored frames that came before frame `number`."""
-        return {name for name, each in self._names.items() if each < number}
+        names = self._names.copy()  # at once: another thread may store a frame meanwhile
+        return {name for name, each in names.items() if each < number}
+
+    def holds(self, frame: Frame) -> bool:
+        """Whether this very frame, and no other of its name, is stored."""
+        return self._names.get(frame.name) == frame.frame_id
 
     @property
     def dropped(self) -> list[DroppedFrame]:

@@ -3,22 +3,28 @@
 from __future__ import annotations
 
 import struct
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
+import lz4.frame
 import numpy as np
 import pytest
+import zstandard
 from mcap.reader import make_reader
+from mcap.records import Chunk
 from mcap.writer import CompressionType
 
 from splatnode.capture import film
 from splatnode.capture.cameras.mcap import Config, image_topics, stream
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.logged.mcap import UnusableLog, unpacked
 from splatnode.capture.stamp import Clock, Stamp
 from tests.support.mcap_files import START_NS, STEP_NS, as_json, calibration, compressed, raw, write
 
 K = (100.0, 0.0, 31.5, 0.0, 110.0, 23.5, 0.0, 0.0, 1.0)
 SIZE = 64, 48
+SCHEMA = struct.pack("<BQHI1sII", 3, 15, 1, 1, b"a", 0, 0)  # a record, of a schema called a
 
 
 def flat(level: int) -> np.ndarray:
@@ -86,6 +92,25 @@ def test_a_file_that_ends_early_is_read_as_far_as_it_goes(tmp_path, compression)
     *read, last = frames(file)
     assert whole == 8 and 0 < len(read) < 8 and all(isinstance(each, Frame) for each in read)
     assert isinstance(last, DroppedFrame) and last.name == "image_rest" and "cannot be read" in last.reason
+
+
+def chunk(compression, data, size):
+    return Chunk(compression, data, 0, 0, uncompressed_crc=0, uncompressed_size=size)
+
+
+@pytest.mark.parametrize("name, compress", [("lz4", lz4.frame.compress), ("zstd", zstandard.compress)])
+def test_a_chunk_is_decompressed_as_far_as_it_says_that_it_goes(name, compress):
+    (told,) = unpacked(chunk(name, compress(SCHEMA), len(SCHEMA)))
+    assert told.name == "a"
+    bomb = compress(bytes(1 << 26))
+    tracemalloc.start()
+    with pytest.raises(UnusableLog, match="says that it holds 1000 bytes, and holds more or fewer"):
+        list(unpacked(chunk(name, bomb, 1000)))
+    most_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most_bytes < 1 << 22
+    with pytest.raises(UnusableLog, match="more or fewer"):
+        list(unpacked(chunk(name, compress(SCHEMA), len(SCHEMA) + 1)))
 
 
 def test_an_index_that_leads_nowhere_is_told(tmp_path):

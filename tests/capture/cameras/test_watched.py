@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import threading
 import time
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,9 +19,13 @@ from splatnode.capture.cameras.watched import Config, stream
 from splatnode.capture.config import Camera, camera_opener
 from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.nothing_new import NothingNew
+from splatnode.capture.reader import Config as ReaderConfig
+from splatnode.capture.reader import Reader, State
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.unavailable import CameraUnavailable
 from tests.capture.cameras.test_folder import with_exif
+from tests.capture.messaging.test_sockets import wait_for
 
 QUICK = {"poll_s": 0.01, "settle_s": 0.05, "give_up_s": 0.4}
 
@@ -31,6 +37,11 @@ def photograph(index=0, suffix=".jpg"):
 
 def watch(folder, **config) -> Any:
     return stream(Config(folder, **{**QUICK, **config}))
+
+
+def opened(opener) -> Any:
+    """The photographs of one opening."""
+    return (item for item in opener() if not isinstance(item, NothingNew))
 
 
 def slowly(path, data, pieces=6, pause_s=0.03):
@@ -97,6 +108,40 @@ def test_a_file_that_never_becomes_whole_is_named(tmp_path, monkeypatch):
     assert "truncated" in dropped.reason and "after 0 s" in dropped.reason and 0.4 <= now[0] < 0.5
 
 
+@pytest.mark.parametrize(
+    ("fails", "error"),
+    [("read", errno.EACCES), ("read", errno.EBUSY), ("read", errno.EIO), ("stat", errno.EIO), ("stat", errno.ESTALE)],
+)
+def test_a_file_that_cannot_be_read_for_a_moment_is_waited_for(tmp_path, monkeypatch, error, fails):
+    """As until the one who put it there changes its mode, or a network share answers again."""
+    failing(monkeypatch, error, fails, times={"a.jpg": 5, "never.jpg": 10**9})
+    for name in ("a.jpg", "never.jpg"):
+        (tmp_path / name).write_bytes(photograph())
+    frames = watch(tmp_path)
+    assert next(frames).name == "a.jpg"
+    dropped = next(frames)
+    assert isinstance(dropped, DroppedFrame) and dropped.name == "never.jpg"
+    assert dropped.reason == f"cannot be read: {os.strerror(error)}, after 0 s"
+
+
+def failing(monkeypatch, error, fails, times):
+    """Looks at the files of these names (`fails`: stat or read) fail so often."""
+
+    def flaky(look):
+        def looked(path, *args, **kwargs):
+            if times.get(path.name, 0) > 0:
+                times[path.name] -= 1
+                raise OSError(error, os.strerror(error), str(path))
+            return look(path, *args, **kwargs)
+
+        return looked
+
+    if fails == "stat":
+        monkeypatch.setattr(Path, "stat", flaky(Path.stat))
+    else:
+        monkeypatch.setattr(watched, "read_image_file", flaky(watched.read_image_file))
+
+
 def test_temporary_and_hidden_files_are_not_looked_at(tmp_path):
     for name in (".hidden.jpg", "a.jpg.tmp", "b.part.jpg", "c.tmp.png", "notes.txt"):
         (tmp_path / name).write_bytes(photograph())
@@ -136,8 +181,8 @@ def test_what_came_while_the_folder_was_away_is_taken_and_nothing_twice(tmp_path
     folder, away = tmp_path / "stick", tmp_path / "away"
     folder.mkdir()
     (folder / "old.jpg").write_bytes(photograph())
-    opened = camera_opener(Camera("watched", Config(folder, existing, **QUICK)))
-    frames: Any = opened()
+    opener = camera_opener(Camera("watched", Config(folder, existing, **QUICK)))
+    frames = opened(opener)
     if existing:
         assert next(frames).name == "old.jpg"
     (folder / "new.jpg").write_bytes(photograph(1))
@@ -146,14 +191,30 @@ def test_what_came_while_the_folder_was_away_is_taken_and_nothing_twice(tmp_path
     with pytest.raises(CameraUnavailable, match="cannot watch"):
         next(frames)
     with pytest.raises(CameraUnavailable, match="cannot watch"):
-        next(opened())
+        next(opened(opener))
     (away / "came.jpg").write_bytes(photograph(2))
     (away / "new.jpg").write_bytes(photograph(3, ".png"))  # another of the same name
     away.rename(folder)
-    again: Any = opened()
+    again = opened(opener)
     (folder / "z.jpg").write_bytes(photograph(4))
     for name in ("came.jpg", "new.jpg", "z.jpg"):
         assert next(again).name == name
+
+
+def test_a_folder_that_is_back_is_no_longer_lost_though_nothing_new_is_in_it(tmp_path):
+    folder, away = tmp_path / "stick", tmp_path / "away"
+    folder.mkdir()
+    (folder / "old.jpg").write_bytes(photograph())
+    config = ReaderConfig(first_pause_s=0.01)
+    white = tmp_path / "white.png"
+    white.write_bytes(cv2.imencode(".png", np.full((48, 64), 255, np.uint8))[1].tobytes())
+    for mask in (None, white):
+        with Reader(camera_opener(Camera("watched", Config(folder, **QUICK)), mask), False, config) as reader:
+            assert reader.next(60) is not None
+            folder.rename(away)
+            wait_for(lambda: reader.state is State.DEGRADED)
+            away.rename(folder)
+            wait_for(lambda: reader.state is State.STREAMING and not reader.why)
 
 
 def test_photographs_that_are_gone_and_come_back_are_not_taken_again(tmp_path, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import socket
 import subprocess
@@ -185,6 +186,30 @@ def test_late_comers_get_the_state(network):
             assert wait_for(lambda: served(client)).header.text == "after"
             for _ in range(30):  # asks again, and is told nothing that it has
                 assert served(client) is None
+
+
+def test_a_state_is_sent_once_to_a_client_that_asks_again_while_it_is_arriving(tmp_path):
+    numbering = Numbering()
+    with StateServer(RECON_SCENE, ipc(tmp_path)) as server:
+        server.publish(Note(**numbering.next()))
+
+        def answers(client, since_s=0.2):
+            """How many replies come to one that asks five times."""
+            for _ in range(5):
+                client._asked = -math.inf
+                wait_for(lambda: client._ask() or client._asked > 0)
+                server.serve(since_s)
+            count = 0
+            while client._dealer.poll(200):
+                count += bool(client._dealer.recv_multipart())
+            return count
+
+        for _ in range(2):  # another connection has a copy of its own
+            with StateClient(RECON_SCENE, ipc(tmp_path), Note) as client:
+                assert answers(client) == 1
+                server.publish(Note(**numbering.next()))
+                assert answers(client) == 1
+        assert len(server._sent) == 2
 
 
 def test_a_restarted_sender_is_followed_and_its_predecessor_is_not(tmp_path):

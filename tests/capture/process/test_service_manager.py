@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import socket
 
 import pytest
@@ -30,3 +32,52 @@ def test_a_time_that_is_none_is_as_good_as_none(manager, monkeypatch, usec):
     monkeypatch.setenv("WATCHDOG_USEC", usec)
     ServiceManager().ready()
     assert manager.recv(4096) == b"READY=1"
+
+
+def told(manager) -> list[bytes]:
+    """All that has come, in order."""
+    found = []
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            found.append(manager.recv(4096, socket.MSG_DONTWAIT))
+    return found
+
+
+def test_what_a_busy_manager_does_not_take_is_sent_again(manager, tmp_path):
+    service = ServiceManager()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as other, contextlib.suppress(BlockingIOError):
+        other.setblocking(False)
+        while True:
+            other.sendto(b"X=1", str(tmp_path / "notify"))
+    service.ready()
+    service.alive("idle")
+    assert set(told(manager)) == {b"X=1"}
+    service.alive("busy")
+    assert told(manager) == [b"READY=1", b"WATCHDOG=1\nSTATUS=busy"]
+    service.alive("busy")
+    assert told(manager) == []  # it has a second for that
+
+
+def test_without_a_descriptor_to_spare_nothing_ends(manager, monkeypatch):
+    service = ServiceManager()
+
+    def none(*_: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    with monkeypatch.context() as short:
+        short.setattr("splatnode.capture.process.service_manager.socket.socket", none)
+        service.ready()
+        service.alive("idle")
+    service.alive("idle")
+    assert told(manager) == [b"READY=1", b"WATCHDOG=1\nSTATUS=idle"]
+
+
+def test_a_manager_that_does_not_listen_is_not_asked_again(manager, tmp_path):
+    manager.close()
+    service = ServiceManager()
+    service.ready()
+    (tmp_path / "notify").unlink()
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as another:
+        another.bind(str(tmp_path / "notify"))
+        service.alive("idle")
+        assert told(another) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 
@@ -62,7 +63,31 @@ def test_two_keys_differ_and_a_file_keeps_one_for_this_user_alone(tmp_path):
         kept_key(path)
 
 
-@pytest.mark.parametrize("text", ["", "short", "k" * 31, "k" * 200, "k" * 40 + " " + "k" * 5])
+def test_a_file_that_was_cut_to_nothing_gets_a_key(tmp_path):
+    """By a full disk, a power cut, or a process that was killed before it wrote."""
+    path = tmp_path / "web.key"
+    path.touch(0o600)
+    key = kept_key(path)
+    assert kept_key(path) == key == path.read_text().strip() and stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert list(tmp_path.iterdir()) == [path]
+    path.write_text("")
+    path.chmod(0o644)
+    with pytest.raises(NotPrivate, match="chmod 600"):
+        kept_key(path)
+    assert path.read_text() == ""
+
+
+def test_a_key_that_the_disk_does_not_take_leaves_no_file(tmp_path, monkeypatch):
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        kept_key(tmp_path / "web.key")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("text", ["short", "k" * 31, "k" * 200, "k" * 40 + " " + "k" * 5])
 def test_a_file_without_a_key_is_refused(tmp_path, text):
     path = tmp_path / "web.key"
     with open(os.open(path, os.O_WRONLY | os.O_CREAT, 0o600), "w") as file:

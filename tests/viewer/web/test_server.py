@@ -204,6 +204,26 @@ def test_visitors_who_misbehave_stop_nothing(monkeypatch, caplog):
     assert not caplog.records  # that is nothing to tell anybody
 
 
+def test_visitors_for_whom_no_thread_could_be_started_take_no_place_for_ever(monkeypatch, caplog):
+    start, failed = threading.Thread.start, threading.Semaphore(0)
+
+    def none(thread: threading.Thread) -> None:
+        if "process_request_thread" in thread.name:
+            failed.release()
+            raise RuntimeError("can't start new thread")
+        start(thread)
+
+    monkeypatch.setattr(server_module, "_MOST_REQUESTS", 2)
+    with shown(scene()) as server:
+        with monkeypatch.context() as short:
+            short.setattr(threading.Thread, "start", none)
+            for _ in range(3):
+                with socket.create_connection(server.server_address[:2], timeout=20) as visitor:
+                    assert visitor.recv(1) == b""
+        assert failed.acquire(timeout=0) and ask(server, "/")[0] == 200
+    assert "can't start new thread" in caplog.text
+
+
 def test_a_port_that_is_taken_is_said():
     with shown(scene()) as server, pytest.raises(OSError, match="another program listens there. --port"):
         Server(Board(), "127.0.0.1", server.server_address[1], None)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import errno
 import os
+import sys
+import threading
 from pathlib import Path
 
 import msgspec
@@ -21,7 +23,7 @@ from splatnode.recon.daemon.checkpoint import left
 from splatnode.recon.daemon.checkpoint import stored_frame as stored_frame_module
 from splatnode.recon.daemon.checkpoint.ledger import VERSION, CheckpointError, Ledger, read_ledger
 from splatnode.recon.daemon.checkpoint.store import REMEMBERED_DROPPED, Store
-from splatnode.recon.daemon.checkpoint.stored_frame import file_name
+from splatnode.recon.daemon.checkpoint.stored_frame import StoredFrame, file_name
 from tests.support.strays import STRAYS
 
 SESSION = "0123456789abcdef" * 2
@@ -110,6 +112,30 @@ def test_frames_of_the_same_name_are_told_apart(open_store):
     names = [store.put(received(i, "same.png")).frame.name for i in range(3)]
     assert len(set(names)) == 3 and names[0] == "same.png"
     assert [stored.frame.name for stored in open_store().frames()] == names
+
+
+def test_names_are_told_while_another_thread_stores_frames(open_store):
+    store, told, before_s = open_store(), threading.Event(), sys.getswitchinterval()
+
+    def remember(number: int) -> None:
+        store._remember(StoredFrame(number, (SESSION, number), received(0, f"{number}.png").frame))
+
+    def remember_more() -> None:
+        for number in range(1000, 20_000):
+            if not told.is_set():
+                remember(number)
+
+    for number in range(1000):
+        remember(number)
+    more = threading.Thread(target=remember_more, daemon=True)
+    sys.setswitchinterval(1e-6)
+    try:
+        more.start()
+        assert all(len(store.names_before(1000)) == 1000 for _ in range(100))
+    finally:
+        sys.setswitchinterval(before_s)
+        told.set()
+        more.join()
 
 
 def test_what_was_taken_is_known_whatever_became_of_it(open_store):
