@@ -45,17 +45,24 @@ class Hit:
         return {"code": code, **asdict(self), "message": message}
 
 
-def hits(config: Config, begun: Scene | None, scene: Scene | None, seconds: Mapping[str, float]) -> tuple[Hit, ...]:
-    """The limits of `config` that bound `scene`, if there is one, which was refined from `begun` in these seconds."""
+def hits(
+    config: Config, begun: Scene | None, scene: Scene | None, seconds: Mapping[str, float], ended_early: bool = False
+) -> tuple[Hit, ...]:
+    """The limits of `config` that bound `scene`, if there is one, which was refined from `begun` in these seconds.
+
+    `ended_early`: the refinement came to its end by a verdict, and not for want of time.
+    """
     if begun is None or scene is None:
         return ()
-    found = (_gaussians(config, begun, scene), _seconds(config, begun, scene, seconds))
+    found = (_gaussians(config, begun, scene), None if ended_early else _seconds(config, begun, scene, seconds))
     return tuple(hit for hit in found if hit is not None)
 
 
 def _gaussians(config: Config, begun: Scene, scene: Scene) -> Hit | None:
     most, count = config.most_gaussians, len(scene.gaussians)
-    if most is None or count < most or begun.num_unlimited <= most:
+    if most is None or begun.num_unlimited <= most:
+        return None
+    if count < most and begun.num_unlimited <= (config.first_gaussians or most):  # it began with all, and fewer stayed
         return None
     share = 1.0 if config.optimize.control is None else STAYS
     would_take = max(round(share * begun.num_unlimited), count)

@@ -292,7 +292,7 @@ class IncrementalReconstruction:
         left_out = self.dropped if dropped is None else dropped
         show, seconds, bound = self._known.show, self.clock.booked, ()
         if final and estimate.verdict.publishable:
-            bound = hits(self.config, self.begun, show.scene, seconds)
+            bound = hits(self.config, self.begun, show.scene, seconds, ended_early=show.verdict is not None)
         made = snapshot(
             next(self.numbers), estimate.conclusion, show, seconds=seconds, dropped=left_out, budget=bound, final=final
         )

@@ -118,6 +118,5 @@ def check_baseline(config: Config, source: Source) -> None:
 
 def with_looks(config: Config, every: int) -> Config:
     """The same reconstruction, with a snapshot to look at `every` so many iterations."""
-    optimising = config.optimize
-    looks = sorted({*optimising.checkpoints, *range(every, optimising.iterations, every)})
-    return msgspec.structs.replace(config, optimize=msgspec.structs.replace(optimising, checkpoints=tuple(looks)))
+    looks = tuple(range(every, config.optimize.iterations, every))
+    return msgspec.structs.replace(config, optimize=msgspec.structs.replace(config.optimize, looks=looks))

@@ -137,7 +137,7 @@ def model(
         clock.lap("optimise")
         yield snapshot(next(numbers), conclusion, show, seconds=clock.booked, dropped=dropped)
         clock.lap("wait")
-    bound = hits(config, begun, show.scene, clock.booked)
+    bound = hits(config, begun, show.scene, clock.booked, ended_early=show.verdict is not None)
     yield snapshot(next(numbers), conclusion, show, seconds=clock.booked, dropped=dropped, budget=bound, final=True)
 
 

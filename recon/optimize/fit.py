@@ -214,4 +214,5 @@ def _regularisation(scene: Scene, config: regularise.Config, seed: int) -> Regul
             raise ValueError(f"{view.name} has no point map, which the losses in `regularise` compare with")
         T_world_camera = view.T_world_camera.double().numpy()
         pointmaps.append(replace(view.pointmap, T_world_camera=T_world_camera, K=view.K.double().numpy()))
-    return Regularisation(pointmaps, [view.image for view in scene.views], config, seed=seed)
+    images = [view.image for view in scene.views]
+    return Regularisation(pointmaps, images, config, seed=seed, shown=fitted_pixels(scene.views))

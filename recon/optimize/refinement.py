@@ -52,7 +52,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The refinement of the preset `balanced`."""
 
     iterations: Annotated[int, Meta(ge=0)] = 500  # steps of the optimiser, one view each
-    checkpoints: tuple[int, ...] = (150,)  # iterations after which the scene is shown, besides the last one
+    checkpoints: tuple[int, ...] = (150,)  # iterations after which the scene is shown and judged, besides the last one
+    looks: tuple[int, ...] = ()  # iterations after which it is shown, too, to somebody who watches
     half_resolution_share: Share = 0.0  # share of the iterations, at the start, on images of half the size
     dssim: Share = 0.4  # weight of D-SSIM in the photometric loss; that of L1 is 1 minus it
     # Largest opacity of what photographs seeded, as the refinement of a begun scene starts: soft Gaussians settle more
@@ -105,9 +106,11 @@ def refine(
     took = time.monotonic() - started
     if deadline and started + took * config.steps / max(config.iterations, 1) > deadline:
         return
-    members, unseen = [first], msgspec.structs.replace(alone, checkpoints=())
+    members, unseen = [first], msgspec.structs.replace(alone, checkpoints=(), looks=())
     for member in range(1, config.ensemble.members):
         members += run(scene, unseen, seed=ensemble.seed_of(member, seed), done=member * config.iterations)
+    if deadline and time.monotonic() >= deadline:
+        return
     with single_torch_thread():
         beside = ensemble.between(members, config.ensemble, seed)
     done = sum(member.iterations - scene.iterations for member in members)
@@ -148,7 +151,7 @@ def _refined(
         with single_torch_thread():
             fit.step(queue.pop(), progress)
         gone_on(done + iteration + 1)
-        if iteration + 1 in config.checkpoints and iteration + 1 < config.iterations:
+        if iteration + 1 in (*config.checkpoints, *config.looks) and iteration + 1 < config.iterations:
             yield fit.scene()
     end = replace(fit.scene(), losses=fit.losses())
     yield end
@@ -163,6 +166,7 @@ def _as_agreement(config: Config) -> Config:
         config,
         iterations=given.iterations,
         checkpoints=(),
+        looks=(),
         half_resolution_share=0.0,
         rates=msgspec.structs.replace(rates, **shorter),
         control=None,

@@ -40,12 +40,23 @@ class Regularisation:
     """The losses of one refinement; it draws the pseudo view of each iteration."""
 
     def __init__(
-        self, pointmaps: Sequence[Pointmap], images: Sequence[npt.NDArray[np.uint8]], config: Config, *, seed: int
+        self,
+        pointmaps: Sequence[Pointmap],
+        images: Sequence[npt.NDArray[np.uint8]],
+        config: Config,
+        *,
+        seed: int,
+        shown: Sequence[npt.NDArray[np.bool_]] | None = None,
     ) -> None:
-        """`pointmaps` and `images` (h, w, 3) RGB are of the training views, in the order of `training_loss`."""
+        """`pointmaps` and `images` (h, w, 3) RGB are of the training views, in the order of `training_loss`.
+
+        `shown` (h, w) are False where these photographs do not show the scene: what a network tells there is not used.
+        """
         self._rng = np.random.default_rng(seed)
         self._pseudo_views = _between(pointmaps, config, self._rng)
-        supervision = Supervision(images, pointmaps, self._pseudo_views, config.nearest_points, config.min_confidence)
+        supervision = Supervision(
+            images, pointmaps, self._pseudo_views, config.nearest_points, config.min_confidence, shown
+        )
         losses = {
             name: choice.module.prepare(choice.config, supervision, seed) for name, choice in config.weighted.items()
         }

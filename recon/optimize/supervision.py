@@ -36,6 +36,8 @@ class Supervision:
     pseudo_views: Sequence[PseudoView]  # V of them
     nearest_points: int  # that are blended in a pixel of a point render
     min_confidence: float  # of a point or a depth that is used
+    # C masks (H, W): False where a photograph does not show the scene; None: all of them do everywhere
+    shown: Sequence[npt.NDArray[np.bool_]] | None = None
 
     @cached_property
     def surfaces(self) -> tuple[SurfaceTarget, ...]:
@@ -72,6 +74,8 @@ class Supervision:
         pairs = list(zip(self.pointmaps, self.images, strict=True))
         completed = [with_monocular(pointmap, image, network) for pointmap, image in pairs]
         changed = sum(new is not old for new, (old, _) in zip(completed, pairs, strict=True))
+        if self.shown is not None:  # a network sees depth in what a mask hides, too
+            completed = [pointmap.masked(shown) for pointmap, shown in zip(completed, self.shown, strict=True)]
         source = f"depth of {network.name} (in {changed} of {len(pairs)} views, scaled by multi-view depth)"
         return completed, source
 

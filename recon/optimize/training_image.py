@@ -50,10 +50,11 @@ class _Exposed:
         return self.loss(torch.where(self.told, rgb, torch.minimum(rgb, self.target)))
 
     def _gains(self, rgb: Tensor) -> Tensor:
-        """(3,) in closed form."""
+        """(3,) in closed form; 1 for a channel of which the photograph tells nothing but black."""
         seen = rgb * self.told
         known = (seen * self.target).sum((0, 1)) + self.prior
-        return known / ((seen * seen).sum((0, 1)) + self.prior).clamp_min(1e-12)
+        gains = known / ((seen * seen).sum((0, 1)) + self.prior).clamp_min(1e-12)
+        return torch.where(self.prior > 0, gains, 1.0)
 
 
 def training_image(

@@ -65,12 +65,15 @@ class Session:
     ) -> None:
         """The arguments are those of `reconstruct`; `every_frame` takes all photographs that are sharp and no copies.
 
-        Photographs without a name are called 0000.png, 0001.png, ... in the order in which they are given.
+        Photographs without a name are called 0000.png, 0001.png, ... in the order in which they are given. There is no
+        limit on the seconds (`budget_s`).
         """
         check_count("threads", threads)
         if is_stereo(scale):
             raise TypeError("a session gets stereo pairs with add(image, right=..., baseline_m=...), not as its scale")
         self._config = configured(preset, config, {"seed": seed}, scale, of_pictures=True)
+        if self._config.budget_s is not None:
+            raise ValueError("a session has no budget_s, for its photographs come one at a time; reconstruct has one")
         self._preset, self._lens, self._threads, self._tell = preset, intrinsics, threads, tell or told_to_nobody
         self._selector = Selector(Selection(every_frame=every_frame, per_second=_EACH, patience_s=0.0), Limits())
         self._work: IncrementalReconstruction | None = IncrementalReconstruction(self._config)

@@ -198,3 +198,8 @@ def test_motions_and_gravity_that_are_none_are_said(arrays):
         ):
             with pytest.raises(kind, match=why):
                 session.add(arrays[1], name="b.png", **bad)
+
+
+def test_a_limit_on_the_seconds_is_refused():
+    with pytest.raises(ValueError, match="a session has no budget_s"):
+        splatnode.Session(config={"budget_s": 30})

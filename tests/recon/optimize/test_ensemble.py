@@ -98,6 +98,21 @@ def test_where_a_deadline_leaves_no_time_for_others_the_first_member_is_the_end(
     assert unhurried.iterations - start.iterations == TOGETHER.steps
 
 
+def test_a_deadline_that_falls_into_a_further_member_leaves_the_first_one_as_it_was(start, monkeypatch):
+    """As on a machine that becomes slower than the first member was."""
+    clock, step, steps = [0.0], Fit.step, [0]
+
+    def slower(self: Fit, index: int, progress: float) -> None:
+        step(self, index, progress)
+        steps[0] += 1
+        clock[0] += 1000.0 if steps[0] > ALONE.iterations + 5 else 0.001
+
+    monkeypatch.setattr(Fit, "step", slower)
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    shown = ends(start, TOGETHER, deadline=100.0)
+    assert [scene.iterations - start.iterations for scene in shown] == [15, 40] and len(shown[-1].losses) == 40
+
+
 def test_one_camera_has_nothing_between(start):
     alone = replace(start, views=start.views[:1])
     assert ensemble.between([alone, alone], ensemble.Config(members=2), seed=0) == []

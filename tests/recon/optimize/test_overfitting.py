@@ -9,10 +9,11 @@ import pytest
 import torch
 from msgspec.structs import replace as replace_fields
 
+from splatnode.recon import modelling
 from splatnode.recon.config import Config
 from splatnode.recon.modelling import refined
 from splatnode.recon.optimize import overfitting, refinement
-from splatnode.recon.optimize.watch import SHORT, examine, watch
+from splatnode.recon.optimize.watch import SHORT, Watch, examine, watch
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.gaussian_render import Camera, render_gaussians
 from splatnode.recon.result.verdict import Code
@@ -114,3 +115,19 @@ def test_a_scene_that_started_soft_is_not_judged_before_it_shows_its_photographs
     first, *_ = refined(truth, replace_fields(Config(), optimize=steps), steps)
     assert first.verdict is None and first.scene is not None and first.scene.iterations == 2
     assert first.scene.gaussians.opacities.max() < 0.15  # it is soft
+
+
+def test_who_watches_changes_no_verdict(truth, monkeypatch):
+    """A scene is judged after the same iterations, however often it is looked at."""
+    judged: list[int] = []
+
+    def noting(watching: Watch, later: Scene) -> tuple[Watch, None]:
+        judged.append(later.iterations)
+        return watching, None
+
+    monkeypatch.setattr(modelling, "examine", noting)
+    first = refinement.MIN_SOFT
+    steps = plain(iterations=first + 20, checkpoints=(first,), looks=(first + 5, first + 10), first_opacity=None)
+    shown = list(refined(truth, replace_fields(Config(), optimize=steps), steps))
+    assert [show.scene.iterations for show in shown if show.scene] == [first, first + 5, first + 10, first + 20]
+    assert judged == [first, first + 20]

@@ -25,7 +25,7 @@ def measure() -> LpipsDistance:
     """One layer that sees differences of neighbouring pixels."""
     kernels = torch.randn(4, 3, 3, 3, generator=torch.Generator().manual_seed(0))
     weights = {"net.0.weight": kernels, "net.0.bias": torch.zeros(4), "lin0.weight": torch.ones(1, 4, 1, 1)}
-    return LpipsDistance(Lpips((Layer(tap=True),), weights), "LPIPS AlexNet")
+    return LpipsDistance(Lpips((Layer(4, tap=True),), weights), "LPIPS AlexNet")
 
 
 @pytest.fixture

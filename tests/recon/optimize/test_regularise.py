@@ -181,6 +181,10 @@ def test_networks_serve_where_their_weights_are(monkeypatch):
     losses = [float(served.training_loss(0, render, progress)) for render in (right, wrong)]
     assert losses[0] < 1e-3 < losses[1]
     assert Regularisation(pointmaps, images, Config(), seed=0).served_by == {}
+    left = np.arange(WIDTH)[None].repeat(HEIGHT, 0) < WIDTH // 2  # what a mask hides, a network sees, too
+    hidden = Regularisation(pointmaps, images, PAPER, seed=0, shown=[left, left])
+    half = Render(right.rgb, torch.where(torch.from_numpy(left), right.depth, wrong.depth), right.normal, None)
+    assert float(hidden.training_loss(0, half, progress)) < 1e-3 < float(served.training_loss(0, half, progress))
 
 
 BRIGHTNESS = """

@@ -64,3 +64,14 @@ def test_what_is_left_of_the_exposure_is_a_gain_that_fits_the_render():
     )
     assert float(exposed.loss(render)) < 0.2 * float(as_it_is.loss(render))
     assert float(exposed.loss(2 * render)) > float(exposed.loss(render))  # the prior: not any gain will do
+
+
+def test_a_colour_that_an_exposed_photograph_has_nowhere_is_wrong_in_a_render():
+    image = np.random.default_rng(0).integers(40, 200, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    image[..., 1:] = 0
+    K = torch.tensor([[40.0, 0, 20], [0, 40, 12], [0, 0, 1]])
+    exposure = Exposure((2.0, 2.0, 2.0), 0.0, None)
+    view = TrainingView("a", 0, image, torch.eye(4), K, exposure=exposure)
+    render = torch.full((HEIGHT, WIDTH, 3), 0.5, requires_grad=True)
+    training_image(view, np.ones((HEIGHT, WIDTH), bool), 1.0, 0.0).loss(render).backward()
+    assert render.grad is not None and bool((render.grad[..., 1:] > 0).all())
