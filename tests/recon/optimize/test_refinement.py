@@ -211,7 +211,7 @@ def with_pointmap(view: TrainingView) -> TrainingView:
 class Brighter:
     """Stands for the losses beside the photometric one: wants everything to be bright, also from a pseudo view."""
 
-    def __init__(self, pointmaps, images, config, *, seed):
+    def __init__(self, pointmaps, images, config, *, seed, shown):
         self.names = [pointmap.name for pointmap in pointmaps]
         camera = pointmaps[1]
         self.view = PseudoView(camera.T_world_camera, camera.K, 64, 48, nearest=1)
