@@ -32,7 +32,8 @@ BASE_BYTES = 500_000_000  # further ones, whatever the size of a frame
 _MAX_THREADS = 8  # each has a frame of its own
 _LEAD = 10  # frames before a part of a video, whose times tell whether the way there was exact
 _AV1 = int.from_bytes(b"AV01", "little")  # OpenCV's number of the codec, which its wheels know and cannot decode
-_NEEDS_AV = 3  # exit code
+_NEEDS_AV, _ENDED_EARLY = 3, 4  # exit codes
+_MOST = 0.9  # of the frames that a container states: some state a few more than there are
 _START, _FRAME = struct.Struct("<d"), struct.Struct("<QII")  # frames a second; index, width, height
 
 
@@ -79,6 +80,8 @@ def decoded(file: Path, every: int, max_pixels: int, span: Span = Span()) -> Ite
         yield from _received(child.stdout, max_pixels)
         if child.wait() == _NEEDS_AV:
             raise VideoError(f"its codec is AV1, which needs PyAV. {remedy('av')}")
+        if child.returncode == _ENDED_EARLY:
+            raise VideoError("it ends before the frames that it states: it is cut, or damaged there")
         if child.returncode != 0:
             raise VideoError(
                 f"its decoder ended ({child.returncode}); is it whole, with frames of {max_pixels} pixels?"
@@ -119,8 +122,9 @@ def main() -> None:
     if has_av and (is_av1 or not span.is_all):
         video.release()
         _write_by_av(out, Path(file), every, max_pixels, span, threads)
-    else:
-        _write_by_opencv(out, video, partial(_opened, file, threads), every, max_pixels, span)
+    elif not _write_by_opencv(out, video, partial(_opened, file, threads), every, max_pixels, span):
+        out.flush()
+        sys.exit(_ENDED_EARLY)
 
 
 def _opened(file: str, threads: int) -> cv2.VideoCapture:
@@ -134,14 +138,14 @@ def _write_by_opencv(
     every: int,
     max_pixels: int,
     span: Span,
-) -> None:
-    """`again` opens the video from its beginning."""
+) -> bool:
+    """Whether all was there. `again` opens the video from its beginning."""
     rate = video.get(cv2.CAP_PROP_FPS)
     out.write(_START.pack(rate))
     width, height = (round(video.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
     if width * height > max_pixels:  # known before a frame is decoded
         out.write(_FRAME.pack(0, width, height))
-        return
+        return True
     first, end = round(span.from_s * rate), math.inf if math.isinf(span.to_s) else round(span.to_s * rate)
     index = first if _sought(video, first, rate) else 0
     if index < first:  # all frames before it are decoded, too
@@ -153,6 +157,7 @@ def _write_by_opencv(
                 height, width = image.shape[:2]
                 out.write(_FRAME.pack(index, width, height) + image.tobytes())
         index += 1
+    return index == 0 or index >= min(end, _MOST * video.get(cv2.CAP_PROP_FRAME_COUNT))
 
 
 def _sought(video: cv2.VideoCapture, first: int, rate: float) -> bool:

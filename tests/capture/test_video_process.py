@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import resource
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,7 @@ import pytest
 
 from splatnode.capture.cameras.video import Config, stream
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.video_process import BASE_BYTES, BYTES_A_PIXEL, VideoError, decoded
+from splatnode.capture.video_process import BASE_BYTES, BYTES_A_PIXEL, Span, VideoError, VideoFrame, decoded
 from tests.support.crafted import Crafted, videos
 from tests.support.crafted.bounded import MARGIN, readings
 
@@ -78,6 +79,30 @@ def test_a_decoder_that_ends_early_is_told_after_the_frames_before(tmp_path, mon
     items = list(stream(Config(tmp_path / "a.avi")))
     assert [item.name for item in items] == ["a_000000.png", "a_000001.png", "a_rest"]
     assert items[2] == DroppedFrame("a_rest", "its decoder ended (-11)")
+
+
+@pytest.mark.parametrize(("span", "whole"), [(Span(), False), (Span(to_s=0.25), True)], ids=["all", "before the cut"])
+def test_a_video_that_was_cut_is_told_after_its_frames(tmp_path, span, whole):
+    writer = cv2.VideoWriter(str(tmp_path / "whole.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 20, (64, 48))
+    for index in range(40):
+        writer.write(np.full((48, 64, 3), 5 * index, np.uint8))
+    writer.release()
+    data = (tmp_path / "whole.avi").read_bytes()
+    (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
+    found = list(until_error(decoded(tmp_path / "cut.avi", 1, LIMIT, span)))
+    errors = [item for item in found if isinstance(item, VideoError)]
+    count = len(found) - len(errors)
+    assert count == 5 if whole else 5 < count < 36
+    assert [str(error) for error in errors] == ([] if whole else [
+        "it ends before the frames that it states: it is cut, or damaged there"
+    ])  # fmt: skip
+
+
+def until_error(frames: Iterator[VideoFrame]) -> Iterator[VideoFrame | VideoError]:
+    try:
+        yield from frames
+    except VideoError as error:
+        yield error
 
 
 def test_frames_pass_unchanged(tmp_path):
