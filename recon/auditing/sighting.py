@@ -45,7 +45,12 @@ def sight(
         if isinstance(frame, DroppedFrame):
             problem = problem or NotSeen(frame.name, UNREADABLE, frame.reason)
             continue
-        found = placed(landmarks, described(frame.image, assumed_lens(frame, fov_deg)))
+        try:
+            photograph = described(frame.image, assumed_lens(frame, fov_deg), name=frame.name)
+        except ValueError as error:  # of its lens, which nothing can undo
+            problem = problem or NotSeen(frame.name, UNREADABLE, str(error))
+            continue
+        found = placed(landmarks, photograph)
         if not isinstance(found, Placed):
             problem = problem or NotSeen(frame.name, found.code.value, found.message)
         elif first is None:

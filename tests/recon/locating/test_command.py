@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
+from splatnode.capture.recording import Recorder
 from splatnode.command_line import main
 from splatnode.recon.result.landmarks_file import LANDMARKS, encode_landmarks
 from tests.support.located import PLACE, known_place, photograph
@@ -72,6 +74,18 @@ def test_a_lens_can_be_given(result, photographs, tmp_path, capsys):
     capsys.readouterr()
     assert main(["locate", str(result), str(photographs), "--calibration", str(lens)]) == 2
     assert "must give width, height, fx" in capsys.readouterr().err
+
+
+def test_a_lens_that_cannot_be_undone_costs_only_its_photograph(result, photographs, tmp_path, capsys):
+    folding = Intrinsics(PLACE.width, PLACE.height, 400, 400, 240, 180, "calibration", (-3.0, 0, 0, 0))
+    with Recorder(tmp_path / "recorded") as recorder:
+        recorder.write(Frame(0, "bent.png", 0, photograph(0)[0], folding))
+    found = tmp_path / "found.json"
+    images = [str(tmp_path / "recorded"), str(photographs / "0.png")]
+    assert main(["locate", str(result), *images, "--json", str(found)]) == 65
+    out = capsys.readouterr().out
+    assert "bent.png: left out: distortion" in out and "1 of 2 photographs were placed" in out
+    assert [each.get("code") for each in json.loads(found.read_text())["photographs"]] == ["UNREADABLE", None]
 
 
 def test_what_is_not_there_is_said(result, photographs, tmp_path, capsys):
