@@ -56,7 +56,7 @@ def sight(
         elif first is None:
             first = Sighting(frame.name, found)
         elif (since := motion(first.placed, found)).significant:
-            told = f"since {first.photograph} it turned by {since.degrees:.2g} degrees"
+            told = f"since {first.photograph} it moved by {since.in_words(landmarks.unit, landmarks.metric)}"
             return NotSeen(
                 frame.name, MOVING, f"{told}: only a camera that stands still in a recording can be compared"
             )

@@ -49,11 +49,7 @@ def _not_compared(audit: Audit, camera: str) -> Iterator[str]:
 
 def amount(audit: Audit, motion: Motion) -> str:
     """How far, with two standard deviations."""
-    turn = f"{motion.degrees:.2g} degrees (± {2 * motion.degrees_sigma:.1g})"
-    distance, sigma = motion.distance, 2 * motion.distance_sigma
-    if audit.metric:
-        return f"{turn} and {100 * distance:.2g} cm (± {100 * sigma:.1g})"
-    return f"{turn} and {100 * distance / audit.unit:.2g} % of the distance (± {100 * sigma / audit.unit:.1g})"
+    return motion.in_words(audit.unit, audit.metric)
 
 
 def _stood(audit: Audit, period: Period) -> str:

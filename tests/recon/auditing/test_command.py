@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -52,14 +53,18 @@ def test_the_camera_that_moved_is_named_with_when_and_by_how_much(result, record
 
 
 def test_a_camera_that_moves_within_a_recording_is_not_compared(result, tmp_path, capsys):
-    left = synthetic.held_out_cameras(PLACE)[0]
-    for day in ("monday", "tuesday"):
+    left, *_ = synthetic.held_out_cameras(PLACE)
+    shifted = left[0].copy(), left[1]
+    shifted[0][:3, 3] += 0.05 * left[0][:3, 0]
+    for day, later in (("monday", turned(left, 2.0)), ("tuesday", shifted)):
         (tmp_path / day / "wrist").mkdir(parents=True)
-        for index in range(2):
-            (tmp_path / day / "wrist" / f"{index}.png").write_bytes(picture(turned(left, 2.0 * index), index))
+        for index, camera in enumerate((left, later)):
+            (tmp_path / day / "wrist" / f"{index}.png").write_bytes(picture(camera, index))
     assert main(["audit", str(result), str(tmp_path / "monday"), str(tmp_path / "tuesday")]) == 65
     out = capsys.readouterr().out
-    assert "wrist was not compared in monday: MOVING: since 0.png it turned by 2 degrees" in out
+    assert "wrist was not compared in monday: MOVING: since 0.png it moved by 2 degrees (±" in out
+    shift = re.search(r"tuesday: MOVING: since 0.png it moved by \S+ degrees .* and (\S+) % of the distance", out)
+    assert shift is not None and float(shift[1]) > 0.5, out
     assert "0 of 1 cameras moved in 2 recordings; 0 could be compared" in out
 
 
