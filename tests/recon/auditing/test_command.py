@@ -39,6 +39,7 @@ def test_the_camera_that_moved_is_named_with_when_and_by_how_much(result, record
     files = ["--json", str(told), "--picture", str(drawn)]
     assert main(["audit", str(result), *map(str, recordings), *files]) == 0
     out = capsys.readouterr().out
+    assert out.startswith("3 recordings, monday to wednesday, of 2 cameras: left, right\n")
     assert "left moved between tuesday and wednesday by 1 degrees" in out.replace("0.99 ", "1 ").replace("1.0 ", "1 ")
     assert "right stood still in 2 recordings" in out and "right was not compared in tuesday: NOT_FOUND" in out
     assert "1 of 2 cameras moved in 3 recordings; 2 could be compared" in out
