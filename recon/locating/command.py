@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 
-from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.given_lens import same_aspect
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.process.terminal import say
 from splatnode.recon.locating.locate import described, located
 from splatnode.recon.locating.outcome import Located, NotLocated
-from splatnode.recon.locating.photographs import assumed_lens, photographs
+from splatnode.recon.locating.photographs import assumed_lens, check_lens, photographs
 from splatnode.recon.result.export.staged import json_bytes, write_files
 from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.landmarks_file import read_landmarks
@@ -22,18 +23,27 @@ def locate(args: argparse.Namespace) -> int:
     """A line a photograph; EXIT_GOOD where all were placed."""
     landmarks = read_landmarks(args.result)
     given = None if args.calibration is None else read_lens(args.calibration)
-    records, refused = [], 0
+    if given is not None:
+        check_lens(given, photographs(args.images, None))
+    records, refused, of_other_lens = [], 0, 0
     for frame in photographs(args.images, given):
         found = frame if isinstance(frame, DroppedFrame) else _found(landmarks, frame, args.fov)
         say(f"{frame.name}: {f'left out: {found.reason}' if isinstance(found, DroppedFrame) else found.sentence}")
         records.append({"name": frame.name, **_record(found, frame)})
         refused += not isinstance(found, Located)
+        of_other_lens += given is not None and isinstance(frame, Frame) and not _is_of(given, frame)
+    if of_other_lens:
+        say(f"the lens was not given to {of_other_lens} of them, which have another aspect ratio than its images")
     say(f"{len(records) - refused} of {len(records)} photographs were placed in {args.result}")
     if args.json is not None:
         told = {"result": str(args.result), "scale": "metric" if landmarks.metric else "relative"}
         write_files(args.json.parent, {args.json.name: json_bytes({**told, "photographs": records})})
         say(f"results: {args.json}")
     return EXIT_REFUSED if refused else EXIT_GOOD
+
+
+def _is_of(given: Intrinsics, frame: Frame) -> bool:
+    return same_aspect(given, frame.width, frame.height)
 
 
 def _found(landmarks: Landmarks, frame: Frame, fov_deg: float | None) -> Located | NotLocated | DroppedFrame:

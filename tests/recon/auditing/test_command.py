@@ -69,6 +69,18 @@ def test_a_camera_that_moves_within_a_recording_is_not_compared(result, tmp_path
     assert "0 of 1 cameras moved in 2 recordings; 0 could be compared" in out
 
 
+def test_a_lens_that_can_be_of_no_camera_is_told_before_the_work(result, recordings, tmp_path, capsys):
+    lens = tmp_path / "lens.yaml"
+    lens.write_text("{width: 100, height: 100, fx: 90, fy: 90, cx: 50, cy: 50}")
+    film = tmp_path / "film" / "left.mp4"
+    film.parent.mkdir()
+    film.write_bytes(b"no video")
+    visits = [str(film.parent), *map(str, recordings)]
+    assert main(["audit", str(result), *visits, "--calibration", str(lens)]) == 2
+    told = capsys.readouterr()
+    assert "got those of 100 x 100 for 480 x 360" in told.err and not told.out
+
+
 def test_mistakes_are_told_in_a_sentence(result, recordings, tmp_path, capsys):
     empty = tmp_path / "empty"
     empty.mkdir()
