@@ -10,7 +10,9 @@ from splatnode.capture.process.terminal import say
 from splatnode.recon.auditing.audit import audit as audited
 from splatnode.recon.auditing.picture import picture
 from splatnode.recon.auditing.stations import recordings
-from splatnode.recon.auditing.table import lines, summary, values
+from splatnode.recon.auditing.table import heading, lines, summary, values
+from splatnode.recon.auditing.taken import one_each
+from splatnode.recon.locating.photographs import check_lens
 from splatnode.recon.result.export.staged import json_bytes, write_files
 from splatnode.recon.result.landmarks_file import read_landmarks
 
@@ -22,6 +24,9 @@ def audit(args: argparse.Namespace) -> int:
     landmarks = read_landmarks(args.result)
     given = None if args.calibration is None else read_lens(args.calibration)
     visits = recordings(args.recordings)
+    if given is not None:
+        check_lens(given, one_each(visits))
+    say(heading(visits))
     with telling() as tell:
         found = audited(landmarks, visits, given, args.fov, tell)
     for line in lines(found):

@@ -55,6 +55,14 @@ class Motion:
         """The standard deviation of the shift in the direction in which it is known worst."""
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
+    def in_words(self, unit: float, metric: bool) -> str:
+        """How far, with two standard deviations: in centimetres if the result is `metric`, else over its `unit`."""
+        turn = f"{self.degrees:.2g} degrees (± {2 * self.degrees_sigma:.1g})"
+        distance, sigma = self.distance, 2 * self.distance_sigma
+        if metric:
+            return f"{turn} and {100 * distance:.2g} cm (± {100 * sigma:.1g})"
+        return f"{turn} and {100 * distance / unit:.2g} % of the distance (± {100 * sigma / unit:.1g})"
+
     @property
     def significant(self) -> bool:
         """Whether it is more than chance."""

@@ -45,13 +45,18 @@ def sight(
         if isinstance(frame, DroppedFrame):
             problem = problem or NotSeen(frame.name, UNREADABLE, frame.reason)
             continue
-        found = placed(landmarks, described(frame.image, assumed_lens(frame, fov_deg)))
+        try:
+            photograph = described(frame.image, assumed_lens(frame, fov_deg), name=frame.name)
+        except ValueError as error:  # of its lens, which nothing can undo
+            problem = problem or NotSeen(frame.name, UNREADABLE, str(error))
+            continue
+        found = placed(landmarks, photograph)
         if not isinstance(found, Placed):
             problem = problem or NotSeen(frame.name, found.code.value, found.message)
         elif first is None:
             first = Sighting(frame.name, found)
         elif (since := motion(first.placed, found)).significant:
-            told = f"since {first.photograph} it turned by {since.degrees:.2g} degrees"
+            told = f"since {first.photograph} it moved by {since.in_words(landmarks.unit, landmarks.metric)}"
             return NotSeen(
                 frame.name, MOVING, f"{told}: only a camera that stands still in a recording can be compared"
             )

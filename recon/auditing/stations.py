@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 from splatnode.capture import film
-from splatnode.capture.cameras.folder import frame_name, image_paths
+from splatnode.capture.cameras.folder import foreign_file, frame_name, image_paths
 from splatnode.capture.lerobot import data_set
 from splatnode.capture.process.packages import remedy
 from splatnode.capture.process.printable import printable, printable_name
@@ -16,6 +19,8 @@ from splatnode.recon.batch import sources
 
 MOST_PHOTOGRAPHS = 3  # of a camera that took many in one recording: the first, the last, and between
 _ONE_CAMERA = "camera"  # the name of that which took a video that is named itself
+
+_log = logging.getLogger(__name__)
 
 _Place = tuple[str, ...]  # where a recording is: the parts of a path, of a data set's with the episode
 
@@ -63,8 +68,9 @@ def recordings(named: Sequence[Path]) -> list[Recording]:
 
     A recording is a folder of photographs, one a camera, or of a folder a camera; an MCAP file, whose image topics are
     cameras; an episode of a LeRobot data set; a video, or a folder of videos, one a camera. A folder may hold such at
-    any depth, and a text file may name them. Where two have one name, more of their paths tells them apart. What cannot
-    be read is a recording with a problem.
+    any depth, and a text file may name them. Folders of photographs that lie side by side are cameras, or recordings if
+    `_hold_a_camera_a_photograph` says so. Where two have one name, more of their paths tells them apart. What cannot be
+    read is a recording with a problem.
     Raises FileNotFoundError or ValueError, with what to do, for what is named and is not there, holds nothing, or is
     named twice.
     """
@@ -96,28 +102,68 @@ def _found(path: Path, lists: tuple[Path, ...] = ()) -> Iterator[_Shot | _Unread
     for camera, pictures in cameras.items():
         yield _Shot(path.absolute().parts, camera, pictures)
     if not cameras:
+        of_days: dict[Path, bool] = {}  # of each folder, whether those in it are recordings
         for each in sources.recordings([path], None):
-            yield _of_source(Path(each.source), named=path.resolve())
+            source = Path(each.source)
+            if source.is_dir() and source.parent not in of_days:
+                of_days[source.parent] = _hold_a_camera_a_photograph(_folders_of_photographs(source.parent))
+            if of_days.get(source.parent) and source.is_dir():
+                yield from (_Shot(source.parts, camera, of) for camera, of in _in_folder(source).items())
+            else:
+                yield _of_source(source, named=path.resolve())
 
 
 def _in_folder(folder: Path) -> dict[str, Photographs | Film]:
-    """The cameras of a folder of photographs, or of folders of them; none of any other."""
+    """The cameras of a folder of photographs, or of folders of them; none of any other.
+
+    What photographs lie beside is left out, and said: small copies of them, for example.
+    """
     if is_recording(folder):
         return {_ONE_CAMERA: Film(folder)}
     if data_set.is_data_set(folder):
         return {}
-    below = sorted(child for child in folder.iterdir() if child.is_dir() and _is_of_one_camera(child))
-    if below:
-        return {frame_name(child): _of_camera(child) for child in below}
-    return {Path(frame_name(path)).stem: Photographs((path,)) for path in image_paths(folder)}
+    below, photographs = _folders_of_photographs(folder), image_paths(folder)
+    if photographs and below:
+        names = ", ".join(frame_name(child) for child in below)
+        _log.warning("%s: its photographs are its cameras; left out: %s", printable_name(folder.name), names)
+    if not photographs:
+        return {} if _hold_a_camera_a_photograph(below) else {frame_name(child): _of_camera(child) for child in below}
+    cameras: defaultdict[str, list[Path]] = defaultdict(list)
+    for path in photographs:
+        cameras[_camera(path)].append(path)
+    return {camera: Photographs(_few(_readable(paths))) for camera, paths in cameras.items()}
+
+
+def _folders_of_photographs(folder: Path) -> list[Path]:
+    return sorted(child for child in folder.iterdir() if child.is_dir() and _is_of_one_camera(child))
 
 
 def _is_of_one_camera(folder: Path) -> bool:
     return is_recording(folder) or (bool(image_paths(folder)) and not (folder / sources.REPORT).is_file())
 
 
+def _hold_a_camera_a_photograph(folders: Sequence[Path]) -> bool:
+    """Whether folders that lie side by side are recordings, with a photograph a camera, rather than cameras.
+
+    They are if two of them have two names of photographs in common that are no numbers of a sequence.
+    """
+    named = [{_camera(path) for path in image_paths(folder)} for folder in folders if not is_recording(folder)]
+    named = [{name for name in names if not name[-1].isdigit()} for names in named]
+    return any(len(one & other) > 1 for one, other in combinations(named, 2))
+
+
+def _camera(path: Path) -> str:
+    """The name of the camera that a photograph, beside those of others, or a video is called by."""
+    return Path(frame_name(path)).stem
+
+
+def _readable(paths: Sequence[Path]) -> Sequence[Path]:
+    """Without raw files, beside which their cameras put photographs; all where there is nothing else."""
+    return [path for path in paths if foreign_file(path) is None] or paths
+
+
 def _of_camera(folder: Path) -> Photographs | Film:
-    return Film(folder) if is_recording(folder) else Photographs(_few(image_paths(folder)))
+    return Film(folder) if is_recording(folder) else Photographs(_few(_readable(image_paths(folder))))
 
 
 def _of_source(path: Path, named: Path) -> _Shot | _Unreadable:
@@ -138,7 +184,7 @@ def _of_source(path: Path, named: Path) -> _Shot | _Unreadable:
         return _Shot(file.parts, printable_name(part), Film(path))
     if path == named:
         return _Shot(path.parts, _ONE_CAMERA, Film(path))
-    camera = frame_name(path) if path.is_dir() else Path(frame_name(path)).stem
+    camera = frame_name(path) if path.is_dir() else _camera(path)
     return _Shot(path.parent.parts, camera, _of_camera(path) if path.is_dir() else Film(path))
 
 

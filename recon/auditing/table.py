@@ -3,14 +3,25 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from splatnode.recon.auditing.audit import Audit
 from splatnode.recon.auditing.history import Period
 from splatnode.recon.auditing.motion import Motion
 from splatnode.recon.auditing.sighting import NotSeen
+from splatnode.recon.auditing.stations import Recording
 
 _MOST_LINES = 3  # of one camera for one reason; of more recordings the first is told, and how many there are
+_MOST_NAMES = 8  # of cameras, in one line
+
+
+def heading(recordings: Sequence[Recording]) -> str:
+    """How what was named is read: which recordings, and which cameras."""
+    cameras = sorted({camera for recording in recordings for camera in recording.cameras})
+    first, last, count = recordings[0].name, recordings[-1].name, len(recordings)
+    visits = f"{count} recordings, {first} to {last}" if count > 1 else f"1 recording, {first}"
+    named = ", ".join(cameras[:_MOST_NAMES]) + (", ..." if len(cameras) > _MOST_NAMES else "")
+    return f"{visits}, of {len(cameras)} camera{'s' if len(cameras) != 1 else ''}{named and ': '}{named}"
 
 
 def lines(audit: Audit) -> Iterator[str]:
@@ -49,11 +60,7 @@ def _not_compared(audit: Audit, camera: str) -> Iterator[str]:
 
 def amount(audit: Audit, motion: Motion) -> str:
     """How far, with two standard deviations."""
-    turn = f"{motion.degrees:.2g} degrees (± {2 * motion.degrees_sigma:.1g})"
-    distance, sigma = motion.distance, 2 * motion.distance_sigma
-    if audit.metric:
-        return f"{turn} and {100 * distance:.2g} cm (± {100 * sigma:.1g})"
-    return f"{turn} and {100 * distance / audit.unit:.2g} % of the distance (± {100 * sigma / audit.unit:.1g})"
+    return motion.in_words(audit.unit, audit.metric)
 
 
 def _stood(audit: Audit, period: Period) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 
 from splatnode.capture import film
@@ -11,7 +12,7 @@ from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.given_lens import seen_through
 from splatnode.capture.process.packages import remedy
 from splatnode.capture.process.printable import printable, printable_name
-from splatnode.recon.auditing.stations import Film, Photographs
+from splatnode.recon.auditing.stations import Film, Photographs, Recording
 from splatnode.recon.locating.photographs import photographs
 
 _MOST_HELD = 9  # photographs in memory, evenly spread over what was read of a film so far
@@ -26,6 +27,16 @@ def taken(pictures: Photographs | Film, given: Intrinsics | None) -> list[Frame 
         return _readable(photographs(pictures.paths, given), pictures.paths[0])
     frames = _readable(_few(_stream(pictures.path)), pictures.path)
     return frames if given is None else [seen_through(frame, given) for frame in frames]
+
+
+def one_each(recordings: Iterable[Recording]) -> Iterator[Frame | DroppedFrame]:
+    """The first photograph that can be read of each camera in each recording; where there is none, why."""
+    for pictures in (each for recording in recordings for each in recording.cameras.values()):
+        if isinstance(pictures, Photographs):
+            frames, path = photographs(pictures.paths, None), pictures.paths[0]
+        else:
+            frames, path = _stream(pictures.path), pictures.path
+        yield from _readable(islice((frame for frame in frames if isinstance(frame, Frame)), 1), path)
 
 
 def _stream(path: Path) -> Iterator[Frame | DroppedFrame]:

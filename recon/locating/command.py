@@ -5,13 +5,15 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 
-from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.given_lens import same_aspect
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.process.terminal import say
-from splatnode.recon.locating.locate import locate as locate_photograph
+from splatnode.recon.locating.locate import described, located
 from splatnode.recon.locating.outcome import Located, NotLocated
-from splatnode.recon.locating.photographs import assumed_lens, photographs
+from splatnode.recon.locating.photographs import assumed_lens, check_lens, photographs
 from splatnode.recon.result.export.staged import json_bytes, write_files
+from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.landmarks_file import read_landmarks
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
@@ -21,17 +23,17 @@ def locate(args: argparse.Namespace) -> int:
     """A line a photograph; EXIT_GOOD where all were placed."""
     landmarks = read_landmarks(args.result)
     given = None if args.calibration is None else read_lens(args.calibration)
-    records, refused = [], 0
+    if given is not None:
+        check_lens(given, photographs(args.images, None))
+    records, refused, of_other_lens = [], 0, 0
     for frame in photographs(args.images, given):
-        if isinstance(frame, DroppedFrame):
-            found = None
-            say(f"{frame.name}: left out: {frame.reason}")
-            records.append({"name": frame.name, "placed": False, "code": "UNREADABLE", "message": frame.reason})
-        else:
-            found = locate_photograph(landmarks, frame.image, assumed_lens(frame, args.fov))
-            say(f"{frame.name}: {found.sentence}")
-            records.append({"name": frame.name, **_record(found, frame)})
+        found = frame if isinstance(frame, DroppedFrame) else _found(landmarks, frame, args.fov)
+        say(f"{frame.name}: {f'left out: {found.reason}' if isinstance(found, DroppedFrame) else found.sentence}")
+        records.append({"name": frame.name, **_record(found, frame)})
         refused += not isinstance(found, Located)
+        of_other_lens += given is not None and isinstance(frame, Frame) and not _is_of(given, frame)
+    if of_other_lens:
+        say(f"the lens was not given to {of_other_lens} of them, which have another aspect ratio than its images")
     say(f"{len(records) - refused} of {len(records)} photographs were placed in {args.result}")
     if args.json is not None:
         told = {"result": str(args.result), "scale": "metric" if landmarks.metric else "relative"}
@@ -40,9 +42,25 @@ def locate(args: argparse.Namespace) -> int:
     return EXIT_REFUSED if refused else EXIT_GOOD
 
 
-def _record(found: Located | NotLocated, frame: Frame) -> dict[str, object]:
+def _is_of(given: Intrinsics, frame: Frame) -> bool:
+    return same_aspect(given, frame.width, frame.height)
+
+
+def _found(landmarks: Landmarks, frame: Frame, fov_deg: float | None) -> Located | NotLocated | DroppedFrame:
+    """Where it was taken; left out where its lens cannot be undone, which costs no other photograph."""
+    try:
+        photograph = described(frame.image, assumed_lens(frame, fov_deg), name=frame.name)
+    except ValueError as error:
+        return DroppedFrame(frame.name, str(error).removeprefix(f"{frame.name}: "))
+    return located(landmarks, photograph)
+
+
+def _record(found: Located | NotLocated | DroppedFrame, frame: Frame | DroppedFrame) -> dict[str, object]:
+    if isinstance(found, DroppedFrame):
+        return {"placed": False, "code": "UNREADABLE", "message": found.reason}
     if isinstance(found, NotLocated):
         return {"placed": False, "code": found.code.value, "message": found.message, "advice": found.advice}
+    assert isinstance(frame, Frame)  # it was located
     arrays = {name: getattr(found, name).tolist() for name in ("T_world_camera", "K", "covariance")}
     size = {"width": frame.width, "height": frame.height}
     return {"placed": True, **arrays, **size, "claim": asdict(found.claim), "points": found.num_points}

@@ -79,9 +79,13 @@ def described(
     image: npt.NDArray[np.uint8],
     intrinsics: Intrinsics | None = None,
     config: Config = Config(),  # noqa: B008
+    name: str = "photograph",
 ) -> Photograph:
-    """What `located` needs of a photograph, which may be looked for in several scenes. As `locate` otherwise."""
-    frame = undistorted(Frame(0, "photograph", 0, image, intrinsics))
+    """What `located` needs of a photograph, which may be looked for in several scenes. As `locate` otherwise.
+
+    `name` is what the sentence of a ValueError calls the photograph.
+    """
+    frame = undistorted(Frame(0, name, 0, image, intrinsics))
     return Photograph(frame, features.extract(frame.image, config.features))
 
 

@@ -3,24 +3,46 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.given_lens import check_fits, same_aspect, seen_through
+from splatnode.capture.lenses.undistort import undistorted
 
 
 def photographs(paths: Sequence[Path], given: Intrinsics | None) -> Iterator[Frame | DroppedFrame]:
-    """The photographs that the paths name, each a file or a folder, in their order; `given` is their lens.
+    """The photographs that the paths name, each a file or a folder, in their order.
 
-    Raises FileNotFoundError for a path that is not there.
+    `given` is the lens of those that have its aspect ratio. Raises FileNotFoundError for a path that is not there.
     """
+    for frame in _named(paths):
+        yield frame if given is None else seen_through(frame, given)
+
+
+def check_lens(given: Intrinsics, frames: Iterable[Frame | DroppedFrame]) -> None:
+    """Looks for a photograph that the lens can be of, and takes no more frames than that needs.
+
+    Raises ValueError where there are photographs and it is of none, or where its distortion cannot be undone.
+    """
+    others: set[tuple[int, int]] = set()
+    for frame in frames:
+        if isinstance(frame, Frame) and same_aspect(given, frame.width, frame.height):
+            undistorted(replace(frame, intrinsics=given, right=None))
+            return
+        if isinstance(frame, Frame):
+            others.add((frame.width, frame.height))
+    check_fits(given, others)
+
+
+def _named(paths: Sequence[Path]) -> Iterator[Frame | DroppedFrame]:
     for path in paths:
         if path.is_dir():
-            yield from folder.stream(folder.Config(folder=path, intrinsics=given))
+            yield from folder.stream(folder.Config(folder=path))
         elif path.is_file():
-            name = folder.frame_name(path)
-            yield from folder.stream(folder.Config(folder=path.parent, names=(name,), intrinsics=given))
+            yield from folder.stream(folder.Config(folder=path.parent, names=(folder.frame_name(path),)))
         else:
             raise FileNotFoundError(f"{str(path)!r} is not there; give photographs, or folders that hold some")
 

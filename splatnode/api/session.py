@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 
 import numpy.typing as npt
 
-from splatnode.api.photographs import Lens, Picture, frame, intrinsics_of, lenses, seen_through
+from splatnode.api.photographs import Lens, Picture, frame, intrinsics_of, lenses
 from splatnode.api.poses import gravity_of, next_motion, pose_of
 from splatnode.api.reconstruction import Changes, check_count, configured
 from splatnode.api.result import Result, result_of
 from splatnode.api.scale import Scale, is_stereo
 from splatnode.capture.frame import Frame
+from splatnode.capture.given_lens import check_fits, seen_through
 from splatnode.capture.motion import Motion
 from splatnode.capture.process.progress import Tell, told_to_nobody
 from splatnode.capture.quality import Limits
@@ -79,6 +80,7 @@ class Session:
         self._work: IncrementalReconstruction | None = IncrementalReconstruction(self._config)
         self._frames: dict[str, Frame] = {}  # that were taken
         self._given: set[str] = set()
+        self._sizes: list[tuple[int, int]] = []  # (width, height) of those that were given, each once
         self._motion: Motion | None = None  # up to the photograph that was given last
         self._evidence = NOTHING  # of metres, in these frames
         self._snapshot: Snapshot | None = None
@@ -112,7 +114,8 @@ class Session:
 
         Returns what became of the photograph once the scene has grown, which takes seconds where it is taken, and
         milliseconds where it is not. Raises TypeError and ValueError where it is no image, its pose, motion, gravity or
-        right image is none, or a name comes again, and RuntimeError after `finish` or `close`.
+        right image is none, a name comes again, or the session's lens has the aspect ratio of no photograph so far,
+        and RuntimeError after `finish` or `close`.
         """
         with self._lock, limits.at_most(self._threads):
             work = self._open()
@@ -126,6 +129,7 @@ class Session:
             frame = replace(frame, **came, right=_right_of(right, baseline_m))
             self._motion = moved
             self._given.add(frame.name)
+            self._sizes += {(frame.width, frame.height)}.difference(self._sizes)
             decision = self._selector.decide(frame)
             if decision.take:
                 self._frames[frame.name] = frame
@@ -183,7 +187,10 @@ class Session:
         made = frame(image, number, name, time.monotonic_ns(), captured_at)
         if self._lens is None:
             return made
-        return seen_through(made, intrinsics_of(self._lens, made.width, made.height))
+        sizes = [*self._sizes, (made.width, made.height)]
+        known = intrinsics_of(self._lens, *sizes[0])
+        check_fits(known, sizes)
+        return seen_through(made, known)
 
 
 def _right_of(picture: Picture | None, baseline_m: float | None) -> RightImage | None:

@@ -77,6 +77,24 @@ def test_a_session_that_is_closed_says_so_and_keeps_its_last_result(arrays):
             ask()
 
 
+def test_a_lens_that_fits_no_photograph_is_told_with_the_first(arrays):
+    square = splatnode.Intrinsics(100, 100, 90, 90, 50, 50, "given")
+    with splatnode.Session(config=QUICK, intrinsics=square) as session:
+        with pytest.raises(ValueError, match="got those of 100 x 100 for 320 x 240"):
+            session.add(arrays[0])
+        assert session.add(arrays[0][:, :240]).taken
+        session.add(arrays[1])  # of another lens
+
+
+def test_a_matrix_is_of_photographs_of_the_size_of_the_first_one(arrays):
+    K = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
+    with splatnode.Session(config=QUICK, intrinsics=K) as session:
+        session.add(arrays[0], name="a.png")
+        session.add(np.ascontiguousarray(arrays[1][::2, ::2]), name="b.png")
+        lens = session._frames["b.png"].intrinsics
+    assert lens is not None and lens.fx == 150 and lens.width == 160
+
+
 def test_all_that_are_sharp_can_be_asked_for(arrays):
     with splatnode.Session(config=QUICK, every_frame=True, scale=(0, 1, 2.0)) as session:
         shifted = np.roll(arrays[0], 3, axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -38,6 +39,7 @@ def test_the_camera_that_moved_is_named_with_when_and_by_how_much(result, record
     files = ["--json", str(told), "--picture", str(drawn)]
     assert main(["audit", str(result), *map(str, recordings), *files]) == 0
     out = capsys.readouterr().out
+    assert out.startswith("3 recordings, monday to wednesday, of 2 cameras: left, right\n")
     assert "left moved between tuesday and wednesday by 1 degrees" in out.replace("0.99 ", "1 ").replace("1.0 ", "1 ")
     assert "right stood still in 2 recordings" in out and "right was not compared in tuesday: NOT_FOUND" in out
     assert "1 of 2 cameras moved in 3 recordings; 2 could be compared" in out
@@ -52,15 +54,31 @@ def test_the_camera_that_moved_is_named_with_when_and_by_how_much(result, record
 
 
 def test_a_camera_that_moves_within_a_recording_is_not_compared(result, tmp_path, capsys):
-    left = synthetic.held_out_cameras(PLACE)[0]
-    for day in ("monday", "tuesday"):
+    left, *_ = synthetic.held_out_cameras(PLACE)
+    shifted = left[0].copy(), left[1]
+    shifted[0][:3, 3] += 0.05 * left[0][:3, 0]
+    for day, later in (("monday", turned(left, 2.0)), ("tuesday", shifted)):
         (tmp_path / day / "wrist").mkdir(parents=True)
-        for index in range(2):
-            (tmp_path / day / "wrist" / f"{index}.png").write_bytes(picture(turned(left, 2.0 * index), index))
+        for index, camera in enumerate((left, later)):
+            (tmp_path / day / "wrist" / f"{index}.png").write_bytes(picture(camera, index))
     assert main(["audit", str(result), str(tmp_path / "monday"), str(tmp_path / "tuesday")]) == 65
     out = capsys.readouterr().out
-    assert "wrist was not compared in monday: MOVING: since 0.png it turned by 2 degrees" in out
+    assert "wrist was not compared in monday: MOVING: since 0.png it moved by 2 degrees (±" in out
+    shift = re.search(r"tuesday: MOVING: since 0.png it moved by \S+ degrees .* and (\S+) % of the distance", out)
+    assert shift is not None and float(shift[1]) > 0.5, out
     assert "0 of 1 cameras moved in 2 recordings; 0 could be compared" in out
+
+
+def test_a_lens_that_can_be_of_no_camera_is_told_before_the_work(result, recordings, tmp_path, capsys):
+    lens = tmp_path / "lens.yaml"
+    lens.write_text("{width: 100, height: 100, fx: 90, fy: 90, cx: 50, cy: 50}")
+    film = tmp_path / "film" / "left.mp4"
+    film.parent.mkdir()
+    film.write_bytes(b"no video")
+    visits = [str(film.parent), *map(str, recordings)]
+    assert main(["audit", str(result), *visits, "--calibration", str(lens)]) == 2
+    told = capsys.readouterr()
+    assert "got those of 100 x 100 for 480 x 360" in told.err and not told.out
 
 
 def test_mistakes_are_told_in_a_sentence(result, recordings, tmp_path, capsys):

@@ -74,3 +74,15 @@ def test_the_camera_that_moved_between_two_logs_is_named_and_the_other_is_not(re
     assert "/left/image moved between day0.mcap and day1.mcap by 2 degrees" in out.replace("2.0 ", "2 ")
     assert "/right/image stood still in 2 recordings" in out
     assert "1 of 2 cameras moved in 2 recordings; 2 could be compared" in out
+
+
+def test_a_lens_that_cannot_be_undone_costs_only_its_camera(result, tmp_path, capsys):
+    for day in range(2):
+        told = [compressed("/left/image", seen("left", 0.0, day)), compressed("/right/image", seen("right", 0.0, day))]
+        lens = calibration("/right/camera_info", (PLACE.width, PLACE.height), RIGHT[1].ravel(), D=(-3.0, 0, 0, 0, 0))
+        write(tmp_path / f"day{day}.mcap", [*told, lens])
+    assert main(["audit", str(result), str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "/left/image stood still in 2 recordings" in out and "photograph:" not in out
+    assert "/right/image was not compared in day0.mcap: UNREADABLE: " in out
+    assert "folds the picture over" in out and "1 could be compared" in out

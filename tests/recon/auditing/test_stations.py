@@ -113,3 +113,47 @@ def test_of_a_folder_of_photographs_likewise(tmp_path):
         put(tmp_path / "day" / "left" / f"{index}.jpg")
     (found,) = recordings([tmp_path / "day"])
     assert found.cameras["left"] == Photographs(tuple(tmp_path / "day" / "left" / f"{i}.jpg" for i in (0, 2, 4)))
+
+
+def test_files_of_one_name_are_of_one_camera_and_none_is_lost(tmp_path):
+    for name in ("left.JPG", "left.NEF", "right.jpg", "right.png", "top.nef"):
+        put(tmp_path / "day" / name)
+    (found,) = recordings([tmp_path / "day"])
+    files = {
+        camera: [path.name for path in of.paths] for camera, of in found.cameras.items() if isinstance(of, Photographs)
+    }
+    assert files == {"left": ["left.JPG"], "right": ["right.jpg", "right.png"], "top": ["top.nef"]}
+
+
+def test_raw_files_beside_the_photographs_of_a_folder_a_camera_are_left_out(tmp_path):
+    for name in ("0.dng", "1.jpg", "1.dng", "2.dng"):
+        put(tmp_path / "day" / "left" / name)
+    (found,) = recordings([tmp_path / "day"])
+    assert found.cameras == {"left": Photographs((tmp_path / "day" / "left" / "1.jpg",))}
+
+
+def test_a_folder_beside_photographs_does_not_hide_them_and_is_named(tmp_path, caplog):
+    for name in ("left.png", "right.png", "thumbs/a.png"):
+        put(tmp_path / "monday" / name)
+    assert cameras(tmp_path / "monday") == {"monday": ["left", "right"]}
+    assert "monday: its photographs are its cameras; left out: thumbs" in caplog.text
+
+
+@pytest.mark.parametrize("deep", ["", "year/"])
+def test_a_folder_of_recordings_that_are_photographs_stands_for_them(tmp_path, deep):
+    """The last one lacks a camera."""
+    days = tmp_path / "days" / deep
+    for name in ("day2/left.png", "day2/right.png", "day10/left.jpg", "day10/right.jpg", "day11/left.png"):
+        put(days / name)
+    put(days / "day12" / "left" / "1.png")
+    both = ["left", "right"]
+    expected = {"day2": both, "day10": both, "day11": ["left"], "day12": ["left"]}
+    found = recordings([tmp_path / "days"])
+    assert {each.name: sorted(each.cameras) for each in found} == expected and list(expected) == [r.name for r in found]
+
+
+def test_folders_of_numbered_photographs_or_of_one_alike_are_cameras(tmp_path):
+    for camera in ("left", "right"):
+        for name in ("frame_1", "frame_2", "preview"):
+            put(tmp_path / "monday" / camera / f"{name}.png")
+    assert cameras(tmp_path / "monday") == {"monday": ["left", "right"]}

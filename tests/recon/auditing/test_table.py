@@ -7,7 +7,8 @@ from xml.etree import ElementTree
 from splatnode.recon.auditing.audit import Audit
 from splatnode.recon.auditing.picture import picture
 from splatnode.recon.auditing.sighting import MOVING, NotSeen
-from splatnode.recon.auditing.table import lines, summary, values
+from splatnode.recon.auditing.stations import Photographs, Recording
+from splatnode.recon.auditing.table import heading, lines, summary, values
 
 NAMES = tuple(f"episode_{number:06d}" for number in range(100))
 WRIST = {number: NotSeen(f"{number}.png", MOVING, f"it turned by {number} degrees") for number in range(1, 99)}
@@ -23,6 +24,15 @@ def test_one_reason_in_many_recordings_is_one_line():
         "episode_000099 was not compared: it is of version v2.1",
     ]
     assert summary(AUDIT) == "0 of 2 cameras moved in 100 recordings; 0 could be compared"
+
+
+def test_how_what_was_named_is_read_is_told_first():
+    of_two = [Recording(name, {"left": Photographs(()), "right": Photographs(())}) for name in ("monday", "friday")]
+    assert heading(of_two) == "2 recordings, monday to friday, of 2 cameras: left, right"
+    many = {f"camera{number}": Photographs(()) for number in range(9)}
+    assert heading([Recording("days", many)]).startswith("1 recording, days, of 9 cameras: camera0, ")
+    assert heading([Recording("days", many)]).endswith("camera7, ...")
+    assert heading([Recording("lost", {}, "is not there")]) == "1 recording, lost, of 0 cameras"
 
 
 def test_the_values_have_all_of_them():

@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.image_file import encode_png
+from splatnode.capture.recording import Recorder
 from splatnode.command_line import main
+from splatnode.recon.locating.photographs import photographs as named
 from splatnode.recon.result.landmarks_file import LANDMARKS, encode_landmarks
 from tests.support.located import PLACE, known_place, photograph
 
@@ -72,6 +75,43 @@ def test_a_lens_can_be_given(result, photographs, tmp_path, capsys):
     capsys.readouterr()
     assert main(["locate", str(result), str(photographs), "--calibration", str(lens)]) == 2
     assert "must give width, height, fx" in capsys.readouterr().err
+
+
+def test_a_lens_that_cannot_be_undone_costs_only_its_photograph(result, photographs, tmp_path, capsys):
+    folding = Intrinsics(PLACE.width, PLACE.height, 400, 400, 240, 180, "calibration", (-3.0, 0, 0, 0))
+    with Recorder(tmp_path / "recorded") as recorder:
+        recorder.write(Frame(0, "bent.png", 0, photograph(0)[0], folding))
+    found = tmp_path / "found.json"
+    images = [str(tmp_path / "recorded"), str(photographs / "0.png")]
+    assert main(["locate", str(result), *images, "--json", str(found)]) == 65
+    out = capsys.readouterr().out
+    assert "bent.png: left out: distortion" in out and "1 of 2 photographs were placed" in out
+    assert [each.get("code") for each in json.loads(found.read_text())["photographs"]] == ["UNREADABLE", None]
+
+
+def test_a_lens_that_can_be_of_no_photograph_is_told_before_the_work(result, photographs, tmp_path, capsys):
+    lens = tmp_path / "lens.yaml"
+    lens.write_text("{width: 100, height: 100, fx: 90, fy: 90, cx: 50, cy: 50}")
+    given = ["--calibration", str(lens)]
+    assert main(["locate", str(result), str(photographs), *given]) == 2
+    told = capsys.readouterr()
+    assert "got those of 100 x 100 for 480 x 360" in told.err and not told.out
+    (photographs / "plain.png").write_bytes(encode_png(np.full((90, 90, 3), 128, np.uint8)))
+    assert main(["locate", str(result), str(photographs), *given]) == 65
+    assert "the lens was not given to 2 of them" in capsys.readouterr().out
+    lens.write_text(f"{{width: {PLACE.width}, height: {PLACE.height}, fx: 400, fy: 400, cx: 240, cy: 180, "
+                    "distortion: [-3, 0, 0, 0]}")  # fmt: skip
+    assert main(["locate", str(result), str(photographs), *given]) == 2
+    told = capsys.readouterr()
+    assert "0.png: distortion" in told.err and not told.out
+
+
+def test_a_lens_that_is_given_is_that_of_a_recording_too(tmp_path):
+    lens = Intrinsics(PLACE.width, PLACE.height, 400, 400, 240, 180, "given")
+    with Recorder(tmp_path / "recorded") as recorder:
+        recorder.write(Frame(0, "a.png", 0, photograph(0)[0], None))
+    (frame,) = named([tmp_path / "recorded"], lens)
+    assert isinstance(frame, Frame) and frame.intrinsics == lens
 
 
 def test_what_is_not_there_is_said(result, photographs, tmp_path, capsys):
