@@ -124,11 +124,12 @@ def seeds() -> str:
     between = [
         f"{median(each):.1f} dB in the median, {max(each):.1f} at most".replace("0.", ".") for each in apart.values()
     ]
+    two = len(others) // 2 - three
+    many = f"three on {three} sets" + (f", of two on {two}" if two else "")
     return (
         f"Of `balanced` it is the mean of three seeds; of MCMC and of a Gaussian a pixel, with our background, of "
-        f"three on {three} sets, of two on {len(others) // 2 - three} and of one on goldcape at 12; the others have "
-        f"one (`race.json`). From seed to seed `balanced` differs by {between[0]}; MCMC by {between[1]}; a Gaussian a "
-        f"pixel by {between[2]}"
+        f"{many} and of one on goldcape at 12; the others have one (`race.json`). From seed to seed `balanced` differs "
+        f"by {between[0]}; MCMC by {between[1]}; a Gaussian a pixel by {between[2]}"
     )
 
 
