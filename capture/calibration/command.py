@@ -9,7 +9,7 @@ from pathlib import Path
 
 from splatnode.capture.calibration.board import Board, board_page
 from splatnode.capture.calibration.coverage import Coverage
-from splatnode.capture.calibration.gathering import MOST_VIEWS, Gathering
+from splatnode.capture.calibration.gathering import Gathering
 from splatnode.capture.calibration.hold_out import Choice, choose
 from splatnode.capture.calibration.lacking import ENOUGH, GOOD, LEAST_VIEWS, TooLittle, too_few, uncovered, unknown
 from splatnode.capture.calibration.models import MODELS, Model
@@ -26,7 +26,8 @@ from splatnode.capture.process.terminal import say
 from splatnode.capture.reader import Reader, State
 
 _OF_AN_END = ("folder", "video")  # cameras of which all is looked at; others are left once the lens is known
-_TRY_EVERY = 4  # views: a lens is looked for so often while more come
+_TRY_EVERY, _TRY_FULL = 4, 20  # views: a lens is looked for so often while more come, and once they replace others
+_GIVEN_UP = 300  # views: where a camera showed so many, everywhere, and the lens is not known, more would not help
 _POLL_S = 0.1
 
 
@@ -84,7 +85,7 @@ def _config(source: Path, changes: list[str]) -> CaptureConfig:
 def _shown(
     config: CaptureConfig, board: Board, models: list[Model], seconds: float | None, tell: Tell
 ) -> tuple[Choice, Coverage]:
-    """The lens, once it is known well, or from all there is."""
+    """The lens, once it is known well, or well enough where further views only replace others; or from all there is."""
     camera = config.camera
     gathering = Gathering(board, moving=is_live(camera) or camera.kind == "video")
     tried, drawn = 0, []
@@ -98,18 +99,20 @@ def _shown(
             if gathering.moving and coverage.drawn != drawn:
                 drawn = coverage.drawn
                 _draw(coverage, tell)
-            ready = len(views) >= max(LEAST_VIEWS, tried + _TRY_EVERY) and uncovered(coverage) is None
+            pause = _TRY_FULL if gathering.is_full else _TRY_EVERY
+            ready = gathering.kept >= max(LEAST_VIEWS, tried + pause) and uncovered(coverage) is None
             if ready and camera.kind not in _OF_AN_END:
-                tried = len(views)
+                tried = gathering.kept
                 tell(Step("looking for the lens", 0, 0, ""))
                 choice = choose(views, board, coverage.width, coverage.height, models)
-                wanted = [] if choice is None else unknown(choice.taken.estimate, coverage, GOOD)
+                limits = ENOUGH if gathering.is_full else GOOD
+                wanted = [] if choice is None else unknown(choice.taken.estimate, coverage, limits)
                 if choice is not None and not wanted:
                     return choice, coverage
+                if gathering.is_full and (choice is None or gathering.kept >= _GIVEN_UP):
+                    break
                 for sentence in wanted:
                     tell(f"{len(views)} views: {sentence}")
-            if len(views) >= MOST_VIEWS:
-                break
     return _judged(gathering, models, tell)
 
 
