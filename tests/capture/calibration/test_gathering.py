@@ -16,6 +16,7 @@ from splatnode.capture.calibration.gathering import MOST_VIEWS, Gathering
 from splatnode.capture.calibration.lacking import TooLittle, uncovered
 from splatnode.capture.calibration.models import MODELS
 from splatnode.capture.calibration.rotations import rotations
+from splatnode.capture.cameras import folder, v4l2
 from splatnode.capture.config import Camera, CaptureConfig
 from splatnode.capture.frame import Frame
 from splatnode.capture.reader import Config, Reader
@@ -120,8 +121,8 @@ def focal_by(monkeypatch: pytest.MonkeyPatch, opened: FromFrames, live: bool) ->
     monkeypatch.setattr(command, "camera_opener", opened)
     monkeypatch.setattr(command, "is_live", lambda camera: live)
     monkeypatch.setattr(command, "Reader", lambda opener, _live, config: Reader(opener, False, config))
-    kind = "v4l2" if live else "folder"
-    config = CaptureConfig(Camera(kind, None), reader=Config())
+    camera = Camera("v4l2", v4l2.Config()) if live else Camera("folder", folder.Config(Path("photographs")))
+    config = CaptureConfig(camera, reader=Config())
     choice, _ = command._shown(config, BOARD, [MODELS["pinhole"]], None, lambda _: None)
     return choice.taken.estimate.lens.fx
 
