@@ -27,5 +27,6 @@ def check_fits(known: Intrinsics, sizes: Collection[tuple[int, int]]) -> None:
         shown = ", ".join(f"{width} x {height}" for width, height in sorted(set(sizes)))
         raise ValueError(
             f"intrinsics must be of images of the photographs' aspect ratio, got those of {known.width} x "
-            f"{known.height} for {shown}. Give the size of the images that were calibrated"
+            f"{known.height} for {shown}. Give the size of the images that were calibrated, or photographs of its "
+            "aspect ratio"
         )

@@ -44,7 +44,7 @@ def read_lens(path: Path) -> Intrinsics:
     """The lens that a file gives; `source` is "calibration" unless the file says otherwise. Raises UnusableLens."""
     shown = printable(str(path))
     try:
-        text = read_bounded(path, MAX_BYTES, UnusableLens, shown).decode()
+        text = read_bounded(path, MAX_BYTES, UnusableLens, shown).decode("utf-8-sig")
     except OSError as error:
         raise UnusableLens(f"{shown}: {error.strerror}; give a file with {_READ}") from error
     except UnicodeDecodeError as error:

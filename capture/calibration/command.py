@@ -7,26 +7,31 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from splatnode.capture import film
 from splatnode.capture.calibration.board import Board, board_page
 from splatnode.capture.calibration.coverage import Coverage
-from splatnode.capture.calibration.gathering import MOST_VIEWS, Gathering
+from splatnode.capture.calibration.gathering import Gathering
 from splatnode.capture.calibration.hold_out import Choice, choose
 from splatnode.capture.calibration.lacking import ENOUGH, GOOD, LEAST_VIEWS, TooLittle, too_few, uncovered, unknown
 from splatnode.capture.calibration.models import MODELS, Model
 from splatnode.capture.calibration.other_board import what_is_shown
 from splatnode.capture.calibration.pdf import PAPERS, pdf_of
 from splatnode.capture.calibration.report import lens_file, told
-from splatnode.capture.config import CaptureConfig, camera_opener, is_live
+from splatnode.capture.config import Camera, CaptureConfig, camera_opener, is_live
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.image_file import SUFFIXES
+from splatnode.capture.lerobot.data_set import is_data_set
 from splatnode.capture.process.config import load_config, merged, parse_changes, typed
 from splatnode.capture.process.durable import write_whole
 from splatnode.capture.process.progress import Step, Tell, telling
 from splatnode.capture.process.terminal import say
 from splatnode.capture.reader import Reader, State
+from splatnode.capture.recording import is_recording
 
-_OF_AN_END = ("folder", "video")  # cameras of which all is looked at; others are left once the lens is known
-_TRY_EVERY = 4  # views: a lens is looked for so often while more come
+_FILMS = ("video", "mcap", "lerobot")  # cameras before which the board was moved
+_OF_AN_END = ("folder", *_FILMS)  # cameras of which all is looked at; others are left once the lens is known
+_TRY_EVERY, _TRY_FULL = 4, 20  # views: a lens is looked for so often while more come, and once they replace others
+_GIVEN_UP = 300  # views: where a camera showed so many, everywhere, and the lens is not known, more would not help
 _POLL_S = 0.1
 
 
@@ -37,8 +42,8 @@ def calibrate(args: argparse.Namespace) -> int:
         return _print_board(args, board)
     if args.source is None or args.out is None:
         raise ValueError(
-            "give a camera's configuration, a folder of photographs or a video, and --out lens.yaml; or --board "
-            "board.pdf, to print the board first"
+            "give a camera's configuration, a folder of photographs, a recording or a video, and --out lens.yaml; or "
+            "--board board.pdf, to print the board first"
         )
     _check_free(args.out)
     config = _config(args.source, args.set)
@@ -72,21 +77,40 @@ def _check_free(path: Path) -> None:
 
 
 def _config(source: Path, changes: list[str]) -> CaptureConfig:
-    """What is read: a folder and a video need no configuration."""
+    """What is read: a folder, a recording and a film need no configuration."""
     if source.suffix.lower() in (".yaml", ".yml"):
         return load_config(source, CaptureConfig, changes)
-    if source.suffix.lower() in SUFFIXES:
+    return typed(merged({"camera": _camera(source)}, parse_changes(changes)), CaptureConfig)
+
+
+def _camera(source: Path) -> dict[str, str]:
+    """The camera's configuration. Raises ValueError where it is of no camera."""
+    file, part = film.file_and_part(source)
+    if is_data_set(file):
+        return {"kind": "lerobot", "folder": str(file), "part": part}
+    if file.suffix.lower() == film.MCAP:
+        return {"kind": "mcap", "file": str(file), "topic": part}
+    if part:
+        raise ValueError(f"{source}: behind a # is a part of an MCAP file or of a LeRobot data set; {file} is neither")
+    if file.suffix.lower() in SUFFIXES:
         raise ValueError(f"{source} is one photograph; give the folder of all that show the board")
-    key, kind = ("folder", "folder") if source.is_dir() or not source.exists() else ("file", "video")
-    return typed(merged({"camera": {"kind": kind, key: str(source)}}, parse_changes(changes)), CaptureConfig)
+    if file.is_file():
+        return {"kind": "video", "file": str(file)}
+    return {"kind": "folder", "folder": str(file)}
+
+
+def _is_moving(camera: Camera) -> bool:
+    """Whether the board is waved before the camera, or was; else each picture was taken with care."""
+    recorded = camera.kind == "folder" and is_recording(camera.config.folder)
+    return is_live(camera) or camera.kind in _FILMS or recorded
 
 
 def _shown(
     config: CaptureConfig, board: Board, models: list[Model], seconds: float | None, tell: Tell
 ) -> tuple[Choice, Coverage]:
-    """The lens, once it is known well, or from all there is."""
+    """The lens, once it is known well, or well enough where further views only replace others; or from all there is."""
     camera = config.camera
-    gathering = Gathering(board, moving=is_live(camera) or camera.kind == "video")
+    gathering = Gathering(board, _is_moving(camera))
     tried, drawn = 0, []
     with Reader(camera_opener(camera, config.body_mask), is_live(camera), config.reader) as reader:
         for frame in _frames(reader, seconds, tell):
@@ -98,18 +122,20 @@ def _shown(
             if gathering.moving and coverage.drawn != drawn:
                 drawn = coverage.drawn
                 _draw(coverage, tell)
-            ready = len(views) >= max(LEAST_VIEWS, tried + _TRY_EVERY) and uncovered(coverage) is None
+            pause = _TRY_FULL if gathering.is_full else _TRY_EVERY
+            ready = gathering.kept >= max(LEAST_VIEWS, tried + pause) and uncovered(coverage) is None
             if ready and camera.kind not in _OF_AN_END:
-                tried = len(views)
+                tried = gathering.kept
                 tell(Step("looking for the lens", 0, 0, ""))
                 choice = choose(views, board, coverage.width, coverage.height, models)
-                wanted = [] if choice is None else unknown(choice.taken.estimate, coverage, GOOD)
+                limits = ENOUGH if gathering.is_full else GOOD
+                wanted = [] if choice is None else unknown(choice.taken.estimate, coverage, limits)
                 if choice is not None and not wanted:
                     return choice, coverage
+                if gathering.is_full and (choice is None or gathering.kept >= _GIVEN_UP):
+                    break
                 for sentence in wanted:
                     tell(f"{len(views)} views: {sentence}")
-            if len(views) >= MOST_VIEWS:
-                break
     return _judged(gathering, models, tell)
 
 
@@ -134,7 +160,8 @@ def _judged(gathering: Gathering, models: list[Model], tell: Tell) -> tuple[Choi
             f"none of {gathering.pictures} pictures shows the board ({gathering.board}): "
             f"{what_is_shown(gathering.unseen, gathering.board)}"
         )
-    missing = [sentence for sentence in (too_few(len(views), gathering.pictures), uncovered(coverage)) if sentence]
+    few = too_few(len(views), gathering.pictures, gathering.moving)
+    missing = [sentence for sentence in (few, uncovered(coverage)) if sentence]
     choice = None
     if len(views) >= LEAST_VIEWS:
         tell(Step("looking for the lens", 0, 0, ""))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
@@ -9,26 +11,41 @@ from splatnode.capture.calibration.board import Board
 from splatnode.capture.calibration.corners import LEAST_CORNERS, View, corner_finder
 from splatnode.capture.calibration.coverage import Coverage, nothing_seen, with_picture, with_view
 from splatnode.capture.calibration.lacking import TooLittle
+from splatnode.capture.calibration.thinning import superfluous
 from splatnode.capture.frame import Frame
 
-MOST_VIEWS = 100
+MOST_VIEWS = 100  # no fewer than the grid of `coverage` has cells
 _STILL = 0.003  # of the longer side: a board that moved by more since the last picture may be smeared
-_REPEATED = 0.02  # of the longer side: a view whose corners are nearer to those of another says nothing new
+_REPEATED = 0.01  # of the longer side: a view with nearly all corners nearer to those of another says nothing new
+_HALF, _NEARLY_ALL = (
+    0.5,
+    0.9,
+)  # of the corners: a tilt moves those at the board's ends, and hardly those about its middle
 _UNSEEN = 4  # pictures without the board that are kept, to find out why
 
 
 class Gathering:
-    """Takes pictures one at a time. Of a `moving` board only views are kept in which it was held still."""
+    """Takes pictures one at a time. Of a `moving` board only views are kept in which it was held still.
+
+    Of more than MOST_VIEWS those are kept that see all that was seen, and lie farthest apart.
+    """
 
     def __init__(self, board: Board, moving: bool) -> None:
         self.board, self.moving = board, moving
         self.pictures = 0
         self.views: list[View] = []
+        self.kept = 0  # views so far, with those that gave way to others
         self.coverage: Coverage | None = None  # before the first picture there is none
         self.unseen: list[npt.NDArray[np.uint8]] = []
         self._find = corner_finder(board)
         self._first = ""
         self._last: View | None = None
+        self._apart = np.empty((0, 0))  # (V, V) of the views, pixels; infinite on the diagonal
+
+    @property
+    def is_full(self) -> bool:
+        """Whether a further view is only kept in place of another."""
+        return len(self.views) == MOST_VIEWS
 
     def take(self, frame: Frame) -> View | None:
         """The view, where it is kept. Raises TooLittle where the picture is not as large as those before."""
@@ -42,12 +59,24 @@ class Gathering:
                 self.unseen.append(frame.image)
             return None
         longer = max(frame.width, frame.height)
-        if self.moving and (before is None or _moved(view, before) > _STILL * longer):
+        if self.moving and (before is None or _moved(view, [before], _HALF)[0] > _STILL * longer):
             return None
-        if any(_moved(view, taken) < _REPEATED * longer for taken in self.views):
+        apart = _moved(view, self.views, _NEARLY_ALL)
+        if (apart < _REPEATED * longer).any():
             return None
+        return self._keep(view, apart, self.coverage)
+
+    def _keep(self, view: View, apart: npt.NDArray[np.float64], coverage: Coverage) -> View | None:
+        """The view, unless of all of them it is the one that says least."""
         self.views.append(view)
-        self.coverage = with_view(self.coverage, view)
+        self._apart = np.block([[self._apart, apart[:, None]], [apart[None], np.full((1, 1), np.inf)]])
+        if len(self.views) > MOST_VIEWS:
+            out = superfluous(self.views, self._apart, coverage.width, coverage.height)
+            self._apart = np.delete(np.delete(self._apart, out, axis=0), out, axis=1)
+            if self.views.pop(out) is view:
+                return None
+        self.kept += 1
+        self.coverage = with_view(coverage, view)  # what gave way was seen in others, too
         return view
 
     def _same_size(self, frame: Frame) -> Coverage:
@@ -63,9 +92,13 @@ class Gathering:
         return self.coverage
 
 
-def _moved(view: View, other: View) -> float:
-    """How far the corners of both lie apart, pixels, in the median; infinite where they share too few."""
-    _, here, there = np.intersect1d(view.ids, other.ids, return_indices=True)
-    if len(here) < LEAST_CORNERS:
-        return np.inf
-    return float(np.median(np.linalg.norm(view.pixels[here] - other.pixels[there], axis=1)))
+def _moved(view: View, others: Sequence[View], share: float) -> npt.NDArray[np.float64]:  # (V,)
+    """How far this share of corners is from those of each other at most, pixels; infinite where too few are in both."""
+    numbers = 1 + max(int(each.ids.max()) for each in (view, *others))
+    places = np.full((len(others), numbers, 2), np.nan)
+    for place, other in zip(places, others, strict=True):
+        place[other.ids] = other.pixels
+    off = np.sort(np.linalg.norm(places[:, view.ids] - view.pixels, axis=-1), axis=1)  # what is not in both is last
+    common = np.isfinite(off).sum(axis=1)
+    last = np.maximum(np.ceil(share * common).astype(int) - 1, 0)
+    return np.where(common < LEAST_CORNERS, np.inf, off[np.arange(len(others)), last])

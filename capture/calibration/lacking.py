@@ -34,12 +34,14 @@ class TooLittle(ValueError):
     exit_code = 65
 
 
-def too_few(views: int, pictures: int) -> str | None:
+def too_few(views: int, pictures: int, moving: bool) -> str | None:
     if views >= LEAST_VIEWS:
         return None
+    show, own = ("shows", "its own") if views == 1 else ("show", "their own")
+    still = ", held still for a moment" if moving else ""
     return (
-        f"{LEAST_VIEWS} pictures that show the board are needed; {views} of {pictures} "
-        f"{'shows' if views == 1 else 'show'} it, from a place and at a tilt of {'its' if views == 1 else 'their'} own"
+        f"{LEAST_VIEWS} pictures that show the board are needed; {views} of {pictures} {show} it, from a place and "
+        f"at a tilt of {own}{still}"
     )
 
 

@@ -18,7 +18,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="?",
         metavar="SOURCE",
-        help="YAML that names the camera, or a folder of photographs, or a video, which show the board",
+        help="YAML that names the camera, or a folder of photographs, a recording, a video, an MCAP file or an "
+        "episode of a LeRobot data set, which show the board",
     )
     add("--out", type=Path, metavar="FILE", help="where the lens goes: YAML, for --intrinsics of other verbs")
     add("--board", type=Path, metavar="FILE", help="write the board to print, a PDF, and do nothing else")

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
+from splatnode.capture.given_lens import check_fits
 from splatnode.capture.image_file import UnusableImage, decode_image
 from splatnode.capture.pace import FramesPerSecond
 from splatnode.capture.stamp import wall_clock
@@ -43,7 +44,10 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def stream(config: Config, system: System | None = None) -> Iterator[Frame | DroppedFrame]:
-    """Frames as they come, stamped by the driver at exposure. Raises CameraUnavailable, at first and when unplugged."""
+    """Frames as they come, stamped by the driver at exposure.
+
+    Raises CameraUnavailable, at first and when unplugged; ValueError where the lens cannot be of the camera's images.
+    """
     path = config.device or _only_camera(system)
     try:
         with Device(path, system) as device:
@@ -73,6 +77,8 @@ def _frames(device: Device, config: Config) -> Iterator[Frame | DroppedFrame]:
     if chosen.pixels not in ("MJPG", "YUYV"):
         has = ", ".join(device.pixel_formats())
         raise CameraUnavailable(f"{device.path} gives {chosen.pixels}, and MJPG or YUYV is needed; it has: {has}")
+    if config.intrinsics is not None:
+        check_fits(config.intrinsics, [(chosen.width, chosen.height)])
     device.set_rate(config.frames_per_second)
     if config.lock:
         locks.run_free(device)

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
+from splatnode.capture.given_lens import check_fits
 from splatnode.capture.image_file import MaxPixels
 from splatnode.capture.pace import Pace, paced
 from splatnode.capture.process.printable import LONGEST_NAME, printable_name
@@ -34,8 +35,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     """The frames at their times in the video; those that cannot be decoded are left out by the decoder, unnamed.
 
-    Raises FileNotFoundError, or ValueError where the file is no video that can be decoded. What goes wrong after a
-    frame is named as a dropped frame, and ends the stream.
+    Raises FileNotFoundError, or ValueError where the file is no video that can be decoded, or the lens cannot be of
+    its images. What goes wrong after a frame is named as a dropped frame, and ends the stream.
     """
     if not config.file.is_file():
         raise FileNotFoundError(f"no file {str(config.file)!r}; give a video, such as an MP4")
@@ -67,7 +68,10 @@ def _stem(config: Config) -> str:
 def _frame(found: VideoFrame, frame_id: int, config: Config) -> Frame | DroppedFrame:
     """Stamps are counted, not read: containers with edited time lines give stamps that go back."""
     rgb = cv2.cvtColor(found.image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
-    intrinsics = config.intrinsics.resized(rgb.shape[1], rgb.shape[0]) if config.intrinsics else None
+    height, width = rgb.shape[:2]
+    if config.intrinsics is not None and frame_id == 0:
+        check_fits(config.intrinsics, [(width, height)])
+    intrinsics = None if config.intrinsics is None else config.intrinsics.resized(width, height)
     name = f"{_stem(config)}_{found.index:06d}.png"
     stamp_ns = round(found.index / found.rate * 1e9)
     return framed(frame_id, name, stamp_ns, rgb, intrinsics, captured_at=Stamp(stamp_ns, Clock.RECORDING))

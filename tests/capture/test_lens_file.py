@@ -45,6 +45,12 @@ def test_of_colmap(tmp_path, line, focal, distortion, model):
     assert lens_in(tmp_path, f"1 {line}\n2 {line}\n") == expected  # as COLMAP writes it, a camera a photograph
 
 
+@pytest.mark.parametrize("text", [COLMAP + "1 PINHOLE 640 480 500 501 320 240\n", OWN + "}"])
+def test_of_an_editor_that_marks_the_order_of_bytes(tmp_path, text):
+    (tmp_path / "lens").write_text(text, encoding="utf-8-sig")
+    assert read_lens(tmp_path / "lens").fy == 501
+
+
 @pytest.mark.parametrize(("bending", "model"), [("radtan", "opencv"), ("equidistant", "fisheye")])
 def test_of_kalibr_whose_pixels_begin_at_their_centre(tmp_path, bending, model):
     expected = (-0.01, 0.02, -0.003, 0.0004)

@@ -16,10 +16,12 @@ from splatnode.capture.calibration import command
 from splatnode.capture.calibration.board import Board
 from splatnode.capture.calibration.lacking import Limits
 from splatnode.capture.cameras import folder
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.lenses import lens as lenses
 from splatnode.capture.reader import Config, Reader
+from splatnode.capture.recording import Recorder
+from tests.support import mcap_files
 from tests.support.board_photographs import Conditions, Photographer, parallel, waved
 from tests.support.fake_camera import fake_camera
 
@@ -146,6 +148,39 @@ def test_too_few_photographs_are_refused_with_all_that_is_missing(photographs, t
     code, told = refusal(capsys, copied(photographs, tmp_path, 3), "--out", tmp_path / "lens.yaml")
     assert code == 65 and "10 pictures that show the board are needed; 3 of 3 show it" in told
     assert "the board was never seen near the picture's corner" in told
+
+
+def as_mcap(images: list[np.ndarray], where: Path) -> Path:
+    mcap_files.write(where / "drive.mcap", [mcap_files.compressed("/front/image", image) for image in images])
+    return where / "drive.mcap#" / "front" / "image"
+
+
+def as_recording(images: list[np.ndarray], where: Path) -> Path:
+    with Recorder(where / "recording") as recorder:
+        for number, image in enumerate(images):
+            recorder.write(framed(number, f"{number}.png", number + 1, image, None))
+    return where / "recording"
+
+
+@pytest.mark.parametrize("recorded", [as_mcap, as_recording])
+def test_of_what_a_robot_recorded_only_views_of_a_board_at_rest_are_taken(photographs, tmp_path, capsys, recorded):
+    moving = [cv2.imread(str(path))[..., ::-1] for path in sorted(photographs.glob("*.png"))[:4]]
+    source = recorded([*moving, moving[3]], tmp_path)
+    code, told = refusal(capsys, source, "--out", tmp_path / "lens.yaml")
+    assert code == 65 and "1 of 5 shows it, from a place and at a tilt of its own, held still for a moment" in told
+
+
+def test_a_film_is_named_as_for_replay(tmp_path, capsys):
+    data_set, film = tmp_path / "set", tmp_path / "film.mp4"
+    (data_set / "meta").mkdir(parents=True)
+    (data_set / "meta" / "info.json").write_text("{}")
+    film.write_bytes(b"")
+    camera = command._config(tmp_path / "set#3" / "observation.images.top", []).camera
+    assert (camera.kind, camera.config.folder, camera.config.part) == ("lerobot", data_set, "3/observation.images.top")
+    assert command._is_moving(camera) and command._is_moving(command._config(film, []).camera)
+    assert not command._is_moving(command._config(tmp_path, []).camera)
+    code, told = refusal(capsys, tmp_path / "film.mp4#3", "--out", tmp_path / "lens.yaml")
+    assert code == 2 and "a part of an MCAP file or of a LeRobot data set" in told
 
 
 def test_photographs_without_the_board_are_refused(tmp_path, capsys):

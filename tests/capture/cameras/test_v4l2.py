@@ -177,6 +177,13 @@ def test_intrinsics_follow_the_size():
     assert frames(Driver(), 1, intrinsics=lens)[0].intrinsics == lens.resized(64, 48)
 
 
+def test_a_lens_of_another_aspect_ratio_ends_the_camera_before_a_frame():
+    driver = Driver()
+    with pytest.raises(ValueError, match="aspect ratio, got those of 128 x 72 for 64 x 48.*or photographs of its"):
+        frames(driver, 1, intrinsics=Intrinsics(128, 72, 100.0, 100.0, 64.0, 36.0, "calibration"))
+    assert driver.delivered == 0 and driver.closed
+
+
 @pytest.mark.parametrize(("event", "reason"), [("error", "driver says"), ("short", "truncated")])
 @pytest.mark.parametrize("pixels", ["MJPG", "YUYV"])
 def test_damaged_frames_are_left_out(event, reason, pixels):

@@ -37,6 +37,11 @@ def test_frames_at_their_times(walk):
     assert frames[-1].captured_at == Stamp(550_000_000, Clock.RECORDING)
 
 
+def test_a_lens_of_another_aspect_ratio_is_refused(walk):
+    with pytest.raises(ValueError, match="aspect ratio, got those of 320 x 180 for 160 x 120"):
+        list(stream(Config(walk, intrinsics=Intrinsics(320, 180, 300.0, 300.0, 160.0, 90.0, "calibration"))))
+
+
 def test_some_of_the_frames(walk):
     frames: list[Any] = list(stream(Config(walk, every=5)))
     assert [(frame.frame_id, frame.name) for frame in frames] == [
