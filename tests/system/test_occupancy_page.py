@@ -21,7 +21,7 @@ def test_the_example_in_python_makes_a_map(tmp_path: Path, monkeypatch, capsys):
     assert "the floor, a plane through" in capsys.readouterr().out
     (files,) = re.findall(r"^\| file \|.*?\n\n", PAGE, re.DOTALL | re.MULTILINE)
     written = {path.name for path in (tmp_path / "demo" / "nav").iterdir()}
-    assert set(re.findall(r"`([\w.]+\.(?:npz|bt|pgm|yaml|ply|glb))`", files)) == written
+    assert set(re.findall(r"`([\w.]+\.(?:npz|bt|pgm|yaml|json|ply|glb))`", files)) == written
 
 
 def test_the_page_has_every_state():

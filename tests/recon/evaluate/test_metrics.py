@@ -78,5 +78,5 @@ def test_lpips_without_weights_is_not_measured(tmp_path, monkeypatch):
 
 def test_lpips_weights_of_something_else_are_a_clear_error(tmp_path):
     torch.save({"net.0.weight": torch.zeros(1)}, tmp_path / "lpips_alex.pth")
-    with pytest.raises(ValueError, match="complete LPIPS network 'alex'"):
+    with pytest.raises(ValueError, match="checkpoint of LPIPS's network 'alex'"):
         load_lpips("alex", tmp_path)
