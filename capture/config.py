@@ -10,7 +10,7 @@ import msgspec
 
 from splatnode.capture import preview, reader, selection
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.masks import Find, all_masked, constant
+from splatnode.capture.masks import all_masked, constant
 from splatnode.capture.messaging import spool
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.nothing_new import NothingNew
@@ -45,17 +45,7 @@ def camera_opener(
     """
     remembering = getattr(camera.module, "opener", None)
     opened = partial(camera.module.stream, camera.config) if remembering is None else remembering(camera.config)
-    return opened if body_mask is None else lambda: _masked(opened(), constant(body_mask))
-
-
-def _masked(
-    items: Iterator[Frame | DroppedFrame | NothingNew], find: Find
-) -> Iterator[Frame | DroppedFrame | NothingNew]:
-    for item in items:
-        if isinstance(item, NothingNew):
-            yield item
-        else:
-            yield from all_masked([item], find)
+    return opened if body_mask is None else lambda: all_masked(opened(), constant(body_mask))
 
 
 def is_live(camera: Camera) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote, unquote
 
 from splatnode.capture.cameras import lerobot, mcap, video
@@ -15,6 +16,7 @@ from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lerobot.data_set import is_data_set
 
 MCAP = ".mcap"
+_MODULES = {"mcap": mcap, "lerobot": lerobot, "video": video}
 _MARK = "#"  # between a file and the part of it that is meant
 
 
@@ -45,13 +47,22 @@ def is_film(path: Path) -> bool:
     return bool(part) or file.is_file()
 
 
-def stream(path: Path) -> Iterator[Frame | DroppedFrame]:
-    """Its frames. Raises FileNotFoundError, or ValueError where they cannot be had."""
+def camera(path: Path) -> tuple[str, dict[str, Any]]:
+    """The kind of camera that gives its frames, and its configuration. Raises ValueError for a part of a video."""
     file, part = file_and_part(path)
     if file.suffix.lower() == MCAP:
-        return mcap.stream(mcap.Config(file=file, topic=part))
+        return "mcap", {"file": file, "topic": part}
     if file.is_dir():
-        return lerobot.stream(lerobot.Config(folder=file, part=part))
+        return "lerobot", {"folder": file, "part": part}
     if part:
-        raise ValueError(f"{str(path)!r}: of an MCAP file a topic can be named behind the #, of a video nothing")
-    return video.stream(video.Config(file=file))
+        raise ValueError(
+            f"{str(path)!r}: behind the # is a part of an MCAP file or of a LeRobot data set; {str(file)!r} is neither"
+        )
+    return "video", {"file": file}
+
+
+def stream(path: Path) -> Iterator[Frame | DroppedFrame]:
+    """Its frames. Raises FileNotFoundError, or ValueError where they cannot be had."""
+    kind, told = camera(path)
+    module = _MODULES[kind]
+    return module.stream(module.Config(**told))

@@ -115,6 +115,12 @@ def _decode(data: bytes) -> npt.NDArray:
     return image
 
 
+def encode_jpeg(image: npt.NDArray[np.uint8], quality: int) -> bytes:
+    """An image (H, W, 3) RGB as a JPEG file; `quality` is 1 to 100."""
+    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return jpeg.tobytes()
+
+
 def encode_png(image: npt.NDArray[np.uint8]) -> bytes:
     """An image (H, W, 3) RGB as a PNG file."""
     _, png = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))

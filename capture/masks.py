@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -32,6 +33,7 @@ _LOSSY = {".jpg", ".jpeg", ".webp"}
 _FILL_SIDE = 64  # pixels of the longer side at which the fill is found: it shows no detail
 
 Find = Callable[[Frame], Mask | None]  # the mask of a frame; None: it has none
+_Other = TypeVar("_Other")  # what a camera gives beside frames
 
 
 class UnusableMask(ValueError):
@@ -59,9 +61,9 @@ def masked(frame: Frame, mask: Mask) -> Frame | DroppedFrame:
 
 
 def all_masked(
-    frames: Iterable[Frame | DroppedFrame], find: Find, tell: Callable[[str], None] = lambda line: None
-) -> Iterator[Frame | DroppedFrame]:
-    """The frames, each with its mask; `tell` hears which have none. Raises UnusableMask."""
+    frames: Iterable[Frame | _Other], find: Find, tell: Callable[[str], None] = lambda line: None
+) -> Iterator[Frame | DroppedFrame | _Other]:
+    """The frames, each with its mask, and all else as it is; `tell` hears which have none. Raises UnusableMask."""
     whole = []
     for frame in frames:
         mask = find(frame) if isinstance(frame, Frame) else None

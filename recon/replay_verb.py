@@ -57,18 +57,9 @@ def add_way(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
     return (
         add("--config", type=Path, metavar="FILE", help="YAML with what differs from the defaults"),
         add("--preset", metavar="P", help="preview, fast, balanced or quality: from quick to good (default: balanced)"),
-        add(
-            "--prior",
-            metavar="K",
-            help="what matches photographs: docs/architecture.md (default: classical)",
-        ),
+        add("--prior", metavar="K", help="what matches photographs: docs/architecture.md (default: classical)"),
         add_device(parser),
-        add(
-            "--size",
-            type=positive,
-            metavar="PIXELS",
-            help="longer side of photographs as modelled (default: 512)",
-        ),
+        add("--size", type=positive, metavar="PIXELS", help="longer side of photographs as modelled (default: 512)"),
         add(
             "--budget-s",
             type=seconds,
@@ -90,12 +81,7 @@ def add_way(parser: argparse.ArgumentParser) -> tuple[argparse.Action, ...]:
         ),
         add_marker(parser),
         add("--max-gaussians", type=positive, metavar="N", help="the best scene with at most so many Gaussians"),
-        add(
-            "--max-mb",
-            type=megabytes,
-            metavar="MB",
-            help="the best scene of at most so many 10^6 bytes",
-        ),
+        add("--max-mb", type=megabytes, metavar="MB", help="the best scene of at most so many 10^6 bytes"),
         add("--seed", type=natural, metavar="N", help="of what is drawn by chance (default: 0)"),
         add_only_seen(parser),
     )

@@ -6,6 +6,7 @@ import argparse
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from splatnode.capture import film
 from splatnode.capture.calibration.board import Board, board_page
@@ -83,20 +84,14 @@ def _config(source: Path, changes: list[str]) -> CaptureConfig:
     return typed(merged({"camera": _camera(source)}, parse_changes(changes)), CaptureConfig)
 
 
-def _camera(source: Path) -> dict[str, str]:
+def _camera(source: Path) -> dict[str, Any]:
     """The camera's configuration. Raises ValueError where it is of no camera."""
-    file, part = film.file_and_part(source)
-    if is_data_set(file):
-        return {"kind": "lerobot", "folder": str(file), "part": part}
-    if file.suffix.lower() == film.MCAP:
-        return {"kind": "mcap", "file": str(file), "topic": part}
-    if part:
-        raise ValueError(f"{source}: behind a # is a part of an MCAP file or of a LeRobot data set; {file} is neither")
-    if file.suffix.lower() in SUFFIXES:
+    if source.suffix.lower() in SUFFIXES:
         raise ValueError(f"{source} is one photograph; give the folder of all that show the board")
-    if file.is_file():
-        return {"kind": "video", "file": str(file)}
-    return {"kind": "folder", "folder": str(file)}
+    if not film.is_film(source) and not is_data_set(source):
+        return {"kind": "folder", "folder": source}
+    kind, told = film.camera(source)
+    return {"kind": kind, **told}
 
 
 def _is_moving(camera: Camera) -> bool:

@@ -17,10 +17,7 @@ from splatnode.capture.frame import Frame
 MOST_VIEWS = 100  # no fewer than the grid of `coverage` has cells
 _STILL = 0.003  # of the longer side: a board that moved by more since the last picture may be smeared
 _REPEATED = 0.01  # of the longer side: a view with nearly all corners nearer to those of another says nothing new
-_HALF, _NEARLY_ALL = (
-    0.5,
-    0.9,
-)  # of the corners: a tilt moves those at the board's ends, and hardly those about its middle
+_HALF, _NEARLY_ALL = 0.5, 0.9  # of the corners: a tilt moves those at the board's ends, hardly those about its middle
 _UNSEEN = 4  # pictures without the board that are kept, to find out why
 
 

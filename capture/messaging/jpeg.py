@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.image_file import UnusableImage, decode_image
+from splatnode.capture.image_file import UnusableImage, decode_image, encode_jpeg
 from splatnode.capture.messaging.wire import WireError
 
 
 def to_jpeg(image: npt.NDArray[np.uint8], quality: int) -> npt.NDArray[np.uint8]:
     """`image` (H, W, 3) RGB as the bytes (N,) of a JPEG file; `quality` is 1 to 100."""
-    _, jpeg = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(jpeg, np.uint8).ravel()
+    return np.frombuffer(encode_jpeg(image, quality), np.uint8)
 
 
 def from_jpeg(jpeg: npt.NDArray, largest_side: int) -> npt.NDArray[np.uint8]:

@@ -105,9 +105,10 @@ def _found(path: Path, lists: tuple[Path, ...] = ()) -> Iterator[_Shot | _Unread
         of_days: dict[Path, bool] = {}  # of each folder, whether those in it are recordings
         for each in sources.recordings([path], None):
             source = Path(each.source)
-            if source.is_dir() and source.parent not in of_days:
-                of_days[source.parent] = _hold_a_camera_a_photograph(_folders_of_photographs(source.parent))
-            if of_days.get(source.parent) and source.is_dir():
+            above = source.parent
+            if source.is_dir() and above not in of_days:
+                of_days[above] = _hold_a_camera_a_photograph(_folders_of_photographs(above))
+            if source.is_dir() and of_days[above]:
                 yield from (_Shot(source.parts, camera, of) for camera, of in _in_folder(source).items())
             else:
                 yield _of_source(source, named=path.resolve())

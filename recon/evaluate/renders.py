@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import cv2
 import numpy as np
 from torch import Tensor
 
+from splatnode.capture.image_file import encode_jpeg
 from splatnode.recon.evaluate.protocol import Row
 
 FOLDER = "renders"
@@ -48,5 +48,4 @@ def kept(out_dir: Path, row: Row) -> dict[str, Path]:
 
 def _jpeg(image: Tensor) -> bytes:
     pixels = np.rint(image.numpy() * 255).astype(np.uint8)
-    _, encoded = cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-    return encoded.tobytes()
+    return encode_jpeg(pixels, _QUALITY)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import asdict
 
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.given_lens import same_aspect
 from splatnode.capture.lens_file import read_lens
 from splatnode.capture.process.terminal import say
@@ -31,7 +31,8 @@ def locate(args: argparse.Namespace) -> int:
         say(f"{frame.name}: {f'left out: {found.reason}' if isinstance(found, DroppedFrame) else found.sentence}")
         records.append({"name": frame.name, **_record(found, frame)})
         refused += not isinstance(found, Located)
-        of_other_lens += given is not None and isinstance(frame, Frame) and not _is_of(given, frame)
+        if given is not None and isinstance(frame, Frame):
+            of_other_lens += not same_aspect(given, frame.width, frame.height)
     if of_other_lens:
         say(f"the lens was not given to {of_other_lens} of them, which have another aspect ratio than its images")
     say(f"{len(records) - refused} of {len(records)} photographs were placed in {args.result}")
@@ -40,10 +41,6 @@ def locate(args: argparse.Namespace) -> int:
         write_files(args.json.parent, {args.json.name: json_bytes({**told, "photographs": records})})
         say(f"results: {args.json}")
     return EXIT_REFUSED if refused else EXIT_GOOD
-
-
-def _is_of(given: Intrinsics, frame: Frame) -> bool:
-    return same_aspect(given, frame.width, frame.height)
 
 
 def _found(landmarks: Landmarks, frame: Frame, fov_deg: float | None) -> Located | NotLocated | DroppedFrame:

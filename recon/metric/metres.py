@@ -92,11 +92,10 @@ def _too_far(snapshot: Snapshot, aligned: Aligned) -> str:
 
     Empty where it can. A coordinate of a Gaussian has 24 bits: so far out the scene would stand on a coarse grid.
     """
-    to_world = aligned.placed(aligned.unit.metres_per_unit)
-    farthest = float(np.abs(to_world(aligned.centre)).max())
     means = snapshot.gaussians.means
     if not len(means):
         return ""
+    farthest = float(np.abs(aligned.to_world(aligned.centre)).max())
     size = aligned.unit.metres_per_unit * float(np.median(np.linalg.norm(means - aligned.centre, axis=1)))
     step = float(np.spacing(np.float32(farthest)))
     if step <= MOST_STEP * size:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -65,7 +66,8 @@ class Fit:
         self._pose_rates = torch.tensor([rates.translation] * 3 + [rates.rotation] * 3)
         self._pose_moments = [Moments(torch.zeros(6), torch.zeros(6)) for _ in scene.views]
         views = (*scene.views, *beside)
-        shown = (*fitted_pixels(scene.views), *(np.ones((view.height, view.width), bool) for view in beside))
+        fitted = fitted_pixels(scene.views)
+        shown = (*fitted, *(np.ones((view.height, view.width), bool) for view in beside))
         few = sum(view.width * view.height for view in views) <= _KEPT_PIXELS
         device = gaussians.means.device
         self._measure = perceptual_loss.load(config.perceptual, device)
@@ -78,7 +80,7 @@ class Fit:
             for half, scale in _SCALES.items()
             if config.half_resolution_share > 0 or not half
         }
-        self._regularisation = _regularisation(scene, config.regularise, seed)
+        self._regularisation = _regularisation(scene, fitted, config.regularise, seed)
         self._iterations = scene.iterations
         # Photometric, of each step on a view of the scene. In one block: small tensors that are kept among those of the
         # steps would split the memory that these give back.
@@ -201,8 +203,10 @@ def _leaves(gaussians: Gaussians, shifts: Shifts | None) -> dict[str, Tensor]:
     return leaves
 
 
-def _regularisation(scene: Scene, config: regularise.Config, seed: int) -> Regularisation | None:
-    """The losses beside the photometric one; None where all weights are 0.
+def _regularisation(
+    scene: Scene, fitted: Sequence[npt.NDArray[np.bool_]], config: regularise.Config, seed: int
+) -> Regularisation | None:
+    """The losses beside the photometric one, in the pixels (h, w) that are `fitted`; None where all weights are 0.
 
     Raises ValueError where they would compare with what is known of a view, and nothing is.
     """
@@ -215,4 +219,4 @@ def _regularisation(scene: Scene, config: regularise.Config, seed: int) -> Regul
         T_world_camera = view.T_world_camera.double().numpy()
         pointmaps.append(replace(view.pointmap, T_world_camera=T_world_camera, K=view.K.double().numpy()))
     images = [view.image for view in scene.views]
-    return Regularisation(pointmaps, images, config, seed=seed, shown=fitted_pixels(scene.views))
+    return Regularisation(pointmaps, images, config, seed=seed, shown=fitted)

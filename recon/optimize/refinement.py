@@ -140,6 +140,7 @@ def _refined(
     turns = np.concatenate([np.resize(own, max(len(own), len(beside))), len(own) + np.arange(len(beside))])
     started = time.monotonic()
     queue: list[int] = []
+    shown = {*config.checkpoints, *config.looks}
     for iteration in range(config.iterations):
         progress = iteration / config.iterations
         if deadline is not None:
@@ -151,7 +152,7 @@ def _refined(
         with single_torch_thread():
             fit.step(queue.pop(), progress)
         gone_on(done + iteration + 1)
-        if iteration + 1 in (*config.checkpoints, *config.looks) and iteration + 1 < config.iterations:
+        if iteration + 1 in shown and iteration + 1 < config.iterations:
             yield fit.scene()
     end = replace(fit.scene(), losses=fit.losses())
     yield end

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
-from splatnode.capture.image_file import UnusableImage, decode_photograph, read_image_file
+from splatnode.capture.image_file import UnusableImage, decode_photograph, encode_jpeg, read_image_file
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import is_printable
 from splatnode.capture.process.records import record_in
@@ -147,16 +147,19 @@ def found_photographs(cameras: tuple[CameraEstimate, ...], folders: Sequence[Pat
     """By camera, its photograph in the first of the `folders` that has one, as large as a window needs it."""
     found = {}
     for camera in cameras:
-        for folder in folders:
-            path = folder / camera.name
-            try:
-                if not path.is_file():
-                    continue
+        try:
+            path = photograph_path(camera, folders)
+            if path is not None:
                 found[camera.name] = _small(decode_photograph(read_image_file(path))[0])
-            except (UnusableImage, OSError) as error:
-                log.warning("%s is shown without its photograph: %s", camera.name, error)
-            break
+        except (UnusableImage, OSError) as error:
+            log.warning("%s is shown without its photograph: %s", camera.name, error)
     return found
+
+
+def photograph_path(camera: CameraEstimate, folders: Sequence[Path]) -> Path | None:
+    """Where the camera's photograph is: in the first of the `folders` that has one. Raises OSError."""
+    paths = (folder / camera.name for folder in folders)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def _small(image: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:
@@ -185,4 +188,4 @@ def photograph_of(camera: CameraEstimate, images: Mapping[str, npt.NDArray[np.ui
     if image is None:
         return None
     sized = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-    return cv2.imencode(".jpg", sized[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+    return encode_jpeg(np.asarray(sized, np.uint8), _JPEG_QUALITY)

@@ -10,18 +10,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.image_file import UnusableImage, decode_photograph, encode_png, read_image_file
+from splatnode.capture.image_file import UnusableImage, decode_photograph, encode_jpeg, encode_png, read_image_file
 from splatnode.capture.lenses.undistort import without_distortion
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
 from splatnode.recon.result.export.stored import StoredResult
 from splatnode.recon.result.snapshot import CameraEstimate
-from splatnode.recon.result.stored_snapshot import photograph_folders
+from splatnode.recon.result.stored_snapshot import photograph_folders, photograph_path
 
 DEFAULT_NAME = "dataset"
 
@@ -47,7 +46,7 @@ def export(result: StoredResult) -> dict[str, bytes]:
 
 def _photograph(camera: CameraEstimate, folders: Sequence[Path]) -> npt.NDArray[np.uint8]:
     """(H, W, 3) in full size, upright, without the distortion of its lens. Raises SceneFileError."""
-    path = next((folder / camera.name for folder in folders if (folder / camera.name).is_file()), None)
+    path = photograph_path(camera, folders)
     if path is None:
         places = " or ".join(str(folder) for folder in folders)
         raise SceneFileError(f"the photograph {camera.name} is not in {places} any more: put it back there")
@@ -71,6 +70,4 @@ def _of_full_size(camera: CameraEstimate, width: int, height: int) -> CameraEsti
 
 
 def _encoded(image: npt.NDArray[np.uint8], name: str) -> bytes:
-    if not name.lower().endswith(_JPEG):
-        return encode_png(image)
-    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+    return encode_jpeg(image, _JPEG_QUALITY) if name.lower().endswith(_JPEG) else encode_png(image)
