@@ -19,11 +19,8 @@ std::vector<int> free_parameters(const Bundle& bundle) {
     std::vector<int> kept;
     for (int i = 0; i < kPose * bundle.num_cameras; ++i)
         if (i / kPose != bundle.fixed_camera) kept.push_back(i);
-    for (int g = 0; g < bundle.num_lenses; ++g) {
-        const LensPrior prior(bundle, g);
-        for (int k = 0; k < kLens; ++k)
-            if (prior.weights[k] > 0) kept.push_back(kPose * bundle.num_cameras + kLens * g + k);
-    }
+    for (int k = 0; k < kLens * bundle.num_lenses; ++k)
+        if (is_free(bundle, k)) kept.push_back(kPose * bundle.num_cameras + k);
     return kept;
 }
 
@@ -53,7 +50,7 @@ bool solve(const System& system, const std::vector<int>& kept, std::vector<doubl
 
 // The parameters of a bundle, to be kept and put back.
 struct State {
-    std::vector<double> rotations, translations, log_focals, radials, shifts, points;
+    std::vector<double> rotations, translations, log_focals, radials, shifts, log_aspects, points;
 
     explicit State(const Bundle& b)
         : rotations(b.rotations, b.rotations + 9 * b.num_cameras),
@@ -61,6 +58,7 @@ struct State {
           log_focals(b.log_focals, b.log_focals + b.num_lenses),
           radials(b.radials, b.radials + 2 * b.num_lenses),
           shifts(b.shifts, b.shifts + 2 * b.num_lenses),
+          log_aspects(b.log_aspects, b.log_aspects + b.num_lenses),
           points(b.points, b.points + 3 * size_t(b.num_points)) {}
 
     void put_back(const Bundle& b) const {
@@ -69,6 +67,7 @@ struct State {
         std::copy(log_focals.begin(), log_focals.end(), b.log_focals);
         std::copy(radials.begin(), radials.end(), b.radials);
         std::copy(shifts.begin(), shifts.end(), b.shifts);
+        std::copy(log_aspects.begin(), log_aspects.end(), b.log_aspects);
         std::copy(points.begin(), points.end(), b.points);
     }
 };
@@ -90,6 +89,7 @@ void move(const Bundle& bundle, const System& system, const std::vector<double>&
     for (int g = 0; g < bundle.num_lenses; ++g) {
         const double* of_lens = &step[kPose * bundle.num_cameras + kLens * g];
         bundle.log_focals[g] += std::clamp(of_lens[0], -0.5, 0.5);
+        bundle.log_aspects[g] += std::clamp(of_lens[5], -0.2, 0.2);
         for (int k = 0; k < 2; ++k) {
             bundle.radials[2 * g + k] += std::clamp(of_lens[1 + k], -0.2, 0.2);
             bundle.shifts[2 * g + k] += of_lens[3 + k];
@@ -133,7 +133,7 @@ CORE_API double core_bundle_adjust(const Bundle* bundle, int max_iterations, dou
     return cost;
 }
 
-// The normal matrix of all poses and lenses with the points eliminated, (6 C + 5 G, 6 C + 5 G), without damping.
+// The normal matrix of all poses and lenses with the points eliminated, (6 C + 6 G, 6 C + 6 G), without damping.
 CORE_API void core_bundle_information(const Bundle* bundle, double* matrix) {
     System system(*bundle);
     assemble(*bundle, 0.0, system);

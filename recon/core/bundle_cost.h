@@ -12,23 +12,26 @@ namespace core {
 
 constexpr int kChunks = 16;          // of points, that are dealt with in parallel
 constexpr double kBehind = 1e6;      // squared pixels: the error of a point behind a camera
-constexpr int kPose = 6, kLens = 5;  // numbers of a camera's pose and of a lens
+constexpr int kPose = 6, kLens = 6;  // numbers of a camera's pose and of a lens
 constexpr int kOwn = kPose + kLens;  // parameters of an observation but its point
 
 // As splatnode.recon.registration.bundle.Problem; observations ordered by point. Parameters are the cameras' poses (rotation
-// vector applied from the left, translation), then the lenses' (log focal, two radial, shift of the principal point).
+// vector applied from the left, translation), then the lenses' (log focal, two radial, shift of the principal point, log
+// of the focal length down over that across).
 struct Bundle {
     double *rotations, *translations;                            // (C, 3, 3), (C, 3)
-    double *log_focals, *radials, *shifts, *points;              // (G,), (G, 2), (G, 2), (P, 3)
+    double *log_focals, *radials, *shifts, *log_aspects;         // (G,), (G, 2), (G, 2), (G,)
+    double* points;                                              // (P, 3)
     const int32_t *lens_of_camera, *camera_of, *first_of_point;  // (C,), (O,), (P + 1,)
     const double* pixels;                                        // (O, 2)
-    const double *prior_log_focals, *prior_sigmas, *radial_sigmas, *shift_sigmas;  // (G,), radial (G, 2); 0 fixes
+    // (G, 6) means of the lens parameters and their information (6 G, 6 G); a diagonal element of 0 fixes a parameter.
+    const double *prior_means, *prior_information;
     int32_t num_cameras, num_lenses, num_points, fixed_camera;
     double robust_squared;
 };
 
 struct Projection {
-    double turned[3], in_camera[3], u, v, focal, squared_radius, residual[2], squared;
+    double turned[3], in_camera[3], u, v, focal, aspect, squared_radius, residual[2], squared;
     double distortion, bend;  // 1 + k1 r^2 + k2 r^4, and its derivative by r^2
 };
 
@@ -44,28 +47,47 @@ static Projection project(const Bundle& bundle, int camera, const double* point,
     p.u = p.in_camera[0] / z;
     p.v = p.in_camera[1] / z;
     p.focal = std::exp(bundle.log_focals[lens]);
+    p.aspect = std::exp(bundle.log_aspects[lens]);
     p.squared_radius = p.u * p.u + p.v * p.v;
     const double first = bundle.radials[2 * lens], second = bundle.radials[2 * lens + 1] * p.squared_radius;
     p.distortion = 1 + (first + second) * p.squared_radius;
     p.bend = first + 2 * second;
     p.residual[0] = p.focal * p.distortion * p.u + bundle.shifts[2 * lens] - pixel[0];
-    p.residual[1] = p.focal * p.distortion * p.v + bundle.shifts[2 * lens + 1] - pixel[1];
+    p.residual[1] = p.focal * p.aspect * p.distortion * p.v + bundle.shifts[2 * lens + 1] - pixel[1];
     p.squared = p.residual[0] * p.residual[0] + p.residual[1] * p.residual[1];
     return p;
 }
 
-// What pulls a lens' parameters; those without weight are fixed.
-struct LensPrior {
-    double deviations[kLens], weights[kLens];
+// What pulls the lenses' parameters: a Gaussian prior, under which lenses may depend on each other.
+struct LensPriors {
+    int size;                        // 6 G
+    std::vector<double> deviations;  // (6 G,) from the means
+    std::vector<double> pull;        // (6 G,) information times deviations: half the gradient
 
-    LensPrior(const Bundle& bundle, int g)
-        : deviations{bundle.log_focals[g] - bundle.prior_log_focals[g], bundle.radials[2 * g],
-                     bundle.radials[2 * g + 1], bundle.shifts[2 * g], bundle.shifts[2 * g + 1]} {
-        const double sigmas[kLens] = {bundle.prior_sigmas[g], bundle.radial_sigmas[2 * g],
-                                      bundle.radial_sigmas[2 * g + 1], bundle.shift_sigmas[g], bundle.shift_sigmas[g]};
-        for (int k = 0; k < kLens; ++k) weights[k] = sigmas[k] > 0 ? 1 / (sigmas[k] * sigmas[k]) : 0.0;
+    explicit LensPriors(const Bundle& bundle)
+        : size(kLens * bundle.num_lenses), deviations(size), pull(size, 0.0) {
+        for (int g = 0; g < bundle.num_lenses; ++g) {
+            const double values[kLens] = {bundle.log_focals[g],    bundle.radials[2 * g],    bundle.radials[2 * g + 1],
+                                          bundle.shifts[2 * g], bundle.shifts[2 * g + 1], bundle.log_aspects[g]};
+            for (int k = 0; k < kLens; ++k)
+                deviations[kLens * g + k] = values[k] - bundle.prior_means[kLens * g + k];
+        }
+        for (int i = 0; i < size; ++i) {
+            const double* row = bundle.prior_information + size_t(i) * size;
+            for (int j = 0; j < size; ++j) pull[i] += row[j] * deviations[j];
+        }
+    }
+
+    double cost() const {
+        double sum = 0;
+        for (int i = 0; i < size; ++i) sum += deviations[i] * pull[i];
+        return sum;
     }
 };
+
+inline bool is_free(const Bundle& bundle, int parameter) {
+    return bundle.prior_information[size_t(parameter) * (kLens * bundle.num_lenses) + parameter] > 0;
+}
 
 static double total_cost(const Bundle& bundle) {
     std::vector<double> costs(kChunks, 0.0);
@@ -82,14 +104,10 @@ static double total_cost(const Bundle& bundle) {
     });
     double cost = 0;
     for (const double value : costs) cost += value;
-    for (int g = 0; g < bundle.num_lenses; ++g) {
-        const LensPrior prior(bundle, g);
-        for (int k = 0; k < kLens; ++k) cost += prior.deviations[k] * prior.deviations[k] * prior.weights[k];
-    }
-    return cost;
+    return cost + LensPriors(bundle).cost();
 }
 
-// Derivatives of a residual (2) by its camera's pose and lens (11) and by its point (3), and its weight.
+// Derivatives of a residual (2) by its camera's pose and lens (12) and by its point (3), and its weight.
 struct Derivatives {
     double by_camera[2][kOwn], by_point[2][3], weight;
 };
@@ -97,9 +115,11 @@ struct Derivatives {
 static Derivatives differentiate(const Bundle& bundle, const Projection& p, int camera) {
     Derivatives d;
     const double z = std::abs(p.in_camera[2]) < 1e-9 ? 1e-9 : p.in_camera[2];
-    const double cross = p.focal * 2 * p.bend * p.u * p.v;
-    const double by_normalised[2][2] = {{p.focal * (p.distortion + 2 * p.bend * p.u * p.u), cross},
-                                        {cross, p.focal * (p.distortion + 2 * p.bend * p.v * p.v)}};
+    const double focals[2] = {p.focal, p.focal * p.aspect};
+    const double cross = 2 * p.bend * p.u * p.v;
+    const double by_normalised[2][2] = {
+        {focals[0] * (p.distortion + 2 * p.bend * p.u * p.u), focals[0] * cross},
+        {focals[1] * cross, focals[1] * (p.distortion + 2 * p.bend * p.v * p.v)}};
     const double* rotation = bundle.rotations + 9 * camera;
     const double normalised[2] = {p.u, p.v};
     for (int k = 0; k < 2; ++k) {
@@ -110,11 +130,12 @@ static Derivatives differentiate(const Bundle& bundle, const Projection& p, int 
         d.by_camera[k][1] = position[0] * p.turned[2] - position[2] * p.turned[0];
         d.by_camera[k][2] = position[1] * p.turned[0] - position[0] * p.turned[1];
         for (int i = 0; i < 3; ++i) d.by_camera[k][3 + i] = position[i];
-        d.by_camera[k][6] = normalised[k] * p.focal * p.distortion;
-        d.by_camera[k][7] = normalised[k] * p.focal * p.squared_radius;
+        d.by_camera[k][6] = normalised[k] * focals[k] * p.distortion;
+        d.by_camera[k][7] = normalised[k] * focals[k] * p.squared_radius;
         d.by_camera[k][8] = d.by_camera[k][7] * p.squared_radius;
         d.by_camera[k][9] = k == 0;
         d.by_camera[k][10] = k == 1;
+        d.by_camera[k][11] = k == 1 ? d.by_camera[k][6] : 0.0;
         for (int i = 0; i < 3; ++i)
             d.by_point[k][i] =
                 position[0] * rotation[i] + position[1] * rotation[3 + i] + position[2] * rotation[6 + i];

@@ -37,7 +37,7 @@ struct System {
     int size;                      // parameters
     std::vector<double> matrix;    // (size, size), lower triangle
     std::vector<double> gradient;  // (size,)
-    std::vector<double> spread;    // (O, 11, 3): (J_camera^T w J_point) (J_point^T w J_point)^-1
+    std::vector<double> spread;    // (O, 12, 3): (J_camera^T w J_point) (J_point^T w J_point)^-1
     std::vector<double> shift;     // (P, 3): (J_point^T w J_point)^-1 J_point^T w residual
     std::vector<Sums> sums;        // of each chunk
 
@@ -50,7 +50,7 @@ struct System {
           sums(kChunks) {}
 };
 
-// Where the k-th of an observation's eleven parameters is among all.
+// Where the k-th of an observation's twelve parameters is among all.
 inline int parameter(const Bundle& bundle, int camera, int k) {
     return k < kPose ? kPose * camera + k
                      : kPose * bundle.num_cameras + kLens * bundle.lens_of_camera[camera] + k - kPose;
@@ -178,13 +178,14 @@ void assemble(const Bundle& bundle, double damping, System& system) {
             row[i] += diagonal * damping + kFloor;
         }
     });
-    for (int g = 0; g < bundle.num_lenses; ++g) {
-        const LensPrior prior(bundle, g);
-        for (int k = 0; k < kLens; ++k) {
-            const int at = kPose * bundle.num_cameras + kLens * g + k;
-            system.matrix[size_t(at) * size + at] += prior.weights[k] * (1 + damping);
-            system.gradient[at] += prior.weights[k] * prior.deviations[k];
-        }
+    const LensPriors priors(bundle);
+    const int first = kPose * bundle.num_cameras;
+    for (int i = 0; i < priors.size; ++i) {
+        const double* information = bundle.prior_information + size_t(i) * priors.size;
+        double* row = &system.matrix[size_t(first + i) * size + first];
+        for (int j = 0; j <= i; ++j) row[j] += information[j];
+        row[i] += information[i] * damping;
+        system.gradient[first + i] += priors.pull[i];
     }
 }
 

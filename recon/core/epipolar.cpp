@@ -9,7 +9,7 @@
 // As splatnode.recon.registration.epipolar.Pose: the second camera's pose in the first one's frame, and both lenses.
 struct EpipolarPose {
     double rotation[9], translation[3];
-    double focals[2], radials[4], shifts[4];
+    double focals[4], radials[4], shifts[4];  // across and down, of the first camera, then of the second
     double min_parallax;  // the sine of the angle between two rays from which on their order along each other is told
     int32_t undistort_iterations;
 };
@@ -19,8 +19,8 @@ namespace {
 
 // At depth 1, without distortion.
 inline void normalise(const EpipolarPose& pose, int camera, const double* pixel, double* ray) {
-    const double x = (pixel[0] - pose.shifts[2 * camera]) / pose.focals[camera];
-    const double y = (pixel[1] - pose.shifts[2 * camera + 1]) / pose.focals[camera];
+    const double x = (pixel[0] - pose.shifts[2 * camera]) / pose.focals[2 * camera];
+    const double y = (pixel[1] - pose.shifts[2 * camera + 1]) / pose.focals[2 * camera + 1];
     ray[0] = x, ray[1] = y, ray[2] = 1;
     for (int i = 0; i < pose.undistort_iterations; ++i) {
         const double squared = ray[0] * ray[0] + ray[1] * ray[1];
@@ -53,7 +53,8 @@ CORE_API void core_sampson_errors(const EpipolarPose* pose, const double* pixels
         essential[3 + j] = t[2] * R[j] - t[0] * R[6 + j];
         essential[6 + j] = t[0] * R[3 + j] - t[1] * R[j];
     }
-    const double focal1 = pose->focals[0], focal2 = pose->focals[1];
+    double inverse[4];  // of the squared focal lengths
+    for (int k = 0; k < 4; ++k) inverse[k] = 1 / (pose->focals[k] * pose->focals[k]);
     for (int i = 0; i < count; ++i) {
         double ray1[3], ray2[3], line1[3], line2[3], turned[3], normal[3], across[3];
         normalise(*pose, 0, pixels1 + 2 * i, ray1);
@@ -63,8 +64,8 @@ CORE_API void core_sampson_errors(const EpipolarPose* pose, const double* pixels
             line1[k] = essential[k] * ray2[0] + essential[3 + k] * ray2[1] + essential[6 + k] * ray2[2];
             turned[k] = dot(R + 3 * k, ray1);
         }
-        const double gradient = (line2[0] * line2[0] + line2[1] * line2[1]) / (focal2 * focal2) +
-                                (line1[0] * line1[0] + line1[1] * line1[1]) / (focal1 * focal1);
+        const double gradient = line2[0] * line2[0] * inverse[2] + line2[1] * line2[1] * inverse[3] +
+                                line1[0] * line1[0] * inverse[0] + line1[1] * line1[1] * inverse[1];
         // Depths along both rays where they come closest: depth1 * turned + t = depth2 * ray2, up to a positive factor.
         cross(ray2, turned, normal);
         cross(ray2, t, across);

@@ -66,7 +66,10 @@ def _stability_arguments(parser: argparse.ArgumentParser) -> None:
         "--counts", type=counts, default=(3, 6, 12), metavar="N,N,N", help="photographs of a window (default: 3,6,12)"
     )
     parser.add_argument(
-        "--given-lens", action="store_true", help="windows of a calibrated camera: splatnode is told the true lens"
+        "--told",
+        choices=("nothing", "exif", "given"),
+        default="nothing",
+        help="windows of a known camera: splatnode is told the true lens, or EXIF's focal length within 3 %",
     )
     _add_engine(parser, "trials", "a trial", 120.0)
     parser.add_argument(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -72,6 +73,8 @@ def _triangulated(graph: ViewGraph, registration: Registration) -> tuple[bundle.
         principals[camera.index] = camera.principal
     shifts = np.zeros((count, 2))
     problem = bundle.without_points(rotations, translations, np.arange(count), log_focals, radials, shifts)
+    aspects = {camera.index: camera.aspect for camera in registration.cameras}
+    problem = replace(problem, log_aspects=np.log([aspects.get(index, 1.0) for index in range(count)]))
     centred = [keyframe.features.points - principals[i] for i, keyframe in enumerate(graph.keyframes)]
     registered = [camera.index for camera in registration.cameras]
     every = tracks.build(centred, graph.pairs)

@@ -15,8 +15,9 @@ Array = npt.NDArray[np.float64]
 def modelled_K(graph: ViewGraph, camera: RegisteredCamera) -> Array:
     """(3, 3) the intrinsics of a registered camera for its image at modelled size."""
     keyframe = graph.keyframes[camera.index]
-    (sx, sy), (cx, cy) = keyframe.scale, camera.principal
-    return np.array([[camera.focal * sx, 0.0, cx * sx], [0.0, camera.focal * sy, cy * sy], [0.0, 0.0, 1.0]])
+
+    (sx, sy), (fx, fy), (cx, cy) = keyframe.scale, camera.focals, camera.principal
+    return np.array([[fx * sx, 0.0, cx * sx], [0.0, fy * sy, cy * sy], [0.0, 0.0, 1.0]])
 
 
 def sparse_points(registration: Registration, camera: RegisteredCamera, scale: tuple[float, float]) -> SparsePoints:

@@ -22,8 +22,10 @@ Index = npt.NDArray[np.int64]
 
 _RAYLEIGH_MEDIAN = 1.1774  # median length of a 2D error whose components have sigma 1: sqrt(2 log 2)
 _MIN_NOISE_PX = 0.05  # at REFERENCE_SIDE: no observation is believed to be better
-# Parameters of a pose (rotation vector, translation) and of a lens (log focal, two radial coefficients, shift x, y)
-_POSE, _LENS = 6, 5
+# Parameters of a pose (rotation vector, translation) and of a lens: log focal, two radial coefficients, shift of the
+# principal point (x, y), log aspect
+_POSE, _LENS = 6, 6
+_MIN_OWN_SIGMA = 1e-6  # of a lens that shares all of a parameter with others: the prior's covariance must be regular
 _MIN_DEPTH = 1e-9  # in the problem's unit of length, in place of 0
 _BEHIND_PX = 1e3  # the error that the robust cost counts for a point behind its camera
 _MIN_CURVATURE = 1e-30  # in place of 0 for a parameter on which no observation depends
@@ -44,6 +46,12 @@ class Problem:
     camera_of: Index  # (O,)
     point_of: Index  # (O,)
     pixels: Array  # (O, 2) relative to the nominal principal point
+    log_aspects: Array | None = None  # (G,) log of the focal length down over that across; None: pixels are square
+
+    @property
+    def aspects(self) -> Array:
+        """(G,) focal length down over that across."""
+        return np.ones(len(self.log_focals)) if self.log_aspects is None else np.exp(self.log_aspects)
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -54,6 +62,26 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 @dataclass(frozen=True, eq=False)
+class Common:
+    """What lenses of one group have in common: each parameter is a common value plus a deviation of the lens.
+
+    The sigmas of `LensPrior` then are those of the deviations; the common values have these, around the same means.
+    They are eliminated: the prior of a group has the covariance own^2 I + common^2 1 1^T.
+    """
+
+    group_of: Index  # (G,)
+    sigmas: Array  # (G, 6) of the common values, equal within a group: log focal, radials, shifts (pixels), log aspect
+
+
+@dataclass(frozen=True, eq=False)
+class Ties:
+    """What holds lenses near others: the difference of their parameters has these sigmas around zero."""
+
+    to: Index  # (G,) the lens that each is near; -1: none
+    sigmas: Array  # (G, 6) of the differences; 0: this parameter is not tied
+
+
+@dataclass(frozen=True, eq=False)
 class LensPrior:
     """Gaussian priors on the parameters of G lenses; a sigma of 0 fixes the parameter."""
 
@@ -61,6 +89,60 @@ class LensPrior:
     sigmas: Array  # (G,) of log focal
     radial_sigmas: Array  # (G, 2) around zero
     shift_sigmas: Array  # (G,) pixels around the nominal principal point
+    aspect_sigmas: Array | None = None  # (G,) of log aspect around zero; None: fixed
+    common: Common | None = None  # None: each lens is independent of the others, but for `ties`
+    ties: Ties | None = None
+
+    @property
+    def means(self) -> Array:
+        """(G, 6)"""
+        return np.column_stack([self.log_focals, np.zeros((len(self.log_focals), _LENS - 1))])
+
+    @property
+    def own_sigmas(self) -> Array:
+        """(G, 6)"""
+        aspects = np.zeros(len(self.sigmas)) if self.aspect_sigmas is None else self.aspect_sigmas
+        return np.column_stack([self.sigmas, self.radial_sigmas, self.shift_sigmas, self.shift_sigmas, aspects])
+
+    @property
+    def free(self) -> npt.NDArray[np.bool_]:
+        """(G, 6) whether a parameter may change."""
+        free = self.own_sigmas > 0
+        return free if self.common is None else free | (self.common.sigmas > 0)
+
+    @property
+    def information(self) -> Array:
+        """(6 G, 6 G) the inverse of the prior's covariance; 0 where a parameter is fixed."""
+        own, free = self.own_sigmas, self.free
+        count = len(own)
+        if self.common is None:
+            alone = np.diag(np.where(free, 1.0 / np.where(free, own, 1.0) ** 2, 0.0).ravel())
+            return alone if self.ties is None else alone + self._of_ties(self.ties, free)
+        information = np.zeros((count, _LENS, count, _LENS))
+        for group in np.unique(self.common.group_of):
+            (members,) = np.nonzero(self.common.group_of == group)
+            for k in range(_LENS):
+                chosen = members[free[members, k]]
+                if len(chosen):
+                    deviations = np.maximum(own[chosen, k], _MIN_OWN_SIGMA) ** 2
+                    shared = self.common.sigmas[chosen[0], k] ** 2
+                    covariance = np.diag(deviations) + shared
+                    information[np.ix_(chosen, [k], chosen, [k])] = np.linalg.inv(covariance)[:, None, :, None]
+        return information.reshape(count * _LENS, count * _LENS)
+
+    @staticmethod
+    def _of_ties(ties: Ties, free: npt.NDArray[np.bool_]) -> Array:
+        """(6 G, 6 G); one end of a tie may be fixed."""
+        information = np.zeros((free.size, free.size))
+        for lens, k in zip(*np.nonzero((ties.to[:, None] >= 0) & (ties.sigmas > 0) & free), strict=True):
+            own, other = _LENS * lens + k, _LENS * ties.to[lens] + k
+            weight = 1.0 / ties.sigmas[lens, k] ** 2
+            information[own, own] += weight
+            if free[ties.to[lens], k]:
+                information[other, other] += weight
+                information[own, other] -= weight
+                information[other, own] -= weight
+        return information
 
 
 def without_points(
@@ -98,15 +180,20 @@ def project(problem: Problem) -> tuple[Array, Array]:
     )
     normalised = in_camera[:, :2] / _safe_depth(in_camera[:, 2:])
     bent = distortion((normalised**2).sum(1), problem.radials[lens])
-    focal = np.exp(problem.log_focals[lens])
-    return normalised * (focal * bent)[:, None] + problem.shifts[lens], in_camera[:, 2]
+    return normalised * _focals(problem, lens) * bent[:, None] + problem.shifts[lens], in_camera[:, 2]
 
 
 def normalise(problem: Problem, camera: Index, pixels: Array) -> Array:
     """(M, 2) coordinates at depth 1, without distortion, of `pixels` (M, 2) of the cameras `camera` (M,)."""
     lens = problem.lens_of_camera[camera]
-    distorted = (pixels - problem.shifts[lens]) / np.exp(problem.log_focals[lens])[:, None]
+    distorted = (pixels - problem.shifts[lens]) / _focals(problem, lens)
     return without_distortion(distorted, problem.radials[lens])
+
+
+def _focals(problem: Problem, lens: Index) -> Array:
+    """(M, 2) across and down, pixels, of the lenses (M,)."""
+    across = np.exp(problem.log_focals[lens])
+    return np.stack([across, across * problem.aspects[lens]], 1)
 
 
 def reprojection_errors(problem: Problem) -> Array:
@@ -168,8 +255,7 @@ def covariance(problem: Problem, prior: LensPrior, config: Config, fixed_camera:
     library().core_bundle_information(ctypes.byref(native), pointer(information))
     free = np.ones(len(information), bool)
     free[_POSE * fixed_camera : _POSE * (fixed_camera + 1)] = False
-    of_lens = np.column_stack([prior.sigmas, prior.radial_sigmas, prior.shift_sigmas, prior.shift_sigmas])
-    free[_POSE * count :] = of_lens.ravel() > 0
+    free[_POSE * count :] = prior.free.ravel()
     observed = np.bincount(problem.camera_of, minlength=count) > 0
     free[: _POSE * count] &= np.repeat(observed, _POSE)
     (kept,) = np.nonzero(free)
@@ -198,7 +284,7 @@ def _gauge_free_inverse(information: Array, free_direction: Array) -> Array:
 
 
 def _scale_direction(problem: Problem, fixed_camera: int) -> Array:
-    """(6 C + 5 G,) change of the parameters when the scene is scaled about the fixed camera, which no error sees."""
+    """(6 C + 6 G,) change of the parameters when the scene is scaled about the fixed camera, which no error sees."""
     fixed_centre = -problem.rotations[fixed_camera].T @ problem.translations[fixed_camera]
     poses = np.zeros((len(problem.rotations), _POSE))
     poses[:, 3:] = problem.translations + problem.rotations @ fixed_centre
@@ -220,13 +306,11 @@ def _by_point(problem: Problem) -> Problem:
 
 def _copy(problem: Problem) -> Problem:
     """The problem with copies of its parameters, which the core changes in place."""
-    return replace(
-        problem,
-        **{
-            name: np.array(getattr(problem, name), dtype=np.float64, order="C")
-            for name in ("rotations", "translations", "log_focals", "radials", "shifts", "points")
-        },
-    )
+    parameters = {
+        name: np.array(getattr(problem, name), dtype=np.float64, order="C")
+        for name in ("rotations", "translations", "log_focals", "radials", "shifts", "points")
+    }
+    return replace(problem, **parameters, log_aspects=np.log(problem.aspects))
 
 
 class _Native(ctypes.Structure):
@@ -235,10 +319,10 @@ class _Native(ctypes.Structure):
     _fields_ = (
         *(
             (name, ctypes.c_void_p)
-            for name in ("rotations", "translations", "log_focals", "radials", "shifts", "points")
+            for name in ("rotations", "translations", "log_focals", "radials", "shifts", "log_aspects", "points")
         ),
         *((name, ctypes.c_void_p) for name in ("lens_of_camera", "camera_of", "first_of_point", "pixels")),
-        *((name, ctypes.c_void_p) for name in ("prior_log_focals", "prior_sigmas", "radial_sigmas", "shift_sigmas")),
+        *((name, ctypes.c_void_p) for name in ("prior_means", "prior_information")),
         *((name, ctypes.c_int32) for name in ("num_cameras", "num_lenses", "num_points", "fixed_camera")),
         ("robust_squared", ctypes.c_double),
     )
@@ -249,15 +333,11 @@ def _native(
 ) -> tuple[_Native, list[npt.NDArray[np.generic]]]:
     """The problem as the core reads it, and the arrays that it points into, which must live as long."""
     first = np.searchsorted(problem.point_of, np.arange(len(problem.points) + 1))
-    lenses = (problem.log_focals, problem.radials, problem.shifts)
+    log_aspects = np.zeros(len(problem.log_focals)) if problem.log_aspects is None else problem.log_aspects
+    lenses = (problem.log_focals, problem.radials, problem.shifts, log_aspects)
     parameters = (problem.rotations, problem.translations, *lenses, problem.points)
     indices = (problem.lens_of_camera, problem.camera_of, first)
-    sigmas = (
-        prior.sigmas / config.noise_px,
-        prior.radial_sigmas / config.noise_px,
-        prior.shift_sigmas / config.noise_px,
-    )
-    observed = (problem.pixels, prior.log_focals, *sigmas)
+    observed = (problem.pixels, prior.means, config.noise_px**2 * prior.information)
     arrays: list[npt.NDArray[np.generic]] = [
         *(np.ascontiguousarray(values, dtype=np.float64) for values in parameters),
         *(np.ascontiguousarray(values, dtype=np.int32) for values in indices),

@@ -47,8 +47,8 @@ def extended(
     finished = finishing.finish(problem, incremental.extend(problem, partial, settings), (), config.mapper.finishing)
     if finished is None:
         return None
-    found = mapper.as_map(problem, finished, settings.triangulation.max_error_px)
-    return register.in_first_camera(found, keyframes, grouping.scales)
+    found = mapper.as_map(problem, finished, settings.triangulation.max_error_px, len(known))
+    return register.in_first_camera(found, keyframes, grouping.scales, config)
 
 
 def _grouping(keyframes: Sequence[Keyframe], start: Sequence[RegisteredCamera]) -> Grouping | None:

@@ -43,11 +43,12 @@ def sampson_errors(estimate: bundle.Problem, views: tuple[int, int], pair: TwoVi
     first, second = views
     rotation = estimate.rotations[second] @ estimate.rotations[first].T
     lenses = estimate.lens_of_camera[list(views)]
-    focals, radials = np.exp(estimate.log_focals[lenses]), estimate.radials[lenses]
+    across, radials = np.exp(estimate.log_focals[lenses]), estimate.radials[lenses]
+    focals = np.stack([across, across * estimate.aspects[lenses]], 1)
     pose = _Pose(
         tuple(rotation.ravel()),
         tuple(estimate.translations[second] - rotation @ estimate.translations[first]),
-        tuple(focals),
+        tuple(focals.ravel()),
         tuple(radials.ravel()),
         tuple(estimate.shifts[lenses].ravel()),
         _MIN_PARALLAX_PX / focals.max(),
@@ -66,7 +67,7 @@ class _Pose(ctypes.Structure):
     _fields_ = (
         ("rotation", ctypes.c_double * 9),
         ("translation", ctypes.c_double * 3),
-        ("focals", ctypes.c_double * 2),
+        ("focals", ctypes.c_double * 4),
         ("radials", ctypes.c_double * 4),
         ("shifts", ctypes.c_double * 4),
         ("min_parallax", ctypes.c_double),

@@ -87,15 +87,15 @@ def _free_lenses(problem: MappingProblem, prior: bundle.LensPrior, config: Confi
     """The prior with distortion and principal point free for all lenses that are not calibrated."""
     unknown = prior.sigmas > 0
     radial_sigmas = np.column_stack([_WIDEST_RADIAL * unknown, np.zeros(len(unknown))])
-    return replace(
-        prior, radial_sigmas=radial_sigmas, shift_sigmas=config.shift_sigma * _longer_sides(problem) * unknown
-    )
+    least = config.shift_sigma * _longer_sides(problem) * unknown
+    return replace(prior, radial_sigmas=radial_sigmas, shift_sigmas=np.maximum(prior.shift_sigmas, least))
 
 
 def _longer_sides(problem: MappingProblem) -> Array:
     """(G,) of each lens' largest picture, pixels."""
     lenses = range(len(problem.lenses))
-    return np.array([max(view.longer_side for view in problem.views if view.lens == g) for g in lenses], np.float64)
+    sides = (max((view.longer_side for view in problem.views if view.lens == g), default=1) for g in lenses)
+    return np.array(list(sides), np.float64)
 
 
 def _held_by_evidence(partial: PartialMap, config: Config) -> PartialMap:

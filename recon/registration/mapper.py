@@ -13,10 +13,22 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from splatnode.recon.registration import bundle, finishing, incremental, inliers, mapping_problem, triangulation
+from splatnode.recon.registration import (
+    bundle,
+    finishing,
+    incremental,
+    inliers,
+    mapping_problem,
+    own_lenses,
+    resection,
+    triangulation,
+)
 from splatnode.recon.registration.mapping_problem import Lens, MappingProblem, Pair, Pairs, PartialMap, View
 from splatnode.recon.registration.patch_image import PatchImage
 
+_MAX_SPLITS = 3  # rounds in which views get lenses of their own
+_DOUBTED_RATIO = 0.9  # inlier ratio of a view below which other focal lengths are tried for it
+_COARSE_PX, _COARSE_ROBUST_PX = 1.0, 4.0  # noise and scale of the robust loss of a coarse search, at REFERENCE_SIDE
 _UNEXPLAINED_BY_PLANE = 1.05  # less the planar share of a pair: above 1, so that a planar pair is better than none
 
 
@@ -29,6 +41,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     score_px: float = 1.25  # error from which on a match scores 0, pixels at REFERENCE_SIDE
     same_rotation_deg: float = 0.5  # largest rotation between the views of two attempts that found the same map
     same_focal: float = 0.02  # largest difference of the log focals of two such attempts
+    own_lenses: own_lenses.Config = own_lenses.Config()
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +55,7 @@ class Map:
     inlier_ratios: dict[Pair, float]  # the share of each pair's matches that agree with the poses
     median_angle_deg: float  # of the points' triangulation angles
     rms_px: float  # of the observations' errors, pixels at REFERENCE_SIDE
+    num_common: int  # lenses that views were taken to share: those from this number on are of single views
 
     def relabelled(self, number: Sequence[int]) -> Map:
         """The same map with the views relabelled: new = number[old], a permutation."""
@@ -93,7 +107,95 @@ def build_map(
     pause()
     _, best = max(attempts, key=_score)
     finished = finishing.finish(problem, best, images, config.finishing)
-    return None if finished is None else as_map(problem, finished, config.incremental.triangulation.max_error_px)
+    if finished is None:
+        return None
+    problem, finished = _with_own_lenses(problem, finished, images, config, pause)
+    return as_map(problem, finished, config.incremental.triangulation.max_error_px, len(lenses))
+
+
+def _with_own_lenses(
+    problem: MappingProblem,
+    finished: finishing.Finished,
+    images: Sequence[PatchImage],
+    config: Config,
+    pause: Callable[[], None],
+) -> tuple[MappingProblem, finishing.Finished]:
+    """Both, with lenses of their own for the views that refute the common one.
+
+    First for views that hardly fit and fit better with another focal length, then for those whose observations say so.
+    """
+    for search in (_with_other_focals, _with_coarse_lenses):
+        if not _doubted(problem, finished.map, config):
+            break
+        pause()
+        found = search(problem, finished.map, config)
+        again = None if found is None else finishing.finish(*found, images, config.finishing)
+        if found is None or again is None:
+            continue
+        if _score_of(found[0], again.map, config) > _score_of(problem, finished.map, config):
+            problem, finished = found[0], again
+    for _ in range(_MAX_SPLITS):
+        pause()
+        freed = own_lenses.free(problem, finished.map, finished.loss, config.own_lenses)
+        if not (freed.refuted.any() or freed.displaced.any()):
+            break
+        apart, partial = own_lenses.split(problem, finished.map, freed, config.own_lenses)
+        partial = incremental.extend(apart, partial, config.incremental)
+        again = finishing.finish(apart, partial, images, config.finishing)
+        if again is None:
+            break
+        problem, finished = apart, again
+    return problem, finished
+
+
+def _doubted(problem: MappingProblem, partial: PartialMap, config: Config) -> list[int]:
+    """The views that are not registered, or whose matches hardly fit."""
+    ratios = inliers.inlier_ratios(problem, partial, config.incremental.triangulation.max_error_px)
+    return [
+        view
+        for view in range(len(problem.views))
+        if view not in partial.registered or inliers.pooled_ratio(ratios, problem.pairs, view) < _DOUBTED_RATIO
+    ]
+
+
+def _with_coarse_lenses(
+    problem: MappingProblem, partial: PartialMap, config: Config
+) -> tuple[MappingProblem, PartialMap] | None:
+    """Both, with own lenses as a coarse search finds them; None where it finds none."""
+    scale = float(np.median(problem.scale))
+    noise_px = scale * _COARSE_PX * float(np.sqrt(config.finishing.correlated))
+    loss = bundle.Config(robust_px=scale * _COARSE_ROBUST_PX, noise_px=noise_px)
+    freed = own_lenses.free(problem, partial, loss, config.own_lenses, config.incremental.triangulation)
+    if not (freed.refuted.any() or freed.displaced.any()):
+        return None
+    problem, partial = own_lenses.split(problem, partial, freed, config.own_lenses)
+    partial = incremental.adjust_quickly(problem, partial, incremental.SETTLED_TOLERANCE, config.incremental)
+    if len(partial.estimate.points) < config.incremental.min_points:
+        return None
+    return problem, incremental.extend(problem, partial, config.incremental)
+
+
+def _with_other_focals(
+    problem: MappingProblem, partial: PartialMap, config: Config
+) -> tuple[MappingProblem, PartialMap] | None:
+    """Both, with other focal lengths for views that hardly fit or do not at all; None where no other one fits."""
+    zoomed = {}
+    for view in _doubted(problem, partial, config):
+        focal = resection.own_focal(problem, partial, view, config.incremental.resection)
+        if focal is not None:
+            zoomed[view] = focal
+    if not zoomed or len(set(partial.registered) - zoomed.keys()) < 2:
+        return None
+    for view, focal in zoomed.items():
+        problem, partial = own_lenses.with_focal(problem, partial, view, focal)
+    partial = incremental.adjust_quickly(problem, partial, incremental.SETTLED_TOLERANCE, config.incremental)
+    if len(partial.estimate.points) < config.incremental.min_points:
+        return None
+    return problem, incremental.extend(problem, partial, config.incremental)
+
+
+def _score_of(problem: MappingProblem, partial: PartialMap, config: Config) -> float:
+    return incremental.score(problem, partial, config.score_px)
 
 
 def _score(attempt: tuple[float, PartialMap]) -> float:
@@ -129,7 +231,7 @@ def _first_pairs(pairs: Pairs) -> list[Pair]:
     return sorted(pairs, key=lambda key: (-strength(key), key))
 
 
-def as_map(problem: MappingProblem, finished: finishing.Finished, max_error_px: float) -> Map:
+def as_map(problem: MappingProblem, finished: finishing.Finished, max_error_px: float, num_common: int) -> Map:
     """The finished map with its quality; matches up to `max_error_px`, at REFERENCE_SIDE, are inliers."""
     partial, estimate = finished.map, finished.map.estimate
     angles = triangulation.largest_angles(
@@ -143,4 +245,5 @@ def as_map(problem: MappingProblem, finished: finishing.Finished, max_error_px: 
         inlier_ratios=inliers.inlier_ratios(problem, partial, max_error_px),
         median_angle_deg=float(np.median(angles)),
         rms_px=finished.rms_px,
+        num_common=num_common,
     )

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import Keyframe, content_key, principal_point
+from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
+from splatnode.recon.geometry import without_distortion
 from splatnode.recon.matching.two_view import TwoView
-from splatnode.recon.registration import bundle, lenses, mapper, uncertainty
+from splatnode.recon.registration import bundle, lenses, mapper, own_lenses, uncertainty
 from splatnode.recon.registration.config import Config
 from splatnode.recon.registration.lenses import Grouping
 from splatnode.recon.registration.mapping_problem import View
@@ -19,6 +20,7 @@ from splatnode.recon.registration.patch_image import patch_image
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
+_DISPLACED = 0.0045  # of the longer side: a wider prior of a principal point was widened by what was found
 _MIN_DEPTH = 1e-9  # median depth of the points, in the map's unit of length, in place of 0
 
 
@@ -36,6 +38,20 @@ class RegisteredCamera:
     centre_sigma_rel: float  # over the spread of the centres, after the best similarity; infinite likewise
     # (3, 3) of the centre, after the best similarity, in the frame and the squared unit of the world; NaN likewise
     centre_covariance: Array
+    aspect: float = 1.0  # focal length down over that across
+    own_lens: bool = False  # the lens that it was taken to share, or that was given, is refuted
+    near_lens: int = -1  # the lens whose focal length it has to within `own_lenses.focal_sigma`; -1: its own alone
+    displaced: bool = False  # the principal point is not where it was taken to be
+    focal_sigma: float = np.inf  # of log focal; infinite where nothing is known
+
+    @property
+    def focals(self) -> Array:
+        """(2,) across and down, pixels."""
+        return self.focal * np.array([1.0, self.aspect])
+
+    def normalise(self, pixels: Array) -> Array:
+        """(M, 2) coordinates at depth 1, without distortion, of `pixels` (M, 2) of the frame at full size."""
+        return without_distortion((pixels - self.principal) / self.focals, np.tile(self.radial, (len(pixels), 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +89,7 @@ def register(
     if built is None:
         return None
     found, grouping = built
-    return in_first_camera(found.relabelled(order), keyframes, [grouping.scales[i] for i in rank])
+    return in_first_camera(found.relabelled(order), keyframes, [grouping.scales[i] for i in rank], config)
 
 
 def _relabelled(pairs: Mapping[tuple[int, int], TwoView], new: Index) -> dict[tuple[int, int], TwoView]:
@@ -137,19 +153,24 @@ def in_lens_pixels(pairs: Mapping[tuple[int, int], TwoView], grouping: Grouping)
     return {(i, j): pair.scaled(grouping.scales[i], grouping.scales[j]) for (i, j), pair in pairs.items()}
 
 
-def in_first_camera(found: mapper.Map, keyframes: Sequence[Keyframe], scales: Sequence[float]) -> Registration:
+def in_first_camera(
+    found: mapper.Map, keyframes: Sequence[Keyframe], scales: Sequence[float], config: Config
+) -> Registration:
     """The map in the frame of the first registered keyframe, scaled to a median point depth of 1.
 
     `scales` are those of the keyframes: pixels of their lens, which the map is in, over their own pixels.
     """
     estimate = found.estimate
     order = sorted(found.views)
-    covariance = bundle.covariance(estimate, found.prior, found.loss, found.views[0])
+    sides = np.array([scale * longer_side(k.frame) for scale, k in zip(scales, keyframes, strict=True)])
+    doubted, prior = own_lenses.uncertain(estimate, found.prior, sides, config.mapper.own_lenses)
+    covariance = bundle.covariance(doubted, prior, found.loss, found.views[0])
     _, depths = bundle.project(estimate)
     unit = 1.0 / max(float(np.median(depths)), _MIN_DEPTH)
     rotation0, translation0 = estimate.rotations[order[0]], estimate.translations[order[0]]
     rotation_sigmas, centre_sigmas = uncertainty.camera_sigmas(estimate, covariance, order)
     covariances = unit**2 * rotation0 @ uncertainty.centre_covariances(estimate, covariance, order) @ rotation0.T
+    focal_sigmas = uncertainty.sigmas(covariance.log_focals)
     cameras = []
     for position, i in enumerate(order):
         T_world_camera = np.eye(4)
@@ -167,6 +188,11 @@ def in_first_camera(found: mapper.Map, keyframes: Sequence[Keyframe], scales: Se
                 rotation_sigma_deg=float(rotation_sigmas[position]),
                 centre_sigma_rel=float(centre_sigmas[position]),
                 centre_covariance=covariances[position],
+                aspect=float(estimate.aspects[lens]),
+                near_lens=own_lenses.near(found.prior, int(lens), config.mapper.own_lenses),
+                displaced=bool(found.prior.shift_sigmas[lens] > _DISPLACED * sides[i]),
+                focal_sigma=float(focal_sigmas[i]),
+                own_lens=bool(lens >= found.num_common),
             )
         )
     principal = np.stack([principal_point(keyframe.frame) for keyframe in keyframes])
@@ -178,7 +204,7 @@ def in_first_camera(found: mapper.Map, keyframes: Sequence[Keyframe], scales: Se
         observed_point=estimate.point_of,
         observed_pixels=estimate.pixels / np.array(scales)[camera_of, None] + principal[camera_of],
         inlier_ratios=found.inlier_ratios,
-        focal_sigma=float(uncertainty.sigmas(covariance.log_focals[estimate.lens_of_camera[order]]).max()),
+        focal_sigma=float(focal_sigmas[order].max()),
         median_angle_deg=found.median_angle_deg,
         rms_px=found.rms_px,
     )

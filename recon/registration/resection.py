@@ -30,6 +30,10 @@ _PAIR_TOLERANCE = 2.0  # of Sampson errors to registered views
 _SCALE_TOLERANCE = 4.0  # of points that fix the length of a translation, whose direction is not exact either
 _MAX_NEIGHBOURS = 4  # registered views, those with most matches, that propose a pose
 _ITERATIONS = {"min_iterations": 200, "max_iterations": 5000, "seed": 0}  # of RANSAC: 5000 do for 10 % inliers
+# Focal lengths that are tried for a view that its lens does not fit, over that of the lens
+_FOCAL_FACTORS = (1.0, 0.4, 0.5, 0.63, 0.72, 0.8, 0.87, 0.93, 1.07, 1.15, 1.25, 1.38, 1.55, 1.75, 2.0, 2.5, 3.2)
+_OWN_FOCAL_TOLERANCE = 1.5  # of reprojection errors then: the map is finished
+_MORE_POINTS = 1.1  # times as many points must fit with another focal length
 _MIN_SCALE_RATIO = 0.4  # share of the points that may fix the length of a translation which must agree on it
 
 
@@ -80,6 +84,23 @@ def resect(problem: MappingProblem, partial: PartialMap, view: int, config: Conf
         if best is None or num_inliers > best.num_inliers:
             best = Resection(rotation, translation, num_inliers, num_inliers / available)
     return best
+
+
+def own_focal(problem: MappingProblem, partial: PartialMap, view: int, config: Config) -> float | None:
+    """The focal length (pixels) with which most of the map's points fit a pose of `view`, where it is not its lens'.
+
+    None where the lens' own focal length, which is tried first, fits nearly as many.
+    """
+    correspondences = _correspondences(partial, problem.growing_tracks, view)
+    limit = config.max_error_px * problem.scale[view]
+    lens = float(np.exp(partial.estimate.log_focals[partial.estimate.lens_of_camera[view]]))
+    everything = np.ones(len(correspondences.tracks), bool)
+    counts = {}
+    for factor in _FOCAL_FACTORS:
+        found = _pnp(correspondences, everything, factor * lens, limit, config, _OWN_FOCAL_TOLERANCE)
+        counts[factor] = 0 if found is None else found[2]
+    best = max(counts, key=lambda factor: counts[factor])
+    return best * lens if counts[best] > _MORE_POINTS * counts[1.0] else None
 
 
 def reprojection_errors(correspondences: Correspondences, rotation: Array, translation: Array, focal: float) -> Array:
@@ -148,7 +169,12 @@ def _proposals(
 
 
 def _pnp(
-    correspondences: Correspondences, chosen: Flags, focal: float, limit: float, config: Config
+    correspondences: Correspondences,
+    chosen: Flags,
+    focal: float,
+    limit: float,
+    config: Config,
+    tolerance: float = _POINT_TOLERANCE,
 ) -> tuple[Array, Array, int] | None:
     """Rotation, translation and number of inliers from the `chosen` correspondences; None for too few inliers."""
     if chosen.sum() < config.min_points:
@@ -157,7 +183,7 @@ def _pnp(
         correspondences.pixels[chosen],
         correspondences.points[chosen],
         epipolar.pinhole(focal),
-        {"max_reproj_error": _POINT_TOLERANCE * limit, **_ITERATIONS},
+        {"max_reproj_error": tolerance * limit, **_ITERATIONS},
     )
     num_inliers = int(sum(info["inliers"]))
     if num_inliers < max(config.min_points, config.min_inlier_ratio * chosen.sum()):

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses import opencv
-from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.lenses.undistort import SQUARE_TOLERANCE, undistorted
 from splatnode.recon.frames.keyframe import Features, Keyframe, modelled_image, modelled_mask
 from splatnode.recon.geometry import distortion
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -33,13 +33,15 @@ _DETAIL = 2  # times the modelled size: what is straightened, so that resampling
 def straightened(graph: ViewGraph, registration: Registration) -> tuple[ViewGraph, Registration]:
     """Both, as if pinholes had taken the photographs whose lens bends lines enough to be sure of it (LEAST_SHIFT).
 
+    So are photographs whose pixels are not square.
+
     Such a keyframe has its `lens`; its frame is at most twice as large as it is modelled. Observations beyond what it
     shows are left out. What came is returned where no lens is such, or one is estimated that folds its picture over.
     """
     lenses = {}
     for camera in registration.cameras:
         lens = _estimated(camera, graph.keyframes[camera.index].frame)
-        if abs(corner_shift(lens)) > LEAST_SHIFT:
+        if abs(corner_shift(lens)) > LEAST_SHIFT or abs(camera.aspect - 1.0) > SQUARE_TOLERANCE:
             lenses[camera.index] = lens
     if not lenses:
         return graph, registration
@@ -69,7 +71,9 @@ def with_lenses(registration: Registration, graph: ViewGraph, known: Mapping[str
             frame = graph.keyframes[camera.index].frame
             own = lens.resized(frame.width, frame.height)
             principal = np.array([own.cx, own.cy])
-            camera = replace(camera, focal=own.fx, principal=principal, radial=np.array(radial_of(own)))
+            camera = replace(
+                camera, focal=own.fx, aspect=own.fy / own.fx, principal=principal, radial=np.array(radial_of(own))
+            )
         cameras.append(camera)
     return replace(registration, cameras=tuple(cameras))
 
@@ -118,8 +122,8 @@ def radial_of(lens: Intrinsics | None) -> tuple[float, float]:
 def _estimated(camera: RegisteredCamera, frame: Frame) -> Intrinsics:
     cx, cy = (float(value) for value in camera.principal)
     radial = (*camera.radial.tolist(), 0.0, 0.0) if camera.radial.any() else ()
-    focal = float(camera.focal)
-    return Intrinsics(frame.width, frame.height, focal, focal, cx, cy, "estimated", radial)
+    fx, fy = (float(value) for value in camera.focals)
+    return Intrinsics(frame.width, frame.height, fx, fy, cx, cy, "estimated", radial)
 
 
 def _seen_by(keyframes: list[Keyframe], registration: Registration) -> Registration:
@@ -135,7 +139,7 @@ def _seen_by(keyframes: list[Keyframe], registration: Registration) -> Registrat
         pixels[own] = straight_pixels(pixels[own], keyframe.lens, pinhole)
         inside[own] = np.all((pixels[own] >= 0) & (pixels[own] < (pinhole.width, pinhole.height)), axis=1)
         principal = np.array([pinhole.cx, pinhole.cy])
-        cameras.append(replace(camera, focal=pinhole.fx, principal=principal, radial=np.zeros(2)))
+        cameras.append(replace(camera, focal=pinhole.fx, principal=principal, radial=np.zeros(2), aspect=1.0))
     return replace(
         registration,
         cameras=tuple(cameras),

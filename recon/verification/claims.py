@@ -61,9 +61,9 @@ class ClaimModel:
 def claims(evidence: Evidence, model: ClaimModel) -> dict[str, Bounds]:
     """The bounds of each camera, by its name, with balls for ellipsoids; the distance to the scene is 1."""
     count, link = len(evidence.cameras), evidence.weakest_link.inlier_ratio
-    focal = model.focal.of(evidence.focal, count)
     found = {}
     for camera in evidence.cameras:
+        focal = model.focal.of(camera.focal, count)
         centre = model.centre.of(camera.errors.centre, count, camera.inlier_ratio, link)
         found[camera.name] = Bounds(
             rotation_deg=model.rotation.of(camera.errors.rotation, count, camera.inlier_ratio, link),

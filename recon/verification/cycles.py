@@ -1,4 +1,4 @@
-"""Cycle consistency: the relative rotations of three pairs, each found by itself, multiply to the identity."""
+"""Cycle consistency: relative poses that single pairs find by themselves, against each other and the registration."""
 
 from __future__ import annotations
 
@@ -10,17 +10,22 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
+from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side, principal_point
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration import epipolar
+from splatnode.recon.registration.cross_product import cross_matrix
 from splatnode.recon.registration.register import Registration
 
 Array = npt.NDArray[np.float64]
 
 MIN_INLIER_RATIO = 0.5  # of a relative pose to be believed: most of its matches support it
-MIN_LENGTH = (
-    1e-12  # of two directions, multiplied: shorter ones have no angle between them, and it counts as 90 degrees
-)
+MIN_LENGTH = 1e-12  # of two directions, multiplied: shorter ones have no angle between them, which counts as 90 degrees
+MIN_SIGMA_DEG = 0.3  # of a direction: what lens and shutter do otherwise than the model
+MIN_NOISE_PX = 0.2  # of a match, at REFERENCE_SIDE
+MEDIAN_OF_NORMAL = 0.6745  # median size of a normal error over its standard deviation
+OUTLIER = 4.0  # times the noise, from which on a match says nothing
+MIN_INFORMATION = 1e-9  # of an eigenvalue, in place of 0
+STEP = 1e-5  # of a rotation or a direction, radians, in differences
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -38,6 +43,7 @@ class Cycles:
     rotation_deg: float  # median angle that is left after going round; 0 without a triangle
     worst_rotation_deg: float
     direction_deg: float  # median angle between the direction in which a pair sees its partner and the registration's
+    direction_sigmas: float  # the same over the standard error that the pair's matches leave of it; 0 without a pair
 
 
 def measure(
@@ -48,17 +54,26 @@ def measure(
 ) -> Cycles:
     cameras = {camera.index: camera for camera in registration.cameras}
     rotations: dict[tuple[int, int], Array] = {}
-    directions = []
+    directions, sigmas = [], []
     for i, j in _strongest_pairs(list(cameras), pairs, config):
         scale = max(longer_side(keyframes[k].frame) for k in (i, j)) / REFERENCE_SIDE
         thinned = _thinned(pairs[i, j], config.max_matches)
-        limit = config.max_error_px * scale
-        rotation, direction, num_inliers = epipolar.relative_pose(thinned, cameras[i].focal, cameras[j].focal, limit)
+        rays = [
+            cameras[k].normalise(points + principal_point(keyframes[k].frame))
+            for k, points in ((i, thinned.points1), (j, thinned.points2))
+        ]
+        focals = [float(np.sqrt(np.prod(cameras[k].focals))) for k in (i, j)]
+        straight = replace(thinned, points1=focals[0] * rays[0], points2=focals[1] * rays[1])
+        rotation, direction, num_inliers = epipolar.relative_pose(straight, *focals, config.max_error_px * scale)
         if num_inliers < MIN_INLIER_RATIO * len(thinned.matches):
             continue  # The pair has no rigid answer for these focal lengths; its inlier ratio says so, too.
         rotations[i, j] = rotation
         T_second_first = np.linalg.inv(cameras[j].T_world_camera) @ cameras[i].T_world_camera
-        directions.append(_angle_between(direction, T_second_first[:3, 3]))
+        angle = _angle_between(direction, T_second_first[:3, 3])
+        directions.append(angle)
+        focal = float(np.mean(focals))
+        sigma = direction_sigma_deg(rays[0], rays[1], rotation, direction, MIN_NOISE_PX * scale / focal)
+        sigmas.append(angle / float(np.hypot(sigma, MIN_SIGMA_DEG)))
     left = []
     for i, j, k in combinations(sorted(cameras), 3):
         if (i, j) in rotations and (j, k) in rotations and (i, k) in rotations:
@@ -69,7 +84,42 @@ def measure(
         rotation_deg=float(np.median(left)) if left else 0.0,
         worst_rotation_deg=float(np.max(left)) if left else 0.0,
         direction_deg=float(np.median(directions)) if directions else 0.0,
+        direction_sigmas=float(np.median(sigmas)) if sigmas else 0.0,
     )
+
+
+def direction_sigma_deg(rays1: Array, rays2: Array, rotation: Array, direction: Array, least_noise: float) -> float:
+    """The standard error of the direction of motion that a pair's matches leave, degrees; 90 where nothing is known.
+
+    `rays1` and `rays2` (M, 2) at depth 1, the pose from the first camera's axes to the second's. By the Sampson errors'
+    Jacobian at the pose; their noise is their median size, at least `least_noise`. With little parallax a rotation does
+    almost what a motion does, and a pair cannot know its direction well.
+    """
+    length = max(float(np.linalg.norm(direction)), MIN_LENGTH)
+    unit = direction / length
+    aside = np.linalg.svd(unit[None])[2][1:]  # two directions across it
+
+    def errors(step: Array) -> Array:
+        turned = rotation + cross_matrix(step[None, :3])[0] @ rotation
+        moved = unit + step[3] * aside[0] + step[4] * aside[1]
+        return _sampson(rays1, rays2, cross_matrix(moved[None])[0] @ turned)
+
+    at = errors(np.zeros(5))
+    noise = max(float(np.median(np.abs(at))) / MEDIAN_OF_NORMAL, least_noise)
+    near = np.abs(at) < OUTLIER * noise
+    jacobian = np.stack([(errors(step) - errors(-step)) / (2 * STEP) for step in STEP * np.eye(5)], 1)[near]
+    information = jacobian.T @ jacobian / noise**2
+    values, vectors = np.linalg.eigh(information)
+    covariance = (vectors / np.maximum(values, MIN_INFORMATION)) @ vectors.T
+    return float(min(np.degrees(np.sqrt(np.trace(covariance[3:, 3:]))), 90.0))
+
+
+def _sampson(rays1: Array, rays2: Array, essential: Array) -> Array:
+    """(M,) signed, at depth 1."""
+    one, other = (np.column_stack([rays, np.ones(len(rays))]) for rays in (rays1, rays2))
+    line2, line1 = one @ essential.T, other @ essential
+    gradient = (line1[:, :2] ** 2).sum(1) + (line2[:, :2] ** 2).sum(1)
+    return (other * line2).sum(1) / np.sqrt(np.maximum(gradient, MIN_LENGTH))
 
 
 def _strongest_pairs(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,7 +34,18 @@ class PoseErrors:
 @dataclass(frozen=True)
 class AllErrors:
     cameras: Mapping[int, PoseErrors]  # by their keyframes' positions
-    focal: Errors  # of the logarithm of the least certain focal length
+    focals: Mapping[int, Errors]  # of the logarithms of their focal lengths, likewise
+
+    @property
+    def focal(self) -> Errors:
+        """Of the least certain focal length, by each source."""
+        return worst(self.focals.values())
+
+
+def worst(errors: Iterable[Errors]) -> Errors:
+    """The largest of each source; NaN where one is."""
+    found = np.array([(of.sigma, of.regions, of.profile) for of in errors])
+    return Errors(*found.max(0).tolist())
 
 
 def measure(fit: refit.Fit, registration: Registration) -> AllErrors:
@@ -51,7 +62,12 @@ def measure(fit: refit.Fit, registration: Registration) -> AllErrors:
         )
         for i, camera in enumerate(registration.cameras)
     }
-    return AllErrors(cameras, Errors(registration.focal_sigma, regions.focal_rel, profile.focal_rel))
+    lens_of = fit.problem.lens_of_camera
+    focals = {
+        camera.index: Errors(camera.focal_sigma, regions.focal_rel[lens_of[i]], profile.focal_rel[lens_of[i]])
+        for i, camera in enumerate(registration.cameras)
+    }
+    return AllErrors(cameras, focals)
 
 
 def travel(registration: Registration) -> float:
@@ -73,6 +89,19 @@ def continued(registration: Registration, known: Mapping[int, PoseErrors]) -> di
     of_rotations = _continued(rotations, {index: of.rotation for index, of in known.items()})
     of_centres = _continued(centres, {index: of.centre for index, of in known.items()})
     return {index: PoseErrors(of_rotations[index], of_centres[index]) for index in rotations}
+
+
+def continued_focals(registration: Registration, known: Mapping[int, Errors]) -> dict[int, Errors]:
+    """Of the focal lengths of a continuation, of which `known` are those of some cameras: the larger sigma counts.
+
+    A further camera has what is known of the least certain focal length.
+    """
+    least_certain = worst(known.values())
+    found = {}
+    for camera in registration.cameras:
+        was = known.get(camera.index, least_certain)
+        found[camera.index] = replace(was, sigma=float(np.maximum(was.sigma, camera.focal_sigma)))
+    return found
 
 
 def _continued(sigmas: Mapping[int, float], known: Mapping[int, Errors]) -> dict[int, Errors]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from splatnode.recon.verification.cycles import Cycles
-from splatnode.recon.verification.epipolar_consistency import Score
 from splatnode.recon.verification.errors import Errors, PoseErrors
 from splatnode.recon.verification.lens import Distortion, FreedLens
 from splatnode.recon.verification.reflection import Reflection
@@ -22,8 +21,9 @@ class CameraEvidence:
     coverage: float  # share of its picture that its points fill: of a box around nearly all of them
     flat_share: float  # of the matches of its flattest pair: those that one homography explains
     gain: float  # of its exposure, over that of most cameras
-    patches: Score  # of it in the pictures that share most points with it
     errors: PoseErrors
+    focal: Errors  # of the logarithm of its focal length
+    own_lens: bool  # it refutes the lens that it was taken to share, or that was given
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,8 @@ Array = npt.NDArray[np.float64]
 
 STEPS = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32, 0.64)  # of log focal, either way; the last is a factor of 1.9
 # Rise of the cost, in units of the variance of an observation, that counts as one standard error. Observations err
-# together: so many of them tell as much as one with an error of its own, as in registration's covariance.
+# together: so many of them tell as much as one with an error of its own, as in registration's covariance. What EXIF
+# says of the focal length is one observation more.
 ONE_SIGMA = finishing.Config().correlated
 
 
@@ -28,7 +29,8 @@ ONE_SIGMA = finishing.Config().correlated
 class Profile:
     """The interval of one standard error, and the most that the cameras move within it."""
 
-    focal_rel: float  # the wider side of the interval, of log focal; the last step where the cost never rises so far
+    # Of each lens: the wider side of the interval, of log focal; the last step where the cost never rises so far
+    focal_rel: tuple[float, ...]
     rotation_deg: tuple[float, ...]  # of each camera, after the best common rotation
     centre: tuple[float, ...]  # of each camera, after the best similarity, in the unit of the world
 
@@ -50,12 +52,12 @@ def profile(fit: refit.Fit) -> Profile:
     whole = refit.adjusted(fit)
     count = len(whole.problem.rotations)
     if not np.isfinite(whole.cost):
-        return Profile(np.nan, (np.nan,) * count, (np.nan,) * count)
+        return Profile((np.nan,) * len(whole.prior.sigmas), (np.nan,) * count, (np.nan,) * count)
     free = (whole.prior.sigmas > 0).astype(np.float64)
     ends = [_end(whole, direction) for direction in (free, -free)] if free.any() else []
     still = np.zeros(count)
     return Profile(
-        focal_rel=max((end.focal_rel for end in ends), default=0.0),
+        focal_rel=tuple((max((end.focal_rel for end in ends), default=0.0) * free).tolist()),
         rotation_deg=tuple(np.max([still, *(end.moved.rotation_deg for end in ends)], axis=0).tolist()),
         centre=tuple(np.max([still, *(end.moved.centre for end in ends)], axis=0).tolist()),
     )
@@ -64,7 +66,7 @@ def profile(fit: refit.Fit) -> Profile:
 def _end(whole: refit.Fit, direction: Array) -> _Step:
     """One end of the interval: between the last step within it and the first beyond, both moved alike."""
     count = len(whole.problem.rotations)
-    before = _Step(0.0, 0.0, refit.Moved(np.zeros(count), np.zeros(count), 0.0))
+    before = _Step(0.0, 0.0, refit.Moved(np.zeros(count), np.zeros(count), np.zeros(len(direction))))
     for step in _steps(whole, direction):
         if step.sigmas >= 1.0:
             share = (1.0 - before.sigmas) / max(step.sigmas - before.sigmas, refit.MIN_COST)
@@ -79,8 +81,9 @@ def _steps(whole: refit.Fit, direction: Array) -> Iterator[_Step]:
     for size in STEPS:
         log_focals = whole.problem.log_focals + size * direction
         held = refit.adjusted(replace(held, problem=replace(held.problem, log_focals=log_focals)))
-        rise = (held.cost - whole.cost) * len(whole.problem.pixels) / noise2
-        yield _Step(size, float(np.sqrt(np.maximum(rise, 0.0) / ONE_SIGMA)), refit.moved(whole, held))
+        rise = (held.cost - whole.cost) * len(whole.problem.pixels) / noise2 / ONE_SIGMA
+        rise += refit.nominal_cost(held) - refit.nominal_cost(whole)
+        yield _Step(size, float(np.sqrt(np.maximum(rise, 0.0))), refit.moved(whole, held))
 
 
 def _between(before: _Step, after: _Step, share: float) -> _Step:
@@ -92,7 +95,7 @@ def _between(before: _Step, after: _Step, share: float) -> _Step:
     moved = refit.Moved(
         mixed(before.moved.rotation_deg, after.moved.rotation_deg),
         mixed(before.moved.centre, after.moved.centre),
-        before.moved.focal_rel + share * (after.moved.focal_rel - before.moved.focal_rel),
+        mixed(before.moved.focals_rel, after.moved.focals_rel),
     )
     return _Step(before.focal_rel + share * (after.focal_rel - before.focal_rel), 1.0, moved)
 
@@ -101,5 +104,5 @@ def _farther(one: refit.Moved, other: refit.Moved) -> refit.Moved:
     return refit.Moved(
         np.maximum(one.rotation_deg, other.rotation_deg),
         np.maximum(one.centre, other.centre),
-        max(one.focal_rel, other.focal_rel),
+        np.maximum(one.focals_rel, other.focals_rel),
     )

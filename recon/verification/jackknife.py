@@ -27,7 +27,7 @@ class Spread:
 
     rotation_deg: tuple[float, ...]  # of each camera, after the best common rotation
     centre: tuple[float, ...]  # of each camera, after the best similarity, in the unit of the world
-    focal_rel: float
+    focal_rel: tuple[float, ...]  # of the logarithm of each lens' focal length
 
 
 def by_regions(fit: refit.Fit) -> Spread:
@@ -40,11 +40,11 @@ def by_regions(fit: refit.Fit) -> Spread:
         ]
         rotations.append(_variance([each.rotation_deg for each in moved]))
         centres.append(_variance([each.centre for each in moved]))
-        focals.append(_variance([np.array([each.focal_rel]) for each in moved]))
+        focals.append(_variance([each.focals_rel for each in moved]))
     return Spread(
         rotation_deg=tuple(np.sqrt(np.mean(rotations, axis=0)).tolist()),
         centre=tuple(np.sqrt(np.mean(centres, axis=0)).tolist()),
-        focal_rel=float(np.sqrt(np.mean(focals))),
+        focal_rel=tuple(np.sqrt(np.mean(focals, axis=0)).tolist()),
     )
 
 

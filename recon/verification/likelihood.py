@@ -66,16 +66,12 @@ def measures(evidence: Evidence, model: ClaimModel) -> dict[str, float]:
     link = evidence.weakest_link
     return {
         "inlier_ratio": _clipped(evidence.inlier_ratio, 0.0, 0.95),
-        "camera_inlier_ratio": _clipped(min(camera.inlier_ratio for camera in cameras), 0.0, 0.95),
         "link_inlier_ratio": _clipped(link.inlier_ratio, 0.0, 1.0),
-        "link_points": _log_clipped(link.shared_points, 10.0, 500.0),
-        "confirmed": _log_clipped(min(camera.confirmed for camera in cameras), 1.0, 200.0),
-        "patches": _clipped(min(camera.patches.sigmas for camera in cameras), -2.0, 8.0),
         "coverage": _log_clipped(min(camera.coverage for camera in cameras), 0.05, 0.5),
         "flat_patch": max(_flat_patch(camera) for camera in cameras),
         "mirrored_cost": _log_clipped(evidence.mirrored_cost, 0.8, 10.0),
         "reflection": _clipped(evidence.reflection.gain, 0.1, 1.0),
-        "directions": _log_clipped(evidence.cycles.direction_deg, 1.0, 30.0),
+        "directions": _log_clipped(evidence.cycles.direction_sigmas, 1.0, 30.0),
         "rotation_bound": _log_clipped(max(each.rotation_deg for each in bounds.values()), 0.3, 30.0),
         "travel_bound": _log_clipped(travel_percent(bounds, evidence), 0.5, 100.0),
     }

@@ -52,9 +52,6 @@ def _wrong_poses(case: Case, against: str) -> Verdict:
         smallest = min(cameras, key=lambda camera: camera.coverage)
         percent = 100 * smallest.coverage
         return refuse(refusals.SMALL_PART, (smallest.name,), name=smallest.name, percent=percent)
-    if against in ("confirmed", "patches"):
-        weakest = min(cameras, key=lambda camera: (camera.confirmed, camera.patches.sigmas))
-        return refuse(refusals.UNCONFIRMED, (weakest.name,), name=weakest.name, points=weakest.confirmed)
     if against in ("rotation_bound", "travel_bound"):
         return why_wide(case)
     return _contradictions(case, against)
@@ -65,19 +62,17 @@ def _contradictions(case: Case, against: str) -> Verdict:
     weakest = min(case.evidence.cameras, key=lambda camera: camera.inlier_ratio)
     if against == "directions":
         return refuse(refusals.DISAGREEING, (weakest.name,), degrees=case.evidence.cycles.direction_deg)
-    if against in ("link_points", "link_inlier_ratio"):
+    if against == "link_inlier_ratio":
         link, inliers = case.evidence.weakest_link, 100 * case.evidence.weakest_link.inlier_ratio
         count, points = len(link.smaller_part), link.shared_points
         return refuse(refusals.WEAKLY_JOINED, (weakest.name,), count=count, points=points, inliers=inliers)
-    if against == "camera_inlier_ratio":
-        return refuse(refusals.CONTRADICTED, (weakest.name,), name=weakest.name, inliers=100 * weakest.inlier_ratio)
     return refuse(refusals.CONTRADICTING, (weakest.name,), inliers=100 * case.evidence.inlier_ratio)
 
 
 def _through_other_lenses(case: Case) -> list[str]:
-    """Frames that were not taken through the lens that took most; none where the camera was calibrated."""
-    cameras = case.registration.cameras
-    lenses = [camera.lens for camera in cameras]
-    common = max(sorted(set(lenses)), key=lenses.count)
-    others = [case.graph.keyframes[camera.index] for camera in cameras if camera.lens != common]
+    """Frames whose size says that another lens took them than most; none where the camera was calibrated."""
+    keyframes = [case.graph.keyframes[camera.index] for camera in case.registration.cameras]
+    sizes = [tuple(sorted((keyframe.frame.width, keyframe.frame.height))) for keyframe in keyframes]
+    common = max(sorted(set(sizes)), key=sizes.count)
+    others = [keyframe for keyframe, size in zip(keyframes, sizes, strict=True) if size != common]
     return [keyframe.name for keyframe in others if keyframe.frame.intrinsics is None]

@@ -21,13 +21,14 @@ FREE_SHIFT = lenses.Config().free_shift_sigma  # of the longer side, as where fr
 def freed(fit: refit.Fit) -> refit.Moved | None:
     """How far the cameras move when the lenses of fewer cameras than the commonest one are set free.
 
-    None where all pictures came through one lens, or every other one came calibrated.
+    None where all pictures came through one lens, or every other one came calibrated. Lenses of single images that
+    refuted the common one are left out: where their principal points are was asked when they were found.
     """
     count = len(fit.prior.sigmas)
     seen_through = np.bincount(fit.problem.lens_of_camera, minlength=count)
-    free = (fit.prior.sigmas > 0) & (np.arange(count) != seen_through.argmax())
+    free = (fit.prior.sigmas > 0) & ~fit.own & (np.arange(count) != seen_through.argmax())
     if not free.any():
         return None
     whole = refit.adjusted(fit)
-    sigmas = np.where(free, FREE_SHIFT * REFERENCE_SIDE * max(fit.scale, 1.0), 0.0)
+    sigmas = np.where(free, FREE_SHIFT * REFERENCE_SIDE * max(fit.scale, 1.0), whole.prior.shift_sigmas)
     return refit.moved(whole, refit.adjusted(replace(whole, prior=replace(whole.prior, shift_sigmas=sigmas))))

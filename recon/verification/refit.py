@@ -11,13 +11,17 @@ import numpy.typing as npt
 
 from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side
 from splatnode.recon.geometry import align_cameras, angles_deg, spread, umeyama
-from splatnode.recon.registration import bundle, tracks
+from splatnode.recon.registration import bundle, finishing, lenses, own_lenses, tracks
 from splatnode.recon.registration.register import Registration
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
+NOMINAL_SIGMA = lenses.Config().exif_sigma
 FREE_SIGMA = 0.3  # of log focal where nothing is known: one sigma is a factor of 1.35
+FREE_SHIFT = lenses.Config().free_shift_sigma  # of the longer side, of a principal point that was displaced
+FREE_ASPECT = 0.1  # of log aspect, where pixels are not square
+SQUARE = 1e-3  # difference of an aspect from 1 from which on they are not
 ROBUST_FACTOR = 3.0  # width of the Cauchy loss over the median error
 ROBUST_PX = (0.4, 1.5)  # least and most width of the Cauchy loss, pixels at REFERENCE_SIDE
 MIN_COST = 1e-12  # pixels squared: a smaller cost counts as this one where ratios are taken; made-up data have none
@@ -34,6 +38,8 @@ class Fit:
     loss: bundle.Config
     scale: float  # longer side of the largest frame, whose pixels these are, over REFERENCE_SIDE
     told: Array  # (G,) focal length that came with the frames; NaN where none did
+    nominal_sigmas: Array  # (G,) of its logarithm where it is nominal, as EXIF's is; infinite for any other lens
+    own: npt.NDArray[np.bool_]  # (G,) lenses of single images, which refute the one that they were taken to share
     units: Array  # (G,) pixels of the largest frame of each lens over those of the largest of all
 
     @property
@@ -70,17 +76,24 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
     chosen = tracks.longest(camera_of, registration.observed_point, len(registration.points), tracks_per_camera)
     observed = chosen[registration.observed_point]
     sides = np.array([longer_side(keyframes[c.index].frame) for c in cameras])
-    lenses, lens_of_camera = np.unique([camera.lens for camera in cameras], return_inverse=True)
-    largest = sides.max()
-    units = np.array([sides[lens_of_camera == lens].max() for lens in range(len(lenses))]) / largest
+    numbers, lens_of_camera = np.unique([camera.lens for camera in cameras], return_inverse=True)
+    count, largest = len(numbers), sides.max()
+    units = np.array([sides[lens_of_camera == lens].max() for lens in range(count)]) / largest
     enlarged = largest / sides
-    focals, radials, sigmas = np.zeros(len(lenses)), np.zeros((len(lenses), 2)), np.zeros(len(lenses))
-    told = np.full(len(lenses), np.nan)
+    focals, aspects, radials, sigmas = np.zeros(count), np.zeros(count), np.zeros((count, 2)), np.zeros(count)
+    told, nominal = np.full(count, np.nan), np.full(count, np.inf)
+    shift_sigmas, aspect_sigmas, own = np.zeros(count), np.zeros(count), np.zeros(count, bool)
+    near = np.full(count, -1)
     for camera, lens, by in zip(cameras, lens_of_camera, enlarged, strict=True):
-        given = keyframes[camera.index].frame.intrinsics
-        focals[lens], radials[lens] = by * camera.focal, camera.radial
+        given = None if camera.own_lens else keyframes[camera.index].frame.intrinsics
+        focals[lens], aspects[lens], radials[lens] = by * camera.focal, camera.aspect, camera.radial
         told[lens] = np.nan if given is None else by * given.fx
-        sigmas[lens] = FREE_SIGMA if given is None or given.source not in ("given", "calibration") else 0.0
+        calibrated = given is not None and given.source in ("given", "calibration")
+        sigmas[lens] = 0.0 if calibrated else FREE_SIGMA
+        nominal[lens] = np.inf if given is None or calibrated else NOMINAL_SIGMA
+        shift_sigmas[lens] = FREE_SHIFT * largest if camera.displaced else 0.0
+        aspect_sigmas[lens] = FREE_ASPECT if abs(camera.aspect - 1.0) > SQUARE else 0.0
+        own[lens], near[lens] = camera.own_lens, camera.near_lens
     principal = np.stack([camera.principal for camera in cameras])
     Ts_camera_world: Array = np.linalg.inv(np.stack([camera.T_world_camera for camera in cameras])).astype(np.float64)
     (kept,) = np.nonzero(chosen)
@@ -90,17 +103,54 @@ def fit(keyframes: Sequence[Keyframe], registration: Registration, tracks_per_ca
         lens_of_camera=lens_of_camera,
         log_focals=np.log(focals),
         radials=radials,
-        shifts=np.zeros((len(lenses), 2)),
+        shifts=np.zeros((count, 2)),
         points=registration.points[kept],
         camera_of=camera_of[observed],
         point_of=np.searchsorted(kept, registration.observed_point[observed]),
         pixels=(enlarged[camera_of, None] * (registration.observed_pixels - principal[camera_of]))[observed],
+        log_aspects=np.log(aspects),
     )
     scale = float(largest) / REFERENCE_SIDE
-    prior = bundle.focal_prior(problem.log_focals, sigmas)
+    is_nominal = np.isfinite(nominal)
+    means = np.where(is_nominal, np.log(np.where(is_nominal, told, 1.0)), problem.log_focals)
+    prior = bundle.LensPrior(
+        log_focals=means,
+        sigmas=np.minimum(sigmas, nominal),
+        radial_sigmas=np.zeros((count, 2)),
+        shift_sigmas=shift_sigmas,
+        aspect_sigmas=aspect_sigmas,
+        ties=_ties(numbers, near),
+    )
     errors = bundle.reprojection_errors(problem)
-    robust_px = float(np.clip(ROBUST_FACTOR * np.median(errors), *(np.array(ROBUST_PX) * scale)))
-    return Fit(problem, prior, bundle.Config(robust_px=robust_px), scale, told, units)
+    median = float(np.median(errors))
+    robust_px = float(np.clip(ROBUST_FACTOR * median, *(np.array(ROBUST_PX) * scale)))
+    noise = bundle.noise_px(len(problem.pixels), len(problem.points), median / scale)
+    loss = bundle.Config(robust_px=robust_px, noise_px=scale * noise * float(np.sqrt(finishing.Config().correlated)))
+    return Fit(problem, prior, loss, scale, told, nominal, own, units)
+
+
+def _ties(numbers: Index, near: Index) -> bundle.Ties | None:
+    """What holds the focal lengths of lenses together that are near one lens: to that one, or to the first of them."""
+    to, sigmas = np.full(len(numbers), -1), np.zeros((len(numbers), 6))
+    for common in np.unique(near[near >= 0]):
+        (members,) = np.nonzero(near == common)
+        (itself,) = np.nonzero(numbers == common)
+        first = itself[0] if len(itself) else members[0]
+        others = members[members != first]
+        to[others], sigmas[others, 0] = first, own_lenses.Config().focal_sigma
+    return bundle.Ties(to, sigmas) if (to >= 0).any() else None
+
+
+def nominal_cost(of: Fit) -> float:
+    """What nominal focal lengths say against those of the fit: squares of standard errors.
+
+    All EXIF data of a camera err together: each lens counts as a share of one observation.
+    """
+    known = np.isfinite(of.nominal_sigmas)
+    if not known.any():
+        return 0.0
+    off = (of.problem.log_focals - np.log(np.where(known, of.told, 1.0))) / of.nominal_sigmas
+    return float(np.mean(off[known] ** 2))
 
 
 def adjusted(start: Fit) -> Fit:
@@ -151,7 +201,7 @@ class Moved:
 
     rotation_deg: Array  # (C,) after the best common rotation
     centre: Array  # (C,) after the best similarity, in the unit of the first fit
-    focal_rel: float  # as in `Shift`
+    focals_rel: Array  # (G,) change of the logarithm of each lens' focal length, without its sign
 
 
 def moved(before: Fit, after: Fit) -> Moved:
@@ -159,14 +209,15 @@ def moved(before: Fit, after: Fit) -> Moved:
     Ts_before, Ts_after = before.Ts_world_camera, after.Ts_world_camera
     count = len(Ts_before)
     if not (np.isfinite(Ts_before).all() and np.isfinite(Ts_after).all()):
-        return Moved(np.full(count, LOST.rotation_deg), np.full(count, LOST.centre_rel), LOST.focal_rel)
+        lost = np.full(len(before.problem.log_focals), LOST.focal_rel)
+        return Moved(np.full(count, LOST.rotation_deg), np.full(count, LOST.centre_rel), lost)
     common = align_cameras(Ts_after, Ts_before)
     centres, target = Ts_after[:, :3, 3], Ts_before[:, :3, 3]
     onto = umeyama(centres, target) if count >= MIN_FOR_CENTRES else common
     return Moved(
         rotation_deg=angles_deg(common.rotation @ Ts_after[:, :3, :3], Ts_before[:, :3, :3]),
         centre=np.linalg.norm(onto(centres) - target, axis=1),
-        focal_rel=float(np.abs(before.problem.log_focals - after.problem.log_focals).max()),
+        focals_rel=np.abs(before.problem.log_focals - after.problem.log_focals),
     )
 
 

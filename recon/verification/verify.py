@@ -13,10 +13,9 @@ import numpy.typing as npt
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.inliers import pooled_ratio
-from splatnode.recon.registration.register import RegisteredCamera, Registration
+from splatnode.recon.registration.register import Registration
 from splatnode.recon.verification import (
     cycles,
-    epipolar_consistency,
     errors,
     exposure,
     flatness,
@@ -26,11 +25,9 @@ from splatnode.recon.verification import (
     reversal,
     weakest_link,
 )
-from splatnode.recon.verification.epipolar_consistency import Picture
-from splatnode.recon.verification.errors import PoseErrors
+from splatnode.recon.verification.errors import Errors, PoseErrors
 from splatnode.recon.verification.evidence import CameraEvidence, Evidence
 from splatnode.recon.verification.reflection import Reflection
-from splatnode.recon.workers import each
 
 Array = npt.NDArray[np.float64]
 
@@ -40,7 +37,6 @@ MIN_MATCHES = 60  # of a pair whose homography says something: fewer are explain
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     tracks_per_camera: int = 300  # tracks of a camera in the bundle that is adjusted again
-    epipolar_consistency: epipolar_consistency.Config = epipolar_consistency.Config()
     cycles: cycles.Config = cycles.Config()
     reflection: reflection.Config = reflection.Config()
 
@@ -57,14 +53,12 @@ def verify(
     fit = refit.fit(graph.keyframes, registration, config.tracks_per_camera)
     sizes = errors.measure(fit, registration)
     pause()
-    registered = [camera.index for camera in registration.cameras]
-    views = pictures(graph, registration, config.epipolar_consistency, registered)
-    cameras = _of_cameras(graph, registration, views, config, sizes.cameras)
+    cameras = _of_cameras(graph, registration, sizes.cameras, sizes.focals)
     pause()
     return Evidence(
         cameras=cameras,
         inlier_ratio=inlier_ratio(graph, registration, None),
-        weakest_link=weakest_link.measure(registration, graph.names, graph.pairs, views, config.epipolar_consistency),
+        weakest_link=weakest_link.measure(registration, graph.names, graph.pairs),
         disconnected=_disconnected(graph, registration),
         reflection=_reflection(graph, registration, config.reflection),
         flatness=flatness.share_on_plane(registration.points),
@@ -84,12 +78,12 @@ def verify_further(graph: ViewGraph, registration: Registration, known: Evidence
 
     None where a further photograph may be mirrored: a few partners cannot tell that for certain, all evidence must.
 
-    Measured anew: the cameras that `known` does not have, with their patches, exposure and whether their photographs
-    are mirrored; and of all cameras the matches, the weakest link, the plane, angles, errors and the focal length, of
-    which the larger uncertainty counts. Reused from `known`, because it says little about one camera more: the known
-    cameras' patches and exposures and that they are not mirrored, the jackknife, the scene mirrored in depth, cycles,
-    freed lenses and distortion. The pose sigmas of a continuation, which aligns no patches, are too large: they are
-    reduced by as much as those of the known cameras are.
+    Measured anew: the cameras that `known` does not have, with their exposure and whether their photographs are
+    mirrored; and of all cameras the matches, the weakest link, the plane, angles, errors and the focal length, of which
+    the larger uncertainty counts. Reused from `known`, because it says little about one camera more: the known cameras'
+    exposures and that they are not mirrored, the jackknife, the scene mirrored in depth, cycles, freed lenses and
+    distortion. The pose sigmas of a continuation, which aligns no patches, are too large: they are reduced by as much
+    as those of the known cameras are.
     """
     before = {camera.name: camera for camera in known.cameras}
     names = {camera.index: graph.keyframes[camera.index].name for camera in registration.cameras}
@@ -97,13 +91,12 @@ def verify_further(graph: ViewGraph, registration: Registration, known: Evidence
     reflections = _reflections_of_further(graph, registration, names.keys() - further, further, config.reflection)
     if not all(each.gain <= config.reflection.max_further_gain for each in reflections):
         return None
-    dense = config.epipolar_consistency
-    partners = (epipolar_consistency.partners(index, names, registration, dense.partners) for index in further)
-    views = pictures(graph, registration, dense, further.union(*partners))
     known_errors = {index: before[name].errors for index, name in names.items() if name in before}
     sizes = errors.continued(registration, known_errors)
+    known_focals = {index: before[name].focal for index, name in names.items() if name in before}
+    focals = errors.continued_focals(registration, known_focals)
     of_further = {index: sizes[index] for index in further}
-    measured = {camera.name: camera for camera in _of_cameras(graph, registration, views, config, of_further)}
+    measured = {camera.name: camera for camera in _of_cameras(graph, registration, of_further, focals)}
     return replace(
         known,
         cameras=tuple(
@@ -111,17 +104,18 @@ def verify_further(graph: ViewGraph, registration: Registration, known: Evidence
                 measured.get(names[camera.index]) or before[names[camera.index]],
                 inlier_ratio=inlier_ratio(graph, registration, camera.index),
                 errors=sizes[camera.index],
+                focal=focals[camera.index],
             )
             for camera in registration.cameras
         ),
         inlier_ratio=inlier_ratio(graph, registration, None),
-        weakest_link=weakest_link.measure(registration, graph.names, graph.pairs, views, config.epipolar_consistency),
+        weakest_link=weakest_link.measure(registration, graph.names, graph.pairs),
         disconnected=_disconnected(graph, registration),
         reflection=reflection.strongest([known.reflection, *reflections]),
         flatness=flatness.share_on_plane(registration.points),
         median_angle_deg=registration.median_angle_deg,
         rms_px=registration.rms_px,
-        focal=replace(known.focal, sigma=float(np.maximum(known.focal.sigma, registration.focal_sigma))),
+        focal=errors.worst(focals.values()),
         travel=errors.travel(registration),
     )
 
@@ -129,34 +123,35 @@ def verify_further(graph: ViewGraph, registration: Registration, known: Evidence
 def _of_cameras(
     graph: ViewGraph,
     registration: Registration,
-    views: Mapping[int, Picture],
-    config: Config,
     sizes: Mapping[int, PoseErrors],
+    focals: Mapping[int, Errors],
 ) -> tuple[CameraEvidence, ...]:
     """Of the cameras that `sizes` has, by keyframe."""
     by = registration.observed_by
     times_seen = np.bincount(registration.observed_point, minlength=len(registration.points))
     by_third = times_seen[registration.observed_point] >= 3
     confirmed = np.bincount(registration.observed_by[by_third], minlength=len(graph.keyframes))
-    scales = {index: graph.keyframes[index].scale for index in views}
-    measured = [camera for camera in registration.cameras if camera.index in sizes]
-    patches = each(
-        lambda camera: epipolar_consistency.in_partners(camera.index, views, registration, config.epipolar_consistency),
-        measured,
+    keyframes = {camera.index: graph.keyframes[camera.index] for camera in registration.cameras}
+    greys = {index: cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY) for index, keyframe in keyframes.items()}
+    gains = exposure.gains(
+        {index: grey.astype(np.float32) for index, grey in greys.items()},
+        registration,
+        {index: keyframe.scale for index, keyframe in keyframes.items()},
     )
-    gains = exposure.gains({index: picture.grey for index, picture in views.items()}, registration, scales)
     return tuple(
         CameraEvidence(
-            name=graph.keyframes[camera.index].name,
+            name=keyframes[camera.index].name,
             inlier_ratio=inlier_ratio(graph, registration, camera.index),
             confirmed=int(confirmed[camera.index]),
-            coverage=coverage(graph.keyframes[camera.index], registration.observed_pixels[by == camera.index]),
+            coverage=coverage(keyframes[camera.index], registration.observed_pixels[by == camera.index]),
             flat_share=flat_share(graph, camera.index),
             gain=gains[camera.index],
-            patches=found,
             errors=sizes[camera.index],
+            focal=focals[camera.index],
+            own_lens=camera.own_lens,
         )
-        for camera, found in zip(measured, patches, strict=True)
+        for camera in registration.cameras
+        if camera.index in sizes
     )
 
 
@@ -192,7 +187,7 @@ def _reflections_of_further(
     """Of each further camera beside the known ones that share most points with it."""
     found = []
     for index in sorted(further):
-        others = epipolar_consistency.partners(index, known, registration, config.partners)
+        others = partners(index, known, registration, config.partners)
         beside = [graph.keyframes[other] for other in others]
         found.append(reflection.measure_further(graph.keyframes[index], beside, config))
     return found
@@ -207,29 +202,8 @@ def inlier_ratio(graph: ViewGraph, registration: Registration, index: int | None
     return pooled_ratio(registration.inlier_ratios, graph.pairs, index)
 
 
-def pictures(
-    graph: ViewGraph, registration: Registration, config: epipolar_consistency.Config, asked: Collection[int]
-) -> dict[int, epipolar_consistency.Picture]:
-    """The registered views among the keyframes `asked`, at modelled size, by keyframe."""
-    cameras = [camera for camera in registration.cameras if camera.index in asked]
-    found = each(lambda camera: _picture(graph.keyframes[camera.index], camera, registration, config), cameras)
-    return {camera.index: picture for camera, picture in zip(cameras, found, strict=True)}
-
-
-def _picture(
-    keyframe: Keyframe, camera: RegisteredCamera, registration: Registration, config: epipolar_consistency.Config
-) -> Picture:
-    scale = np.array(keyframe.scale)
-    (fx, fy), (cx, cy) = camera.focal * scale, camera.principal * scale
-    mine = registration.observed_by == camera.index
-    to_camera = np.linalg.inv(camera.T_world_camera)
-    points = registration.points[registration.observed_point[mine]]
-    found = epipolar_consistency.picture(
-        cv2.cvtColor(keyframe.image, cv2.COLOR_RGB2GRAY).astype(np.float32),
-        np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
-        camera.T_world_camera,
-        registration.observed_pixels[mine] * scale,
-        points @ to_camera[2, :3] + to_camera[2, 3],
-        config,
-    )
-    return found if (mask := keyframe.mask) is None else found.hidden(mask)
+def partners(index: int, among: Collection[int], registration: Registration, count: int) -> list[int]:
+    """The `count` views of `among` that share most points with the view `index`."""
+    mine = registration.observed_point[registration.observed_by == index]
+    shared = np.bincount(registration.observed_by[np.isin(registration.observed_point, mine)], minlength=max(among) + 1)
+    return sorted((other for other in among if other != index), key=lambda other: (-shared[other], other))[:count]

@@ -11,12 +11,9 @@ import numpy.typing as npt
 from splatnode.recon.matching.components import connected_components
 from splatnode.recon.matching.two_view import TwoView
 from splatnode.recon.registration.register import Registration
-from splatnode.recon.verification import epipolar_consistency
-from splatnode.recon.workers import each
 
 MIN_CONSISTENT_SHARE = 0.6  # of a pair's matches that the poses explain, for it to connect its frames
 MIN_CONSISTENT_MATCHES = 20  # that the poses explain, for a pair to connect its frames
-MAX_PAIRS_SCORED = 3  # pairs across the link in which patches are looked for, those that share most points
 
 
 @dataclass(frozen=True)
@@ -27,7 +24,6 @@ class WeakestLink:
     shared_points: int  # of the pairs of frames across the link, summed
     matches: int  # of the verified pairs across it
     inliers: float  # of these, how many the poses explain
-    patches: epipolar_consistency.Score  # across it
 
     @property
     def inlier_ratio(self) -> float:
@@ -39,31 +35,21 @@ def measure(
     registration: Registration,
     names: Sequence[str],
     pairs: Mapping[tuple[int, int], TwoView],
-    pictures: Mapping[int, epipolar_consistency.Picture],
-    config: epipolar_consistency.Config,
 ) -> WeakestLink:
     """What connects the two parts into which the cameras fall without the last edge of the maximum spanning tree.
 
-    Patches across it are looked for in what there is of `pictures`. `names` are those of all keyframes.
+    `names` are those of all keyframes.
     """
     indices = [camera.index for camera in registration.cameras]
     shared = shared_points(registration)
     one, other = _two_parts(indices, shared)
-    across = sorted(((i, j) for i in one for j in other), key=lambda pair: (-shared[pair], pair))
-    asked = [
-        (pictures[a], pictures[b], config)
-        for i, j in across[:MAX_PAIRS_SCORED]
-        for a, b in ((i, j), (j, i))
-        if i in pictures and j in pictures
-    ]
-    scores = each(lambda one_way: epipolar_consistency.score(*one_way), asked)
+    across = [(i, j) for i in one for j in other]
     verified = [key for i, j in across if (key := (min(i, j), max(i, j))) in registration.inlier_ratios]
     return WeakestLink(
         smaller_part=tuple(names[index] for index in sorted(min(one, other, key=len))),
         shared_points=int(sum(shared[pair] for pair in across)),
         matches=sum(len(pairs[key].matches) for key in verified),
         inliers=sum(registration.inlier_ratios[key] * len(pairs[key].matches) for key in verified),
-        patches=epipolar_consistency.pooled(scores, config),
     )
 
 

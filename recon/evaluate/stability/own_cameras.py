@@ -30,7 +30,7 @@ def cameras_of(estimate: Estimate) -> tuple[CameraEstimate, ...]:
     bounds, found = estimate.bounds, []
     for camera in estimate.registration.cameras:
         frame = estimate.graph.keyframes[camera.index].frame
-        K = np.diag([camera.focal, camera.focal, 1.0])
+        K = np.diag([*camera.focals, 1.0])
         K[:2, 2] = camera.principal
         of_camera = (camera.T_world_camera, K, frame.width, frame.height, bounds.get(frame.name))
         found.append(CameraEstimate(frame.name, frame.frame_id, *of_camera))

@@ -60,7 +60,7 @@ def _lines(samples: Sequence[Sample], kind: str) -> list[_Line]:
                 lines.append(_Line(sample.scene, centre, camera.errors.centre, camera.inlier_ratio, link, count))
             else:
                 focal = float(np.abs(np.log1p(max(found.focal_pct, -99.0) / 100.0)))
-                lines.append(_Line(sample.scene, focal, sample.evidence.focal, 1.0, 1.0, count))
+                lines.append(_Line(sample.scene, focal, camera.focal, 1.0, 1.0, count))
     return lines
 
 

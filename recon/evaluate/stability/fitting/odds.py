@@ -19,12 +19,8 @@ Array = npt.NDArray[np.float64]
 # Of the slopes: whether more of a measure speaks for the poses, or against them.
 FOR = (
     "inlier_ratio",
-    "camera_inlier_ratio",
     "link_inlier_ratio",
-    "link_points",
     "coverage",
-    "confirmed",
-    "patches",
     "mirrored_cost",
 )
 AGAINST = ("flat_patch", "reflection", "directions", "rotation_bound", "travel_bound")

@@ -42,7 +42,7 @@ class Plan:
     per_kind: int = 2  # windows of each scene, count and stride, at most
     counts: tuple[int, ...] = COUNTS
     seed: int = 0  # of the draw of the windows
-    given_lens: bool = False  # splatnode is told the true intrinsics, as of a calibrated camera
+    told: ours.Told = "nothing"  # of the lens, to splatnode: see `ours.frames_of`
     fresh: bool = False  # measures each window's seconds from photographs on, too
     timeout_s: float = 120.0  # of one method on one window, from the start of its process on
     max_memory_mb: float | None = None  # of the same
@@ -110,7 +110,7 @@ def _results(plan: Plan, todo: Sequence[Job], engine: Engine, folder: Path) -> I
 
 def _work(plan: Plan, job: Job, known: Pieces) -> Work:
     if job.method == OURS:
-        return partial(ours.answered, job.place, job.window, plan.config, plan.fresh, plan.given_lens, known)
+        return partial(ours.answered, job.place, job.window, plan.config, plan.fresh, plan.told, known)
     from splatnode.recon.evaluate.stability.windows import rivals  # needs pycolmap
 
     return partial(rivals.answered, job.place, job.window, job.method, plan.config.seed, plan.fresh, known)
@@ -119,7 +119,7 @@ def _work(plan: Plan, job: Job, known: Pieces) -> Work:
 class _Rows(msgspec.Struct, frozen=True):
     rows: list[Row]
     machine: dict[str, Any] = {}
-    given_lens: bool = False
+    told: ours.Told = "nothing"
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -131,9 +131,8 @@ def _resumed(out: Path, plan: Plan, cores_each: int) -> list[Row]:
     path = out / FILE
     content = _read(path)
     begun = content.rows or (path.exists() and (out / _JOURNAL).exists())
-    if begun and content.given_lens != plan.given_lens:
-        told = "with --given-lens" if content.given_lens else "without --given-lens"
-        raise ValueError(f"{path} holds windows {told}: give another folder with --out DIR")
+    if begun and content.told != plan.told:
+        raise ValueError(f"{path} holds windows with --told {content.told}: give another folder with --out DIR")
     before = content.machine.get("threads")  # which each window had, before a row said so itself
     known = [row.cores or before for row in content.rows if row.seconds is not None]
     check_same_cores([cores for cores in known if cores], cores_each, path)
@@ -156,7 +155,7 @@ def _write(path: Path, plan: Plan, rows: dict[Key, Row], asked: Sequence[Key], c
         "command": command,
         "machine": this_machine(),
         "seed": plan.seed,
-        "given_lens": plan.given_lens,
+        "told": plan.told,
         "summary": summarise(ordered),
         "rows": [{**asdict(row), "right": row.right, "found": row.found.value} for row in ordered],
     }

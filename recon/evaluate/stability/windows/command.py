@@ -32,7 +32,7 @@ def windows(args: argparse.Namespace) -> int:
         methods,
         per_kind=args.per_kind,
         counts=args.counts,
-        given_lens=args.given_lens,
+        told=args.told,
         fresh=args.fresh,
         timeout_s=args.timeout_s,
         max_memory_mb=args.max_memory,

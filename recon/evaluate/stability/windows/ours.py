@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import time
+import zlib
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Literal
 
-from splatnode.capture.frame import Frame
+import numpy as np
+
+from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.config import Config
 from splatnode.recon.estimation import Estimate, estimate_cameras
 from splatnode.recon.evaluate.stability.own_cameras import cameras_of, registered
@@ -22,15 +26,18 @@ from splatnode.recon.matching.match import match
 from splatnode.recon.matching.moving import without_moving
 from splatnode.recon.preparation import load_prior, prepare
 
+Told = Literal["nothing", "exif", "given"]  # of the lens
+EXIF_ERROR = 0.03  # by which EXIF's focal length is off at most, of its logarithm
+
 
 def answered(
-    place: Place, window: Window, config: Config, fresh: bool, given_lens: bool, known: Pieces
+    place: Place, window: Window, config: Config, fresh: bool, told: Told, known: Pieces
 ) -> tuple[Answer, dict[Key, bytes]]:
     """The answer, and what was found for it that is not `known` of the scene. It is called in a process of its own.
 
-    `given_lens`: the true intrinsics come with the photographs; `fresh`: measures the seconds from photographs on, too.
+    `told`: what comes with the photographs, see `frames_of`; `fresh`: measures the seconds from photographs on, too.
     """
-    matcher, frames = load_prior(config).matcher, frames_of(place, window, given_lens)
+    matcher, frames = load_prior(config).matcher, frames_of(place, window, told)
     kept, _, rejected = screen_all(frames, config.screening)
     keyframes = [prepare(frame, config, plain_features(known, frame.name)) for frame in kept]
     graph, found = matched(keyframes, known, config.matching, matcher)
@@ -44,16 +51,22 @@ def answered(
     return Answer(estimate.verdict, cameras, seconds, timed_on, fresh_seconds, fresh_on, evidence), found
 
 
-def frames_of(place: Place, window: Window, given_lens: bool = False) -> list[Frame]:
+def frames_of(place: Place, window: Window, told: Told = "nothing") -> list[Frame]:
     """The photographs without what masks hide; their ids are their positions in the scene.
 
-    Nothing is known about the camera, or with `given_lens` its true intrinsics.
+    Nothing is known about the camera; or the true intrinsics are given; or EXIF tells the focal length alone, within
+    3 %, by one factor for all photographs, as one camera errs.
     """
     frames = []
+    generator = np.random.default_rng([window.start, window.stride, window.count, zlib.crc32(place.name.encode())])
+    factor = float(np.exp(generator.uniform(-EXIF_ERROR, EXIF_ERROR)))
     for frame in place.scene.frames(window.names):
-        index = place.names.index(frame.name)
-        camera = place.scene.cameras[frame.name] if given_lens else None
-        intrinsics = None if camera is None else camera.intrinsics_for(frame.width, frame.height)
+        index, intrinsics = place.names.index(frame.name), None
+        if told != "nothing":
+            intrinsics = place.scene.cameras[frame.name].intrinsics_for(frame.width, frame.height)
+        if told == "exif" and intrinsics is not None:
+            size, focal = (frame.width, frame.height), factor * intrinsics.fx
+            intrinsics = Intrinsics(*size, focal, focal, size[0] / 2, size[1] / 2, "exif")
         frames.append(replace(frame, frame_id=index, stamp_ns=index, intrinsics=intrinsics))
     return frames
 

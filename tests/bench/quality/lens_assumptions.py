@@ -1,0 +1,177 @@
+"""Images that break what is assumed of lenses: `python -m tests.bench lens_assumptions SCENE ... --out FILE`.
+
+For each scene, number of images (3, 6, 12), kind of `recon/evaluate/stability/lens_assumptions.py` and setting (nothing
+told, EXIF right and unchanged, lens given for all), cameras and verdict are estimated from a window that overlaps well,
+and compared with the truth. Wrong is a camera beyond 2.5 times a bound, or beyond 5 degrees or 10 % of the distance
+without the word rough. A trial counts as answered where it is published and not wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+import zlib
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from splatnode.recon.config import Config
+from splatnode.recon.estimation import estimate_cameras
+from splatnode.recon.evaluate.stability.case import frames, world
+from splatnode.recon.evaluate.stability.claim import ROUGH
+from splatnode.recon.evaluate.stability.lens_assumptions import COUNTS, KINDS, SETTINGS, Kind, with_intrinsics
+from splatnode.recon.evaluate.stability.outcome import compare
+from splatnode.recon.evaluate.stability.own_cameras import cameras_of
+from splatnode.recon.evaluate.stability.places import Photo, Place, neighbours, parallel
+from splatnode.recon.evaluate.stability.windows.store import Key, among, matched, plain_features
+from splatnode.recon.evaluate.truth import load_scene
+from splatnode.recon.frames.screening import screen_all
+from splatnode.recon.ladder.ladder import climbed
+from splatnode.recon.matching.moving import without_moving
+from splatnode.recon.preparation import load_prior, prepare
+
+STEP_DEG = 12.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One line of the result. Ratios are errors over bounds, the largest of all cameras; None without an answer."""
+
+    scene: str
+    count: int
+    kind: str
+    setting: str
+    verdict: str
+    published: bool
+    wrong: bool
+    right: bool  # every camera within 2 degrees and 5 % of the spread, published or not
+    num_cameras: int
+    rotation_ratio: float | None
+    centre_ratio: float | None
+    focal_ratio: float | None
+    rotation_bound_deg: float | None  # medians over the cameras
+    centre_bound_percent: float | None
+    focal_bound_percent: float | None
+    worst: str | None
+    seconds: float
+    message: str
+
+
+def window(place: Place, count: int) -> list[Photo]:
+    """Consecutive photographs that overlap well; all the same in every run. Empty where the scene has too few."""
+    starts, stride = neighbours(place.Ts_world_camera, count, STEP_DEG)
+    if not starts:
+        starts, stride = parallel(place.Ts_world_camera, count)
+    if not starts:
+        stride = max(1, min(2, (len(place.names) - 1) // max(1, count - 1)))
+        starts = list(range(len(place.names) - stride * (count - 1)))
+    if not starts:
+        return []
+    generator = np.random.default_rng([count, zlib.crc32(place.name.encode())])
+    start = int(generator.choice(starts))
+    return place.photos([start + stride * index for index in range(count)])
+
+
+def run_trial(photos: Sequence[Photo], kind: Kind, setting: str, known: dict[Key, bytes], config: Config) -> Trial:
+    """`known` keeps features and matches of the photographs by their names, for the next trials of the scene."""
+    generator = np.random.default_rng([len(photos), zlib.crc32(f"{photos[0].place} {kind.name}".encode())])
+    changed = kind.change(with_intrinsics(photos, setting), generator)
+    started = time.perf_counter()
+    kept, _, rejected = screen_all(frames(changed), config.screening)
+    prior = load_prior(config)
+    pieces = {key: known[key] for key in among(known.keys(), [photo.name for photo in changed])}
+    keyframes = [prepare(frame, config, plain_features(pieces, frame.name)) for frame in kept]
+    graph, found = matched(keyframes, pieces, config.matching, prior.matcher)
+    known.update(found)
+    graph = without_moving(graph, prior.matcher)
+    estimate = climbed(estimate_cameras(graph, rejected, config), rejected, config)
+    seconds = time.perf_counter() - started
+    cameras, published = cameras_of(estimate), estimate.verdict.publishable
+    score = compare(cameras, (world(changed),), rough=estimate.verdict.code.value == ROUGH)
+    ratios: dict[str, float] = {}
+    bounds: dict[str, float] = {}
+    worst = None
+    if published and score.errors:
+        for what in ("rotation", "centre", "focal"):
+            each = {e.name: (e.claimed()[what][0] / e.claimed()[what][1]) for e in score.errors if e.claimed()}
+            bounds[what] = float(np.median([e.claimed()[what][1] for e in score.errors if e.claimed()]))
+            ratios[what] = max(each.values(), default=0.0)
+        worst = max(score.errors, key=lambda e: max(x / b for x, b in e.claimed().values()) if e.claimed() else 0).name
+    return Trial(
+        photos[0].place, len(photos), kind.name, setting, estimate.verdict.code.value, published,
+        published and not score.right, score.exact, len(cameras) if published else 0,
+        ratios.get("rotation"), ratios.get("centre"), ratios.get("focal"),
+        bounds.get("rotation"), bounds.get("centre"), bounds.get("focal"), worst, seconds, estimate.verdict.message,
+    )  # fmt: skip
+
+
+def run_scene(
+    folder: Path, counts: Sequence[int], kinds: Sequence[str], settings: Sequence[str], journal: Path | None
+) -> list[Trial]:
+    scene = load_scene(folder)
+    place = Place(scene, tuple(name for name in scene.paths if name in scene.cameras))
+    config, found = Config(), []
+    for count in counts:
+        photos = window(place, count)
+        if not photos:
+            continue
+        caches: dict[str, dict[Key, bytes]] = defaultdict(dict)
+        for setting in settings:
+            for name in kinds:
+                if setting not in KINDS[name].settings:
+                    continue
+                cache = caches["given" if setting == "given" else "centred"]
+                trial = run_trial(photos, KINDS[name], setting, cache, config)
+                found.append(trial)
+                if journal is not None:
+                    with journal.open("a") as lines:
+                        lines.write(json.dumps(asdict(trial)) + "\n")
+    return found
+
+
+def table(trials: Sequence[Trial]) -> Iterator[str]:
+    """Each kind and setting: trials, answered and right, wrong, refused, and the share of those whose clean set is."""
+    clean = {(t.scene, t.count, t.setting) for t in trials if t.kind == "clean" and t.published and not t.wrong}
+    groups: dict[tuple[str, str], list[Trial]] = defaultdict(list)
+    for trial in trials:
+        groups[trial.kind, trial.setting].append(trial)
+    damaged = [t for t in trials if t.kind != "clean"]
+    for (kind, setting), rows in [*groups.items(), (("all damaged", "any"), damaged)]:
+        answerable = [t for t in rows if (t.scene, t.count, t.setting) in clean]
+        good = sum(t.published and not t.wrong for t in answerable)
+        wrong = [t for t in rows if t.wrong]
+        yield (
+            f"{kind:24s} {setting:8s} trials {len(rows):3d}, answered {sum(t.published for t in rows):3d}, "
+            f"wrong {len(wrong):2d}; clean answered {len(answerable):3d}, of these answered and not wrong {good:3d} "
+            f"({100 * good / max(1, len(answerable)):.0f} %)"
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", type=Path, nargs="+")
+    parser.add_argument("--out", type=Path, required=True, help="JSON file; FILE.jsonl beside it grows meanwhile")
+    parser.add_argument("--counts", type=int, nargs="+", default=COUNTS)
+    parser.add_argument("--kinds", nargs="+", default=list(KINDS))
+    parser.add_argument("--settings", nargs="+", default=SETTINGS)
+    parser.add_argument("--processes", type=int, default=2)
+    arguments = parser.parse_args()
+    journal = arguments.out.with_suffix(".jsonl")
+    of_scene = partial(
+        run_scene, counts=arguments.counts, kinds=arguments.kinds, settings=arguments.settings, journal=journal
+    )
+    with ProcessPoolExecutor(arguments.processes) as pool:
+        trials = [trial for found in pool.map(of_scene, arguments.scenes) for trial in found]
+    lines = list(table(trials))
+    arguments.out.write_text(json.dumps({"table": lines, "trials": [asdict(t) for t in trials]}, indent=1))
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()
