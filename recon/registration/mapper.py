@@ -26,7 +26,8 @@ from splatnode.recon.registration import (
 from splatnode.recon.registration.mapping_problem import Lens, MappingProblem, Pair, Pairs, PartialMap, View
 from splatnode.recon.registration.patch_image import PatchImage
 
-_MAX_SPLITS = 3  # rounds in which views get lenses of their own
+_MAX_SPLITS = 4  # rounds in which views get lenses of their own
+_MAX_DOUBTED = 8  # views for which other focal lengths are tried at once
 _DOUBTED_RATIO = 0.9  # inlier ratio of a view below which other focal lengths are tried for it
 _COARSE_PX, _COARSE_ROBUST_PX = 1.0, 4.0  # noise and scale of the robust loss of a coarse search, at REFERENCE_SIDE
 _UNEXPLAINED_BY_PLANE = 1.05  # less the planar share of a pair: above 1, so that a planar pair is better than none
@@ -109,53 +110,52 @@ def build_map(
     finished = finishing.finish(problem, best, images, config.finishing)
     if finished is None:
         return None
-    problem, finished = _with_own_lenses(problem, finished, images, config, pause)
+    problem, finished = give_own_lenses(problem, finished, images, config, pause)
     return as_map(problem, finished, config.incremental.triangulation.max_error_px, len(lenses))
 
 
-def _with_own_lenses(
+def give_own_lenses(
     problem: MappingProblem,
     finished: finishing.Finished,
     images: Sequence[PatchImage],
     config: Config,
-    pause: Callable[[], None],
+    pause: Callable[[], None] = lambda: None,
 ) -> tuple[MappingProblem, finishing.Finished]:
     """Both, with lenses of their own for the views that refute the common one.
 
     First for views that hardly fit and fit better with another focal length, then for those whose observations say so.
     """
-    for search in (_with_other_focals, _with_coarse_lenses):
-        if not _doubted(problem, finished.map, config):
-            break
-        pause()
-        found = search(problem, finished.map, config)
-        again = None if found is None else finishing.finish(*found, images, config.finishing)
-        if found is None or again is None:
-            continue
-        if _score_of(found[0], again.map, config) > _score_of(problem, finished.map, config):
-            problem, finished = found[0], again
+    searches = [_with_other_focals, _with_coarse_lenses]
     for _ in range(_MAX_SPLITS):
         pause()
+        before = finished
+        for search in searches if _doubted(problem, finished.map, config) else ():
+            found = search(problem, finished.map, config)
+            again = None if found is None else finishing.finish(*found, images, config.finishing)
+            if found is None or again is None:
+                continue
+            if _score_of(found[0], again.map, config) > _score_of(problem, finished.map, config):
+                problem, finished = found[0], again
+        searches = [_with_other_focals]
         freed = own_lenses.free(problem, finished.map, finished.loss, config.own_lenses)
-        if not (freed.refuted.any() or freed.displaced.any()):
+        if freed.refuted.any() or freed.displaced.any():
+            apart, partial = own_lenses.split(problem, finished.map, freed, config.own_lenses)
+            again = finishing.finish(apart, partial, images, config.finishing)
+            if again is not None:
+                problem, finished = apart, again
+        if finished is before:
             break
-        apart, partial = own_lenses.split(problem, finished.map, freed, config.own_lenses)
-        partial = incremental.extend(apart, partial, config.incremental)
-        again = finishing.finish(apart, partial, images, config.finishing)
-        if again is None:
-            break
-        problem, finished = apart, again
     return problem, finished
 
 
 def _doubted(problem: MappingProblem, partial: PartialMap, config: Config) -> list[int]:
-    """The views that are not registered, or whose matches hardly fit."""
+    """The views that are not registered, or whose matches hardly fit; those first that fit least."""
     ratios = inliers.inlier_ratios(problem, partial, config.incremental.triangulation.max_error_px)
-    return [
-        view
+    of_view = {
+        view: inliers.pooled_ratio(ratios, problem.pairs, view) if view in partial.registered else 0.0
         for view in range(len(problem.views))
-        if view not in partial.registered or inliers.pooled_ratio(ratios, problem.pairs, view) < _DOUBTED_RATIO
-    ]
+    }
+    return sorted((view for view in of_view if of_view[view] < _DOUBTED_RATIO), key=lambda view: (of_view[view], view))
 
 
 def _with_coarse_lenses(
@@ -180,8 +180,16 @@ def _with_other_focals(
 ) -> tuple[MappingProblem, PartialMap] | None:
     """Both, with other focal lengths for views that hardly fit or do not at all; None where no other one fits."""
     zoomed = {}
-    for view in _doubted(problem, partial, config):
-        focal = resection.own_focal(problem, partial, view, config.incremental.resection)
+    for view in _doubted(problem, partial, config)[:_MAX_DOUBTED]:
+        # Points that the view helped to place where it does not belong must not speak for it.
+        registered = tuple(each for each in partial.registered if each != view)
+        if len(registered) < 2:
+            continue
+        rest = replace(partial, registered=registered)
+        rest = incremental.adjust_quickly(problem, rest, incremental.SETTLED_TOLERANCE, config.incremental)
+        if len(rest.estimate.points) < config.incremental.min_points:
+            continue
+        focal = resection.own_focal(problem, rest, view, config.incremental.resection)
         if focal is not None:
             zoomed[view] = focal
     if not zoomed or len(set(partial.registered) - zoomed.keys()) < 2:

@@ -75,7 +75,7 @@ def free(
     partial: PartialMap,
     loss: bundle.Config,
     config: Config,
-    coarse: triangulation.Config | None,
+    coarse: triangulation.Config | None = None,
 ) -> Freed:
     """The map adjusted with a lens for each view, and which views refute that theirs is common.
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.verification.causes import why_wide
@@ -14,8 +17,29 @@ def accepted(case: Case) -> Verdict:
     left_out = _left_out(case)
     rough = _rough(case)
     if rough:
-        return Verdict(Code.OK_ROUGH, f"{_placed(case)}, roughly: {rough}.", _sharper(case), left_out, publishable=True)
-    return _partial(case, left_out) if left_out else _all_placed(case)
+        message = f"{_placed(case)}, roughly: {rough}."
+        found = Verdict(Code.OK_ROUGH, message, _sharper(case), left_out, publishable=True)
+    else:
+        found = _partial(case, left_out) if left_out else _all_placed(case)
+    lenses = _own_lenses(case)
+    return replace(found, message=f"{found.message} {lenses}") if lenses else found
+
+
+def _own_lenses(case: Case) -> str:
+    """A sentence about images whose lens is not the one that they were taken to share, or that was given."""
+    names = case.graph.names
+    own = {names[camera.index]: camera.focal for camera in case.registration.cameras if camera.own_lens}
+    if not own:
+        return ""
+    others = [camera.focal for camera in case.registration.cameras if not camera.own_lens]
+    beside = f"; the others have {np.median(others):.0f}" if others else ""
+    if len(own) == 1:
+        ((name, focal),) = own.items()
+        return f"{name} has a lens of its own, with a focal length of {focal:.0f} pixels{beside}."
+    least, most = min(own.values()), max(own.values())
+    return (
+        f"{len(own)} images have lenses of their own, with focal lengths of {least:.0f} to {most:.0f} pixels{beside}."
+    )
 
 
 def _left_out(case: Case) -> tuple[str, ...]:

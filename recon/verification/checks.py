@@ -84,6 +84,22 @@ class Case(Judged):
     registration: Registration
 
 
+def given_lens(case: Case) -> Verdict | None:
+    """Most images refute the lens that was given for them: it is wrong, not they."""
+    frames = {camera.index: case.graph.keyframes[camera.index].frame for camera in case.registration.cameras}
+    told = [
+        (camera, given)
+        for camera in case.registration.cameras
+        if (given := frames[camera.index].intrinsics) is not None and given.source in ("given", "calibration")
+    ]
+    refuted = [(camera, given) for camera, given in told if camera.own_lens]
+    if 2 * len(refuted) <= len(told):
+        return None
+    camera, given = max(refuted, key=lambda each: abs(each[0].focal / each[1].fx - 1.0))
+    change = 100 * (camera.focal / given.fx - 1.0)
+    return refuse(refusals.WRONG_FOCAL, case.names, given=given.fx, found=camera.focal, change=change)
+
+
 def given_focal(case: Judged) -> Verdict | None:
     """The photographs contradict a focal length that came with them."""
     doubted = [freed for freed in case.evidence.freed if _contradicted(freed, case.config)]

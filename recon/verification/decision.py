@@ -33,6 +33,7 @@ LIMITS = (  # each asks one piece of the evidence, and decides by itself
 )
 CHECKS = (  # what is surer about the reason comes first; those after the first may take all numbers for finite
     undetermined,
+    checks.given_lens,
     *LIMITS,
     bends_strongly,
     odds,

@@ -66,6 +66,7 @@ def measures(evidence: Evidence, model: ClaimModel) -> dict[str, float]:
     link = evidence.weakest_link
     return {
         "inlier_ratio": _clipped(evidence.inlier_ratio, 0.0, 0.95),
+        "camera_inlier_ratio": _clipped(min(camera.inlier_ratio for camera in cameras), 0.0, 0.95),
         "link_inlier_ratio": _clipped(link.inlier_ratio, 0.0, 1.0),
         "coverage": _log_clipped(min(camera.coverage for camera in cameras), 0.05, 0.5),
         "flat_patch": max(_flat_patch(camera) for camera in cameras),

@@ -66,6 +66,8 @@ def _contradictions(case: Case, against: str) -> Verdict:
         link, inliers = case.evidence.weakest_link, 100 * case.evidence.weakest_link.inlier_ratio
         count, points = len(link.smaller_part), link.shared_points
         return refuse(refusals.WEAKLY_JOINED, (weakest.name,), count=count, points=points, inliers=inliers)
+    if against == "camera_inlier_ratio":
+        return refuse(refusals.CONTRADICTED, (weakest.name,), name=weakest.name, inliers=100 * weakest.inlier_ratio)
     return refuse(refusals.CONTRADICTING, (weakest.name,), inliers=100 * case.evidence.inlier_ratio)
 
 

@@ -128,11 +128,6 @@ SMALL_PART = Refusal(
     "What {name} shares with the others fills only {percent:.0f} % of its picture: too little to tell where it stands.",
     "Add a photograph between {name} and its neighbours.",
 )
-UNCONFIRMED = Refusal(
-    Code.AMBIGUOUS,
-    "{name} could stand elsewhere: only {points} of its points are confirmed by two others.",
-    "Add a photograph between {name} and its neighbours.",
-)
 MOVING = Refusal(
     Code.MOVING_SCENE,
     "One flat thing fits, and the rest does not fit with it ({inliers:.0f} % of the matches): it may have moved.",

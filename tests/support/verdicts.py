@@ -15,7 +15,6 @@ from splatnode.recon.registration.register import RegisteredCamera, Registration
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.verification.cycles import Cycles
 from splatnode.recon.verification.decision import Config, decide
-from splatnode.recon.verification.epipolar_consistency import Score
 from splatnode.recon.verification.errors import Errors, PoseErrors
 from splatnode.recon.verification.evidence import CameraEvidence, Evidence
 from splatnode.recon.verification.lens import Distortion
@@ -24,7 +23,6 @@ from splatnode.recon.verification.weakest_link import WeakestLink
 
 PLAIN, RICH = 20, 2000  # features
 SURE = PoseErrors(Errors(0.05, 0.05, 0.05), Errors(0.001, 0.001, 0.001))
-FOUND, BY_CHANCE = Score(300, 0.8, 0.2), Score(300, 0.2, 0.2)
 
 
 def keyframe(index: int, num_features: int = RICH, size: tuple[int, int] = (64, 48)) -> Keyframe:
@@ -68,7 +66,8 @@ def registration(indices: tuple[int, ...]) -> Registration:
         T_world_camera = np.eye(4)
         T_world_camera[0, 3] = 0.2 * index
         principal, still = np.array([32.0, 24.0]), np.zeros((3, 3))
-        cameras.append(RegisteredCamera(index, T_world_camera, 0, 64.0, principal, np.zeros(2), 0.05, 0.005, still))
+        of_pose = T_world_camera, 0, 64.0, principal, np.zeros(2), 0.05, 0.005, still
+        cameras.append(RegisteredCamera(index, *of_pose, focal_sigma=0.01))
     return Registration(
         cameras=tuple(cameras),
         points=np.zeros((0, 3)),
@@ -84,7 +83,9 @@ def registration(indices: tuple[int, ...]) -> Registration:
 
 def camera(index: int, **what: object) -> CameraEvidence:
     """A camera about which there is no doubt, but for `what`."""
-    return replace(CameraEvidence(f"{index}.png", 1.0, 200, 0.7, 0.5, 1.0, FOUND, SURE), **what)
+    return replace(
+        CameraEvidence(f"{index}.png", 1.0, 200, 0.7, 0.5, 1.0, SURE, Errors(0.01, 0.01, 0.01), False), **what
+    )
 
 
 def unsure(rotation: float = 0.05, centre: float = 0.001) -> PoseErrors:
@@ -96,15 +97,16 @@ def evidence(
     indices: tuple[int, ...], doubtful: dict[int, dict[str, object]] | None = None, **what: object
 ) -> Evidence:
     """Evidence for cameras about which there is no doubt, but for `doubtful` ones and `what` concerns all."""
+    lens = {"focal": what["focal"]} if "focal" in what else {}
     good = Evidence(
-        cameras=tuple(camera(index, **(doubtful or {}).get(index, {})) for index in indices),
+        cameras=tuple(camera(index, **lens, **(doubtful or {}).get(index, {})) for index in indices),
         inlier_ratio=1.0,
-        weakest_link=WeakestLink((f"{indices[-1]}.png",), shared_points=500, matches=200, inliers=200.0, patches=FOUND),
+        weakest_link=WeakestLink((f"{indices[-1]}.png",), shared_points=500, matches=200, inliers=200.0),
         disconnected=(),
         reflection=Reflection(("0.png",), -0.2),
         flatness=0.5,
         mirrored_cost=10.0,
-        cycles=Cycles(1, 0.1, 0.1, 0.1),
+        cycles=Cycles(1, 0.1, 0.1, 0.1, 0.5),
         median_angle_deg=10.0,
         rms_px=0.3,
         focal=Errors(0.01, 0.01, 0.01),

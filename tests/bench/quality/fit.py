@@ -59,6 +59,7 @@ def main() -> None:
 def _windows(results: list[Path], numbers: Mapping[str, Numbers], out: Path) -> None:
     """windows.json of all windows in `results`, judged by the numbers without their scene, its charts and tables."""
     contents = [content for content in map(load, results) if "rows" in content]
+    contents = [content for content in contents if content.get("told", "nothing") == "nothing"]
     rows = [row for content in contents for row in msgspec.convert(content["rows"], list[Row])]
     judged = rejudged([row for row in rows if row.count in COUNTS], numbers)
     records = [{**{name: getattr(row, name) for name in KEPT}, "found": row.found.value} for row in judged]

@@ -13,7 +13,7 @@ import json
 import time
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -24,11 +24,12 @@ import numpy as np
 from splatnode.recon.config import Config
 from splatnode.recon.estimation import estimate_cameras
 from splatnode.recon.evaluate.stability.case import frames, world
-from splatnode.recon.evaluate.stability.claim import ROUGH
+from splatnode.recon.evaluate.stability.claim import ROUGH, CameraError
 from splatnode.recon.evaluate.stability.lens_assumptions import COUNTS, KINDS, SETTINGS, Kind, with_intrinsics
 from splatnode.recon.evaluate.stability.outcome import compare
-from splatnode.recon.evaluate.stability.own_cameras import cameras_of
+from splatnode.recon.evaluate.stability.own_cameras import cameras_of, registered
 from splatnode.recon.evaluate.stability.places import Photo, Place, neighbours, parallel
+from splatnode.recon.evaluate.stability.windows.row import OURS
 from splatnode.recon.evaluate.stability.windows.store import Key, among, matched, plain_features
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.frames.screening import screen_all
@@ -61,6 +62,11 @@ class Trial:
     worst: str | None
     seconds: float
     message: str
+    # As a trial of the stability matrix has them, for `python -m tests.bench fit`
+    method: str
+    note: str
+    errors: tuple[CameraError, ...]  # of the published cameras; of a refusal, of those that were registered
+    evidence: Mapping[str, object] | None
 
 
 def window(place: Place, count: int) -> list[Photo]:
@@ -92,7 +98,8 @@ def run_trial(photos: Sequence[Photo], kind: Kind, setting: str, known: dict[Key
     graph = without_moving(graph, prior.matcher)
     estimate = climbed(estimate_cameras(graph, rejected, config), rejected, config)
     seconds = time.perf_counter() - started
-    cameras, published = cameras_of(estimate), estimate.verdict.publishable
+    estimate, published = registered(estimate, config), estimate.verdict.publishable
+    cameras = cameras_of(estimate)
     score = compare(cameras, (world(changed),), rough=estimate.verdict.code.value == ROUGH)
     ratios: dict[str, float] = {}
     bounds: dict[str, float] = {}
@@ -108,6 +115,8 @@ def run_trial(photos: Sequence[Photo], kind: Kind, setting: str, known: dict[Key
         published and not score.right, score.exact, len(cameras) if published else 0,
         ratios.get("rotation"), ratios.get("centre"), ratios.get("focal"),
         bounds.get("rotation"), bounds.get("centre"), bounds.get("focal"), worst, seconds, estimate.verdict.message,
+        OURS, f"{photos[0].place}, {len(photos)} images: {kind.name}, {setting} told", score.errors,
+        estimate.evidence_record,
     )  # fmt: skip
 
 

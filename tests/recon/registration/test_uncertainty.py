@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from splatnode.recon.geometry import Similarity, umeyama
-from splatnode.recon.registration import bundle, mapper, uncertainty
+from splatnode.recon.registration import bundle, mapper, own_lenses, register, uncertainty
 from splatnode.recon.registration.register import in_first_camera
 from splatnode.recon.result.bounds import axes_of
 from tests.recon.registration.test_bundle import NOISE_PX, PRIOR, problem
@@ -87,8 +87,10 @@ def test_the_covariances_are_in_the_frame_and_unit_of_the_world():
         points=turn(true.points),
     )
     keyframes = graph_of(4).keyframes
+    sure = own_lenses.Config(focal_sigma=0.0, shift_sigma=0.0, radial_sigma=0.0)
+    config = register.Config(mapper=mapper.Config(own_lenses=sure))
     one, other = (
-        in_first_camera(mapper.Map(ALL, of, FIXED_LENS, QUIET, {}, 1.0, 0.3), keyframes, [1.0] * 4)
+        in_first_camera(mapper.Map(ALL, of, FIXED_LENS, QUIET, {}, 1.0, 0.3, 1), keyframes, [1.0] * 4, config)
         for of in (true, moved)
     )
     inside = uncertainty.centre_covariances(true, bundle.covariance(true, FIXED_LENS, QUIET), ALL)

@@ -14,7 +14,6 @@ from splatnode.recon.verification.lens import Distortion, FreedLens
 from splatnode.recon.verification.reflection import Reflection
 from splatnode.recon.verification.weakest_link import WeakestLink
 from tests.support.verdicts import (
-    BY_CHANCE,
     all_pairs,
     evidence,
     graph,
@@ -132,7 +131,7 @@ def test_a_lens_that_bends_the_picture():
 
 
 def test_two_places_that_almost_no_point_joins():
-    link = WeakestLink(names(3, 4), shared_points=3, matches=180, inliers=150.0, patches=BY_CHANCE)
+    link = WeakestLink(names(3, 4), shared_points=3, matches=180, inliers=150.0)
     given = refused(verdict(5, weakest_link=link), Code.SPLIT)
     assert given.frames == names(3, 4)
 

@@ -65,7 +65,7 @@ EVERY_NUMBER = tuple(numbers_of(Evidence))
 
 def test_the_walk_over_types_finds_the_numbers_wherever_they_are():
     for path in (
-        ("cameras", 0, "patches", "share"),
+        ("cameras", 0, "focal", "sigma"),
         ("weakest_link", "shared_points"),
         ("freed", 0, "found"),
         ("rms_px",),

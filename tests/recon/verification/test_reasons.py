@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
+from splatnode.capture.frame import Intrinsics
 from splatnode.recon.evaluate.stability.fitting.odds import FOR
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.result.verdict import Code
@@ -18,7 +20,6 @@ from splatnode.recon.verification.likelihood import OddsModel
 from splatnode.recon.verification.models import Fitted
 from splatnode.recon.verification.reflection import Reflection
 from tests.support.verdicts import (
-    BY_CHANCE,
     all_pairs,
     evidence,
     graph,
@@ -130,7 +131,7 @@ def doubting(measure: str) -> Fitted:
         (
             "directions",
             {2: {"inlier_ratio": 0.45}},
-            {"cycles": Cycles(4, 0.5, 1.0, 25.0)},
+            {"cycles": Cycles(4, 0.5, 1.0, 25.0, 30.0)},
             Code.AMBIGUOUS,
             (2,),
             "disagree by 25 degrees",
@@ -144,8 +145,6 @@ def doubting(measure: str) -> Fitted:
             "The smaller part has 1 of them",
         ),
         ("coverage", {2: {"coverage": 0.06}}, {}, Code.AMBIGUOUS, (2,), "fills only 6 % of its picture"),
-        ("confirmed", {3: {"confirmed": 2}, 1: {"confirmed": 60}}, {}, Code.AMBIGUOUS, (3,), "only 2 of its points"),
-        ("patches", {1: {"patches": BY_CHANCE, "confirmed": 80}}, {}, Code.AMBIGUOUS, (1,), "could stand elsewhere"),
         (
             "mirrored_cost",
             {},
@@ -175,10 +174,24 @@ def test_what_speaks_most_against_the_poses_is_the_reason(measure, what, whole, 
     assert decide(*at, evidence((0, 1, 2, 3)), Config(), doubting(measure)).code == Code.OK
 
 
-def test_frames_through_another_lens_that_do_not_fit_are_named():
-    mixed = registration((0, 1, 2, 3))
-    mixed = replace(mixed, cameras=tuple(replace(camera, lens=int(camera.index == 1)) for camera in mixed.cameras))
-    uncertain = evidence((0, 1, 2, 3), {1: {"inlier_ratio": 0.3, "patches": BY_CHANCE}})
-    doubted = doubting("camera_inlier_ratio")
-    given = refused(decide(graph(4, all_pairs(4)), mixed, uncertain, Config(), doubted), Code.MIXED_CAMERAS)
+def test_frames_of_another_size_that_do_not_fit_are_named():
+    uncertain = evidence((0, 1, 2, 3), {1: {"inlier_ratio": 0.3}})
+    found, doubted = graph(4, all_pairs(4)), doubting("camera_inlier_ratio")
+    keyframes = list(found.keyframes)
+    smaller = np.zeros((30, 40, 3), np.uint8)
+    keyframes[1] = replace(keyframes[1], frame=replace(keyframes[1].frame, image=smaller, intrinsics=None))
+    found = replace(found, keyframes=tuple(keyframes))
+    given = refused(decide(found, registration((0, 1, 2, 3)), uncertain, Config(), doubted), Code.MIXED_CAMERAS)
     assert given.frames == names(1)
+
+
+def test_most_images_that_refute_a_given_lens_refute_its_calibration():
+    found, cameras = graph(4, all_pairs(4)), registration((0, 1, 2, 3))
+    told = Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0, "given")
+    keyframes = [replace(each, frame=replace(each.frame, intrinsics=told)) for each in found.keyframes]
+    found = replace(found, keyframes=tuple(keyframes))
+    for many, code in (((0, 1, 2), Code.FOCAL_SUSPECT), ((1,), Code.OK)):
+        own = [replace(each, own_lens=each.index in many, focal=72.0) for each in cameras.cameras]
+        given = decide(found, replace(cameras, cameras=tuple(own)), evidence((0, 1, 2, 3)), Config())
+        assert given.code == code
+        assert "72" in given.message

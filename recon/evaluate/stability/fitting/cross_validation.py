@@ -47,18 +47,25 @@ def left_out(samples: Sequence[Sample], numbers: Mapping[str, Numbers]) -> list[
 
 
 def report(pairs: Sequence[Judgement]) -> dict[str, object]:
-    """Of windows and of the matrix; of windows by their count of photographs, too."""
-    windows = [pair for pair in pairs if pair[0].window]
+    """Of windows and of the matrix; of windows by their count of photographs and by scene, too."""
+    windows = [pair for pair in pairs if pair[0].window and not pair[0].told]
+    by_scene = {
+        scene: asdict(counts([pair for pair in pairs if pair[0].window and pair[0].scene == scene]))
+        for scene in sorted({sample.scene for sample, _ in windows})
+    }
     by_count = {
         str(count): asdict(counts([pair for pair in windows if pair[0].count == count]))
         for count in sorted({sample.count for sample, _ in windows})
     }
+    right = [(s, numbers) for s, numbers in windows if s.right]
     return {
         "windows": asdict(counts(windows)),
         "windows_by_count": by_count,
+        "windows_by_scene": by_scene,
+        "windows_told": asdict(counts([pair for pair in pairs if pair[0].window and pair[0].told])),
         "matrix": asdict(counts([pair for pair in pairs if not pair[0].window])),
         "beyond": [named(sample) for sample, numbers in pairs if _beyond(sample, numbers)],
-        "right_refused": [named(s) for s, numbers in pairs if s.right and s.window and not published(s, numbers)],
+        "right_refused": [named(s) for s, numbers in right if not published(s, numbers)],
     }
 
 

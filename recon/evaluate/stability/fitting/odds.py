@@ -19,6 +19,7 @@ Array = npt.NDArray[np.float64]
 # Of the slopes: whether more of a measure speaks for the poses, or against them.
 FOR = (
     "inlier_ratio",
+    "camera_inlier_ratio",
     "link_inlier_ratio",
     "coverage",
     "mirrored_cost",

@@ -6,7 +6,7 @@ import gzip
 import json
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ class Sample:
     stood_still: bool  # the pairs alone refused it: the camera only turned, or not even that
     evidence: Evidence
     errors: Mapping[str, CameraError]  # by camera; of those that have a true one
+    told: bool = False  # what EXIF or a calibration says of the lens came with the photographs of a window
 
     @property
     def pair(self) -> bool:
@@ -67,7 +68,9 @@ def read(paths: list[Path]) -> list[Sample]:
         content = load(path)
         if "rows" in content:
             rows = record_of(content["rows"], list[Row])
-            found += [of_window(row) for row in rows if row.method == OURS and row.evidence is not None]
+            told = content.get("told", "nothing") != "nothing"
+            windows = (of_window(row) for row in rows if row.method == OURS and row.evidence is not None)
+            found += [replace(window, told=told) for window in windows]
         elif "trials" in content:
             found += list(_of_trials(content["trials"]))
         else:

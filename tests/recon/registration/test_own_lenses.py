@@ -1,0 +1,146 @@
+"""Images of the built-in place that do not share a lens: each is found with its own, within its bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import lru_cache
+
+import msgspec
+import numpy as np
+import pytest
+
+from splatnode.capture.cameras import synthetic
+from splatnode.recon.config import Config
+from splatnode.recon.estimation import Estimate, estimate_cameras
+from splatnode.recon.evaluate.stability.case import frames, world
+from splatnode.recon.evaluate.stability.lens_assumptions import KINDS, keystone_corrected, with_intrinsics, zoomed
+from splatnode.recon.evaluate.stability.outcome import compare
+from splatnode.recon.evaluate.stability.own_cameras import cameras_of
+from splatnode.recon.evaluate.stability.places import Photo
+from splatnode.recon.evaluate.truth import TrueCamera
+from splatnode.recon.registration import bundle
+from splatnode.recon.registration.register import register
+from tests.support.synthetic import view_graph
+
+pytestmark = pytest.mark.numerical
+
+PLACE = synthetic.Config(views=6, width=640, height=480)
+
+
+@lru_cache(maxsize=1)
+def photographs() -> tuple[Photo, ...]:
+    cameras = synthetic.scene_cameras(PLACE)
+    found = []
+    for frame, (T_world_camera, K) in zip(synthetic.stream(PLACE), cameras, strict=True):
+        found.append(
+            Photo(frame.name, frame.image, TrueCamera(T_world_camera, K, PLACE.width, PLACE.height), "built-in")
+        )
+    return tuple(found)
+
+
+def estimate(photos: Sequence[Photo]) -> Estimate:
+    return estimate_cameras(view_graph(frames(photos)), (), Config())
+
+
+def check_within_bounds(photos: Sequence[Photo], found: Estimate) -> None:
+    cameras = cameras_of(found)
+    assert found.verdict.publishable, found.verdict.message
+    assert len(cameras) == len(photos)
+    score = compare(cameras, (world(photos),))
+    for error in score.errors:
+        for what, (size, bound) in error.claimed().items():
+            assert size <= 1.5 * bound, (error.name, what, size, bound)
+
+
+def own(found: Estimate) -> list[str]:
+    assert found.registration is not None
+    return [found.graph.names[camera.index] for camera in found.registration.cameras if camera.own_lens]
+
+
+def test_images_of_one_lens_keep_it():
+    found = estimate(photographs())
+    check_within_bounds(photographs(), found)
+    assert own(found) == []
+
+
+@pytest.mark.parametrize("factor", [1.05, 1.3, 2.0])
+def test_a_digitally_zoomed_image_gets_a_lens_of_its_own(factor):
+    photos = [zoomed(photo, factor) if index == 3 else photo for index, photo in enumerate(photographs())]
+    found = estimate(photos)
+    check_within_bounds(photos, found)
+    assert photos[3].name in own(found)
+
+
+@pytest.mark.parametrize("setting", ["exif", "given"])
+def test_an_image_that_contradicts_what_is_told_gets_a_lens_of_its_own(setting):
+    told = with_intrinsics(photographs(), setting)
+    photos = [zoomed(photo, 1.1) if index == 2 else photo for index, photo in enumerate(told)]
+    found = estimate(photos)
+    check_within_bounds(photos, found)
+    assert own(found) == [photos[2].name]
+
+
+@pytest.mark.parametrize("kind", ["cameras 1 : 1.12", "breathing 2 %", "all keystone", "all off-centre crops"])
+def test_what_no_image_shares_is_found(kind):
+    photos = KINDS[kind].change(photographs(), np.random.default_rng(0))
+    check_within_bounds(photos, estimate(photos))
+
+
+def test_a_principal_point_that_all_images_have_elsewhere_is_found():
+    photos = [keystone_corrected(photo, 8.0) for photo in photographs()]
+    found = estimate(photos)
+    assert found.registration is not None
+    for camera in found.registration.cameras:
+        true = photos[camera.index].camera
+        assert true is not None
+        assert np.abs(camera.principal - true.K[:2, 2]).max() < 0.02 * PLACE.width
+
+
+def test_tied_lenses_share_what_is_not_refuted():
+    """The information of a tie is that of the difference of two parameters."""
+    count = 3
+    sigmas = np.zeros((count, 6))
+    sigmas[1, 0] = 0.01
+    prior = bundle.LensPrior(
+        np.zeros(count),
+        np.full(count, 0.5),
+        np.zeros((count, 2)),
+        np.zeros(count),
+        ties=bundle.Ties(np.array([-1, 0, -1]), sigmas),
+    )
+    covariance = np.linalg.inv(prior.information[::6, ::6])
+    apart = np.array([1.0, -1.0, 0.0])
+    assert apart @ covariance @ apart == pytest.approx(0.01**2, rel=1e-3)
+    assert covariance[2, 2] == pytest.approx(0.25)
+    fixed = replace(prior, sigmas=np.array([0.0, 0.5, 0.5]))
+    assert fixed.information[0, 0] == 0.0
+    assert fixed.information[6, 6] == pytest.approx(1 / 0.01**2 + 1 / 0.5**2)
+
+
+def test_a_group_has_the_covariance_of_common_and_own():
+    count, own_sigma, common_sigma = 4, 0.02, 0.3
+    common = np.zeros((count, 6))
+    common[:, 0] = common_sigma
+    prior = bundle.LensPrior(
+        np.zeros(count),
+        np.full(count, own_sigma),
+        np.zeros((count, 2)),
+        np.zeros(count),
+        common=bundle.Common(np.zeros(count, np.int64), common),
+    )
+    covariance = np.linalg.inv(prior.information[::6, ::6])
+    assert np.allclose(covariance, own_sigma**2 * np.eye(count) + common_sigma**2)
+    assert prior.free[:, 0].all() and not prior.free[:, 1:].any()
+
+
+def test_what_is_not_refuted_widens_the_covariance():
+    """A lens that is taken to be common may differ a little from image to image."""
+    graph, settings = view_graph(frames(photographs())), Config().registration
+    tight = msgspec.structs.replace(settings.mapper.own_lenses, focal_sigma=1e-5, shift_sigma=1e-5, radial_sigma=1e-5)
+    sure = msgspec.structs.replace(settings, mapper=msgspec.structs.replace(settings.mapper, own_lenses=tight))
+    wide, narrow = (register(graph.keyframes, graph.pairs, each) for each in (settings, sure))
+    assert wide is not None and narrow is not None
+    pairs = list(zip(wide.cameras, narrow.cameras, strict=True))
+    assert all(one.centre_sigma_rel > 1.2 * other.centre_sigma_rel for one, other in pairs)
+    assert all(one.focal_sigma > 1.2 * other.focal_sigma for one, other in pairs)
