@@ -47,7 +47,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     widest_radial: float = 0.1
     widest_aspect: float = 0.3
     # A deviation of at least so many standard errors stays
-    refuted_at: float = 3.5
+    refuted_at: float = 4.25
     # Of what all images have in common where it is given: calibrations differ by as much
     calibrated_focal: float = 0.002  # of log focal
     calibrated_shift: float = 0.001  # of the principal point, as a share of the longer side

@@ -121,8 +121,14 @@ def run_trial(photos: Sequence[Photo], kind: Kind, setting: str, known: dict[Key
 
 
 def run_scene(
-    folder: Path, counts: Sequence[int], kinds: Sequence[str], settings: Sequence[str], journal: Path | None
+    folder: Path,
+    counts: Sequence[int],
+    kinds: Sequence[str],
+    settings: Sequence[str],
+    journal: Path | None,
+    sample: int | None = None,
 ) -> list[Trial]:
+    """`sample`: at most so many kinds for each number of images and setting, drawn at random, besides the clean set."""
     scene = load_scene(folder)
     place = Place(scene, tuple(name for name in scene.paths if name in scene.cameras))
     config, found = Config(), []
@@ -132,9 +138,9 @@ def run_scene(
             continue
         caches: dict[str, dict[Key, bytes]] = defaultdict(dict)
         for setting in settings:
-            for name in kinds:
-                if setting not in KINDS[name].settings:
-                    continue
+            possible = [name for name in kinds if setting in KINDS[name].settings and name != "clean"]
+            drawn = np.random.default_rng([count, zlib.crc32(f"{place.name} {setting}".encode())]).permutation(possible)
+            for name in [*(["clean"] if "clean" in kinds else []), *drawn[:sample].tolist()]:
                 cache = caches["given" if setting == "given" else "centred"]
                 trial = run_trial(photos, KINDS[name], setting, cache, config)
                 found.append(trial)
@@ -169,11 +175,17 @@ def main() -> None:
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS)
     parser.add_argument("--kinds", nargs="+", default=list(KINDS))
     parser.add_argument("--settings", nargs="+", default=SETTINGS)
+    parser.add_argument("--sample", type=int, help="kinds for each scene, number of images and setting, at most")
     parser.add_argument("--processes", type=int, default=2)
     arguments = parser.parse_args()
     journal = arguments.out.with_suffix(".jsonl")
     of_scene = partial(
-        run_scene, counts=arguments.counts, kinds=arguments.kinds, settings=arguments.settings, journal=journal
+        run_scene,
+        counts=arguments.counts,
+        kinds=arguments.kinds,
+        settings=arguments.settings,
+        journal=journal,
+        sample=arguments.sample,
     )
     with ProcessPoolExecutor(arguments.processes) as pool:
         trials = [trial for found in pool.map(of_scene, arguments.scenes) for trial in found]
