@@ -37,11 +37,14 @@ class BoundModel:
     inlier_ratio: float
     link: float  # of the share of matches explained across the weakest link: parts may lean against each other
     count: float  # of the number of cameras
+    own_lens: float = 1.0  # times, where an image has a lens of its own: which images have one is not certain
 
-    def of(self, errors: Errors, count: int, inlier_ratio: float = 1.0, link: float = 1.0) -> float:
+    def of(
+        self, errors: Errors, count: int, inlier_ratio: float = 1.0, link: float = 1.0, own_lens: bool = False
+    ) -> float:
         """The bound in the unit of `errors`: never less than a source says. NaN and infinity stay what they are."""
         sources = {"sigma": errors.sigma, "regions": errors.regions, "profile": errors.profile}
-        product = self.factor * count**self.count
+        product = self.factor * count**self.count * (self.own_lens if own_lens else 1.0)
         product *= max(inlier_ratio, MIN_INLIER_RATIO) ** self.inlier_ratio * max(link, MIN_INLIER_RATIO) ** self.link
         for name, value in sources.items():
             product *= math.hypot(value, self.floor) ** getattr(self, name)
@@ -61,12 +64,12 @@ class ClaimModel:
 def claims(evidence: Evidence, model: ClaimModel) -> dict[str, Bounds]:
     """The bounds of each camera, by its name, with balls for ellipsoids; the distance to the scene is 1."""
     count, link = len(evidence.cameras), evidence.weakest_link.inlier_ratio
-    found = {}
+    own, found = any(camera.own_lens for camera in evidence.cameras), {}
     for camera in evidence.cameras:
-        focal = model.focal.of(camera.focal, count)
-        centre = model.centre.of(camera.errors.centre, count, camera.inlier_ratio, link)
+        focal = model.focal.of(camera.focal, count, own_lens=own)
+        centre = model.centre.of(camera.errors.centre, count, camera.inlier_ratio, link, own)
         found[camera.name] = Bounds(
-            rotation_deg=model.rotation.of(camera.errors.rotation, count, camera.inlier_ratio, link),
+            rotation_deg=model.rotation.of(camera.errors.rotation, count, camera.inlier_ratio, link, own),
             centre=centre,
             centre_percent=100.0 * centre,
             focal_percent=100.0 * math.expm1(min(focal, MAX_LOG_FOCAL)),

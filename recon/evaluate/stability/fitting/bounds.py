@@ -18,6 +18,7 @@ Array = npt.NDArray[np.float64]
 # Of the errors that are fitted: a little more than the 95 % that are claimed, for further scenes differ.
 QUANTILE = 0.955
 RIDGE = 1e-3  # penalty of squared powers, for each camera: where two sources say the same, both count alike
+MIN_OWN_LENSES = 50  # cameras of sets with own lenses, from which on they have a factor of their own
 NEGLIGIBLE = 1e-6  # a smaller power is 0
 # Errors are not told from these: true cameras are no better known. Degrees, of the distance, of log focal.
 FLOORS = {"rotation": 0.1, "centre": 2e-4, "focal": 2e-3}
@@ -33,6 +34,7 @@ class _Line:
     inlier_ratio: float
     link: float
     count: int
+    own_lens: bool  # of any camera of its set
 
 
 def fit(samples: Sequence[Sample]) -> ClaimModel:
@@ -49,18 +51,18 @@ def _lines(samples: Sequence[Sample], kind: str) -> list[_Line]:
     lines = []
     for sample in samples:
         count, link = len(sample.evidence.cameras), sample.evidence.weakest_link.inlier_ratio
+        of_set = link, count, any(camera.own_lens for camera in sample.evidence.cameras)
         for camera in sample.evidence.cameras:
             found = sample.errors[camera.name]
             if kind == "rotation":
-                lines.append(
-                    _Line(sample.scene, found.rotation_deg, camera.errors.rotation, camera.inlier_ratio, link, count)
-                )
+                sizes = found.rotation_deg, camera.errors.rotation
+                lines.append(_Line(sample.scene, *sizes, camera.inlier_ratio, *of_set))
             elif kind == "centre":
                 centre = (found.centre_pct or 0.0) / 100.0
-                lines.append(_Line(sample.scene, centre, camera.errors.centre, camera.inlier_ratio, link, count))
+                lines.append(_Line(sample.scene, centre, camera.errors.centre, camera.inlier_ratio, *of_set))
             else:
                 focal = float(np.abs(np.log1p(max(found.focal_pct, -99.0) / 100.0)))
-                lines.append(_Line(sample.scene, focal, camera.focal, 1.0, 1.0, count))
+                lines.append(_Line(sample.scene, focal, camera.focal, 1.0, 1.0, *of_set[1:]))
     return lines
 
 
@@ -88,9 +90,13 @@ def _fitted(lines: Sequence[_Line], floor: float, profile: bool = False, link: b
     ).x
     powers[1:][~np.array(list(used.values()))] = 0.0
     powers = np.where(np.abs(powers) < NEGLIGIBLE, 0.0, powers)
-    factor = np.exp(powers[0] + _quantile(wanted - design @ powers, weights, QUANTILE))
+    left, own = wanted - design @ powers, np.array([line.own_lens for line in lines])
+    of_common = _quantile(left[~own], weights[~own], QUANTILE)
     found = dict(zip(used, powers[1:], strict=True))
-    return BoundModel(**{name: float(f"{n:.3g}") for name, n in {"factor": factor, "floor": floor, **found}.items()})
+    found |= {"factor": np.exp(powers[0] + of_common), "floor": floor}
+    if own.sum() >= MIN_OWN_LENSES:
+        found["own_lens"] = max(1.0, np.exp(_quantile(left[own], weights[own], QUANTILE) - of_common))
+    return BoundModel(**{name: float(f"{number:.3g}") for name, number in found.items()})
 
 
 def _logarithms(line: _Line, floor: float) -> list[float]:
