@@ -294,7 +294,8 @@ class IncrementalReconstruction:
         if final and estimate.verdict.publishable:
             bound = hits(self.config, self.begun, show.scene, seconds, ended_early=show.verdict is not None)
         made = snapshot(
-            next(self.numbers), estimate.conclusion, show, seconds=seconds, dropped=left_out, budget=bound, final=final
-        )
+            next(self.numbers), estimate.conclusion, show, self.config,
+            seconds=seconds, dropped=left_out, budget=bound, final=final,
+        )  # fmt: skip
         log.info("%s", in_words(made))
         return made
