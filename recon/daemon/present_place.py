@@ -50,6 +50,7 @@ class PresentPlace:
         self._final = FinalResult(store, output)
         self._compared: frozenset[str] = frozenset()  # those of the scene that was compared with the finished ones
         self._exported_s = time.monotonic()
+        self._fallbacks: tuple[tuple[str, str], ...] = ()  # those without a gain that the checkpoint has
         self._shown: Snapshot | None = None  # last
         self.settled = True  # nothing can be made better before the next keyframe
         self.under_way: list[Arrived] = []  # keyframes that are being worked in, and that no scene shows yet
@@ -89,7 +90,7 @@ class PresentPlace:
                 self._take_in_one(one, later)
         finally:
             self.under_way = self.owed
-            self._output.save_fallbacks(self._store, self._work)
+            self._keep_fallbacks()
         self.state = State.LOST if self._strangers() else State.GROWING
 
     def _take_in_together(self, arrived: Sequence[Arrived]) -> list[Arrived]:
@@ -303,7 +304,7 @@ class PresentPlace:
                 try:
                     finishing.judge(self._work, self._forget, self._pause)
                 finally:
-                    self._output.save_fallbacks(self._store, self._work)
+                    self._keep_fallbacks()
             more = self._lost(fitted)
         for keyframes in membership.apart(self._work, self._pause):
             names = [keyframe.name for keyframe in keyframes]
@@ -311,6 +312,12 @@ class PresentPlace:
             self._output.parted(scene, names)
             event(log, logging.INFO, "parted", scene=self._store.scene_id, part=scene, keyframes=len(names))
             self._work.retract(names)
+
+    def _keep_fallbacks(self) -> None:
+        """Writes into the checkpoint which fallbacks gained nothing, where there are others than before."""
+        if self._work.known.memory.fruitless != self._fallbacks:
+            self._fallbacks = self._work.known.memory.fruitless
+            self._output.save_fallbacks(self._store, self._work)
 
     def _settle_judged(self) -> None:
         refined = Shown()

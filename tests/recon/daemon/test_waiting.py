@@ -220,7 +220,7 @@ def test_a_pause_does_not_count_as_fallback_time(monkeypatch):
     assert done
 
 
-def test_what_an_earlier_process_stored_comes_before_what_comes_now_and_counts_as_waiting(config):
+def test_what_an_earlier_process_stored_comes_before_what_comes_now_and_counts_as_waiting(config, monkeypatch):
     with closing(Store(config.checkpoint)) as store:
         recipe, inbox = config.reconstruction, Inbox()
         stored = store_all(store, photographs())
@@ -230,7 +230,7 @@ def test_what_an_earlier_process_stored_comes_before_what_comes_now_and_counts_a
         node._backlog = keyframes[:5]
         inbox.put(keyframes[5], threading.Event())
         taken = []
-        node.place.take_in = taken.append
+        monkeypatch.setattr(node.place, "take_in", taken.append)
         assert node.delay[0] > 0
         for _ in range(3):
             node._turn(0.0)
