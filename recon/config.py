@@ -18,6 +18,7 @@ from splatnode.recon.optimize.control.control import ControlChoice
 from splatnode.recon.priors import classical
 from splatnode.recon.rasterize.device import Device
 from splatnode.recon.registration import config as registration
+from splatnode.recon.result import consistent_depth
 from splatnode.recon.result.export.formats.ply import most_in_ply
 from splatnode.recon.scene import background, completion, denied, initialisation, light, pixelwise, seeding
 from splatnode.recon.verification import decision, verify
@@ -77,6 +78,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     preview: refinement.Config = PREVIEW  # the refinement after each keyframe
     optimize: refinement.Config = refinement.Config()  # the refinement after the last keyframe
     metric: metric.Config = metric.Config()  # the scale in metres of what is published
+    # From how much depth that other views confirm a scene counts as seen, also away from the cameras
+    consistent_depth: consistent_depth.Config = consistent_depth.Config()
     # At most so many in the scene; None: as many as it calls for
     max_gaussians: Annotated[int, Meta(ge=1)] | None = None
     max_mb: Annotated[float, Meta(gt=0)] | None = None  # largest scene.ply, in 10^6 bytes; None: as large as it gets

@@ -22,6 +22,28 @@ def pausing_until(deadline: float | None, pause: Callable[[], None] = lambda: No
     return ask
 
 
+class Timer:
+    """Counts the seconds that work takes without its pauses, and ends it by OutOfTime after `most_s` of them."""
+
+    def __init__(self, most_s: float, pause: Callable[[], None] = lambda: None) -> None:
+        self._most_s, self._pause = most_s, pause
+        self._began_s, self._paused_s = time.monotonic(), 0.0
+
+    @property
+    def spent_s(self) -> float:
+        return time.monotonic() - self._began_s - self._paused_s
+
+    def pause(self) -> None:
+        """What the work calls about once a second: pauses, then raises OutOfTime where the time is spent."""
+        before = time.monotonic()
+        try:
+            self._pause()
+        finally:
+            self._paused_s += time.monotonic() - before
+        if self.spent_s >= self._most_s:
+            raise OutOfTime
+
+
 def is_over(until: float) -> bool:
     """Whether it is `until` or later, a time of `time.monotonic()`; of infinity, which is never, no clock is asked."""
     return until < math.inf and time.monotonic() >= until

@@ -6,19 +6,22 @@ Only steps that take `pause` compute: it is called about once a second at least,
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import logging
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+import math
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.recon.budget import hits
 from splatnode.recon.clock import Clock
 from splatnode.recon.config import Config
+from splatnode.recon.deadline import OutOfTime, Timer
 from splatnode.recon.estimation import Estimate, continued, estimate_cameras, estimate_depth
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.frames.screening import Rejected, Screened
-from splatnode.recon.ladder.ladder import climbed
+from splatnode.recon.ladder.ladder import climbed, fallback_key
 from splatnode.recon.matching.match import completed, matched_soon
 from splatnode.recon.matching.moving import without_moving
 from splatnode.recon.matching.view_graph import ViewGraph
@@ -35,6 +38,7 @@ from splatnode.recon.scene.scene import Scene
 log = logging.getLogger(__name__)
 
 MAX_CAMERA_SHIFT = 0.1  # in median depths: where a new estimate moves a camera further, a scene begins anew
+WORTH_S = 0.1  # of fallbacks that gained nothing, from which on it is worth to remember that
 
 Pause = Callable[[], None]
 
@@ -70,6 +74,7 @@ class IncrementalReconstruction:
         self.clock = Clock()
         self.numbers: Iterator[int] = itertools.count(1)  # of the snapshots
         self.dropped: list[DroppedFrame] = []
+        self._fallback_budget_s = self._fallbacks_left_s = math.inf  # seconds
         check_device(config)
         self._prior = load_prior(config)
         empty = ViewGraph(config.matching)
@@ -200,10 +205,43 @@ class IncrementalReconstruction:
         graph, rejected = without_moving(self.graph, self._prior.matcher, pause=pause), self._known.screened.rejected
         estimate = estimate_cameras(graph, rejected, self.config, pause)
         self.clock.lap("poses")
-        estimate = climbed(estimate, rejected, self.config, pause)
+        estimate = self._with_fallbacks(estimate, rejected, pause)
         self._remember(estimate)
         self.clock.lap("ladder")
         return estimate
+
+    @contextlib.contextmanager
+    def fallback_budget(self, seconds: float) -> Iterator[None]:
+        """Meanwhile all fallbacks together take at most so long; what a `pause` takes does not count."""
+        self._fallback_budget_s = self._fallbacks_left_s = seconds
+        try:
+            yield
+        finally:
+            self._fallback_budget_s = self._fallbacks_left_s = math.inf
+
+    def _with_fallbacks(self, estimate: Estimate, rejected: Sequence[Rejected], pause: Pause) -> Estimate:
+        """The estimate after what else there is to try, unless that gained nothing from the same start before."""
+        start, memory = fallback_key(estimate.graph, self.config), self._known.memory
+        told = memory.recall_fruitless(start)
+        if told is not None:
+            verdict = estimate.verdict
+            return replace(estimate, verdict=replace(verdict, message=verdict.message + told)) if told else estimate
+        left_s = self._fallbacks_left_s
+        if left_s <= 0:
+            return estimate
+        timer, found = Timer(left_s, pause), estimate
+        try:
+            found = climbed(estimate, rejected, self.config, timer.pause)
+        except OutOfTime:
+            log.info("fallbacks ended after %.1f s, all that there were", left_s)
+            if left_s < self._fallback_budget_s:  # others had a part of it: another time there may be more
+                return estimate
+        finally:
+            self._fallbacks_left_s -= timer.spent_s
+        if found.registration is estimate.registration and (found is not estimate or timer.spent_s > WORTH_S):
+            told = found.verdict.message.removeprefix(estimate.verdict.message)
+            self._known = replace(self._known, memory=memory.remember_fruitless(start, told))
+        return found
 
     def estimate_quickly(self) -> Estimate | None:
         """What is remembered, or what continues it with cameras for all keyframes; None without either."""
@@ -294,7 +332,8 @@ class IncrementalReconstruction:
         if final and estimate.verdict.publishable:
             bound = hits(self.config, self.begun, show.scene, seconds, ended_early=show.verdict is not None)
         made = snapshot(
-            next(self.numbers), estimate.conclusion, show, seconds=seconds, dropped=left_out, budget=bound, final=final
-        )
+            next(self.numbers), estimate.conclusion, show, self.config,
+            seconds=seconds, dropped=left_out, budget=bound, final=final,
+        )  # fmt: skip
         log.info("%s", in_words(made))
         return made

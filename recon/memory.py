@@ -11,6 +11,8 @@ REMEMBERED = 8  # estimates: a keyframe that is tried with each of several other
 REMEMBERED_MASKED = 2  # estimates with things that move, whose photographs are copies without these
 REMEMBERED_REFUSED = 100  # sets of keyframes of which nothing came: they need not be tried again
 
+REMEMBERED_FRUITLESS = 200  # starts of fallbacks that gained nothing
+
 Key = tuple[tuple[str, ...], int]  # the keyframes' names, and how many frames were rejected beside them
 
 
@@ -21,6 +23,8 @@ class Memory:
     recent: tuple[tuple[Key, Estimate], ...] = ()
     refused: tuple[frozenset[str], ...] = ()  # sets of keyframes for which a thorough estimate forbade a scene
     proven: frozenset[str] = frozenset()  # keyframes of the last thorough estimate that was publishable
+    # Starts of fallbacks that gained nothing (recon.ladder.ladder.fallback_key), and what the verdict then said of them
+    fruitless: tuple[tuple[str, str], ...] = ()
 
     def recall(self, key: Key) -> Estimate | None:
         """The estimate for just these keyframes, if it is remembered."""
@@ -39,6 +43,15 @@ class Memory:
             return replace(memory, proven=names)
         refused = [known for known in self.refused if known != names]
         return replace(memory, refused=(*refused, names)[-REMEMBERED_REFUSED:])
+
+    def remember_fruitless(self, start: str, told: str) -> Memory:
+        """With a start from which fallbacks gained nothing; `told` is what the verdict says of what was tried."""
+        others = [each for each in self.fruitless if each[0] != start]
+        return replace(self, fruitless=(*others, (start, told))[-REMEMBERED_FRUITLESS:])
+
+    def recall_fruitless(self, start: str) -> str | None:
+        """What was told of fallbacks from this start; None where they were not tried, or gained something."""
+        return dict(self.fruitless).get(start)
 
     def was_refused(self, names: Collection[str]) -> bool:
         """Whether a thorough estimate for these keyframes is known, and forbade a scene."""

@@ -24,6 +24,7 @@ from splatnode.recon.priors.confirmed import confirmed_depths
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.device import chosen
 from splatnode.recon.registration.straightened import straightened
+from splatnode.recon.result.consistent_depth import with_consistent_depth
 from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.scene import denied, growth, light
@@ -143,18 +144,22 @@ def snapshot(
     sequence: int,
     conclusion: Conclusion,
     show: Shown,
+    config: Config,
     *,
     seconds: Mapping[str, float],
     dropped: Collection[DroppedFrame] = (),
     budget: Collection[Hit] = (),
     final: bool = False,
 ) -> Snapshot:
-    """What is known of the cameras, and the scene, now; `seconds` by stage. Only a publishable verdict has a scene."""
+    """What is known of the cameras, and the scene, now; `seconds` by stage. Only a publishable verdict has a scene.
+
+    The verdict says how many of the scene's pixels have multi-view consistent depth.
+    """
     verdict = conclusion.verdict
     if verdict.publishable and show.verdict is not None:
         verdict = show.verdict
     scene = show.scene if verdict.publishable else None
-    return Snapshot(
+    made = Snapshot(
         sequence=sequence,
         verdict=verdict,
         cameras=scene.cameras(conclusion.bounds, conclusion.captured_at) if scene else (),
@@ -174,6 +179,7 @@ def snapshot(
         gains=scene.gains() if scene else {},
         falloffs=_falloffs(scene) if scene else {},
     )
+    return replace(made, verdict=with_consistent_depth(verdict, made.consistent_depth, config.consistent_depth))
 
 
 def _falloffs(scene: Scene) -> dict[str, float]:

@@ -49,7 +49,7 @@ def reconstruct(
     look = looked_at_first(estimate, config)
     clock.lap("points")
     if look is not None:
-        yield snapshot(next(numbers), estimate.conclusion, look, seconds=clock.booked, dropped=dropped)
+        yield snapshot(next(numbers), estimate.conclusion, look, config, seconds=clock.booked, dropped=dropped)
         clock.lap("wait")
     estimate = _with_depth(estimate, prior, config, clock, tell)
     conclusion, begun = estimate.conclusion_to_save, begin_scene(estimate, config)
@@ -127,7 +127,7 @@ def model(
     show = shown(begun, config)
     clock.lap("points")
     if show_begun:
-        yield snapshot(next(numbers), conclusion, show, seconds=clock.booked, dropped=dropped)
+        yield snapshot(next(numbers), conclusion, show, config, seconds=clock.booked, dropped=dropped)
         clock.lap("wait")
 
     def gone_on(done: int) -> None:
@@ -135,10 +135,12 @@ def model(
 
     for show in refined(begun, config, config.optimize, clock.deadline(config.budget_s), gone_on):
         clock.lap("optimise")
-        yield snapshot(next(numbers), conclusion, show, seconds=clock.booked, dropped=dropped)
+        yield snapshot(next(numbers), conclusion, show, config, seconds=clock.booked, dropped=dropped)
         clock.lap("wait")
     bound = hits(config, begun, show.scene, clock.booked, ended_early=show.verdict is not None)
-    yield snapshot(next(numbers), conclusion, show, seconds=clock.booked, dropped=dropped, budget=bound, final=True)
+    yield snapshot(
+        next(numbers), conclusion, show, config, seconds=clock.booked, dropped=dropped, budget=bound, final=True
+    )
 
 
 def reconstruct_stream(frames: Iterable[Frame | DroppedFrame], config: Config) -> Iterator[Snapshot]:

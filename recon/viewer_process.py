@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_SCENE
+from splatnode.capture.messaging.services import RECON_DEPTH, RECON_SCENE
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
+from splatnode.recon.result.depth_message import depth_header
 from splatnode.recon.result.message import to_message
 from splatnode.recon.result.snapshot import Snapshot
 
@@ -48,6 +49,7 @@ class _Stage:
 
     def __init__(self, network: Network) -> None:
         self._server = StateServer(RECON_SCENE, network)
+        self._depths = StateServer(RECON_DEPTH, network)
         self._newest: Snapshot | None = None
         self._closing = False
         self._thread = threading.Thread(target=self._serve, name="audience", daemon=True)
@@ -60,16 +62,21 @@ class _Stage:
         self._closing = True
         self._thread.join()
         self._server.close()
+        self._depths.close()
 
     def show(self, snapshot: Snapshot) -> None:
         self._newest = snapshot
 
     def _serve(self) -> None:
         numbering = Numbering()
+        depth_numbering = Numbering(numbering.session)
         published = None
         while not self._closing:
             newest = self._newest
             if newest is not None and newest is not published:
-                self._server.publish(*to_message(newest, numbering.session, numbering.next()))
+                numbers, session = numbering.next(), numbering.session
+                self._depths.publish(depth_header(newest, session, numbers["sequence"], depth_numbering.next()))
+                self._server.publish(*to_message(newest, session, numbers))
                 published = newest
+            self._depths.serve(0)
             self._server.serve(_SERVE_S)

@@ -105,6 +105,7 @@ def overview_picture(analysis: Analysis, width: int, height: int) -> Image:
     said = [*words.verdict_lines(moment), f"Next view: {words.advice_line(analysis.advice, moment)}"]
     said += [
         *words.bounds_lines(moment),
+        *words.depth_lines(moment),
         *words.place_lines(moment),
         *words.count_lines(moment),
         *words.dropped_lines(moment),

@@ -14,10 +14,11 @@ import numpy.typing as npt
 
 from splatnode.capture.messaging.broadcast import Subscriber
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_SCENE, RECON_STATUS
+from splatnode.capture.messaging.services import RECON_DEPTH, RECON_SCENE, RECON_STATUS
 from splatnode.capture.messaging.state import StateClient
 from splatnode.capture.process.problems import Problems, is_said
 from splatnode.recon.daemon.status import ReconStatus
+from splatnode.recon.result.depth_message import DepthHeader, with_depth
 from splatnode.recon.result.export import viewer_safe
 from splatnode.recon.result.message import CameraRecord, SceneHeader, camera_from, from_message
 from splatnode.recon.result.snapshot import CameraEstimate, Snapshot
@@ -27,6 +28,7 @@ from splatnode.viewer.moment import Moment
 log = logging.getLogger(__name__)
 
 _POLL_S = 0.25
+_DEPTH_S = 0.3  # that a scene waits for the message about its depth; an older node sends none
 
 
 class Source(Protocol):
@@ -75,6 +77,8 @@ class Live:
     def __init__(self, network: Network) -> None:
         """Raises what opening the network raises: NetworkError, KeyFileError."""
         self._client = StateClient(RECON_SCENE, network, SceneHeader)
+        self._depths = StateClient(RECON_DEPTH, network, DepthHeader)
+        self._depth: DepthHeader | None = None  # the newest
         self._heartbeats = Subscriber(RECON_STATUS, network, ReconStatus)
         self._refusals = Problems()
         self._newest: Moment | None = None
@@ -115,6 +119,7 @@ class Live:
             self._lock.notify_all()
         self._thread.join()
         self._client.close()
+        self._depths.close()
         self._heartbeats.close()
 
     def _listen(self) -> None:
@@ -131,7 +136,8 @@ class Live:
                 self.scene = message.header.session, message.header.sequence
                 try:
                     live = from_message(message)
-                    moment = Moment(_safe(live.snapshot), time.monotonic(), live.scene_id)
+                    snapshot = self._with_depth(_safe(live.snapshot), self.scene)
+                    moment = Moment(snapshot, time.monotonic(), live.scene_id)
                 except Exception as error:  # of one scene; the next one may do
                     if is_said(self._refusals.add("scenes that were refused", error)):
                         log.warning("a scene of the node was refused: %s", error)
@@ -143,6 +149,18 @@ class Live:
             with self._lock:
                 self._error = error
                 self._lock.notify_all()
+
+    def _with_depth(self, snapshot: Snapshot, scene: tuple[str, int]) -> Snapshot:
+        """The snapshot of message `scene` with its shares of multi-view consistent depth, if these come in time."""
+        deadline = time.monotonic() + _DEPTH_S
+        while (depth := self._depth) is None or (depth.session, depth.scene_sequence) != scene:
+            if depth is not None and depth.session == scene[0] and depth.scene_sequence > scene[1]:
+                return snapshot  # a newer scene is on its way already
+            message = self._depths.poll(max(0.0, deadline - time.monotonic()))
+            if message is None:
+                return snapshot
+            self._depth = message.header
+        return with_depth(snapshot, depth)
 
 
 def load_result(place: Path, photographs: Path | None = None) -> Moment:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from splatnode.recon.result.bounds_in_words import of_camera, of_cameras
+from splatnode.recon.result.consistent_depth import percent
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.viewer.advice import Advice
 from splatnode.viewer.graph import place_lines as graph_lines
@@ -63,6 +64,32 @@ def bounds_lines(moment: Moment, camera: CameraEstimate | None = None) -> list[s
         return [f"{camera.name}: {of_camera(camera.bounds, snapshot.scale)}"]
     known = of_cameras(snapshot.cameras, snapshot.scale)
     return [f"Cameras: {known}"] if known else []
+
+
+def depth_lines(moment: Moment, camera: CameraEstimate | None = None) -> list[str]:
+    """How many pixels of `camera`, or where there is none, of all, have multi-view consistent depth, if it is known."""
+    if camera is not None:
+        known = camera.consistent_depth
+        return [] if known is None else [f"{camera.name}: other views confirm {percent(known)} of its depth"]
+    total = moment.snapshot.consistent_depth
+    if total is None:
+        return []
+    least = min(view_shares(moment), key=lambda share: share[1])
+    of_all = f"Depth: other views confirm it in {percent(total)} of the pixels"
+    return [f"{of_all}, least in {least[0]}: {percent(least[1])}"]
+
+
+def view_shares(moment: Moment) -> list[tuple[str, float]]:
+    """Each view's name and its share of pixels with multi-view consistent depth, where that is known."""
+    known = ((camera.name, camera.consistent_depth) for camera in moment.snapshot.cameras)
+    return [(name, share) for name, share in known if share is not None]
+
+
+def view_depth_lines(moment: Moment, most: int) -> list[str]:
+    """The share of each view, the smallest first; of more than `most` views the number of the others."""
+    shares = sorted(view_shares(moment), key=lambda share: share[1])
+    lines = [f"{name}: {percent(share)}" for name, share in shares[:most]]
+    return lines + [f"{len(shares) - most} more, with larger shares"] * (len(shares) > most)
 
 
 def dropped_lines(moment: Moment, most: int = _MOST_DROPPED) -> list[str]:

@@ -33,3 +33,4 @@ RECON_STATUS = Service("recon.status", Pattern.BROADCAST, 5)
 RECON_CONTROL = Service("recon.control", Pattern.COMMANDS, 6)
 CAPTURE_CONTROL = Service("capture.control", Pattern.COMMANDS, 7)
 RECON_MAP = Service("recon.map", Pattern.STATE, 8)  # and 9, for requests; where it is configured
+RECON_DEPTH = Service("recon.depth", Pattern.STATE, 10)  # and 11, for requests

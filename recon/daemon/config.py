@@ -36,6 +36,9 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # So many keyframes in a row that do not fit the scene begin a scene of their own, as another place. Higher: a few
     # poor keyframes begin none, but more keyframes of another place are taken before its scene begins.
     lost_after: Annotated[int, msgspec.Meta(ge=3)] = 3
+    # How long making a scene final may look for further matches, all rounds together: what does not belong to the scene
+    # is tried with it in several ways. Higher: a place of weak matches may keep more keyframes, and is final later
+    fallback_s: Annotated[float, msgspec.Meta(ge=0)] = 20.0
     export_every_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0  # between provisional results, while the scene grows
     # Between messages that say how the process is, which `splatnode status` shows
     status_every_s: Annotated[float, msgspec.Meta(gt=0)] = 1.0

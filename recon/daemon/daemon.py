@@ -3,7 +3,7 @@
 intake    capture.keyframes -> checkpoint, acknowledged -> inbox
 worker    inbox -> scenes, saved and exported
 watcher   capture.preview -> has the camera moved?
-main      recon.scene, recon.map, recon.status, recon.control; the service manager; signals
+main      recon.scene, recon.depth, recon.map, recon.status, recon.control; the service manager; signals
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import msgspec
 
 from splatnode.capture.messaging.broadcast import Publisher
 from splatnode.capture.messaging.commands import Answer, CommandServer, Seen
-from splatnode.capture.messaging.services import RECON_CONTROL, RECON_MAP, RECON_SCENE, RECON_STATUS
+from splatnode.capture.messaging.services import RECON_CONTROL, RECON_DEPTH, RECON_MAP, RECON_SCENE, RECON_STATUS
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.capture.process.after_ready import after_ready
@@ -48,6 +48,7 @@ from splatnode.recon.daemon.watcher import Watcher
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.metric.arguments import marker_changes
 from splatnode.recon.result import bounds_in_words
+from splatnode.recon.result.depth_message import depth_header
 from splatnode.recon.result.export.staged import completed
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.message import CameraRecord, camera_record, to_message
@@ -91,6 +92,7 @@ class Daemon:
             make_sure_of_room(_FILES, _THREADS)
             network = config.network
             self._scenes = self._resources.enter_context(StateServer(RECON_SCENE, network))
+            self._depths = self._resources.enter_context(StateServer(RECON_DEPTH, network))
             maps = self._resources.enter_context(StateServer(RECON_MAP, network)) if config.map.live else None
             self._heartbeat = self._resources.enter_context(Publisher(RECON_STATUS, network))
             self._commands = self._resources.enter_context(CommandServer(RECON_CONTROL, network, Command))
@@ -108,6 +110,7 @@ class Daemon:
         self._watcher = Watcher(network, config.tracking, lambda: self._worker.place.finished, self._problems, stopping)
         self._scene_numbers = Numbering()
         session = self._scene_numbers.session
+        self._depth_numbers = Numbering(session)
         self._status_numbers = Numbering(session)
         self._maps = None if maps is None else MapOffer(maps, Numbering(session))
         self._sequence = 0  # of the last scene's message
@@ -135,6 +138,7 @@ class Daemon:
         try:
             while not self._stopping.is_set():
                 self._scenes.serve(SERVE_S)
+                self._depths.serve(0)
                 self._commands.serve(0, self._answer)
                 if self._maps is not None:
                     self._maps.serve()
@@ -184,6 +188,8 @@ class Daemon:
         self._sequence = int(numbers["sequence"])
         try:
             header, arrays = to_message(shown.snapshot, shown.scene_id, numbers)
+            depth = self._depth_numbers.next()
+            self._depths.publish(depth_header(shown.snapshot, shown.scene_id, self._sequence, depth))
             self._scenes.publish(header, arrays)
         except Exception as error:  # of one snapshot; the next one may do
             if is_said(self._problems.add("scenes that could not be shown", f"{type(error).__name__}: {error}")):

@@ -33,9 +33,13 @@ _Step = Callable[[Store, checkpoint.Restored, Pause], bool]
 
 
 class LeftPlaces:
-    def __init__(self, here: Store, config: Config, output: Output, atlas: Atlas) -> None:
-        """`here` is the checkpoint which has left/ in it, `config` how scenes are made."""
+    def __init__(self, here: Store, config: Config, output: Output, atlas: Atlas, fallback_s: float = math.inf) -> None:
+        """`here` is the checkpoint which has left/ in it, `config` how scenes are made.
+
+        Fallbacks take at most `fallback_s` seconds of each step with a place.
+        """
         self._here, self._config, self._output, self._atlas = here, config, output, atlas
+        self._fallback_s = fallback_s
         self._work: IncrementalReconstruction | None = None  # that is being finished
         self._not_before_s: dict[Path, float] = {}  # monotonic, for those that could not be finished
         self._retract_after_s = -math.inf  # monotonic: a keyframe could not be taken out before
@@ -84,7 +88,8 @@ class LeftPlaces:
                 found = checkpoint.restore(store, self._config)
                 self._work = found.work
                 give_back_memory()
-                done = step(store, found, pause)
+                with found.work.fallback_budget(self._fallback_s):
+                    done = step(store, found, pause)
         except OSError as error:
             self._output.complain(
                 f"{folder.name} cannot be finished ({error.strerror or error}): make room on the disk"
@@ -133,6 +138,7 @@ class LeftPlaces:
         else:
             event(log, logging.INFO, "judging", scene=store.scene_id)
             self._weigh(store, found, pause)
+            self._output.save_fallbacks(store, work)
             if not work.estimate_soon(pause).publishable:
                 return self._make(store, found, pause)
             work.update(pause)

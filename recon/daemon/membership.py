@@ -84,6 +84,12 @@ def apart(work: IncrementalReconstruction, pause: Pause = without_pause) -> list
     return [group for group in others if len(group) >= PLACE]
 
 
+def is_split(work: IncrementalReconstruction, pause: Pause = without_pause) -> bool:
+    """Whether the keyframes show several places: groups that verified pairs join to each other, and to no other."""
+    work.complete(pause)
+    return sum(len(group) > 1 for group in work.graph.components()) > 1
+
+
 def prove(work: IncrementalReconstruction, pause: Pause = without_pause) -> None:
     """Estimates thoroughly what was added provisionally and what was set aside: together, else one after the other.
 

@@ -54,6 +54,13 @@ class Output:
         except OSError as error:
             self.complain(f"the scene cannot be saved ({error.strerror}): make room on the disk")
 
+    def save_fallbacks(self, place: Store, work: IncrementalReconstruction) -> None:
+        """Writes which fallbacks gained nothing, so that no process tries them again."""
+        try:
+            checkpoint.save_fallbacks(place, work)
+        except OSError as error:
+            self.complain(f"what was tried cannot be saved ({error.strerror}): make room on the disk")
+
     def export(
         self,
         snapshot: Snapshot,

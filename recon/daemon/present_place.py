@@ -50,6 +50,7 @@ class PresentPlace:
         self._final = FinalResult(store, output)
         self._compared: frozenset[str] = frozenset()  # those of the scene that was compared with the finished ones
         self._exported_s = time.monotonic()
+        self._fallbacks: tuple[tuple[str, str], ...] = ()  # those without a gain that the checkpoint has
         self._shown: Snapshot | None = None  # last
         self.settled = True  # nothing can be made better before the next keyframe
         self.under_way: list[Arrived] = []  # keyframes that are being worked in, and that no scene shows yet
@@ -59,34 +60,63 @@ class PresentPlace:
         self.finished: Finished | None = None  # while no keyframe waits
 
     def go_on(self, found: checkpoint.Restored) -> None:
-        """Goes on where an earlier process was."""
+        """Goes on where an earlier process was. Keyframes that it did not work in come as if they had just arrived."""
         self._work = found.work
         self.settled = found.final or not found.keyframes
         self._final.names = frozenset(self._work.names) if found.final else frozenset()
         if not found.keyframes:
             return
         event(log, logging.INFO, "restored", scene=self._store.scene_id, keyframes=found.keyframes, new=len(found.new))
-        if found.new or self._work.scene is None:
-            self.take_in([Arrived(keyframe, time.monotonic()) for keyframe in found.new])
-        else:
-            self.state = State.IDLE if self.settled else State.GROWING
+        self.settled = self.settled and not found.new
+        self.state = State.IDLE if self.settled else State.GROWING
+        if self._work.scene is not None:
             self._show(final=self.settled)
+        elif not found.new:
+            self.take_in([])
 
     def take_in(self, arrived: Sequence[Arrived]) -> None:
-        """Keyframes that have come, shown together."""
+        """Keyframes that have come, shown together where all belong to one place, else one after the other.
+
+        So the same places come of them as if each had come by itself: of keyframes that waited, those of the next
+        places would else begin one together.
+        """
         self.state, self.settled, self.finished = State.GROWING, False, None
-        arrived = self.owed = self.under_way = self._with_those_before(arrived)
+        self.owed = self.under_way = self._with_those_before(arrived)
         try:
-            keyframes = finishing.screened(self._work, (each.keyframe for each in arrived), self._forget)
-            strangers = self._added(keyframes)
-            self.owed = []
-            if not strangers or len(strangers) < len(keyframes):
-                self._show_grown(arrived)
-            if strangers and self._receive(strangers):
-                self._show_grown(arrived)
+            apart = self._take_in_together(self.owed)
+            self.owed = self.under_way = apart
+            while self.owed:
+                one, *later = self.owed
+                self._take_in_one(one, later)
         finally:
             self.under_way = self.owed
+            self._keep_fallbacks()
         self.state = State.LOST if self._strangers() else State.GROWING
+
+    def _take_in_together(self, arrived: Sequence[Arrived]) -> list[Arrived]:
+        """Works in keyframes, and returns those that are to be worked in one after the other, which it leaves out."""
+        if len(arrived) == 1:
+            return list(arrived)
+        keyframes = finishing.screened(self._work, (each.keyframe for each in arrived), self._forget)
+        standing = self._work.scene is not None
+        strangers = self._added(keyframes)
+        if not standing and keyframes and membership.is_split(self._work, self._unless_stopping):
+            strangers = {keyframe.name for keyframe in keyframes}
+        self._work.retract(strangers)  # they are screened again
+        apart = [each for each in arrived if each.keyframe.name in strangers]
+        self.owed = apart
+        if not strangers or len(strangers) < len(keyframes):
+            self._show_grown(arrived)
+        return apart
+
+    def _take_in_one(self, arrived: Arrived, later: list[Arrived]) -> None:
+        """Works a keyframe in; `later` are those that follow it."""
+        keyframes = finishing.screened(self._work, [arrived.keyframe], self._forget)
+        strangers = self._added(keyframes)
+        self.owed = later
+        if not strangers or self._receive(strangers):
+            self._show_grown([arrived])
+        self.under_way = later
 
     def _with_those_before(self, arrived: Sequence[Arrived]) -> list[Arrived]:
         """Also those keyframes that a step that failed left out, and that nobody has removed since."""
@@ -262,9 +292,34 @@ class PresentPlace:
     def settle(self) -> None:
         """Makes the scene afresh from all keyframes and refines it. Raises Abandoned when something comes."""
         self.state = State.REFINING
-        fitted = set(self._work.names)
-        finishing.judge(self._work, self._forget, self._pause)
-        self._lost(fitted)
+        self._judge()
+        self._settle_judged()
+
+    def _judge(self) -> None:
+        """Weighs all evidence; what shows other places begins others, or becomes places of its own that wait."""
+        more = True
+        while more:
+            fitted = set(self._work.names)
+            with self._work.fallback_budget(self._config.fallback_s):
+                try:
+                    finishing.judge(self._work, self._forget, self._pause)
+                finally:
+                    self._keep_fallbacks()
+            more = self._lost(fitted)
+        for keyframes in membership.apart(self._work, self._pause):
+            names = [keyframe.name for keyframe in keyframes]
+            scene = self._store.part(names, present=True)
+            self._output.parted(scene, names)
+            event(log, logging.INFO, "parted", scene=self._store.scene_id, part=scene, keyframes=len(names))
+            self._work.retract(names)
+
+    def _keep_fallbacks(self) -> None:
+        """Writes into the checkpoint which fallbacks gained nothing, where there are others than before."""
+        if self._work.known.memory.fruitless != self._fallbacks:
+            self._fallbacks = self._work.known.memory.fruitless
+            self._output.save_fallbacks(self._store, self._work)
+
+    def _settle_judged(self) -> None:
         refined = Shown()
         for refined in finishing.refine(self._work, self._recipe, self._pause):
             if refined.scene is not None and refined.scene.iterations in self._recipe.optimize.checkpoints:

@@ -6,7 +6,7 @@ import logging
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import msgspec
 
@@ -19,7 +19,7 @@ from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
 from splatnode.recon.daemon.free_space import FreeSpace, Mapped
-from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
+from splatnode.recon.daemon.inbox import BATCH, Arrived, Event, Inbox, LeftOut
 from splatnode.recon.daemon.left_places import LeftPlaces
 from splatnode.recon.daemon.output import Output, Published
 from splatnode.recon.daemon.present_place import Abandoned, PresentPlace
@@ -50,13 +50,14 @@ class Worker:
         self.place = PresentPlace(config, self._recipe, store, self._output, self._pause)
         self._free_space = FreeSpace(config.map)
         self._atlas = Atlas(store.directory, self._recipe, self._output.places)
-        self._left = LeftPlaces(store, self._recipe, self._output, self._atlas)
+        self._left = LeftPlaces(store, self._recipe, self._output, self._atlas, config.fallback_s)
         self._quiet_since_s = time.monotonic()  # when what came last was worked in
         self._wait_s, self._not_before_s = FIRST_WAIT_S, -math.inf  # for memory or the disk; monotonic
         self._shortage = ""  # the last one that was told
         self.problem = ""
         self.moved_s = time.monotonic()  # when the work last got on
         self.rests = 0  # how often there was nothing to do
+        self._backlog: list[Arrived] = []  # keyframes that an earlier process stored and did not work in
         self.loading = len(store.names)  # keyframes of an earlier process that are not known again yet
 
     @property
@@ -90,7 +91,7 @@ class Worker:
         """How long the oldest keyframe has waited that no scene shows yet, seconds, and what it waits for."""
         if self.loading:
             return time.monotonic() - self._quiet_since_s, f"{_keyframes(self.loading)} being loaded"
-        under_way, waiting = list(self.place.under_way), len(self._inbox)
+        under_way, waiting = [*self.place.under_way, *self._backlog], len(self._inbox)
         oldest_s = under_way[0].at_s if under_way else self._inbox.oldest_s
         if oldest_s is None:
             return 0.0, ""
@@ -101,6 +102,7 @@ class Worker:
         found = self._restored()
         self.loading = 0
         if found is not None:
+            self._backlog = [Arrived(keyframe, time.monotonic()) for keyframe in found.new]
             self._guarded(lambda: self.place.go_on(found))
         give_back_memory()
         while not self._stopping.is_set():
@@ -130,7 +132,7 @@ class Worker:
     def _turn(self, wait_s: float) -> bool:
         """Works in what has come, or makes the scene better if it is time; False where there was nothing to do."""
         self.moved_s = time.monotonic()
-        events = self._inbox.get(wait_s)
+        events = self._next_events(wait_s)
         arrived = [each for each in events if isinstance(each, Arrived)]
         left_out = [each.name for each in events if isinstance(each, LeftOut)]
         now = time.monotonic()
@@ -144,6 +146,13 @@ class Worker:
             self._guarded(lambda: self._take_in([]) if self.place.owed else self.place.settle())
         self._quiet_since_s = time.monotonic()
         return True
+
+    def _next_events(self, wait_s: float) -> Sequence[Event]:
+        """What is worked in next: first what an earlier process stored, as many at a time as if it had just come."""
+        if self._backlog:
+            events, self._backlog = self._backlog[:BATCH], self._backlog[BATCH:]
+            return events
+        return self._inbox.get(wait_s)
 
     def _take_in(self, arrived: list[Arrived]) -> None:
         """A keyframe that was retracted while it was prepared comes after the word of that, and is not taken in."""
@@ -167,7 +176,8 @@ class Worker:
     def _pause(self, until_s: float) -> None:
         """Raises Abandoned if the daemon stops, and from `until_s` (monotonic) on if something has come."""
         self.moved_s = time.monotonic()
-        if self._stopping.is_set() or (len(self._inbox) and self.moved_s > until_s):
+        waiting = len(self._inbox) + len(self._backlog)
+        if self._stopping.is_set() or (waiting and self.moved_s > until_s):
             raise Abandoned
 
     def _guarded(self, step: Callable[[], object], present: bool = True) -> None:

@@ -8,6 +8,7 @@ somebody asked for a deadline.
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import math
 import time
@@ -22,6 +23,7 @@ from splatnode.recon.ladder import learned, tilts
 from splatnode.recon.ladder.better import better
 from splatnode.recon.ladder.others import without_the_doubtful
 from splatnode.recon.ladder.rung import Means, Rung
+from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.result.verdict import Code
 
 log = logging.getLogger(__name__)
@@ -52,6 +54,23 @@ def climbed(
     if _lacks_matches(estimate):
         estimate = _with_more(estimate, rejected, config, pause, rungs, until)
     return estimate if is_over(until) else without_the_doubtful(estimate, rejected, config, pause)
+
+
+def fallback_key(graph: ViewGraph, config: Config, rungs: Sequence[Rung] = RUNGS) -> str:
+    """Identifies what the rungs start from: the keyframes, their matches, the budget, and which rungs are available.
+
+    Rungs that gained nothing gain nothing from an equal start. The key is the same in another process.
+    """
+    digest, names = hashlib.blake2b(digest_size=16), graph.names
+    available = [f"{rung.name}: {rung.obstacle()}" for rung in rungs]
+    for text in (repr(config.ladder), *available, *sorted(names)):
+        digest.update(f"{text}\0".encode(errors="surrogateescape"))
+    by_name = {tuple(sorted((names[i], names[j]))): pair for (i, j), pair in graph.pairs.items()}
+    for pair in sorted(by_name):
+        found = by_name[pair]
+        matched = f"{len(found.matches)}, {found.num_candidates}, {found.log10_nfa!r}"
+        digest.update("\0".join((*pair, matched, "")).encode(errors="surrogateescape"))
+    return digest.hexdigest()
 
 
 def _with_more(

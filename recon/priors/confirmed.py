@@ -35,6 +35,14 @@ def confirmed(pointmaps: Sequence[Pointmap]) -> list[Mask]:
     return each(agrees, range(len(known)))
 
 
+def consistent_shares(masks: Sequence[Mask], used: Sequence[Mask]) -> list[float]:
+    """The share of each view's used pixels (h, w) whose depth is multi-view consistent, by the masks of `confirmed`.
+
+    It is 0 for a view of which nothing is used.
+    """
+    return [float(mask[own].mean()) if own.any() else 0.0 for mask, own in zip(masks, used, strict=True)]
+
+
 def confirmed_depths(pointmaps: Sequence[Pointmap]) -> dict[str, npt.NDArray[np.float16]]:
     """By photograph the depths that another one confirms, one for REDUCTION squared pixels; 0 where there is none.
 

@@ -25,6 +25,7 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
     gaussians = viewer_safe(snapshot.gaussians)
     verdict = snapshot.verdict
     worst = widest(camera.bounds for camera in snapshot.cameras if camera.bounds is not None)
+    share = snapshot.consistent_depth
     stages = {stage: seconds for stage, seconds in snapshot.seconds.items() if stage != "total"}
     return {
         **snapshot.scale.record(),
@@ -39,6 +40,7 @@ def build_report(snapshot: Snapshot, *, seed: int, preset: str, peak_rss_mb: flo
             "provisional": verdict.provisional or not snapshot.final,
         },
         "bounds": None if worst is None else asdict(worst),
+        "consistent_depth": None if share is None else round(share, 4),
         "evidence": snapshot.evidence,
         "seconds": {**stages, "total": snapshot.seconds.get("total", sum(stages.values()))},
         "peak_rss_mb": peak_rss_mb,

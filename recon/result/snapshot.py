@@ -34,6 +34,9 @@ class CameraEstimate:
     # Estimated, of the photograph in full size: its distortion was taken out of the image, whose pinhole is K. None: K
     # is estimated of the photograph as it came, or without the distortion that was given
     lens: Intrinsics | None = None
+    # Share of its pixels, 0 to 1, whose depth is multi-view consistent: a point of another view has it, too. None: not
+    # known, as of a coarse preview
+    consistent_depth: float | None = None
 
     @property
     def K_photographed(self) -> npt.NDArray[np.float64]:
@@ -91,3 +94,13 @@ class Snapshot:
     gains: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # taken out of photographs: red, green, blue
     falloffs: Mapping[str, float] = field(default_factory=dict)  # of lenses that dim their corners, by photograph
     scenes: tuple[str, ...] = ()  # that it was merged of, by scene_id, where it was read from a result
+
+    @property
+    def consistent_depth(self) -> float | None:
+        """The share of all cameras' pixels whose depth is multi-view consistent, 0 to 1: the mean over the cameras.
+
+        None where it is not known of every camera.
+        """
+        shares = [camera.consistent_depth for camera in self.cameras]
+        known = [share for share in shares if share is not None]
+        return sum(known) / len(known) if known and len(known) == len(shares) else None

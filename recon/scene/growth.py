@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import msgspec
@@ -14,7 +14,7 @@ from splatnode.recon.registration.register import Registration
 from splatnode.recon.result.sources import frame_of
 from splatnode.recon.scene import initialisation, light
 from splatnode.recon.scene.gaussians import concatenate
-from splatnode.recon.scene.scene import Scene
+from splatnode.recon.scene.scene import Scene, TrainingView
 from splatnode.recon.scene.told_light import told_logs
 
 NUM_NEIGHBOURS = 3  # views beside a further one that tell what of it is known, hidden or empty: each costs time
@@ -62,15 +62,17 @@ def grow(
         lenses={graph.keyframes[index].name: graph.keyframes[index].lens for index in shown},
     )
     views = tuple(view for view in begun.views if view.name in further)
+    before = tuple(_compared_further(view, begun.views) for view in scene.views)
     ids = torch.tensor([view.frame_id for view in views], dtype=torch.int32)
     fresh = begun.gaussians.subset(torch.isin(frame_of(begun.gaussians.source_frame), ids))
-    return replace(scene, views=scene.views + views, gaussians=concatenate([scene.gaussians, fresh]))
+    return replace(scene, views=before + views, gaussians=concatenate([scene.gaussians, fresh]))
 
 
 def without_views(scene: Scene, names: Collection[str]) -> Scene:
     """The scene without these views and the Gaussians that were seeded from them, in its first camera's world."""
     gone = torch.tensor([view.frame_id for view in scene.views if view.name in names], dtype=torch.int32)
-    views = tuple(view for view in scene.views if view.name not in names)
+    # What the views that go away confirmed is not known of the others any more.
+    views = tuple(replace(view, consistent_depth=None) for view in scene.views if view.name not in names)
     kept = scene.gaussians.subset(~torch.isin(frame_of(scene.gaussians.source_frame), gone))
     if not views:
         return replace(scene, views=(), gaussians=kept)
@@ -82,6 +84,14 @@ def without_views(scene: Scene, names: Collection[str]) -> Scene:
         ),
         gaussians=kept.transformed(1.0, T_camera_world[:3, :3], T_camera_world[:3, 3]),
     )
+
+
+def _compared_further(view: TrainingView, beside: Sequence[TrainingView]) -> TrainingView:
+    """The view with the share that those `beside` it confirm, where that is more: some of what it shares is theirs."""
+    found = next((each.consistent_depth for each in beside if each.name == view.name), None)
+    if found is None or (view.consistent_depth is not None and view.consistent_depth >= found):
+        return view
+    return replace(view, consistent_depth=found)
 
 
 def _falloff(scene: Scene, pointmap: Pointmap) -> float:

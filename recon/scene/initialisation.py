@@ -12,6 +12,7 @@ import torch
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.frames import border
+from splatnode.recon.priors.confirmed import confirmed, consistent_shares
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.scene import background, completion, pixelwise, seeding
 from splatnode.recon.scene.gaussians import Gaussians, concatenate
@@ -52,6 +53,9 @@ def initial_scene(
     valid = border.valid_masks(pictures)
     known_masks = [masks.get(pointmap.name) for pointmap in pointmaps]
     pointmaps = tuple(map(Pointmap.hidden, map(Pointmap.masked, pointmaps, valid), known_masks))
+    used = [rim if mask is None else rim & mask for rim, mask in zip(valid, known_masks, strict=True)]
+    sure = confirmed(pointmaps)
+    shares = consistent_shares(sure, used)
     usable = [each.masked(each.confidence >= config.completion.min_usable_confidence) for each in pointmaps]
     surroundings = "fill" if config.pixelwise is None else config.pixelwise.surroundings
     shells = [] if surroundings == "none" else [_shell(usable, pictures, config)]
@@ -62,13 +66,13 @@ def initial_scene(
     del usable
     if config.pixelwise is not None:
         surfaces = pixelwise.pixelwise_gaussians(dense, pictures, config.pixelwise, limit)
-        return Scene(_views(dense, images, masks, exposures, lenses), concatenate([surfaces, *shells]))
+        return Scene(_views(dense, shares, images, masks, exposures, lenses), concatenate([surfaces, *shells]))
     surfaces = seeding.initial_gaussians(dense, pictures, config.seeding)
     num_unlimited = len(surfaces) + sum(map(len, shells))
     if limit is not None and len(surfaces) > limit:
         surfaces = seeding.initial_gaussians(dense, pictures, config.seeding, limit)
     return Scene(
-        _views(pointmaps, images, masks, exposures, lenses),
+        _views(pointmaps, shares, images, masks, exposures, lenses),
         concatenate([surfaces, *shells]),
         num_unlimited=num_unlimited,
     )
@@ -81,6 +85,7 @@ def _shell(pointmaps: Sequence[Pointmap], pictures: Sequence[Image], config: Con
 
 def _views(
     pointmaps: Sequence[Pointmap],
+    shares: Sequence[float],
     images: Mapping[str, Image],
     masks: Mapping[str, Mask | None],
     exposures: Mapping[str, Exposure],
@@ -97,6 +102,7 @@ def _views(
             mask=masks.get(pointmap.name),
             exposure=exposures.get(pointmap.name),
             lens=lenses.get(pointmap.name),
+            consistent_depth=share,
         )
-        for pointmap in pointmaps
+        for pointmap, share in zip(pointmaps, shares, strict=True)
     )

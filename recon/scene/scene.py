@@ -43,6 +43,8 @@ class TrainingView:
     exposure: Exposure | None = None  # that was taken out of the photograph; None: nothing was
     lens: Intrinsics | None = None  # estimated, whose distortion was taken out of the photograph; None: nothing was
     moved: float = 0.0  # share of the photograph that the mask hides because other views see through it
+    # Share of the pixels that the scene is fitted to whose depth another view confirms; None: nobody has compared them
+    consistent_depth: float | None = None
 
     @property
     def width(self) -> int:
@@ -97,6 +99,7 @@ class Scene:
                 bounds=bounds.get(view.name),
                 captured_at=captured_at.get(view.name),
                 lens=view.lens,
+                consistent_depth=view.consistent_depth,
             )
             for view in self.views
         )

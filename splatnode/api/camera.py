@@ -32,6 +32,9 @@ class Camera:
     lens: Intrinsics | None = None
     bounds: Bounds | None = None  # the claim: its errors are smaller with 95 %; None: nothing is claimed
     captured_at: Stamp | None = None  # nanoseconds, and of which clock; None: nobody knows
+    # Share of the photograph's pixels, 0 to 1, whose depth is multi-view consistent: another view has the same point.
+    # None: not known, as of a coarse preview
+    consistent_depth: float | None = None
 
     @property
     def T_camera_world(self) -> Array:
@@ -63,4 +66,5 @@ def camera_of(estimate: CameraEstimate, lens: Intrinsics | None = None) -> Camer
         lens=lens or estimate.lens,
         bounds=estimate.bounds,
         captured_at=estimate.captured_at,
+        consistent_depth=estimate.consistent_depth,
     )

@@ -77,6 +77,16 @@ class Result:
         return known | {"colours": mean_colours(have.sh), "seen": seen(have.source_frame)}
 
     @property
+    def consistent_depth(self) -> float | None:
+        """The share of all pixels, 0 to 1, whose depth is multi-view consistent: another view has the same point.
+
+        It is the mean of `Camera.consistent_depth` over `cameras`. Where it is small, the scene is measured from its
+        cameras alone and a guess from elsewhere: `verdict.message` says so below the configured limit. None: not
+        known, as of a coarse preview, after a refusal, or where an earlier splatnode wrote the result.
+        """
+        return self._snapshot.consistent_depth
+
+    @property
     def seconds(self) -> dict[str, float]:
         """How long it took, by stage, and `total`."""
         return dict(self._snapshot.seconds)

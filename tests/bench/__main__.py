@@ -51,6 +51,7 @@ BENCHMARKS = {
         "walk_occupancy",
         "metres",
         "motions",
+        "consistent_depth",
     ),
     "speed": ("rasterize", "stereo", "growth", "throughput", "campaign"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),

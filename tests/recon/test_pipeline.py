@@ -24,6 +24,7 @@ from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.optimize import refinement
 from splatnode.recon.pipeline import reconstruct, reconstruct_stream
 from splatnode.recon.rasterize.cpu import rasterize
+from splatnode.recon.result.consistent_depth import percent
 from splatnode.recon.result.preview import render_rgb
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
@@ -143,6 +144,16 @@ def test_cameras_have_the_times_at_which_their_photographs_were_captured(snapsho
 
 def test_a_dropped_frame_is_named_in_the_snapshots_that_follow(streamed):
     assert [snapshot.dropped for snapshot in streamed] == [()] * 3 + [(BLURRED,)] * 6
+
+
+@pytest.mark.parametrize("snapshots", ["at_hand", "streamed"])
+def test_the_verdict_tells_how_much_depth_other_views_confirm(snapshots, request):
+    final = request.getfixturevalue(snapshots)[-1]
+    assert all(0.3 < camera.consistent_depth < 1.0 for camera in final.cameras)
+    told = f"Other views confirm the depth of {percent(final.consistent_depth)} of the pixels."
+    assert final.verdict.message.endswith(told)
+    coarse = request.getfixturevalue("at_hand")[0]
+    assert coarse.consistent_depth is None and "confirm" not in coarse.verdict.message
 
 
 def test_the_first_camera_is_the_world(streamed):

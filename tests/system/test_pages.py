@@ -131,7 +131,7 @@ def test_every_service_state_and_field_of_a_lens_is_told():
     page = text("docs/messages.md")
     offered = [each for each in vars(services).values() if isinstance(each, services.Service)]
     both = [*offered, *(each.requests for each in offered if each.pattern is services.Pattern.STATE)]
-    rows = re.findall(r"^\| `([\w.]+)` \| \w+ \| (\w+) \| \+(\d) \|", page, re.MULTILINE)
+    rows = re.findall(r"^\| `([\w.]+)` \| \w+ \| (\w+) \| \+(\d+) \|", page, re.MULTILINE)
     assert {(each.name, each.pattern.name.lower(), str(each.tcp_port)) for each in both} == set(rows)
     records = (Intrinsics, GivenPose, Motion, Gravity, ExposureSettings)
     of_records = [name for record in records for name in record.__dataclass_fields__]

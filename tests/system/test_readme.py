@@ -11,8 +11,11 @@ import subprocess
 from collections.abc import Callable, Iterable, Sequence
 from statistics import mean, median, quantiles
 
+import numpy as np
 import pytest
+from scipy.stats import spearmanr
 
+from splatnode.recon.result import consistent_depth
 from tests.conftest import ROOT
 from tests.system import race_page
 
@@ -917,6 +920,27 @@ def test_the_table_of_the_readme():
         f"{walk['loops']['loop_links']} loops, none wrong |",
         on=README,
     )
+
+
+def test_consistent_depth():
+    every = list(raw("consistent_depth")["rows"].values())
+    found = [row for row in every if row["consistent_depth"] is not None]
+    pairs = sum(len(row["photographs"]) == 2 for row in every)
+    says(f"{len(every)} small sets of photographs, {len(every) - pairs} of three to twelve views and {pairs} pairs")
+    shares = [100 * row["consistent_depth"] for row in found]
+    says(f"{len(found)} were published; their share is {min(shares):.0f} to {max(shares):.0f} %")
+    limit = consistent_depth.Config().min_share
+    for words, kept in (
+        ("below 45 %", [row for row in found if row["consistent_depth"] < limit]),
+        ("45 % and more", [row for row in found if row["consistent_depth"] >= limit]),
+    ):
+        quality, poor = [row["psnr"] for row in kept], [view["psnr"] < 20 for row in kept for view in row["held_out"]]
+        says(
+            f"| {words} | {len(kept)} | {np.mean(quality):.1f} dB, {min(quality):.1f} to {max(quality):.1f} "
+            f"| {part(float(np.mean([row['ssim'] for row in kept])), 3)} | {100 * np.mean(poor):.0f} % |"
+        )
+    correlation, _ = spearmanr([row["consistent_depth"] for row in found], [row["psnr"] for row in found])
+    says(f"The rank correlation of share and PSNR is {part(float(np.asarray(correlation)), 2)}")
 
 
 def test_needles():

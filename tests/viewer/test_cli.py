@@ -23,10 +23,11 @@ import pytest
 from splatnode import command_line
 from splatnode.capture.messaging.broadcast import Publisher
 from splatnode.capture.messaging.network import Network
-from splatnode.capture.messaging.services import RECON_SCENE, RECON_STATUS
+from splatnode.capture.messaging.services import RECON_DEPTH, RECON_SCENE, RECON_STATUS
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
 from splatnode.recon.result.camera_check import camera_problem
+from splatnode.recon.result.depth_message import depth_header
 from splatnode.recon.result.export import SceneFileError, write_result
 from splatnode.recon.result.message import to_message
 from splatnode.recon.result.report import build_report
@@ -292,6 +293,34 @@ def test_a_viewer_that_comes_late_sees_the_newest_scene(node):
     assert len(there.snapshot.gaussians) == 225 and list(there.snapshot.images) == ["0.png", "1.png"]
     assert source.take() is None and source.age_s is not None and source.age_s < 60
     source.close()
+
+
+@pytest.mark.parametrize("first", ["depth", "scene"])
+def test_a_viewer_joins_the_share_of_confirmed_depth_to_its_scene(node, first):
+    server, network = node
+    scenes, depths = Numbering(), Numbering()
+    made = snapshot()
+    cameras = tuple(replace(each, consistent_depth=0.5 + 0.1 * n) for n, each in enumerate(made.cameras))
+    made = replace(made, cameras=cameras)
+    with StateServer(RECON_DEPTH, network) as of_depth:
+        source = Live(network)
+        publish = [
+            lambda numbers: of_depth.publish(
+                depth_header(made, "place", numbers["sequence"], depths.next() | {"session": numbers["session"]})
+            ),
+            lambda numbers: server.publish(*to_message(made, "place", numbers)),
+        ]
+        deadline = time.monotonic() + 60
+        shares = None
+        while shares != [0.5, 0.6] and time.monotonic() < deadline:
+            numbers = scenes.next()
+            for each in publish if first == "depth" else reversed(publish):
+                each(numbers)
+            of_depth.serve(0.02)
+            if (there := source.take()) is not None:
+                shares = [each.consistent_depth for each in there.snapshot.cameras]
+        assert shares == [0.5, 0.6]
+        source.close()
 
 
 def test_a_viewer_is_told_between_scenes_where_the_live_camera_is(node):

@@ -187,3 +187,16 @@ def test_words_are_plain():
     file = moment(wall(3))
     assert "file" in words.advice_line(None, replace(file, snapshot=replace(file.snapshot, cameras=(), final=True)))
     assert words.time_line(State(), (there,)) == "snapshot 1 of 1, the newest"
+
+
+def test_the_panel_tells_how_much_depth_other_views_confirm_of_a_view_and_of_all():
+    shares = (0.8, 0.35, 0.5)
+    cameras = [replace(camera(0.1 * n, frame_id=n), consistent_depth=share) for n, share in enumerate(shares)]
+    there = moment(wall(3), *cameras)
+    (of_all,) = words.depth_lines(there)
+    assert of_all == "Depth: other views confirm it in 55 % of the pixels, least in 1.png: 35 %"
+    assert words.depth_lines(there, cameras[2]) == ["2.png: other views confirm 50 % of its depth"]
+    assert words.view_depth_lines(there, 2) == ["1.png: 35 %", "2.png: 50 %", "1 more, with larger shares"]
+    unknown = moment(wall(3), camera(0.0))
+    assert words.depth_lines(unknown) == words.depth_lines(unknown, unknown.snapshot.cameras[0]) == []
+    assert words.view_depth_lines(unknown, 2) == []

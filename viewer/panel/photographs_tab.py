@@ -52,7 +52,9 @@ class PhotographsTab:
         self._free.enabled = index >= 0
         self._blend.enabled = session.photograph() is not None
         self._blend.double_value = state.blend
-        self._bounds.say(words.bounds_lines(moment, session.camera()) if index >= 0 else [])
+        camera = session.camera() if index >= 0 else None
+        known = [*words.bounds_lines(moment, camera), *words.depth_lines(moment, camera)]
+        self._bounds.say(known if index >= 0 else [])
         left_out = words.dropped_lines(moment, _MOST_DROPPED)
         self._dropped.say([f"Left out: {len(moment.snapshot.dropped)}", *left_out])
 

@@ -28,7 +28,8 @@ class SceneTab:
         advice = words.advice_line(analysis.advice if analysis else None, moment)
         self._words["advice"].say([f"Next view: {advice}"])
         self._words["scale"].say(words.scale_lines(moment, session.ground()))
-        self._words["bounds"].say(words.bounds_lines(moment, session.camera()))
+        camera = session.camera()
+        self._words["bounds"].say([*words.bounds_lines(moment, camera), *words.depth_lines(moment, camera)])
         self._words["places"].say(words.place_lines(moment))
         rate = [f"{1 / seconds:.0f} pictures/s ({1000 * seconds:.0f} ms each)"] if seconds else []
         feed = words.feed_line(age, moment.snapshot.final) + (", paused" if state.paused else "")

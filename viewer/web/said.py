@@ -10,6 +10,7 @@ from splatnode.viewer import words
 from splatnode.viewer.session import Session
 
 _MOST_DROPPED = 200  # photographs that are listed
+_MOST_VIEWS = 100  # whose share of confirmed depth is listed
 _LONGEST = 2000  # characters of a line
 
 
@@ -21,7 +22,8 @@ def said(session: Session) -> dict[str, Any]:
     snapshot, analysis = moment.snapshot, session.analysis()
     sections = [
         ("Next view", [words.advice_line(analysis.advice if analysis else None, moment)]),
-        ("How well it is known", words.bounds_lines(moment)),
+        ("How well it is known", [*words.bounds_lines(moment), *words.depth_lines(moment)]),
+        ("Depth that other views confirm", words.view_depth_lines(moment, _MOST_VIEWS)),
         ("Places", words.place_lines(moment)),
         ("What there is", words.count_lines(moment)),
         (f"Photographs left out: {len(snapshot.dropped)}", words.dropped_lines(moment, _MOST_DROPPED)),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from splatnode.capture.frame import Frame
 from splatnode.capture.process.memory_shortage import is_shortage
@@ -34,12 +34,20 @@ class Restored:
 def save(store: Store, work: IncrementalReconstruction, final: bool) -> None:
     """Keeps what `work` knows; whether its scene is `final`. Raises OSError."""
     store.save("graph", *saved.graph_message(work.graph))
+    save_fallbacks(store, work)
     estimate = work.remembered()
     if estimate is not None and estimate.publishable:
         store.save("judgement", *saved_estimate.estimate_message(estimate, work.proven))
     if work.scene is not None:
         store.save("pointmaps", *saved_estimate.pointmaps_message(work.known.pointmaps))
         store.save("scene", *saved.scene_message(work.scene, final))
+
+
+def save_fallbacks(store: Store, work: IncrementalReconstruction) -> None:
+    """Keeps which fallbacks gained nothing. Raises OSError."""
+    fruitless = work.known.memory.fruitless
+    if fruitless:
+        store.save("fallbacks", saved_estimate.FallbacksRecord(list(fruitless)), [])
 
 
 def restore(store: Store, config: Config) -> Restored:
@@ -122,9 +130,11 @@ def _screened(graph: ViewGraph) -> Screened:
 
 
 def _memory(store: Store, graph: ViewGraph) -> Memory:
-    """With the estimate of just these keyframes, if the checkpoint has one."""
+    """With the estimate of just these keyframes, if the checkpoint has one, and what gained nothing before."""
+    record = store.load("fallbacks", saved_estimate.FallbacksRecord)
+    memory = Memory(fruitless=() if record is None else tuple(record.header.fruitless))
     record = store.load("judgement", saved_estimate.EstimateRecord)
     if record is None or record.header.names != graph.names:
-        return Memory()
-    estimate = saved_estimate.estimate_from(record, graph)
-    return Memory(recent=(((tuple(graph.names), 0), estimate),), proven=frozenset(record.header.proven))
+        return memory
+    estimate, proven = saved_estimate.estimate_from(record, graph), frozenset(record.header.proven)
+    return replace(memory, recent=(((tuple(graph.names), 0), estimate),), proven=proven)

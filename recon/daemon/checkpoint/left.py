@@ -28,12 +28,13 @@ def keep(directory: Path, ledger: Ledger, files: Iterable[str], instead: str) ->
     _link(directory, directory / LEFT / ledger.scene_id, ledger, files, instead)
 
 
-def part(folder: Path, ledger: Ledger, files: Iterable[str], instead: str) -> None:
-    """Links `files` of a place that was left, in `folder`, into a folder of their own beside it, as `keep` does.
+def part(folder: Path, ledger: Ledger, files: Iterable[str], instead: str, present: bool) -> None:
+    """Links `files` of a place, in `folder`, into a folder of their own among those that were left, as `keep` does.
 
-    One that is there already, from a process that did not get any further, stays as it is.
+    `present`: the place is where the camera is, else one that was left. A part that is there already, from a process
+    that did not get any further, stays as it is.
     """
-    target = folder.with_name(ledger.scene_id)
+    target = folder / LEFT / ledger.scene_id if present else folder.with_name(ledger.scene_id)
     if not (target / LEDGER).exists():
         _link(folder, target, ledger, files, instead)
 
@@ -100,9 +101,13 @@ def remove(folder: Path) -> None:
 
 
 def remove_half_left(directory: Path, place: int) -> None:
-    """Removes half-written files, and folders of places that were not left yet, `place` among them, or removed."""
+    """Removes half-written files, and folders of places that were not left yet, `place` among them, or removed.
+
+    A part of `place` stays: it is a place of its own from the moment when its folder has a ledger.
+    """
     for folder in (directory / LEFT).glob("scene-*"):
-        if _place(folder)[0] >= place or not (folder / LEDGER).exists():
+        number, *part = _place(folder)
+        if number > place or (number == place and not part) or not (folder / LEDGER).exists():
             remove(folder)
     for folder in (*folders(directory), *finished(directory)):
         remove_leftovers(folder)

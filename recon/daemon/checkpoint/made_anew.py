@@ -14,7 +14,7 @@ from splatnode.recon.daemon.checkpoint.ledger import LIMITS
 
 log = logging.getLogger(__name__)
 
-MADE_ANEW = ("graph", "judgement", "scene", "pointmaps")
+MADE_ANEW = ("graph", "judgement", "fallbacks", "scene", "pointmaps")
 SHOWN = ("scene", "pointmaps")  # those of them that only a scene that grows has need of
 
 

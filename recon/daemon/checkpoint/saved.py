@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import msgspec
@@ -44,6 +44,7 @@ class SceneRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gains: list[tuple[float, float, float] | None] = []  # of each view's photograph over its image; empty: of none
     falloffs: list[float] = []  # of each view's lens; empty: none dims its corners
     headroom: float = 1.0
+    consistent_depth: list[float | None] = []  # share of each view's pixels; empty: not known of any
 
 
 def graph_message(graph: ViewGraph) -> tuple[GraphRecord, list[npt.NDArray]]:
@@ -85,7 +86,8 @@ def scene_message(scene: Scene, final: bool) -> tuple[SceneRecord, list[npt.NDAr
     lenses = [view.lens for view in scene.views]
     gains = [view.exposure and view.exposure.gains for view in scene.views]
     falloffs = [view.exposure.falloff if view.exposure else 0.0 for view in scene.views]
-    header = SceneRecord(views, scene.iterations, final, lenses, gains, falloffs, scene.headroom)
+    shares = [view.consistent_depth for view in scene.views]
+    header = SceneRecord(views, scene.iterations, final, lenses, gains, falloffs, scene.headroom, shares)
     return header, [tensor.numpy() for tensor in (*cameras, *gaussians)]
 
 
@@ -106,6 +108,8 @@ def scene_from(message: Message[SceneRecord], keyframes: Mapping[str, Keyframe])
             header.views, lenses, zip(gains, falloffs, strict=True), Ts_world_camera, Ks, strict=True
         )
     )
+    shares = header.consistent_depth or [None] * len(views)
+    views = tuple(replace(view, consistent_depth=share) for view, share in zip(views, shares, strict=True))
     return Scene(views, Gaussians(*gaussians), header.iterations, headroom=header.headroom)
 
 

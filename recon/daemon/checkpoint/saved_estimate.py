@@ -37,6 +37,12 @@ class EstimateRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     numbers: Numbers  # of the registration
 
 
+class FallbacksRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Fallbacks that gained nothing, as recon.memory.Memory has them."""
+
+    fruitless: list[tuple[str, str]]
+
+
 class PointmapsRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Arrays: OF_POINTMAP for each; depths as half floats, confidence and normals in 256 steps.
 

@@ -4,14 +4,15 @@
     frames/<number>     a keyframe as it came; numbers count all keyframes that ever came
     graph               features and matches
     judgement           the cameras that they lead to, the evidence and the verdict
+    fallbacks           what was tried for want of matches, and gained nothing: it is not tried again
     scene               cameras and Gaussians as they are shown
     pointmaps           depth maps of its views, from which it grows
     left/<place>/       a place that was left and whose scene is not final yet: a checkpoint of its own
     finished/<place>/   one whose scene is final: frames, graph and judgement
     codes               in the folder of a place that was left: that it is judged, and by what it is recognised
 
-Graph, judgement, scene and pointmaps are computed again where they are missing. A keyframe is acknowledged once its
-file is there. Every file is whole or not there, and has a checksum. A place is what one scene shows.
+Graph, judgement, fallbacks, scene and pointmaps are computed again where they are missing. A keyframe is acknowledged
+once its file is there. Every file is whole or not there, and has a checksum. A place is what one scene shows.
 """
 
 from __future__ import annotations
@@ -191,8 +192,11 @@ class Store:
             left.keep(self.directory, ledger, [*frames, *made], _INSTEAD)
             self.begin_place(first, shared)
 
-    def part(self, names: Collection[str]) -> str:
-        """Makes a place of its own of frames of this place, which was left; forgets them; its id. Raises OSError."""
+    def part(self, names: Collection[str], present: bool = False) -> str:
+        """Makes a place of its own of frames of this place, forgets them, and returns its id. Raises OSError.
+
+        It waits among the places that were left. `present`: this place is where the camera is, else it was left, too.
+        """
         with self._writing:
             numbers = sorted(self._names[name] for name in names)
             began = {
@@ -203,8 +207,9 @@ class Store:
                 "follows": "",
                 "shared": (),
             }
-            ledger = msgspec.structs.replace(self.ledger, next=self._next, identity=None, **began)
-            left.part(self.directory, ledger, [f"frames/{file_name(number)}" for number in numbers], _INSTEAD)
+            ledger = msgspec.structs.replace(self.ledger, next=self._next, identity=None, retracted=(), **began)
+            frames = [f"frames/{file_name(number)}" for number in numbers]
+            left.part(self.directory, ledger, frames, _INSTEAD, present)
             for name in names:
                 self.forget(name, f"it shows another place: {ledger.scene_id}")
             return ledger.scene_id

@@ -30,6 +30,7 @@ Number = Annotated[float, msgspec.Meta(ge=-MAX_COORDINATE, le=MAX_COORDINATE)]
 Row3: TypeAlias = tuple[Number, Number, Number]
 Row4: TypeAlias = tuple[Number, Number, Number, Number]
 Low = Annotated[float, msgspec.Meta(gt=0, le=1)]
+Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 High = Annotated[float, msgspec.Meta(ge=1, le=MAX_COORDINATE)]
 Text = Annotated[str, msgspec.Meta(max_length=LONGEST_TEXT)]
 
@@ -47,6 +48,11 @@ LENS_MEANING = (
     "picture that K, width and height are of; null: nothing estimated was"
 )
 
+CONSISTENT_DEPTH_MEANING = (
+    "share of the photograph's pixels, 0 to 1, whose depth is multi-view consistent: a point of another view has it, "
+    "too; null: not known"
+)
+
 
 def camera_record(camera: CameraEstimate) -> dict[str, object]:
     """A camera as cameras.json and report.json hold it."""
@@ -60,6 +66,7 @@ def camera_record(camera: CameraEstimate) -> dict[str, object]:
         "height": camera.height,
         "lens": None if camera.lens is None else asdict(camera.lens),
         "bounds": None if camera.bounds is None else asdict(camera.bounds),
+        "consistent_depth": None if camera.consistent_depth is None else round(camera.consistent_depth, 4),
     }
 
 
@@ -78,6 +85,7 @@ def encode_cameras(cameras: Sequence[CameraEstimate], scale: Scale = RELATIVE) -
             "stamp_ns": STAMP_MEANING,
             "lens": LENS_MEANING,
             "bounds": BOUNDS_MEANING,
+            "consistent_depth": CONSISTENT_DEPTH_MEANING,
             "pixel_origin": "the centre of the top-left pixel is (0.5, 0.5)",
             "cameras": [camera_record(camera) for camera in cameras],
         }
@@ -103,6 +111,7 @@ class _Camera(msgspec.Struct, frozen=True):
     stamp_ns: Annotated[int, msgspec.Meta(ge=0, le=LARGEST_NS)] | None = None
     clock: Clock | None = None
     lens: Intrinsics | None = None
+    consistent_depth: Share | None = None
 
 
 class _File(msgspec.Struct, frozen=True):
@@ -156,4 +165,5 @@ def _camera(record: _Camera, name: str) -> CameraEstimate:
     bounds = record.bounds and Bounds(**msgspec.structs.asdict(record.bounds))
     captured_at = None if record.stamp_ns is None or record.clock is None else Stamp(record.stamp_ns, record.clock)
     size = record.width, record.height
-    return CameraEstimate(record.name, record.frame_id, T_world_camera, K, *size, bounds, captured_at, record.lens)
+    known = bounds, captured_at, record.lens, record.consistent_depth
+    return CameraEstimate(record.name, record.frame_id, T_world_camera, K, *size, *known)

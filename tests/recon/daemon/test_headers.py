@@ -24,13 +24,14 @@ from splatnode.capture.right_image import Baseline
 from splatnode.recon.daemon import control
 from splatnode.recon.daemon.status import ReconStatus
 from splatnode.recon.occupancy.message import MapHeader
+from splatnode.recon.result.depth_message import DepthHeader
 from splatnode.recon.result.message import SceneHeader
 
 SCHEMAS = [
     keyframe_messages.FrameHeader, keyframe_messages.DroppedHeader, keyframe_messages.Delivery,
     keyframe_messages.Served, keyframe_messages.Ready, keyframe_messages.Acknowledge, keyframe_messages.Refuse,
     preview.PreviewHeader, status.CaptureStatus, status.Heartbeat, commands.Seen, commands.Answer, control.Retract,
-    Want, ReconStatus, SceneHeader, MapHeader,
+    Want, ReconStatus, SceneHeader, MapHeader, DepthHeader,
 ]  # fmt: skip
 # Their __post_init__ knows all their bounds.
 CHECKED_BY_THEMSELVES = (Intrinsics, GivenPose, Motion, Gravity, ExposureSettings, Baseline)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from splatnode.recon.priors.confirmed import confirmed, confirmed_depths
+from splatnode.recon.priors.confirmed import confirmed, confirmed_depths, consistent_shares
 from tests.support.synthetic import plane_pointmap
 
 WIDTH, HEIGHT = 64, 48
@@ -50,3 +50,13 @@ def test_of_an_odd_side_the_last_pixels_are_left_out():
     odd = replace(wall(), depth=wall().depth[:47, :63], confidence=wall().confidence[:47, :63])
     kept = confirmed_depths([odd, replace(odd, name="again")])[odd.name]
     assert kept.shape == (23, 31) and (kept > 0).all()
+
+
+def test_the_share_of_consistent_depth_is_of_the_pixels_that_are_used():
+    left, right = wall(-0.2), wall(0.2)
+    masks = confirmed([left, right])
+    half = np.zeros((HEIGHT, WIDTH), bool)
+    half[:, 32:] = True  # of the left view the half that both see
+    every, none = np.ones_like(half), np.zeros_like(half)
+    whole, seen, nothing = (consistent_shares([masks[0]], [used])[0] for used in (every, half, none))
+    assert whole == masks[0].mean() and seen == masks[0][:, 32:].mean() > 1.2 * whole and nothing == 0.0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -78,3 +80,18 @@ def test_a_view_that_goes_takes_its_gaussians_along_and_the_next_becomes_the_wor
     kept = scene.gaussians.subset(frame_of(scene.gaussians.source_frame) != 0)
     torch.testing.assert_close(rest.gaussians.means, kept.means - torch.tensor([STEP, 0, 0]), rtol=0, atol=1e-5)
     assert without_views(scene, {"00.png", "01.png", "02.png"}).views == ()
+
+
+def test_growing_tells_how_much_of_the_depth_further_views_confirm_and_a_view_that_goes_takes_that_along():
+    graph = graph_of(4)
+    scene = scene_of(2, graph)
+    scene = replace(scene, views=tuple(replace(view, consistent_depth=0.3) for view in scene.views))
+    grown = grow(scene, maps_of(range(4)), graph, registration_of(4), CONFIG, LIGHT)
+    first, second, third, fourth = (view.consistent_depth for view in grown.views)
+    assert min(first, second, third, fourth) > 0.5  # the views overlap, and show one wall
+    more = replace(grown.views[0], consistent_depth=0.999)  # by views that are no neighbours
+    again = replace(grown, views=(more, *grown.views[1:3]))
+    kept = grow(again, maps_of(range(4)), graph, registration_of(4), CONFIG, LIGHT)
+    assert kept.views[0].consistent_depth == 0.999
+    rest = without_views(grown, {"03.png"})
+    assert [view.consistent_depth for view in rest.views] == [None] * 3

@@ -66,6 +66,8 @@ def test_features_and_pairs_come_back_to_the_bit(graph):
 
 def test_the_scene_comes_back_to_the_bit(graph, scene):
     keyframes = {keyframe.name: keyframe for keyframe in graph.keyframes}
+    first, *others = scene.views
+    scene = replace(scene, views=(replace(first, consistent_depth=0.625), *others))  # of the others it is not known
     found = scene_from(over_the_disk(*scene_message(scene, final=True)), keyframes)
     assert found.iterations == 40
     for field in fields(Gaussians):
@@ -73,6 +75,7 @@ def test_the_scene_comes_back_to_the_bit(graph, scene):
     for one, other in zip(found.views, scene.views, strict=True):
         assert torch.equal(one.T_world_camera, other.T_world_camera) and torch.equal(one.K, other.K)
         assert (one.name, one.frame_id) == (other.name, other.frame_id)
+        assert one.consistent_depth == other.consistent_depth
         assert np.array_equal(one.image, other.image)
     found.gaussians.means.add_(1)  # it can be optimised: its memory is its own
 
