@@ -84,20 +84,14 @@ class Case(Judged):
     registration: Registration
 
 
-def given_lens(case: Case) -> Verdict | None:
+def given_lens(case: Judged) -> Verdict | None:
     """Most images refute the lens that was given for them: it is wrong, not they."""
-    frames = {camera.index: case.graph.keyframes[camera.index].frame for camera in case.registration.cameras}
-    told = [
-        (camera, given)
-        for camera in case.registration.cameras
-        if (given := frames[camera.index].intrinsics) is not None and given.source in ("given", "calibration")
-    ]
-    refuted = [(camera, given) for camera, given in told if camera.own_lens]
-    if 2 * len(refuted) <= len(told):
+    changes = [camera.refuted_focal for camera in case.evidence.cameras if camera.refuted_focal is not None]
+    refuted = [change for change in changes if change != 1.0]
+    if 2 * len(refuted) <= len(changes):
         return None
-    camera, given = max(refuted, key=lambda each: abs(each[0].focal / each[1].fx - 1.0))
-    change = 100 * (camera.focal / given.fx - 1.0)
-    return refuse(refusals.WRONG_FOCAL, case.names, given=given.fx, found=camera.focal, change=change)
+    change = 100 * (float(np.median(refuted)) - 1.0)
+    return refuse(refusals.WRONG_LENS, case.names, refuted=len(refuted), count=len(changes), change=change)
 
 
 def given_focal(case: Judged) -> Verdict | None:

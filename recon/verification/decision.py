@@ -24,6 +24,7 @@ from splatnode.recon.verification.undetermined import undetermined
 __all__ = ["Config", "decide", "refuse_before_registration"]
 
 LIMITS = (  # each asks one piece of the evidence, and decides by itself
+    checks.given_lens,
     checks.given_focal,
     checks.distortion,
     checks.moving_plane,
@@ -33,7 +34,6 @@ LIMITS = (  # each asks one piece of the evidence, and decides by itself
 )
 CHECKS = (  # what is surer about the reason comes first; those after the first may take all numbers for finite
     undetermined,
-    checks.given_lens,
     *LIMITS,
     bends_strongly,
     odds,

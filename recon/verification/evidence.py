@@ -23,7 +23,9 @@ class CameraEvidence:
     gain: float  # of its exposure, over that of most cameras
     errors: PoseErrors
     focal: Errors  # of the logarithm of its focal length
-    own_lens: bool  # it refutes the lens that it was taken to share, or that was given
+    own_lens: bool  # its lens is not what it was taken for: it refutes the one that it shares, or that was given
+    # Of its focal length over the one that a calibration gives, where it refutes that; 1 where it does not; None: none
+    refuted_focal: float | None = None
 
 
 @dataclass(frozen=True)

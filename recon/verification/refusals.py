@@ -74,6 +74,12 @@ WRONG_FOCAL = Refusal(
     "{change:+.0f} %.",
     _CALIBRATION,
 )
+WRONG_LENS = Refusal(
+    Code.FOCAL_SUSPECT,
+    "{refuted} of {count} photographs contradict the lens that was given for them: they ask for other focal lengths, in "
+    "the median {change:+.0f} %.",
+    _CALIBRATION,
+)
 WRONG_FOCAL_BY_VOTE = Refusal(
     Code.FOCAL_SUSPECT,
     "With the given focal length of {given:.0f} pixels the photographs find no place; pairs of them ask for about "

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from splatnode.recon.frames.keyframe import Keyframe
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.registration.inliers import pooled_ratio
-from splatnode.recon.registration.register import Registration
+from splatnode.recon.registration.register import RegisteredCamera, Registration
 from splatnode.recon.verification import (
     cycles,
     errors,
@@ -148,11 +148,19 @@ def _of_cameras(
             gain=gains[camera.index],
             errors=sizes[camera.index],
             focal=focals[camera.index],
-            own_lens=camera.own_lens,
+            own_lens=camera.own_lens or camera.displaced or abs(camera.aspect - 1.0) > refit.SQUARE,
+            refuted_focal=_refuted_focal(camera, keyframes[camera.index]),
         )
         for camera in registration.cameras
         if camera.index in sizes
     )
+
+
+def _refuted_focal(camera: RegisteredCamera, keyframe: Keyframe) -> float | None:
+    given = keyframe.frame.intrinsics
+    if given is None or given.source not in ("given", "calibration"):
+        return None
+    return camera.focal / given.fx if camera.own_lens else 1.0
 
 
 def coverage(keyframe: Keyframe, pixels: Array) -> float:

@@ -24,7 +24,7 @@ FOR = (
     "coverage",
     "mirrored_cost",
 )
-AGAINST = ("flat_patch", "reflection", "directions", "rotation_bound", "travel_bound")
+AGAINST = ("flat_patch", "reflection", "directions", "own_lenses", "rotation_bound", "travel_bound")
 SIGNS = {**dict.fromkeys(FOR, 1), **dict.fromkeys(AGAINST, -1)}
 WRONG_WEIGHT = 4.0  # of a wrong registration beside a right one: there are fewer, and each counts more
 RIDGE = 0.02  # penalty of squared slopes (in standard deviations), for each registration and slope
