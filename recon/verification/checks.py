@@ -86,7 +86,7 @@ class Case(Judged):
 
 def given_lens(case: Judged) -> Verdict | None:
     """Most images refute the lens that was given for them: it is wrong, not they."""
-    changes = [camera.refuted_focal for camera in case.evidence.cameras if camera.refuted_focal is not None]
+    changes = [camera.refuted_focal for camera in case.evidence.cameras if camera.refuted_focal > 0]
     refuted = [change for change in changes if change != 1.0]
     if 2 * len(refuted) <= len(changes):
         return None

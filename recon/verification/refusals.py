@@ -76,8 +76,8 @@ WRONG_FOCAL = Refusal(
 )
 WRONG_LENS = Refusal(
     Code.FOCAL_SUSPECT,
-    "{refuted} of {count} photographs contradict the lens that was given for them: they ask for other focal lengths, in "
-    "the median {change:+.0f} %.",
+    "{refuted} of {count} photographs contradict the lens that was given for them: they ask for other focal lengths, "
+    "in the median {change:+.0f} %.",
     _CALIBRATION,
 )
 WRONG_FOCAL_BY_VOTE = Refusal(

@@ -156,10 +156,10 @@ def _of_cameras(
     )
 
 
-def _refuted_focal(camera: RegisteredCamera, keyframe: Keyframe) -> float | None:
+def _refuted_focal(camera: RegisteredCamera, keyframe: Keyframe) -> float:
     given = keyframe.frame.intrinsics
     if given is None or given.source not in ("given", "calibration"):
-        return None
+        return 0.0
     return camera.focal / given.fx if camera.own_lens else 1.0
 
 
