@@ -24,7 +24,7 @@ class CameraEvidence:
     errors: PoseErrors
     focal: Errors  # of the logarithm of its focal length
     own_lens: bool  # its lens is not what it was taken for: it refutes the one that it shares, or that was given
-    # Of its focal length over the one that a calibration gives, where it refutes that; 1 where it does not; 0: none came
+    # Its focal length over the one that a calibration gives, where it refutes that; 1: it does not; 0: there is none
     refuted_focal: float = 0.0
 
 
