@@ -188,7 +188,7 @@ def _frames(
 
 def in_words_of_range(used: ValueRange) -> str:
     """What is told of images of 16 bits whose values are stretched."""
-    return f"photographs of 16 bits use {used} alone: this range is stretched to 8 bits, alike for all of them"
+    return f"16-bit photographs use only {used}: this range is stretched to 8 bits, alike for all of them"
 
 
 def with_transparency(item: Frame | DroppedFrame, mask: Mask | None) -> Frame | DroppedFrame:

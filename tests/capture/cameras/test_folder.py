@@ -192,10 +192,7 @@ def test_images_of_sixteen_bits_with_twelve_used_are_stretched_alike_and_that_is
     assert np.abs(third.image.astype(int) - PICTURE).mean() < 4
     assert first.encoded is None, "a recording would store the file, whose upper 8 bits are nearly black"
     (told,) = [record.message for record in caplog.records]
-    assert (
-        told
-        == "photographs of 16 bits use 12 of 16 bits alone: this range is stretched to 8 bits, alike for all of them"
-    )
+    assert told == "16-bit photographs use only 12 of 16 bits: this range is stretched to 8 bits, alike for all of them"
 
 
 def test_a_narrow_band_of_sixteen_bits_is_stretched_though_a_pixel_is_hot(tmp_path, caplog):
@@ -203,7 +200,7 @@ def test_a_narrow_band_of_sixteen_bits_is_stretched_though_a_pixel_is_hot(tmp_pa
     thermal[3, 3] = 65_535
     frame = read_frame(tmp_path, "a.png", encoded(".png", thermal))
     assert frame.image.min() < 20 and np.percentile(frame.image, 99) > 220
-    assert "use the values 7" in caplog.text
+    assert "use only the values 7" in caplog.text
 
 
 @pytest.mark.parametrize("suffix", [".jpe", ".jfif", ".JFIF", ".mpo", ".ppm", ".pgm", ".jp2", ".dib"])
