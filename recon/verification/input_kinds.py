@@ -49,8 +49,6 @@ MIN_STATIC_CELLS = 0.15  # of the picture
 MIN_SIDE_CELLS = 0.5  # of the middle half of a quarter along one side, to count that side as standing still
 MIN_STATIC_SIDES = 3  # a robot sees itself at one side, or at two
 MIN_STATIC_PAIRS_RATIO = 0.8  # of the pairs: all of them share the background, however far the thing turned
-MOVING_PX = 5.0  # motion from which on a match moves for sure, pixels at REFERENCE_SIDE
-MIN_MOVING_MATCHES = 40  # of a pair that one geometry explains. Measured: up to 27 by chance where nothing moves
 
 STEREO = Refusal(
     Code.STEREO_IMAGES,
@@ -65,8 +63,8 @@ PANORAMAS = Refusal(
 )
 TURNTABLE = Refusal(
     Code.TURNTABLE,
-    "The camera stood still, and something before it turned: {static} of {of} pairs of photographs share a background "
-    "that does not move, beside a thing that does.",
+    "The camera stood still: {static} of {of} pairs of photographs share a background that does not move. What differs "
+    "turned or moved before it, as on a turntable.",
     "Hide the background by masks (--masks) or by a plain cloth behind and under the thing, or move the camera around "
     "the thing instead of turning it.",
 )
@@ -126,13 +124,12 @@ def measure_seam(image: npt.NDArray[np.uint8]) -> float | None:
 
 @dataclass(frozen=True)
 class StaticPair:
-    """What stands still in two photographs, and what moves."""
+    """What stands still in two photographs."""
 
     matches: int  # that stand still
     ratio: float  # of all matches
     cells: float  # share of the picture's cells in which matches stand still
     sides: int  # of the picture, along which they do
-    moving: int  # matches that move and that one geometry explains
 
     @property
     def has_static_background(self) -> bool:
@@ -151,12 +148,10 @@ def measure_static(graph: ViewGraph, pair: Pair) -> StaticPair:
     cells = _cells(points1[still], size, STATIC_GRID)
     across, down = (count // 4 for count in STATIC_GRID)
     middle = cells[across:-across], cells[:, down:-down]
-    strips = middle[1][:across], middle[1][-across:], middle[0][:, :down], middle[0][:, -down:]
-    sides = sum(bool(strip.mean() >= MIN_SIDE_CELLS) for strip in strips)
-    view, moving = graph.pairs.get((min(pair), max(pair))), 0
-    if view is not None:
-        moving = int((two_view.motion_px(view.points1, view.points2, side) >= MOVING_PX).sum())
-    return StaticPair(int(still.sum()), float(still.mean()) if len(still) else 0.0, float(cells.mean()), sides, moving)
+    strips = middle[0][:, :down], middle[0][:, -down:], middle[1][:across], middle[1][-across:]
+    sides = [bool(strip.mean() >= MIN_SIDE_CELLS) for strip in strips]
+    ratio = float(still.mean()) if len(still) else 0.0
+    return StaticPair(int(still.sum()), ratio, float(cells.mean()), sum(sides))
 
 
 def refuse_stereo_or_panorama(keyframes: Sequence[Keyframe]) -> Verdict | None:
@@ -200,16 +195,17 @@ def _is_stereo(keyframe: Keyframe, layout: StereoLayout) -> bool:
 
 
 def explain_refusal(verdict: Verdict, graph: ViewGraph) -> Verdict:
-    """The verdict; where there is no scene because something turned before a camera that stood still: that one."""
-    if verdict.publishable or not graph.plain:
+    """The verdict; where there is no scene because something turned before a camera that stood still: that one.
+
+    Copies of one photograph were left out before: those that are left differ by something that moved.
+    """
+    if verdict.publishable or verdict.code is Code.STATIC_CAMERA or not graph.plain:
         return verdict
     pairs = [measure_static(graph, pair) for pair in sorted(graph.plain)]
-    static = [pair for pair in pairs if pair.has_static_background]
-    moving = sum(pair.moving >= MIN_MOVING_MATCHES for pair in static)
-    hidden = sum(keyframe.moving > 0.0 for keyframe in graph.keyframes)  # what moves, found before and masked
-    if len(static) < MIN_STATIC_PAIRS_RATIO * len(pairs) or 2 * max(moving, hidden) < len(graph.keyframes):
+    static = sum(pair.has_static_background for pair in pairs)
+    if static < MIN_STATIC_PAIRS_RATIO * len(pairs):
         return verdict
-    return refuse(TURNTABLE, graph.names, static=len(static), of=len(pairs))
+    return refuse(TURNTABLE, graph.names, static=static, of=len(pairs))
 
 
 def _cells(points: Array, size: Array, shape: tuple[int, int]) -> Mask:

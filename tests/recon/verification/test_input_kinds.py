@@ -125,7 +125,8 @@ def test_a_robot_that_sees_itself_and_a_camera_that_stands_still_are_no_turntabl
     assert explain_refusal(REFUSED, graph_of(*renumbered(seen))) is REFUSED
     grains = [np.random.default_rng(seed).normal(size=body.shape) for seed in range(4)]
     still = renumbered(np.clip(body + grain, 0, 255).astype(np.uint8) for grain in grains)
-    assert explain_refusal(REFUSED, graph_of(*still)) is REFUSED
+    copies = Verdict(Code.STATIC_CAMERA, "The camera did not move.", "Step to the side.")
+    assert explain_refusal(copies, graph_of(*still)) is copies
 
 
 def python_in(section: str) -> str:
