@@ -7,6 +7,9 @@ before it allocates the memory.
 
 from __future__ import annotations
 
+import contextlib
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -15,18 +18,22 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture import exif, heif_file
+from splatnode.capture import exif, heif_file, jpeg2000
 from splatnode.capture.exif_time import exif_time
 from splatnode.capture.exposure_settings import ExposureSettings
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.image_header import UnusableImage, read_header
-from splatnode.capture.orientation import ON_ITS_SIDE, ORIENTATION
+from splatnode.capture.image_header import ImageHeader, UnusableImage, read_header
+from splatnode.capture.orientation import ON_ITS_SIDE, ORIENTATION, upright
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.stamp import Stamp
+from splatnode.capture.value_range import Extent, ValueRange, find_range, measure_extent, to_eight_bits
 
 # Of what can be decoded, HEIC and AVIF with the extra heic.
-SUFFIXES = {".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff", ".webp", *heif_file.SUFFIXES}
+_JPEG_SUFFIXES = {".jpg", ".jpeg", ".jpe", ".jfif", ".jif", ".mpo"}
+_MAYBE_DEEP_SUFFIXES = {".png", ".tif", ".tiff", ".ppm", ".pgm", ".pnm"}  # which may have 16 bits a channel
+SUFFIXES = {*_JPEG_SUFFIXES, *_MAYBE_DEEP_SUFFIXES, ".bmp", ".dib", ".webp", *jpeg2000.SUFFIXES, *heif_file.SUFFIXES}
+_MAX_MEASURED = 30  # files of a set whose values are looked at before the first is decoded
 MAX_PIXELS = 100_000_000  # of an image, unless another limit is given
 MaxPixels = Annotated[int, msgspec.Meta(ge=1, le=1 << 30)]  # of a configuration; OpenCV decodes no more
 BYTES_A_PIXEL = 16  # of memory at most beside the file itself, until an image is decoded; afterwards it has 3
@@ -41,6 +48,7 @@ class DecodedImage(NamedTuple):
     intrinsics: Intrinsics | None
     captured_at: Stamp | None
     exposure: ExposureSettings | None
+    mask: npt.NDArray[np.bool_] | None = None  # (H, W), False where alpha is 0; None: it hides nothing
 
 
 def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
@@ -51,51 +59,81 @@ def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
     return read_bounded(path, _FILE_BYTES_A_PIXEL * max_pixels + _FURTHER_FILE_BYTES, UnusableImage)
 
 
-def decode_photograph(data: bytes, max_pixels: int = MAX_PIXELS) -> DecodedImage:
-    """As `decode_image`, of a file that a person put there: HEIC and AVIF are decoded, too, in a process of their own.
+def decode_photograph(data: bytes, max_pixels: int = MAX_PIXELS, used: ValueRange | None = None) -> DecodedImage:
+    """As `decode_image`, of a file that a person put there: HEIC, AVIF and JPEG 2000, too, in a process of their own.
 
     What another process sent goes to `decode_image`. Raises UnusableImage.
     """
-    if not heif_file.is_heif(data):
-        return decode_image(data, max_pixels)
-    image, tiff = heif_file.decode(data, max_pixels)
-    return _with_exif(image, tiff)
+    if heif_file.is_heif(data):
+        return _with_exif(*heif_file.decode(data, max_pixels))
+    if jpeg2000.is_jpeg2000(data):
+        return _with_exif(jpeg2000.decode(data, max_pixels), b"")
+    return decode_image(data, max_pixels, used)
 
 
 def check_whole(data: bytes) -> None:
     """Raises UnusableImage where an image file is not complete, or is none."""
     if heif_file.is_heif(data):
         heif_file.check_whole(data)
+    elif jpeg2000.is_jpeg2000(data):
+        jpeg2000.check_whole(data)
     else:
         read_header(data)
 
 
 def upright_size(data: bytes) -> tuple[int, int] | None:
     """Width and height that an image file is decoded to; None where only decoding it tells. Raises UnusableImage."""
-    if heif_file.is_heif(data):
+    if heif_file.is_heif(data) or jpeg2000.is_jpeg2000(data):
         return None
     header = read_header(data)
     turned = (exif.first(exif.read_tags(header.exif), ORIENTATION) or 1) in ON_ITS_SIDE
     return (header.height, header.width) if turned else (header.width, header.height)
 
 
-def decode_image(data: bytes, max_pixels: int = MAX_PIXELS) -> DecodedImage:
+def decode_image(data: bytes, max_pixels: int = MAX_PIXELS, used: ValueRange | None = None) -> DecodedImage:
     """The image (H, W, 3) uint8 RGB, upright after its EXIF orientation, with what its EXIF tells.
 
-    Grey becomes RGB, 16 bits become the upper 8, and alpha is dropped: the colours beneath it are kept as stored, as
-    COLMAP does. Of a file with several pages, the first. It takes at most BYTES_A_PIXEL of memory for each of
-    `max_pixels`, whatever the file says. Raises UnusableImage.
+    Grey becomes RGB. Of 16 bits, the range `used` becomes 8, without it the upper 8. Alpha becomes a mask: the colours
+    beneath it are kept as stored. Of a file with several pages, the first. It takes at most BYTES_A_PIXEL of memory for
+    each of `max_pixels`, whatever the file says. Raises UnusableImage.
     """
     with foreign(UnusableImage):
         header = read_header(data)
         if header.width * header.height > max_pixels:
             raise UnusableImage(f"{header.width} x {header.height}: more than {max_pixels} pixels; make it smaller")
-        image = _decode(header.decodable)
+        mask = _decode_alpha(header) if header.has_alpha else None
+        image = _decode(header, used)
         height, width = image.shape[:2]
         if sorted((width, height)) != sorted((header.width, header.height)):
             stated = f"{header.width} x {header.height}"
             raise UnusableImage(f"damaged: it states {stated} pixels and is decoded to {width} x {height}")
-        return _with_exif(cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False), header.exif)
+        image = cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+        return _with_exif(image, header.exif)._replace(mask=mask)
+
+
+def measure_values(data: bytes, max_pixels: int = MAX_PIXELS) -> Extent | None:
+    """The extent of the values of an image file of 16 bits; None of another one, or one that cannot be decoded."""
+    try:
+        with foreign(UnusableImage):
+            header = read_header(data)
+            if header.bits <= 8 or header.width * header.height > max_pixels:
+                return None
+            return measure_extent(_decode_as(header, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH))
+    except UnusableImage:
+        return None
+
+
+def find_common_range(paths: Sequence[Path], max_pixels: int = MAX_PIXELS) -> ValueRange | None:
+    """What the images of 16 bits among these files use of them, all together; None: the upper 8 bits show it.
+
+    Of many files, evenly spread ones are looked at. What cannot be read says nothing.
+    """
+    deep = [path for path in paths if path.suffix.lower() in _MAYBE_DEEP_SUFFIXES]
+    extents = []
+    for path in deep[:: math.ceil(len(deep) / _MAX_MEASURED) or 1]:
+        with contextlib.suppress(OSError, UnusableImage):
+            extents.append(measure_values(read_image_file(path, max_pixels), max_pixels))
+    return find_range(extent for extent in extents if extent is not None)
 
 
 def _with_exif(image: npt.NDArray[np.uint8], tiff: bytes) -> DecodedImage:
@@ -105,9 +143,33 @@ def _with_exif(image: npt.NDArray[np.uint8], tiff: bytes) -> DecodedImage:
     return DecodedImage(image, intrinsics, exif_time(tiff), exif.exif_exposure(tags))
 
 
-def _decode(data: bytes) -> npt.NDArray:
+def _decode(header: ImageHeader, used: ValueRange | None) -> npt.NDArray[np.uint8]:
+    """(H, W, 3) BGR, upright."""
+    if header.bits <= 8 or used is None:
+        return np.asarray(_decode_as(header, cv2.IMREAD_COLOR), np.uint8)
+    deep = _decode_as(header, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH)
+    return to_eight_bits(deep, used) if deep.dtype == np.uint16 else np.asarray(deep, np.uint8)
+
+
+def _decode_alpha(header: ImageHeader) -> npt.NDArray[np.bool_] | None:
+    """(H, W) upright, where alpha is above 0; None where that is everywhere, or nowhere: such a channel says nothing.
+
+    Where colours are stored multiplied by alpha, those that it dims are hidden, too.
+    """
+    image = _decode_as(header, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 3 or image.shape[2] != 4:
+        return None
+    alpha = image[..., 3]
+    mask = alpha == np.iinfo(alpha.dtype).max if header.is_premultiplied else alpha > 0
+    if mask.all() or not mask.any():
+        return None
+    orientation = 1 if header.turns_itself else int(exif.first(exif.read_tags(header.exif), ORIENTATION) or 1)
+    return np.ascontiguousarray(upright(mask, orientation))
+
+
+def _decode_as(header: ImageHeader, flags: int) -> npt.NDArray:
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        image = cv2.imdecode(np.frombuffer(header.decodable, np.uint8), flags)
     except cv2.error as error:
         raise UnusableImage(f"damaged: {error.err}") from error
     if image is None:

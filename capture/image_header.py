@@ -29,10 +29,14 @@ class ImageHeader:
     height: int
     exif: bytes = field(default=b"", repr=False)  # a TIFF structure
     decodable: bytes = field(default=b"", repr=False)  # the file, without what a decoder does not need
+    bits: int = 8  # of a channel: up to 16
+    has_alpha: bool = False  # whether a channel, or a colour, tells what is transparent
+    is_premultiplied: bool = False  # whether the colours are stored multiplied by alpha
+    turns_itself: bool = False  # whether decoders turn the image upright though they were told not to
 
 
 def read_header(data: bytes) -> ImageHeader:
-    """Size and EXIF of a JPEG, PNG, WebP, TIFF or BMP file that is structurally complete. Raises UnusableImage.
+    """Size and EXIF of a JPEG, PNG, WebP, TIFF, BMP, PPM or PGM file that is complete. Raises UnusableImage.
 
     No side is 0 or above MAX_SIDE.
     """
@@ -45,6 +49,7 @@ def read_header(data: bytes) -> ImageHeader:
         b"II*\0": _tiff_header,
         b"MM\0*": _tiff_header,
         b"BM": _bmp_header,
+        **dict.fromkeys((b"P2", b"P3", b"P5", b"P6"), _pnm_header),
     }
     for magic, reader in readers.items():
         if data.startswith(magic):
@@ -56,7 +61,27 @@ def read_header(data: bytes) -> ImageHeader:
                 size = f"{header.width} x {header.height}"
                 raise UnusableImage(f"{size}: each side must have 1 to {MAX_SIDE} pixels; resize or cut it")
             return header
-    raise UnusableImage(f"not an image: no JPEG, PNG, WebP, TIFF or BMP begins with {data[:4].hex(' ')}")
+    raise UnusableImage(f"not an image: no JPEG, PNG, WebP, TIFF, BMP, PPM or PGM begins with {data[:4].hex(' ')}")
+
+
+def image_kind(start: bytes) -> str | None:
+    """The kind of image file that begins with these bytes, 16 of them suffice; None where none is known that does."""
+    kinds = {
+        b"\xff\xd8\xff": "JPEG",
+        b"\x89PNG\r\n\x1a\n": "PNG",
+        b"II*\0": "TIFF",
+        b"MM\0*": "TIFF",
+        b"GIF8": "GIF",
+        b"\0\0\0\x0cjP  ": "JPEG 2000",
+        b"\xff\x4f\xff\x51": "JPEG 2000",
+        b"\0\0\0\x0cJXL ": "JPEG XL",
+        b"8BPS": "Photoshop",
+    }
+    if start.startswith(b"RIFF") and start[8:12] == b"WEBP":
+        return "WebP"
+    if start[4:8] == b"ftyp" and start[8:12] in (b"heic", b"heix", b"mif1", b"avif"):
+        return "HEIC or AVIF"
+    return next((kind for magic, kind in kinds.items() if start.startswith(magic)), None)
 
 
 _JPEG_MARKER = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")  # in entropy-coded data, FF 00 and FF D0..D7 are no markers
@@ -99,13 +124,15 @@ def _jpeg_header(data: bytes) -> ImageHeader:
 
 
 _PNG_START = 8
+_PNG_WITH_ALPHA = {4, 6}  # colour types: grey, and colours
 _PNG_NEEDED = {b"IHDR", b"PLTE", b"tRNS", b"IDAT", b"eXIf", b"IEND"}  # eXIf: the orientation
 
 
 def _png_header(data: bytes) -> ImageHeader:
     """Chunks (PNG, third edition): IHDR comes first and once. Texts and profiles are left out: they are compressed."""
     tiff, position, kept, has_pixels = b"", _PNG_START, [data[:_PNG_START]], False
-    width, height = struct.unpack_from(">II", data, _PNG_START + 8)
+    width, height, bits, colours = struct.unpack_from(">IIBB", data, _PNG_START + 8)
+    has_alpha = colours in _PNG_WITH_ALPHA
     for part in range(_MAX_PARTS):
         length, kind = struct.unpack_from(">I4s", data, position)
         if (kind == b"IHDR") != (part == 0) or (part == 0 and length != 13):
@@ -117,8 +144,9 @@ def _png_header(data: bytes) -> ImageHeader:
         if kind == b"IEND":
             if not has_pixels:
                 raise UnusableImage("damaged: a PNG without an image")
-            return ImageHeader(width, height, tiff, decodable=b"".join(kept))
+            return ImageHeader(width, height, tiff, b"".join(kept), max(8, bits), has_alpha)
         has_pixels = has_pixels or kind == b"IDAT"
+        has_alpha = has_alpha or kind == b"tRNS"
         if kind == b"eXIf":
             tiff = tiff or data[position + 8 : position + 8 + length]
         position += 12 + length
@@ -132,7 +160,7 @@ def _webp_header(data: bytes) -> ImageHeader:
         raise UnusableImage("not an image: a RIFF file that is not WebP")
     if riff_size + 8 > len(data):
         raise UnusableImage("truncated: the file ends early")
-    size, tiff, position, parts = None, b"", 12, 0
+    size, tiff, position, parts, has_alpha = None, b"", 12, 0, False
     while position + 8 <= riff_size + 8:
         kind, length = struct.unpack_from("<4sI", data, position)
         body = data[position + 8 : position + 8 + length]
@@ -141,6 +169,7 @@ def _webp_header(data: bytes) -> ImageHeader:
             size = stated
         elif kind == b"VP8X" or stated not in (None, size):
             raise UnusableImage(f"damaged: the WebP states its size twice, {size} and {stated}")
+        has_alpha = has_alpha or _webp_has_alpha(kind, body)
         if kind == b"EXIF":
             tiff = tiff or body.removeprefix(b"Exif\0\0")
         position, parts = position + 8 + length + length % 2, parts + 1
@@ -148,7 +177,14 @@ def _webp_header(data: bytes) -> ImageHeader:
             raise UnusableImage(f"damaged: a WebP must begin with its size and have at most {_MAX_PARTS} chunks")
     if size is None:
         raise UnusableImage("damaged: a WebP without an image")
-    return ImageHeader(*size, exif=tiff, decodable=data[: riff_size + 8])
+    return ImageHeader(*size, exif=tiff, decodable=data[: riff_size + 8], has_alpha=has_alpha)
+
+
+def _webp_has_alpha(kind: bytes, body: bytes) -> bool:
+    """Whether a chunk of this kind says that there is alpha."""
+    if kind == b"VP8L":
+        return bool(int.from_bytes(body[1:5], "little") >> 28 & 1)
+    return kind == b"ALPH"
 
 
 def _webp_size(kind: bytes, body: bytes) -> tuple[int, int] | None:
@@ -175,7 +211,11 @@ _TIFF_SIZES = {  # name -> tag and largest value
     "TileWidth": (322, 2**32 - 1),
     "TileLength": (323, 2**32 - 1),
 }
+_TIFF_PHOTOMETRIC, _TIFF_RGB = 262, 2
+_TIFF_EXTRA = 338  # ExtraSamples: what the channels beside the colours are
+_ASSOCIATED, _UNASSOCIATED = 1, 2  # alpha by which colours are multiplied, and not
 _TIFF_DEPTHS = {32997, 32998}  # of volumes, by which libtiff multiplies sizes
+_TIFF_SHORT = 3
 _TIFF_WHOLE = {1, 3, 4}  # types BYTE, SHORT and LONG
 _MAX_TILE = 1 << 22  # pixels of a tile or a strip, unless the image has more
 
@@ -207,7 +247,34 @@ def _tiff_header(data: bytes) -> ImageHeader:
     tile = sizes.get("TileWidth", 1) * sizes.get("TileLength", 1)
     if max(strip, tile) > max(_MAX_TILE, width * height):
         raise UnusableImage(f"damaged: the TIFF of {width} x {height} has a part of {max(strip, tile)} pixels")
-    return ImageHeader(width, height, exif=data, decodable=data)
+    extra = values.get(_TIFF_EXTRA, ())
+    of_colours = values.get(_TIFF_PHOTOMETRIC, (_TIFF_RGB,))[0] == _TIFF_RGB and sizes.get("SamplesPerPixel", 1) == 4
+    alpha = int(extra[0]) if len(extra) == 1 else (_UNASSOCIATED if of_colours and _TIFF_EXTRA not in kinds else 0)
+    if extra and alpha == _UNASSOCIATED and sizes.get("BitsPerSample", 8) <= 8:
+        decodable = _as_associated(data, offset, order)  # libtiff would multiply the colours by alpha
+    else:
+        decodable = data
+    return ImageHeader(
+        width,
+        height,
+        exif=data,
+        decodable=decodable,
+        bits=max(8, sizes.get("BitsPerSample", 8)),
+        has_alpha=alpha in (_ASSOCIATED, _UNASSOCIATED),
+        is_premultiplied=alpha == _ASSOCIATED,
+        turns_itself=True,
+    )
+
+
+def _as_associated(data: bytes, offset: int, order: str) -> bytes:
+    """The TIFF whose directory at `offset` says of its one extra sample that colours are multiplied by it already."""
+    changed = bytearray(data)
+    (entries,) = struct.unpack_from(order + "H", data, offset)
+    for entry in range(entries):
+        place = offset + 2 + 12 * entry
+        if struct.unpack_from(order + "H", data, place)[0] == _TIFF_EXTRA:
+            struct.pack_into(order + "HIHH", changed, place + 2, _TIFF_SHORT, 1, _ASSOCIATED, 0)
+    return bytes(changed)
 
 
 _BMP_OLD_SIZE, _BMP_LEAST_SIZE = 12, 36  # bytes of the second header: OS/2 1.x, and what OpenCV reads
@@ -219,3 +286,22 @@ def _bmp_header(data: bytes) -> ImageHeader:
         raise UnusableImage(f"damaged: no BMP has a header of {header_size} bytes")
     width, height = struct.unpack_from("<HH" if header_size == _BMP_OLD_SIZE else "<ii", data, 18)
     return ImageHeader(abs(width), abs(height), decodable=data)
+
+
+_PNM_HEADER = re.compile(rb"(P[2356])" + 3 * rb"(?:[ \t\r\n]+(?:#[^\n]*\n)*)+([0-9]{1,6})" + rb"[ \t\r\n]")
+
+
+def _pnm_header(data: bytes) -> ImageHeader:
+    """PPM and PGM (netpbm): sizes as numbers, then all pixels. The decoder gets a header without remarks."""
+    match = _PNM_HEADER.match(data)
+    if match is None:
+        raise UnusableImage("damaged: a PPM or PGM must begin with its width, its height and its largest value")
+    kind, (width, height, most) = match[1], map(int, match.groups()[1:])
+    if not 1 <= most <= 65_535:
+        raise UnusableImage(f"damaged: the largest value of a PPM or PGM must be 1 to 65535, is {most}")
+    bits, pixels = (16 if most > 255 else 8), data[match.end() :]
+    samples = width * height * (3 if kind in (b"P3", b"P6") else 1)
+    if len(pixels) < (samples * bits // 8 if kind in (b"P5", b"P6") else 2 * samples - 1):
+        raise UnusableImage("truncated: the file ends early")
+    decodable = b"%s\n%d %d\n%d\n" % (kind, width, height, most) + pixels
+    return ImageHeader(width, height, decodable=decodable, bits=bits)

@@ -27,6 +27,10 @@ MIN_UNSATURATED, MAX_UNSATURATED = 4, 245  # grey levels between which a change 
 MIN_COMPARED_SHARE = 0.05  # of the pixels: with fewer that are unsaturated in both images, all are compared
 
 
+THUMBNAIL_PX = 128  # longer side of an image below which it is taken for a thumbnail, beside larger ones
+THUMBNAIL_RATIO = 3.0  # of the largest image's longer side over a thumbnail's: a scaled set is none
+
+
 class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     blur_px: float = 8.0  # widest edges of a usable frame, pixels at 640; sharp photographs of smooth objects reach 7
     relative_blur: float = 3.0  # a frame is unusable when its edges are so many times as wide as the sharpest frame's
@@ -145,6 +149,18 @@ def why_unusable(quality: Quality, limits: Limits, sharpest_px: float | None = N
     if sharpest_px is not None and quality.blur_px > limits.relative_blur * max(sharpest_px, 1):
         return f"blurred: its edges are {quality.blur_px:.1f} px wide, those of the sharpest {sharpest_px:.1f}"
     return None
+
+
+def why_too_small(size: tuple[int, int], largest: int) -> str | None:
+    """Why an image of this (width, height) is left out beside one whose longer side is `largest`; None: it is used.
+
+    SIFT finds a few dozen features in so few pixels, whose pixel is as wide as a step between two photographs.
+    """
+    longer = max(size)
+    if longer >= THUMBNAIL_PX or longer * THUMBNAIL_RATIO > largest:
+        return None
+    shown = f"{size[0]} x {size[1]} pixels, beside others of up to {largest}"
+    return f"too small, as thumbnails are: {shown}; give it in full size"
 
 
 def why_redundant(measured: float, limits: Limits) -> str | None:

@@ -47,12 +47,14 @@ from splatnode.recon.rasterize.device import Device
 from splatnode.recon.rasterize.dispatch import rasterizer
 from splatnode.recon.replay_source import Request, Source, asked_for, source
 from splatnode.recon.result import bounds_in_words
+from splatnode.recon.result.export.manifest import LIVE_PICTURE
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.moving_in_words import moving_in_words
 from splatnode.recon.result.size import largest_result_bytes
 from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.whole import FILE, is_whole
 from splatnode.recon.result.write import finish
-from splatnode.recon.viewer_process import viewer
+from splatnode.recon.viewer_process import Show, viewer
 
 EXIT_GOOD, EXIT_REFUSED = 0, 65
 # Of the search for a held-out view's pose, half of them at half the resolution: 33.0 dB in the mean, as 100 at full.
@@ -66,6 +68,8 @@ def replay(args: argparse.Namespace) -> int:
     path, listed = asked_for(args.source)
     request = Request(path, listed, args.views, args.frames or (), args.every_frame, args.masks, _lens(args))
     _check_apart(args.out, path)
+    if not args.map and is_whole(args.out):
+        raise ValueError(f"{args.out} holds the scenes of a map or of a node ({FILE}); give another --out")
     if args.map and args.only_seen:
         raise ValueError("--only-seen is for one scene: a merged map does not tell what two photographs confirm")
     if args.map:
@@ -85,10 +89,7 @@ def _replay(args: argparse.Namespace, request: Request, config: Config, tell: Te
     check_baseline(config, given)
     known = _known_of_metres(args, given)
     needed_bytes = largest_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
-    with (
-        result_folder(args.out, needed_bytes),
-        viewer(args.out / "view") if args.view else contextlib.nullcontext(shown_to_nobody) as show,
-    ):
+    with result_folder(args.out, needed_bytes), _viewer(args) as show:
         config = with_looks(config, LOOK_EVERY) if args.view else config
         preset_name = args.preset or "balanced"
         made = reconstructed(
@@ -102,6 +103,13 @@ def _replay(args: argparse.Namespace, request: Request, config: Config, tell: Te
         else:
             _tell(snapshot, args.out)
     return EXIT_GOOD if snapshot.verdict.publishable else EXIT_REFUSED
+
+
+def _viewer(args: argparse.Namespace) -> contextlib.AbstractContextManager[Show]:
+    """A viewer with --view, else nobody. The picture that an earlier run showed is none of this one: it is removed."""
+    pictures = args.out / "view"
+    (pictures / LIVE_PICTURE).unlink(missing_ok=True)
+    return viewer(pictures) if args.view else contextlib.nullcontext(shown_to_nobody)
 
 
 def _check_apart(out: Path, photographs: Path) -> None:

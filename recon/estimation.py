@@ -24,6 +24,7 @@ from splatnode.recon.verification.claims import claims, shaped
 from splatnode.recon.verification.decision import decide, refuse_before_registration
 from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.fitted import FITTED
+from splatnode.recon.verification.input_kinds import explain_refusal
 from splatnode.recon.verification.likelihood import record, weigh
 from splatnode.recon.verification.verify import verify, verify_further
 
@@ -137,12 +138,13 @@ def estimate_cameras(
     """
     refusal = refuse_before_registration(graph, rejected, config.decision)
     if refusal is not None:
-        return Estimate(graph, None, None, refusal)
+        return Estimate(graph, None, None, explain_refusal(refusal, graph))
     registration = register(graph.keyframes, graph.pairs, config.registration, pause)
     pause()
     evidence = verify(graph, registration, config.verification, pause)
     give_back_memory()
-    return Estimate(graph, registration, evidence, decide(graph, registration, evidence, config.decision))
+    verdict = explain_refusal(decide(graph, registration, evidence, config.decision), graph)
+    return Estimate(graph, registration, evidence, verdict)
 
 
 def estimate_depth(

@@ -28,7 +28,7 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.memory import Key, Memory
 from splatnode.recon.modelling import Shown, begin_scene, in_words, refined, shown, snapshot
 from splatnode.recon.optimize import refinement
-from splatnode.recon.preparation import check_device, load_prior, prepare
+from splatnode.recon.preparation import UnusableFrame, check_device, load_prior, prepare
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import without_hidden
 from splatnode.recon.result.snapshot import Snapshot
@@ -125,7 +125,8 @@ class IncrementalReconstruction:
     def take(self, frame: Frame, pause: Pause = without_pause) -> None:
         """Adds a frame to the view graph unless it says nothing new. Time counts from the first one.
 
-        A frame that turns out to be blurred beside a sharper one is left out again.
+        A frame that turns out to be blurred beside a sharper one is left out again, and so is one that cannot become a
+        keyframe. Raises UnusableFrame where that is the first one.
         """
         if not self._known.screened.summaries:
             self.clock = Clock()
@@ -135,7 +136,19 @@ class IncrementalReconstruction:
         self.retract({each.name for each in rejected})
         self.clock.lap("poses")
         if frame.name in self._known.screened.summaries:
-            self.add(prepare(frame, self.config), pause)
+            self._prepare_and_add(frame, pause)
+
+    def _prepare_and_add(self, frame: Frame, pause: Pause) -> None:
+        try:
+            keyframe = prepare(frame, self.config)
+        except UnusableFrame as error:
+            if not self.graph.keyframes:
+                raise
+            log.warning("left out: %s", error)
+            self.drop(DroppedFrame(frame.name, str(error).removeprefix(f"{frame.name}: ")))
+            self.retract({frame.name})
+            return
+        self.add(keyframe, pause)
 
     def screen(self, frame: Frame) -> list[Rejected]:
         """The frames that say nothing beside the others, now that there is this one too: it, or earlier ones."""

@@ -25,7 +25,7 @@ from splatnode.recon.matching.match import match
 from splatnode.recon.matching.moving import without_moving
 from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.modelling import begin_scene, looked_at_first, refined, shown, snapshot
-from splatnode.recon.preparation import check_device, load_prior, prepare
+from splatnode.recon.preparation import check_device, load_prior, prepare_all
 from splatnode.recon.priors.prior import Prior
 from splatnode.recon.result.snapshot import Snapshot
 from splatnode.recon.scene.scene import Scene
@@ -71,9 +71,8 @@ def _estimate_cameras(
     frames: Iterable[Frame | DroppedFrame], prior: Prior, config: Config, clock: Clock, tell: Tell = told_to_nobody
 ) -> tuple[Estimate, list[DroppedFrame]]:
     kept, dropped, rejected = screen_all(frames, config.screening)
-    keyframes = [
-        prepare(frame, config) for frame in counted(kept, tell, "finding points to match", len(kept), "photograph")
-    ]
+    looked_through = counted(kept, tell, "finding points to match", len(kept), "photograph")
+    keyframes, unusable = prepare_all(looked_through, config)
     deadline = clock.deadline(config.budget_s) or math.inf
     half = clock.started + (deadline - clock.started) / 2  # the least that cameras take is not bound by a budget
     graph = match(keyframes, config.matching, prior.matcher, until=half, tell=tell)
@@ -84,7 +83,7 @@ def _estimate_cameras(
     clock.lap("poses")
     estimate = climbed(estimate, rejected, config, _doing("looking for more matches", tell), until=deadline)
     clock.lap("ladder")
-    return estimate, dropped
+    return estimate, dropped + unusable
 
 
 def _shared(graph: ViewGraph) -> Iterator[str]:

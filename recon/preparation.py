@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from dataclasses import replace
 
 import msgspec
 
-from splatnode.capture.frame import Frame
+from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lenses.undistort import undistorted
 from splatnode.recon.config import Config
-from splatnode.recon.frames.keyframe import Features, Keyframe, modelled_image
+from splatnode.recon.frames.keyframe import LIBRARY_ERRORS, Features, Keyframe, modelled_image
 from splatnode.recon.matching import features
 from splatnode.recon.priors.prior import Prior
 from splatnode.recon.rasterize.device import chosen, in_words
 
 log = logging.getLogger(__name__)
+
+
+class UnusableFrame(ValueError):
+    """One frame that cannot become a keyframe; the text names it and says why."""
 
 
 def load_prior(config: Config) -> Prior:
@@ -33,8 +38,35 @@ def check_device(config: Config) -> None:
 def prepare(frame: Frame, config: Config, found: Features | None = None) -> Keyframe:
     """The frame without distortion, with its image at modelled size and its features, unless these are known.
 
-    No other frame is needed. Raises ValueError where the given intrinsics cannot be used.
+    No other frame is needed. Raises UnusableFrame where the given intrinsics cannot be used, or a library fails.
     """
-    frame = replace(undistorted(frame), encoded=None)  # recordings alone want the file as it came
-    found = found or features.used(features.extract(frame.image, config.matching.features), frame.mask)
-    return Keyframe(frame, modelled_image(frame.image, config.size), found)
+    try:
+        straight = undistorted(frame)
+    except ValueError as error:  # it names the frame
+        raise UnusableFrame(str(error)) from error
+    except LIBRARY_ERRORS as error:
+        raise UnusableFrame(f"{frame.name}: its distortion cannot be taken out: {error}") from error
+    frame = replace(straight, encoded=None)  # recordings alone want the file as it came
+    try:
+        found = found or features.used(features.extract(frame.image, config.matching.features), frame.mask)
+        return Keyframe(frame, modelled_image(frame.image, config.size), found)
+    except LIBRARY_ERRORS as error:
+        raise UnusableFrame(f"{frame.name}: no features can be found in it: {error}") from error
+
+
+def prepare_all(frames: Iterable[Frame], config: Config) -> tuple[list[Keyframe], list[DroppedFrame]]:
+    """The keyframes of all frames that can become one, and the others with the reason, which the log tells too.
+
+    Raises UnusableFrame, of the first frame, where none of them can: then what they have in common is to blame.
+    """
+    keyframes, dropped, first = list[Keyframe](), list[DroppedFrame](), None
+    for frame in frames:
+        try:
+            keyframes.append(prepare(frame, config))
+        except UnusableFrame as error:
+            log.warning("left out: %s", error)
+            dropped.append(DroppedFrame(frame.name, str(error).removeprefix(f"{frame.name}: ")))
+            first = first or error
+    if first is not None and not keyframes:
+        raise first
+    return keyframes, dropped

@@ -64,7 +64,7 @@ def view(args: argparse.Namespace) -> int:
         raise ValueError("--export needs a finished result and a file that ends with .mp4")
     width, height = args.size or _PICTURE
     with telling() as tell:
-        say(write_movie(_moment(finished), args.export, width, height, args.pictures, tell))
+        say(write_movie(_moment(finished), args.export, width, height, args.pictures, of=args.what, tell=tell))
     return EXIT_GOOD
 
 
@@ -102,7 +102,7 @@ def _as_pictures(args: argparse.Namespace, finished: Moment | Maps | None, netwo
     folder = _folder(args, finished)
     if finished is not None:
         with telling() as tell:
-            say(write_series(_moment(finished), folder, width, height, args.pictures, tell))
+            say(write_series(_moment(finished), folder, width, height, args.pictures, of=args.what, tell=tell))
         return EXIT_GOOD
     source = _source(finished, network)
     _give_way()

@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.process.progress import Step, Tell, counted, told_to_nobody
-from splatnode.recon.result.export import ResultWriteError, write_file, write_files
+from splatnode.recon.result.export import ResultWriteError, write_beside, write_file
+from splatnode.recon.result.export.manifest import LIVE_PICTURE
 from splatnode.viewer import words
 from splatnode.viewer.analysis import Analysis, analyse
 from splatnode.viewer.ground import ground, ground_lines
@@ -32,24 +33,24 @@ Image = npt.NDArray[np.uint8]
 
 FRAMES_PER_S = 25
 _DRAWING = "drawing"
-_LIVE = "live.png"
 _WAIT_S = 0.1
 _PATIENCE_S = 1.0  # without a word
 
 
 def write_series(
-    moment: Moment, folder: Path, width: int, height: int, frames: int, tell: Tell = told_to_nobody
+    moment: Moment, folder: Path, width: int, height: int, frames: int, *, of: Path, tell: Tell = told_to_nobody
 ) -> Path:
     """overview.png with all there is to say, a picture from each camera beside its photograph, and a turntable.
 
+    `of` is the result that they show: what lies in its folder belongs to it.
     `tell` hears how many are drawn. Raises ResultWriteError where they cannot be written.
     """
-    of = 1 + len(moment.snapshot.cameras) + frames
-    tell(Step(_DRAWING, 0, of, "picture"))
+    total = 1 + len(moment.snapshot.cameras) + frames
+    tell(Step(_DRAWING, 0, total, "picture"))
     files = {"overview.png": encode_png(overview_picture(analyse(moment), width, height))}
     view = overview(moment)
     for camera in moment.snapshot.cameras:
-        tell(Step(_DRAWING, len(files), of, "picture"))
+        tell(Step(_DRAWING, len(files), total, "picture"))
         here = at_camera(view, camera)
         image = paint(moment.snapshot.gaussians, Shapes((), ()), here, State(), width, height)
         photograph = moment.snapshot.images.get(camera.name)
@@ -58,13 +59,15 @@ def write_series(
         files[f"camera_{camera.frame_id:03d}.png"] = encode_png(image)
     for number, image in enumerate(turntable(moment, width, height, frames)):
         files[f"turntable_{number:03d}.png"] = encode_png(image)
-        tell(Step(_DRAWING, len(files), of, "picture"))
-    write_files(folder, files)
+        tell(Step(_DRAWING, len(files), total, "picture"))
+    write_beside(folder, files, of)
     return folder
 
 
-def write_movie(moment: Moment, path: Path, width: int, height: int, frames: int, tell: Tell = told_to_nobody) -> Path:
-    """The turntable as an MP4; `tell` hears how many of its pictures are drawn.
+def write_movie(
+    moment: Moment, path: Path, width: int, height: int, frames: int, *, of: Path, tell: Tell = told_to_nobody
+) -> Path:
+    """The turntable of the result `of` as an MP4; `tell` hears how many of its pictures are drawn.
 
     Raises ResultWriteError; RuntimeError where this OpenCV cannot write MP4.
     """
@@ -82,7 +85,7 @@ def write_movie(moment: Moment, path: Path, width: int, height: int, frames: int
             raise ResultWriteError(
                 errno.ENOSPC, f"the movie does not fit into {where}: free some space or name another folder by TMPDIR"
             )
-        write_file(path, draft.read_bytes())
+        write_beside(path, {"": draft.read_bytes()}, of)
     return path
 
 
@@ -123,9 +126,9 @@ def keep_picture(
     for moment in _moments(source, say):
         started = time.perf_counter()
         picture = overview_picture(analyse(moment), width, height)
-        write_file(folder / _LIVE, encode_png(picture))
+        write_file(folder / LIVE_PICTURE, encode_png(picture))
         line = words.verdict_lines(moment)[0]
-        say(f"{folder / _LIVE}: {line} ({time.perf_counter() - started:.1f} s)")
+        say(f"{folder / LIVE_PICTURE}: {line} ({time.perf_counter() - started:.1f} s)")
         if until_final and moment.snapshot.final:
             return
 

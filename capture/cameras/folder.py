@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -22,19 +24,35 @@ from splatnode.capture.image_file import (
     MaxPixels,
     UnusableImage,
     decode_photograph,
+    find_common_range,
     read_image_file,
 )
+from splatnode.capture.image_header import image_kind
+from splatnode.capture.masks import Mask, masked
 from splatnode.capture.name_time import name_time
 from splatnode.capture.pace import FramesPerSecond, Pace, paced
 from splatnode.capture.process.printable import printable, printable_name
 from splatnode.capture.right_image import LONGEST_M, SIGMA_M, Baseline, RightImage, grey, partners
+from splatnode.capture.value_range import ValueRange
 
 if TYPE_CHECKING:
     from splatnode.capture.poses_file import Trajectory
 
 DEFAULT_STEP_NS = 100_000_000  # between two loops of a single photograph, which has no rate
 # Photographs that cannot be decoded here; they are reported as dropped.
-FOREIGN_SUFFIXES = {".jxl", ".gif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf"}
+_RAW = {
+    ".dng", ".cr2", ".cr3", ".crw", ".nef", ".nrw", ".arw", ".srf", ".sr2", ".raf", ".orf", ".rw2", ".rwl", ".pef",
+    ".srw", ".x3f", ".3fr", ".iiq", ".erf", ".kdc", ".dcr", ".mrw", ".gpr",
+}  # fmt: skip
+_OTHER_IMAGES = {
+    ".jxl", ".gif", ".jxr", ".wdp", ".hdp", ".jpx", ".jpf", ".jpm", ".j2c", ".jls", ".tga", ".psd", ".xcf", ".exr",
+    ".hdr", ".pic", ".pfm", ".pbm", ".pam", ".pxm", ".ras", ".sr", ".pcx", ".svg", ".heics", ".insp",
+}  # fmt: skip
+FOREIGN_SUFFIXES = _RAW | _OTHER_IMAGES
+_MAX_OTHER_FILES = 1000  # of a folder, whose content is looked at for images that their names hide
+
+
+log = logging.getLogger(__name__)
 
 
 class Right(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -90,7 +108,7 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
             raise ValueError(f"{str(config.folder)!r} is a recording, which has its poses in it: leave out poses")
         recorded = recording.read(config.folder)
         return paced(_looped(lambda: recorded.frames(config.names, config.max_pixels), config.loops), config.pace)
-    paths = chosen_images(config.folder, config.names)  # before the first frame, so that mistakes show at once
+    paths = chosen_images(config.folder, config.names)  # at once, before the first frame, so that mistakes show at once
     rights = {} if config.right is None else _partners(config.right.folder, paths)
     poses = None if config.poses is None else _known_poses(config.poses.file, paths)
     return paced(_looped(lambda: _frames(paths, rights, poses, config), config.loops), config.pace)
@@ -136,7 +154,9 @@ def _looped(once: Callable[[], Iterator[Frame | DroppedFrame]], loops: int) -> I
 def _frames(
     paths: list[Path], rights: Mapping[str, Path], poses: Trajectory | None, config: Config
 ) -> Iterator[Frame | DroppedFrame]:
-    frame_id = 0
+    frame_id, used = 0, find_common_range(paths, config.max_pixels)
+    if used is not None:
+        log.warning("%s", in_words_of_range(used))
     for path in paths:
         if (unreadable := foreign_file(path)) is not None:
             yield unreadable
@@ -144,21 +164,57 @@ def _frames(
         name = frame_name(path)
         try:
             data = read_image_file(path, config.max_pixels)
-            image, intrinsics, captured_at, exposure = decode_photograph(data, config.max_pixels)
+            decoded = decode_photograph(data, config.max_pixels, used)
             right = _right_of(path, rights, config)
         except UnusableImage as error:
             yield DroppedFrame(name, str(error))
         except OSError as error:
             yield DroppedFrame(name, f"cannot be read: {error.strerror}")
         else:
+            image, intrinsics = decoded.image, decoded.intrinsics
             height, width = image.shape[:2]
             if config.intrinsics is not None and same_aspect(config.intrinsics, width, height):
                 intrinsics = config.intrinsics.resized(width, height)
             stamp_ns = round(frame_id / config.frames_per_second * 1e9)
-            known = image, intrinsics, data, captured_at or name_time(name)
-            item = framed(frame_id, name, stamp_ns, *known, right=right, exposure=exposure)
+            # A file whose values are stretched is no file of this image: a recording would store it as it was.
+            known = image, intrinsics, data if used is None else None, decoded.captured_at or name_time(name)
+            item = framed(frame_id, name, stamp_ns, *known, right=right, exposure=decoded.exposure)
+            item = with_transparency(item, decoded.mask)
             frame_id += isinstance(item, Frame)
             yield _with_pose(item, poses, config.poses)
+    if not config.names:
+        yield from _hidden_images(config.folder)
+
+
+def in_words_of_range(used: ValueRange) -> str:
+    """What is told of images of 16 bits whose values are stretched."""
+    return f"16-bit photographs use only {used}: this range is stretched to 8 bits, alike for all of them"
+
+
+def with_transparency(item: Frame | DroppedFrame, mask: Mask | None) -> Frame | DroppedFrame:
+    """Without what its alpha channel hides, which is no part of the photograph."""
+    if isinstance(item, DroppedFrame) or mask is None:
+        return item
+    masked_item = masked(item, mask)
+    if isinstance(masked_item, DroppedFrame):
+        return DroppedFrame(item.name, f"its alpha channel hides {100 * (1 - mask.mean()):.1f} % of it")
+    return masked_item
+
+
+def _hidden_images(folder: Path) -> Iterator[DroppedFrame]:
+    """The files that are images by their content and not by their name, each left out."""
+    known = SUFFIXES | FOREIGN_SUFFIXES
+    visible = [path for path in folder.iterdir() if not path.name.startswith(".") and path.suffix.lower() not in known]
+    for path in sorted(visible, key=natural_order)[:_MAX_OTHER_FILES]:
+        with contextlib.suppress(OSError):
+            if path.is_file() and (kind := _image_kind(path)) is not None:
+                shown = f"{path.suffix} is no suffix of photographs" if path.suffix else "its name has no suffix"
+                yield DroppedFrame(frame_name(path), f"{shown}, and its content is {kind}: give it that suffix")
+
+
+def _image_kind(path: Path) -> str | None:
+    with path.open("rb") as file:
+        return image_kind(file.read(16))
 
 
 def _with_pose(item: Frame | DroppedFrame, poses: Trajectory | None, given: Poses | None) -> Frame | DroppedFrame:
@@ -245,7 +301,9 @@ def chosen_images(folder: Path, names: tuple[str, ...] = ()) -> list[Path]:
     paths = image_paths(folder)
     if not paths:
         inside = sorted(frame_name(child) for child in folder.iterdir() if child.is_dir() and image_paths(child))
+        hidden = [f"{each.name}: {each.reason}" for each in _hidden_images(folder)]
         advice = f"give one of its folders: {', '.join(inside)}" if inside else "give a folder of JPEGs or PNGs"
+        advice = f"{hidden[0]}{f', and {len(hidden) - 1} more' if len(hidden) > 1 else ''}" if hidden else advice
         raise ValueError(f"no photographs in {str(folder)!r}; {advice}")
     suffixes = sorted({path.suffix.lower() for path in paths})
     remedies = [_remedy(suffix) for suffix in suffixes]

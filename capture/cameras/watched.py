@@ -10,7 +10,7 @@ from typing import Annotated
 
 import msgspec
 
-from splatnode.capture.cameras.folder import foreign_file, frame_name, image_paths
+from splatnode.capture.cameras.folder import foreign_file, frame_name, image_paths, with_transparency
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.given_lens import same_aspect
 from splatnode.capture.image_file import (
@@ -19,12 +19,14 @@ from splatnode.capture.image_file import (
     UnusableImage,
     check_whole,
     decode_photograph,
+    measure_values,
     read_image_file,
 )
 from splatnode.capture.name_time import name_time
 from splatnode.capture.nothing_new import NothingNew
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.unavailable import CameraUnavailable
+from splatnode.capture.value_range import find_range
 
 REMEMBERED = 100_000  # photographs that were taken and are no longer there: all may be back
 _TEMPORARY_SUFFIXES = {".tmp", ".part", ".partial", ".crdownload", ".filepart"}
@@ -159,14 +161,19 @@ def _given_up(name: str, why: str, waited_s: float, config: Config) -> DroppedFr
 
 def _decoded(name: str, data: bytes, written_at: Stamp, config: Config, frame_id: int) -> Frame | DroppedFrame:
     try:
-        image, intrinsics, captured_at, exposure = decode_photograph(data, config.max_pixels)
+        extent = measure_values(data, config.max_pixels)
+        used = None if extent is None else find_range([extent])
+        decoded = decode_photograph(data, config.max_pixels, used)
     except UnusableImage as error:
         return DroppedFrame(name, str(error))
+    image, intrinsics = decoded.image, decoded.intrinsics
     height, width = image.shape[:2]
     if config.intrinsics is not None and same_aspect(config.intrinsics, width, height):
         intrinsics = config.intrinsics.resized(width, height)
-    captured_at = captured_at or name_time(name) or written_at
-    return framed(frame_id, name, time.monotonic_ns(), image, intrinsics, data, captured_at, exposure=exposure)
+    captured_at = decoded.captured_at or name_time(name) or written_at
+    known = image, intrinsics, data if used is None else None, captured_at
+    item = framed(frame_id, name, time.monotonic_ns(), *known, exposure=decoded.exposure)
+    return with_transparency(item, decoded.mask)
 
 
 def _listed(folder: Path) -> list[Path]:

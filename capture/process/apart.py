@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import resource
+import subprocess
 import sys
 
 
@@ -13,6 +15,28 @@ def command(module: str, *arguments: str) -> list[str]:
     """
     code = f"import sys; sys.path[:] = {sys.path!r}; from {module} import main; main()"
     return [sys.executable, "-I", "-c", code, *arguments]
+
+
+def answer(module: str, data: bytes, most: int, *arguments: str) -> tuple[bytes, int]:
+    """What the process of `command` writes, `most` bytes of it, once it has read `data`; and how it ended."""
+    child = subprocess.Popen(
+        command(module, *arguments),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,  # what a decoder says of a stranger's file is a stranger's text
+        start_new_session=True,  # Ctrl-C is for us
+    )
+    with child:
+        assert child.stdin is not None and child.stdout is not None
+        try:
+            with contextlib.suppress(BrokenPipeError):  # it ended before it had read all
+                child.stdin.write(data)
+                child.stdin.close()
+            found = child.stdout.read(most)
+            child.stdout.close()  # what it would write beyond ends it
+            return found, child.wait()
+        finally:
+            child.kill()
 
 
 def limit_memory(further_bytes: int) -> None:

@@ -14,6 +14,10 @@ from splatnode.capture.frame import Frame, Intrinsics
 REFERENCE_SIDE = 1024
 
 
+# What OpenCV and NumPy raise where they cannot work with the pixels or points of one image. Such a fault costs that
+# image or that pair, and is logged with its name; every other exception is a fault of ours and surfaces.
+LIBRARY_ERRORS = (cv2.error, np.linalg.LinAlgError)
+
 PLAIN = 1.0  # the tilt of features of the image as it is
 
 

@@ -102,9 +102,14 @@ def screen(summaries: Sequence[FrameSummary], config: Config) -> tuple[list[int]
     for summary in summaries:
         blur_px = summary.quality.blur_px
         sharpest[summary.size] = min(sharpest[summary.size], math.inf if blur_px is None else blur_px)
+    largest = max((max(summary.size) for summary in summaries), default=0)
     kept: list[int] = []
     rejected: list[Rejected] = []
     for index, summary in enumerate(summaries):
+        too_small = quality.why_too_small(summary.size, largest)
+        if too_small is not None:
+            rejected.append(Rejected(summary.name, Code.TOO_FEW_VIEWS, too_small))
+            continue
         why = quality.why_unusable(summary.quality, config.limits, sharpest[summary.size])
         if why is not None:
             rejected.append(Rejected(summary.name, _code(summary.quality, config.limits), why))

@@ -28,7 +28,7 @@ from splatnode.recon.mapping.scenes import (
 )
 from splatnode.recon.merging.command import EXIT_GOOD, EXIT_REFUSED, Reports, most, write_maps
 from splatnode.recon.replay_source import IMAGES, Recording, Request, recording
-from splatnode.recon.result.export import read_cameras, write_file
+from splatnode.recon.result.export import read_cameras, remove_result, write_file
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.folder import result_folder
@@ -48,6 +48,7 @@ def replay_map(args: argparse.Namespace, request: Request, config: Config) -> in
         tell(str(source.choice))
     began_s = time.monotonic()
     with result_folder(args.out, KEYFRAME_BYTES * len(source.choice.names)):
+        remove_result(args.out)  # of one scene, beside which nobody would find the map's
         frames = _kept(source, args.out) if source.is_film else source.frames()
         told = _ToldOfMap(args.json, len(source.choice.names))
         with _only_warnings():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -12,7 +13,7 @@ import numpy.typing as npt
 
 from splatnode.capture.process.progress import Step, Tell, told_to_nobody
 from splatnode.recon.deadline import is_over
-from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.frames.keyframe import LIBRARY_ERRORS, Keyframe
 from splatnode.recon.matching import features, pair_matching
 from splatnode.recon.matching.candidates import to_glance_at
 from splatnode.recon.matching.config import Config
@@ -20,6 +21,8 @@ from splatnode.recon.matching.image_code import image_code
 from splatnode.recon.matching.pair_matching import MatchedPair
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.workers import each, in_turn
+
+log = logging.getLogger(__name__)
 
 FIRST_COMPARISONS = 4  # keyframes that a further one is matched with at once
 MIN_PARTNERS = 2  # verified pairs that it then needs; with fewer it is matched with all
@@ -197,6 +200,15 @@ def _of(keyframes: Sequence[Keyframe], pair: Sequence[int]) -> tuple[Keyframe, K
 
 
 def _with_tilted_features(keyframe: Keyframe, tilts: Sequence[float], config: Config) -> Keyframe:
+    """With features of these tilts; as it is, which the log tells, where a library fails on its image."""
+    try:
+        return _add_tilted_features(keyframe, tilts, config)
+    except LIBRARY_ERRORS as error:
+        log.warning("%s is matched without simulated tilts: %s", keyframe.name, error)
+        return keyframe
+
+
+def _add_tilted_features(keyframe: Keyframe, tilts: Sequence[float], config: Config) -> Keyframe:
     found = features.add_tilted(keyframe.features, keyframe.frame.image, tilts, config.features)
     return replace(keyframe, features=features.used(found, keyframe.frame.mask))
 

@@ -8,6 +8,7 @@ no two say that it stands still: a pattern that repeats stands still where photo
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,11 +19,20 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.masks import masked
-from splatnode.recon.frames.keyframe import REFERENCE_SIDE, Keyframe, longer_side, modelled_image, principal_point
+from splatnode.recon.frames.keyframe import (
+    LIBRARY_ERRORS,
+    REFERENCE_SIDE,
+    Keyframe,
+    longer_side,
+    modelled_image,
+    principal_point,
+)
 from splatnode.recon.matching import features, two_view
 from splatnode.recon.matching.match import Matcher, completed
 from splatnode.recon.matching.view_graph import Pair, ViewGraph
 from splatnode.recon.workers import each
+
+log = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -111,7 +121,7 @@ def moving_points(graph: ViewGraph) -> list[Mask]:
     needed = min(VOTES, len(matches))
     for _ in range(ROUNDS):
         asked = [(graph, pair, found) for pair, found in matches.items()]
-        groups = [group for found in each(lambda one: list(_groups(*one)), asked) for group in found]
+        groups = [group for found in each(lambda one: _find_groups(*one), asked) for group in found]
         votes = [np.zeros(len(points), int) for points in moving]
         for group in groups:
             if group.moves:
@@ -125,6 +135,16 @@ def moving_points(graph: ViewGraph) -> list[Mask]:
             (i, j): found[~(moving[i][found[:, 0]] | moving[j][found[:, 1]])] for (i, j), found in matches.items()
         }
     return moving
+
+
+def _find_groups(graph: ViewGraph, pair: Pair, matches: Index) -> list[_Group]:
+    """Those of `_groups`; none, which the log tells, where a library fails on this pair."""
+    try:
+        return list(_groups(graph, pair, matches))
+    except LIBRARY_ERRORS as error:
+        first, second = (graph.keyframes[index].name for index in pair)
+        log.warning("%s and %s are not searched for what moves: %s", first, second, error)
+        return []
 
 
 def _groups(graph: ViewGraph, pair: Pair, matches: Index) -> Iterator[_Group]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,9 +10,18 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import PLAIN, Features, Keyframe, longer_side, principal_point
+from splatnode.recon.frames.keyframe import (
+    LIBRARY_ERRORS,
+    PLAIN,
+    Features,
+    Keyframe,
+    longer_side,
+    principal_point,
+)
 from splatnode.recon.matching import appearance_check, nearest_neighbours, two_view
 from splatnode.recon.matching.two_view import TwoView
+
+log = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -96,7 +106,16 @@ def _match(
 
 
 def _verified(keyframe1: Keyframe, keyframe2: Keyframe, matches: Index, config: Config) -> MatchedPair:
-    """The matches with their two-view geometry.
+    """The matches with their two-view geometry; without one, and a line in the log, where a library fails on them."""
+    try:
+        return _estimate_geometry(keyframe1, keyframe2, matches, config)
+    except LIBRARY_ERRORS as error:
+        log.warning("%s and %s count as sharing nothing: %s", keyframe1.name, keyframe2.name, error)
+        return MatchedPair(matches, None, 0.0)
+
+
+def _estimate_geometry(keyframe1: Keyframe, keyframe2: Keyframe, matches: Index, config: Config) -> MatchedPair:
+    """The matches with their two-view geometry. Raises LIBRARY_ERRORS.
 
     The first frame is scaled to the longer side of the second: one focal length in pixels may then hold for both.
     """

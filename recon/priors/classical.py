@@ -83,7 +83,8 @@ class ClassicalPrior(Prior):
             points = sparse_points(registration, camera, keyframe.scale)
             near, far = stereo.depth_range(points.depths)
             near_far = (near, self._config.far_margin * far)
-            views.append(stereo.StereoView(keyframe.image, modelled_K(graph, camera), camera.T_world_camera, near_far))
+            K, T_world_camera = modelled_K(graph, camera), camera.T_world_camera
+            views.append(stereo.StereoView(keyframe.image, K, T_world_camera, near_far, keyframe.name))
             sparse.append(points)
         return views, sparse
 

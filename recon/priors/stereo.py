@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -14,10 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.recon.deadline import OutOfTime
+from splatnode.recon.frames.keyframe import LIBRARY_ERRORS
 from splatnode.recon.priors import consistency
 from splatnode.recon.priors.consistency import DepthMap
 from splatnode.recon.priors.patchmatch import Level, Matching, Planes, Search, improve, make_level, resized
 from splatnode.recon.workers import each
+
+log = logging.getLogger(__name__)
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -64,6 +68,7 @@ class StereoView:
     K: Float64  # (3, 3)
     T_world_camera: Float64  # (4, 4)
     depth_range: tuple[float, float]  # nearest and farthest z that is searched
+    name: str = "a view"  # of its keyframe, for the log
 
     def __post_init__(self) -> None:
         if self.image.ndim != 3 or self.image.shape[2] != 3 or self.image.dtype != np.uint8:
@@ -111,7 +116,7 @@ def depth_maps(
             levels[stage.level] = each(_level, views, [stage.level] * len(views))
         at_level = levels[stage.level]
         if not planes:
-            planes = each(_start, views, at_level, known_points)
+            planes = each(_start_or_unknown, views, at_level, known_points)
         planes = each(resized, planes, at_level)
         improved = list(planes)
         try:
@@ -243,6 +248,15 @@ def depth_range(depths: Float64, margin: float = 1.5) -> tuple[float, float]:
 
 def _level(view: StereoView, level: int) -> Level:
     return make_level(view.image, view.K, view.T_world_camera, view.depth_range, level)
+
+
+def _start_or_unknown(view: StereoView, level: Level, sparse: SparsePoints | None) -> Planes:
+    """As `_start`; all unknown, which the log tells, where a library fails on this view's points."""
+    try:
+        return _start(view, level, sparse)
+    except LIBRARY_ERRORS as error:
+        log.warning("%s: stereo begins without its sparse points: %s", view.name, error)
+        return _start(view, level, None)
 
 
 def _start(view: StereoView, level: Level, sparse: SparsePoints | None) -> Planes:

@@ -15,7 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
-from splatnode.capture.image_file import UnusableImage, decode_photograph, encode_jpeg, read_image_file
+from splatnode.capture.image_file import (
+    UnusableImage,
+    decode_photograph,
+    encode_jpeg,
+    find_common_range,
+    read_image_file,
+)
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import is_printable
 from splatnode.capture.process.records import record_in
@@ -146,11 +152,12 @@ def _report(path: Path) -> _Report | None:
 def found_photographs(cameras: tuple[CameraEstimate, ...], folders: Sequence[Path]) -> dict[str, npt.NDArray[np.uint8]]:
     """By camera, its photograph in the first of the `folders` that has one, as large as a window needs it."""
     found = {}
+    used = find_common_range([folder / camera.name for camera in cameras for folder in folders])
     for camera in cameras:
         try:
             path = photograph_path(camera, folders)
             if path is not None:
-                found[camera.name] = _small(decode_photograph(read_image_file(path))[0])
+                found[camera.name] = _small(decode_photograph(read_image_file(path), used=used).image)
         except (UnusableImage, OSError) as error:
             log.warning("%s is shown without its photograph: %s", camera.name, error)
     return found

@@ -15,6 +15,7 @@ from splatnode.recon.registration.register import Registration
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.recon.verification import lens, refusals
 from splatnode.recon.verification.config import Config
+from splatnode.recon.verification.input_kinds import refuse_stereo_or_panorama
 from splatnode.recon.verification.refusals import refuse
 
 Pair = tuple[int, int]
@@ -22,7 +23,8 @@ Pair = tuple[int, int]
 
 def refuse_before_registration(graph: ViewGraph, rejected: Sequence[Rejected], config: Config) -> Verdict | None:
     """Why there can be no scene whatever the poses are, or None. `rejected` are the frames that screening left out."""
-    return _too_little(graph, rejected, config) or _no_motion(graph, config)
+    kind = refuse_stereo_or_panorama(graph.keyframes)
+    return kind or _too_little(graph, rejected, config) or _no_motion(graph, config)
 
 
 def refuse_unplaced(graph: ViewGraph, registration: Registration | None, config: Config) -> Verdict:

@@ -11,14 +11,16 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.cameras.folder import SUFFIXES, frame_name
+from splatnode.capture.cameras.folder import SUFFIXES, frame_name, in_words_of_range
 from splatnode.capture.exif import exif_exposure, exif_intrinsics, read_tags
 from splatnode.capture.exif_time import exif_time
-from splatnode.capture.frame import Frame, Intrinsics
+from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.given_lens import check_fits, seen_through
+from splatnode.capture.masks import masked
 from splatnode.capture.orientation import ORIENTATION, upright
 from splatnode.capture.process.progress import Tell
 from splatnode.capture.stamp import Stamp
+from splatnode.capture.value_range import Extent, ValueRange, find_range, measure_extent, to_eight_bits
 from splatnode.recon.replay_source import Request, Source, asked_for, at_hand, source
 
 STEP_NS = 100_000_000  # between two photographs that have no time, as in a folder
@@ -39,7 +41,10 @@ def photographs(images: Images, views: int | None, every_frame: bool, tell: Tell
         return source(Request(path, listed, views, every_frame=every_frame), tell)
     if any(paths):
         raise TypeError("images must be all paths or all pictures, got both. Read the files, or write the pictures")
-    frames = [frame(each, index, picture_name(index), index * STEP_NS) for index, each in enumerate(given)]
+    used = find_range([extent for extent in map(_extent, given) if extent is not None])
+    if used is not None:
+        tell(in_words_of_range(used))
+    frames = [frame(each, index, picture_name(index), index * STEP_NS, used=used) for index, each in enumerate(given)]
     return at_hand(frames, views, every_frame, tell)
 
 
@@ -59,28 +64,46 @@ def names_of(images: Images) -> list[str]:
     ]
 
 
-def frame(picture: Picture, frame_id: int, name: str, stamp_ns: int, captured_at: Stamp | None = None) -> Frame:
-    """A picture as a frame, with what its EXIF tells of lens, time and exposure. Raises TypeError, ValueError."""
+def frame(
+    picture: Picture,
+    frame_id: int,
+    name: str,
+    stamp_ns: int,
+    captured_at: Stamp | None = None,
+    used: ValueRange | None = None,
+) -> Frame:
+    """A picture as a frame, with what its EXIF tells of lens, time and exposure, without what its alpha hides.
+
+    `used` as for `pixels`. Raises TypeError, ValueError.
+    """
     try:
-        image, tiff = pixels(picture), _tiff(picture)
+        image, tiff = pixels(picture, used), _tiff(picture)
         height, width = image.shape[:2]
         tags, taken_at = read_tags(tiff), captured_at or exif_time(tiff)
         intrinsics, exposure = exif_intrinsics(tags, width, height), exif_exposure(tags)
-        return Frame(frame_id, name, stamp_ns, image, intrinsics, captured_at=taken_at, exposure=exposure)
+        made = Frame(frame_id, name, stamp_ns, image, intrinsics, captured_at=taken_at, exposure=exposure)
+        mask = _opaque(picture)
+        if mask is None:
+            return made
+        seen = masked(made, mask)
+        if isinstance(seen, DroppedFrame):
+            raise ValueError(f"its alpha channel hides {100 * (1 - mask.mean()):.1f} % of it: leave alpha out")
+        return seen
     except (TypeError, ValueError) as error:
         raise type(error)(f"image {name}: {error}") from error
 
 
-def pixels(picture: Picture) -> npt.NDArray[np.uint8]:
-    """A copy of a picture (H, W, 3) RGB, treated as a file's: upright, grey as RGB, 16 bits as the upper 8, no alpha.
+def pixels(picture: Picture, used: ValueRange | None = None) -> npt.NDArray[np.uint8]:
+    """A copy of a picture (H, W, 3) RGB, treated as a file's: upright, grey as RGB, no alpha.
 
+    Of 16 bits the range `used` becomes 8; None: what this picture uses of them alone.
     An array must be (H, W), (H, W, 1), (H, W, 3) or (H, W, 4), of uint8 or uint16. Raises TypeError, ValueError.
     """
     array = _of_pil(picture) if _is_pil(picture) else picture
     if not isinstance(array, np.ndarray):
         raise TypeError(f"must be a NumPy array (H, W, 3) uint8 or a PIL image, got {type(picture).__name__}")
     if array.dtype == np.uint16:
-        array = (array >> 8).astype(np.uint8)
+        array = to_eight_bits(array, used or find_range([measure_extent(array)] if array.size else []))
     if array.dtype != np.uint8:
         raise TypeError(f"must be uint8, got {array.dtype}. Of floats in [0, 1]: (255 * image).round().astype('uint8')")
     if array.ndim == 2:
@@ -135,6 +158,27 @@ def as_list(images: Any) -> list[Any]:
     if not given:
         raise ValueError("images must have at least one photograph, got none")
     return given
+
+
+def _extent(picture: Picture) -> Extent | None:
+    """Of the values of a picture of 16 bits; None of another one."""
+    array = _of_pil(picture) if _is_pil(picture) else picture
+    deep = isinstance(array, np.ndarray) and array.dtype == np.uint16 and array.size
+    return measure_extent(array[..., :3] if array.ndim == 3 else array) if deep else None
+
+
+def _opaque(picture: Picture) -> npt.NDArray[np.bool_] | None:
+    """(H, W) where a picture's alpha is above 0; None where it has none, or one that says nothing, as of a file."""
+    if _is_pil(picture):
+        if "A" not in picture.getbands() and "transparency" not in picture.info:
+            return None
+        alpha = upright(np.asarray(picture.convert("RGBA"))[..., 3], picture.getexif().get(ORIENTATION, 1))
+    elif picture.ndim == 3 and picture.shape[2] == 4:
+        alpha = picture[..., 3]
+    else:
+        return None
+    mask = alpha > 0
+    return None if mask.all() or not mask.any() else np.ascontiguousarray(mask)
 
 
 def _is_pil(picture: Any) -> bool:

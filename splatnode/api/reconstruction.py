@@ -47,7 +47,7 @@ def reconstruct(
 
     - `images`: a folder, a film (a video, an image topic `"drive.mcap#/front/image"`, an episode of a LeRobot data set
       `"pusht#3/CAMERA"`), a list of photographs of one folder (paths), or a list of pictures: NumPy arrays (H, W, 3)
-      uint8 RGB, or PIL images. Grey is taken as RGB, 16 bits as the upper 8, alpha is dropped. Of a film, and of more
+      uint8 RGB, or PIL images. Grey becomes RGB, where alpha is 0 there is no photograph. Of a film, and of more
       than 30 photographs, keyframes are chosen.
     - `intrinsics`: the lens of all photographs of its aspect ratio: `Intrinsics`, or K (3, 3) in pixels of the
       photographs without distortion. None: what EXIF tells, else it is estimated.

@@ -8,8 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from splatnode.api.photographs import frame, pixels
+from splatnode.api.photographs import frame, photographs, pixels
 from splatnode.capture.exposure_settings import ExposureSettings
+from splatnode.capture.frame import Frame
 from splatnode.capture.image_file import decode_image
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (24, 32, 4)).astype(np.uint8)
@@ -47,6 +48,28 @@ def test_a_pil_image_is_taken_as_its_file(mode):
         picture.putalpha(77)
     picture.save(file, "png")
     assert np.array_equal(pixels(picture), decode_image(file.getvalue()).image)
+
+
+def test_what_alpha_hides_is_no_part_of_a_picture():
+    array = PICTURE.copy()
+    array[..., 3] = 255
+    array[:8, :8, 3] = 0
+    made = frame(array, 0, "0.png", 0)
+    assert made.mask is not None and not made.mask[:8, :8].any() and made.mask.sum() == 24 * 32 - 64
+    image = pytest.importorskip("PIL.Image")
+    assert np.array_equal(frame(image.fromarray(array), 0, "0.png", 0).mask, made.mask)
+    nothing = np.dstack([PICTURE[..., :3], np.eye(24, 32, dtype=np.uint8)])
+    with pytest.raises(ValueError, match="alpha channel hides 96.9 % of it"):
+        frame(nothing, 0, "0.png", 0)
+
+
+def test_pictures_of_twelve_used_bits_are_stretched_alike_and_that_is_told():
+    told = []
+    dark, bright = DEEP >> 5, DEEP >> 4
+    made = [each for each in photographs([dark, bright], None, True, told.append).frames if isinstance(each, Frame)]
+    assert np.abs(made[1].image[..., 0].astype(int) - (bright >> 4)).max() <= 1
+    assert np.abs(made[0].image[..., 0].astype(int) - (dark >> 4)).max() <= 1
+    assert any("12 of 16 bits" in str(line) for line in told)
 
 
 def test_a_deep_pil_image_keeps_its_upper_bits():

@@ -19,7 +19,7 @@ from tests.support.crafted.bounded import MARGIN, readings
 from tests.support.crafted.images import png
 
 LIMIT = 1_000_000  # pixels
-ENCODINGS = (".jpg", ".png", ".webp", ".tif", ".bmp")
+ENCODINGS = (".jpg", ".png", ".webp", ".tif", ".bmp", ".ppm")
 
 
 def read(file: Crafted) -> str:

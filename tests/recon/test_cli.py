@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import shutil
@@ -16,7 +17,7 @@ import pytest
 from splatnode import command_line
 from splatnode.capture.cameras.folder import Config, stream
 from splatnode.capture.recording import Recorder
-from splatnode.recon import offline, replay_source
+from splatnode.recon import cli, offline, replay_source
 from splatnode.recon.result.scale import Scale
 from tests.support.exported import make_snapshot
 
@@ -55,6 +56,26 @@ def test_what_cannot_end_well_is_not_begun(photographs, monkeypatch, capsys, arg
     assert said in capsys.readouterr().err
     assert {path.name for path in photographs.parent.iterdir()} == {"photographs"}
     assert {path.name for path in photographs.iterdir()} == {"a.png", "b.png"}
+
+
+def test_a_folder_with_the_scenes_of_a_map_is_not_written_into(photographs, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(offline, "reconstruct", lambda *_: pytest.fail("was begun"))
+    out = tmp_path / "walk"
+    out.mkdir()
+    (out / "places.json").write_text("{}")
+    assert command_line.main(["replay", str(photographs), "--out", str(out)]) == 2
+    assert "walk holds the scenes of a map or of a node (places.json); give another --out" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == ["places.json"]
+
+
+def test_the_picture_that_an_earlier_run_showed_is_removed_and_others_stay(tmp_path):
+    pictures = tmp_path / "view"
+    pictures.mkdir()
+    for name in ("live.png", "mine.png"):
+        (pictures / name).write_bytes(b"a picture")
+    with cli._viewer(argparse.Namespace(out=tmp_path, view=False)) as show:
+        assert show is offline.shown_to_nobody
+    assert [path.name for path in pictures.iterdir()] == ["mine.png"]
 
 
 def test_a_baseline_of_a_photograph_that_was_not_chosen_says_so(photographs, monkeypatch, capsys):

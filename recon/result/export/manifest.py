@@ -16,8 +16,12 @@ from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.limits import read_json_file
 
 MANIFEST = "manifest.json"  # of a result
+EXPORTS = "exports.json"  # of what was made of a result afterwards and put into its folder: exports, pictures
 OF_A_MAP = "map.json"  # of a map of free space
 MAPS = "occupancy"  # the folder in a result's own that its map is in, where nobody names another
+
+
+LIVE_PICTURE = "live.png"  # which a viewer without a window keeps up to date while a scene is made
 
 
 class _Entry(msgspec.Struct, frozen=True):
@@ -41,11 +45,11 @@ def digests(path: Path) -> dict[str, str]:
     return {}
 
 
-def maps_of(folder: Path) -> dict[str, str]:
-    """SHA-256 by file of the maps that were made of the result in `folder`, and of their manifests."""
+def made_of(folder: Path) -> dict[str, str]:
+    """SHA-256 by file of what was made of the result in `folder`, and of the manifests: maps, exports and pictures."""
     found = {}
-    for manifest in (OF_A_MAP, f"{MAPS}/{OF_A_MAP}"):
-        within = manifest.removesuffix(OF_A_MAP)
+    for manifest in (OF_A_MAP, f"{MAPS}/{OF_A_MAP}", EXPORTS):
+        within = manifest.removesuffix(OF_A_MAP).removesuffix(EXPORTS)
         listed = {f"{within}{name}": digest for name, digest in digests(folder / manifest).items()}
         with contextlib.suppress(OSError):
             listed |= {manifest: sha256((folder / manifest).read_bytes())} if listed else {}

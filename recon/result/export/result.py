@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -13,7 +14,7 @@ from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
 from splatnode.recon.result.export.formats.ply import encode_ply
 from splatnode.recon.result.export.formats.tum import encode_tum
-from splatnode.recon.result.export.manifest import MANIFEST, MAPS, digests, entries, maps_of, sha256
+from splatnode.recon.result.export.manifest import EXPORTS, MANIFEST, MAPS, digests, entries, made_of, sha256
 from splatnode.recon.result.export.prepare import viewer_safe
 from splatnode.recon.result.export.staged import ResultWriteError, explanation, json_bytes, write_files
 from splatnode.recon.result.snapshot import Snapshot
@@ -33,15 +34,15 @@ def write_result(
 
     A scene that its verdict does not let be published leaves report.json and manifest.json only. The folder holds one
     result: files that an earlier manifest lists, that are unchanged since, and that this result does not have are
-    removed once the new manifest is there, and so are maps that were made of it. `report` is that of `build_report`.
-    Raises ResultWriteError, with an earlier result intact, where the files cannot be written.
+    removed once the new manifest is there, and so is what was made of it: maps, exports and pictures. `report` is that
+    of `build_report`. Raises ResultWriteError, with an earlier result intact, where the files cannot be written.
     """
     files = {"report.json": json_bytes(report)}
     if snapshot.verdict.publishable:
         files = _scene_files(snapshot, preview) | dict(further) | files
     previous = digests(out_dir / MANIFEST)
     manifest = {**snapshot.scale.record(), "verdict": snapshot.verdict.code.value, "files": entries(files)}
-    gone = maps_of(out_dir) | previous
+    gone = made_of(out_dir) | previous
     superseded = {name: digest for name, digest in gone.items() if name not in files and name != MANIFEST}
     write_files(out_dir, files | {MANIFEST: json_bytes(manifest)}, superseded)
     return out_dir / MANIFEST
@@ -63,10 +64,28 @@ def copy_result(folder: Path, out_dir: Path) -> Path:
     if not files:
         raise SceneFileError(f"{folder} has no {MANIFEST} that can be read: it is no result that was written whole")
     files[MANIFEST] = (folder / MANIFEST).read_bytes()
-    gone = maps_of(out_dir) | digests(out_dir / MANIFEST)
+    gone = made_of(out_dir) | digests(out_dir / MANIFEST)
     superseded = {name: digest for name, digest in gone.items() if name not in files}
     write_files(out_dir, files, superseded)
     return out_dir / MANIFEST
+
+
+def write_beside(path: Path, contents: Mapping[str, bytes], of: Path) -> None:
+    """Writes what was made of the result `of`, a folder or its scene file: `contents`, by path relative to `path`.
+
+    The name "" is that of the file `path` itself. What lies inside of the result's folder is listed in its
+    `exports.json`: the next result that is written there removes it, unless somebody has changed it meanwhile.
+    Raises ResultWriteError.
+    """
+    folder = Path(os.path.realpath(of if of.is_dir() else of.parent))
+    target = Path(os.path.realpath(path.parent)) / path.name
+    if not (target.is_relative_to(folder) and digests(folder / MANIFEST)):
+        write_files(path.parent, {os.path.normpath(f"{path.name}/{name}"): data for name, data in contents.items()})
+        return
+    place = target.relative_to(folder)
+    files = {os.path.normpath(place / name): data for name, data in contents.items()}
+    known = {name: {"sha256": digest} for name, digest in digests(folder / EXPORTS).items()}
+    write_files(folder, files | {EXPORTS: json_bytes({"files": known | entries(files)})})
 
 
 def remove_result(out_dir: Path) -> None:
@@ -81,7 +100,7 @@ def remove_result(out_dir: Path) -> None:
         own = {MANIFEST: sha256((out_dir / MANIFEST).read_bytes())}
     except OSError as error:
         raise ResultWriteError(error.errno, explanation(error, out_dir)) from error
-    write_files(out_dir, {}, maps_of(out_dir) | previous | own)
+    write_files(out_dir, {}, made_of(out_dir) | previous | own)
     for folder in (out_dir / MAPS, out_dir):
         with contextlib.suppress(OSError):  # others' files may be in it
             folder.rmdir()

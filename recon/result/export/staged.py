@@ -10,6 +10,7 @@ import contextlib
 import errno
 import fcntl
 import hashlib
+import itertools
 import json
 import os
 import re
@@ -204,8 +205,8 @@ def _remove(folder: Path, name: str, digest: str) -> None:
     if hashlib.sha256(path.read_bytes()).hexdigest() == digest:
         path.unlink()
         with contextlib.suppress(OSError):  # others' files may be beside it
-            if path.parent != folder:
-                path.parent.rmdir()
+            for parent in itertools.takewhile(lambda parent: parent != folder, path.parents):
+                parent.rmdir()
 
 
 def _is_inside(folder: Path, name: str) -> bool:

@@ -1,3 +1,4 @@
+import io
 import math
 import os
 import struct
@@ -9,7 +10,8 @@ import pytest
 from splatnode.capture.cameras.folder import Config, stream
 from splatnode.capture.exif import exif_intrinsics, read_tags
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.image_file import UnusableImage, read_header
+from splatnode.capture.image_file import UnusableImage, decode_image
+from splatnode.capture.image_header import read_header
 from splatnode.capture.stamp import Clock, Stamp
 
 # Left half red, right half blue, the top left corner white: tells every orientation and channel order apart.
@@ -70,6 +72,18 @@ def read_frame(folder, name, data):
     return frame
 
 
+def frames_in(folder, **options):
+    items = list(stream(Config(folder, **options)))
+    frames = [item for item in items if isinstance(item, Frame)]
+    assert len(frames) == len(items)
+    return frames
+
+
+def reasons_in(folder, **options):
+    """Of what is left out, by name."""
+    return {item.name: item.reason for item in stream(Config(folder, **options)) if isinstance(item, DroppedFrame)}
+
+
 @pytest.mark.parametrize("suffix", [".jpg", ".JPEG", ".png", ".bmp", ".tif", ".webp"])
 def test_every_format_gives_the_same_rgb(tmp_path, suffix):
     frame = read_frame(tmp_path, "a" + suffix, encoded(suffix.lower()))
@@ -93,9 +107,143 @@ def test_sixteen_bits_become_eight(tmp_path):
     assert np.array_equal(deep_grey.image, np.repeat(PICTURE[..., :1], 3, 2))
 
 
-def test_alpha_is_dropped(tmp_path):
+def test_an_alpha_channel_that_hides_all_says_nothing(tmp_path):
     transparent = np.dstack([PICTURE, np.zeros_like(PICTURE[..., 0])])
     assert np.array_equal(read_frame(tmp_path, "a.png", encoded(".png", transparent)).image, PICTURE)
+
+
+LOSSLESS = {".webp": (cv2.IMWRITE_WEBP_QUALITY, 101)}
+SHAPE = np.ones(PICTURE.shape[:2], bool)
+SHAPE[:20, 10:40] = False  # its middle is in no symmetry of the picture
+
+
+def with_alpha(deep: bool = False, half: int = 255) -> np.ndarray:
+    """The picture with an alpha of 0 in a corner and of `half` beside it."""
+    alpha = np.where(SHAPE, 255, 0).astype(np.uint8)
+    alpha[:20, 40:50] = half
+    both = np.dstack([PICTURE, alpha])
+    return both.astype(np.uint16) * 257 if deep else both
+
+
+@pytest.mark.parametrize(
+    ("suffix", "deep"), [(".png", False), (".png", True), (".tif", False), (".tif", True), (".webp", False)]
+)
+def test_what_alpha_hides_is_no_part_of_the_photograph(tmp_path, suffix, deep):
+    frame = read_frame(tmp_path, "a" + suffix, encoded(suffix, with_alpha(deep), *LOSSLESS.get(suffix, ())))
+    assert frame.mask is not None and np.array_equal(frame.mask, SHAPE)
+    assert np.array_equal(frame.image[SHAPE], PICTURE[SHAPE])
+    assert frame.encoded is None
+    opaque = np.dstack([PICTURE, np.full_like(PICTURE[..., 0], 255)])
+    assert read_frame(tmp_path, "a" + suffix, encoded(suffix, opaque)).mask is None
+
+
+@pytest.mark.parametrize(("extra", "hidden_half"), [(2, False), (1, True), (0, None)])
+def test_the_alpha_of_a_tiff_is_what_its_extra_sample_says(tmp_path, extra, hidden_half):
+    """libtiff multiplies the colours by an alpha that is not associated: they came out black where it is 0."""
+    image = pytest.importorskip("PIL.Image")
+    file = io.BytesIO()
+    image.fromarray(with_alpha(half=128)).save(file, "tiff")
+    data = bytearray(file.getvalue())
+    place = data.index(struct.pack("<HHI", 338, 3, 1))
+    struct.pack_into("<H", data, place + 8, extra)
+    frame = read_frame(tmp_path, "a.tif", bytes(data))
+    if hidden_half is None:
+        assert frame.mask is None and np.array_equal(frame.image, PICTURE)
+        return
+    used = SHAPE.copy()
+    used[:20, 40:50] = not hidden_half
+    assert frame.mask is not None and np.array_equal(frame.mask, used)
+    assert np.array_equal(frame.image[used], PICTURE[used])
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_alpha_is_turned_as_its_photograph_is(tmp_path, orientation):
+    image = pytest.importorskip("PIL.Image")
+    marked = with_alpha()
+    marked[SHAPE] = [250, 250, 250, 255]
+    marked[~SHAPE] = [0, 0, 0, 0]
+    for suffix in ("png", "tiff", "webp"):
+        file, exif = io.BytesIO(), image.Exif()
+        exif[ORIENTATION] = orientation
+        options = {"lossless": True, "exact": True} if suffix == "webp" else {}
+        image.fromarray(marked).save(file, suffix, exif=exif, **options)
+        decoded = decode_image(file.getvalue())
+        assert decoded.mask is not None and decoded.mask.shape == decoded.image.shape[:2], suffix
+        assert np.array_equal(decoded.mask, decoded.image.max(2) > 128), suffix
+
+
+def test_a_photograph_of_which_alpha_leaves_next_to_nothing_is_named(tmp_path):
+    alpha = np.zeros_like(PICTURE[..., 0])
+    alpha[:4, :4] = 255
+    dropped = read_one(tmp_path, "a.png", encoded(".png", np.dstack([PICTURE, alpha])))
+    assert isinstance(dropped, DroppedFrame) and dropped.reason == "its alpha channel hides 99.5 % of it"
+
+
+@pytest.mark.parametrize("suffix", [".png", ".tif", ".ppm"])
+def test_images_of_sixteen_bits_with_twelve_used_are_stretched_alike_and_that_is_told(tmp_path, suffix, caplog):
+    dark = PICTURE.astype(np.uint16) * 257 >> 6  # of a darker photograph: up to 10 bits
+    bright = PICTURE.astype(np.uint16) * 257 >> 4
+    (tmp_path / f"1{suffix}").write_bytes(encoded(suffix, dark))
+    (tmp_path / f"2{suffix}").write_bytes(encoded(suffix, bright))
+    (tmp_path / "3.jpg").write_bytes(encoded())
+    first, second, third = frames_in(tmp_path)
+    assert np.abs(second.image.astype(int) - PICTURE).max() <= 1
+    assert np.abs(first.image.astype(int) - PICTURE // 4).max() <= 1
+    assert np.abs(third.image.astype(int) - PICTURE).mean() < 4
+    assert first.encoded is None, "a recording would store the file, whose upper 8 bits are nearly black"
+    (told,) = [record.message for record in caplog.records]
+    assert told == "16-bit photographs use only 12 of 16 bits: this range is stretched to 8 bits, alike for all of them"
+
+
+def test_a_narrow_band_of_sixteen_bits_is_stretched_though_a_pixel_is_hot(tmp_path, caplog):
+    thermal = 7000 + 8 * np.tile(PICTURE[..., 0].astype(np.uint16), (4, 4))
+    thermal[3, 3] = 65_535
+    frame = read_frame(tmp_path, "a.png", encoded(".png", thermal))
+    assert frame.image.min() < 20 and np.percentile(frame.image, 99) > 220
+    assert "use only the values 7" in caplog.text
+
+
+@pytest.mark.parametrize("suffix", [".jpe", ".jfif", ".JFIF", ".mpo", ".ppm", ".pgm", ".jp2", ".dib"])
+def test_rarer_suffixes_are_read(tmp_path, suffix):
+    kind = {".jpe": ".jpg", ".jfif": ".jpg", ".mpo": ".jpg", ".dib": ".bmp"}.get(suffix.lower(), suffix)
+    picture = PICTURE[..., 0] if suffix == ".pgm" else PICTURE
+    frame = read_frame(tmp_path, "a" + suffix, encoded(kind, picture))
+    expected = np.repeat(PICTURE[..., :1], 3, 2) if suffix == ".pgm" else PICTURE
+    assert np.abs(frame.image[24:46:4, 4:28:4].astype(int) - expected[24:46:4, 4:28:4]).max() < 12
+
+
+def test_a_jpeg_2000_file_is_refused_where_it_is_cut_or_too_large(tmp_path):
+    data = encoded(".jp2")
+    for bad, reason in ((data[: len(data) // 2], "truncated"), (data[:200] + data[-2:], "its decoder ended")):
+        dropped = read_one(tmp_path, "a.jp2", bad)
+        assert isinstance(dropped, DroppedFrame) and reason in dropped.reason
+    dropped = read_one(tmp_path, "a.jp2", data, max_pixels=64 * 48 - 1)
+    assert isinstance(dropped, DroppedFrame) and "64 x 48: more than" in dropped.reason
+
+
+@pytest.mark.parametrize(
+    "header", [b"P6 64 48 255\n", b"P6\n# a remark\n64 # another\n48\n255\n", b"P6\t64\r\n48 255 "]
+)
+def test_a_ppm_with_remarks_is_read_and_a_cut_one_is_not(tmp_path, header):
+    frame = read_frame(tmp_path, "a.ppm", header + PICTURE.tobytes())
+    assert np.array_equal(frame.image, PICTURE)
+    dropped = read_one(tmp_path, "a.ppm", header + PICTURE.tobytes()[:-1])
+    assert dropped == DroppedFrame("a.ppm", "truncated: the file ends early")
+
+
+def test_images_that_cannot_be_read_are_named_whatever_their_suffix(tmp_path):
+    (tmp_path / "1.jpg").write_bytes(encoded())
+    (tmp_path / "2.psd").write_bytes(b"8BPS\0\1")
+    (tmp_path / "3.jpg_original").write_bytes(encoded())
+    (tmp_path / "4").write_bytes(encoded(".png"))
+    (tmp_path / "notes.txt").write_text("no image")
+    (tmp_path / "cameras.json").write_text("{}")
+    assert reasons_in(tmp_path) == {
+        "2.psd": ".psd files cannot be read. Convert it to JPEG or PNG",
+        "3.jpg_original": ".jpg_original is no suffix of photographs, and its content is JPEG: give it that suffix",
+        "4": "its name has no suffix, and its content is PNG: give it that suffix",
+    }
+    assert len(list(stream(Config(tmp_path, names=("1.jpg",))))) == 1
 
 
 @pytest.mark.parametrize("order", [">", "<"])

@@ -8,7 +8,8 @@ import pytest
 
 from splatnode import command_line
 from splatnode.capture.image_file import encode_png
-from splatnode.recon.result.export import read_cameras
+from splatnode.recon.result.export import export_scene, read_cameras
+from tests.support.exported import make_snapshot, write
 from tests.support.synthetic import photographs
 
 
@@ -48,7 +49,10 @@ def test_what_makes_no_scene_is_told(folder, tmp_path, capsys):
     for path in sorted(folder.iterdir())[1:]:
         path.unlink()
     out = tmp_path / "out"
+    write(make_snapshot(), out)  # of one scene: beside it nobody would find the map's
+    export_scene(out, "spz")
     assert command_line.main(["replay", str(folder), "--map", "--out", str(out)]) == 65
+    assert not any((out / name).exists() for name in ("scene.ply", "scene.spz", "cameras.json", "exports.json"))
     report = json.loads((out / "report.json").read_text())
     assert report["maps"] == {} and report["keyframes_in_a_map"] == 0
     (left_out,) = report["left_out"]

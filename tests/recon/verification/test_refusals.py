@@ -11,14 +11,14 @@ import pytest
 
 import splatnode.recon
 from splatnode.recon.result.verdict import Code
-from splatnode.recon.verification import refusals, strong_lens, undetermined
+from splatnode.recon.verification import input_kinds, refusals, strong_lens, undetermined
 from splatnode.recon.verification.decision import CHECKS
 from splatnode.recon.verification.refusals import Refusal, refuse
 
 ROOT = Path(splatnode.recon.__file__).parent
 ENTRIES = {
     name: entry
-    for module in (refusals, strong_lens, undetermined)
+    for module in (refusals, strong_lens, undetermined, input_kinds)
     for name, entry in vars(module).items()
     if isinstance(entry, Refusal)
 }

@@ -202,8 +202,9 @@ def _read_recording(files: stored.Files, folder: Path) -> object:
 
 
 def _read_photograph(data: bytes, folder: Path) -> object:
-    image, lens, captured_at, exposure = decode_image(data, _MAX_PIXELS)
-    return Frame(0, "a.png", 0, image, lens, captured_at=captured_at, exposure=exposure)
+    found = decode_image(data, _MAX_PIXELS)
+    told = {"captured_at": found.captured_at, "exposure": found.exposure}
+    return Frame(0, "a.png", 0, found.image, found.intrinsics, mask=found.mask, **told)
 
 
 _CAPTURE = {"camera": {"kind": "folder", "folder": "photos"}, "spool": {"max_mb": 5}, "reader": {"silence_s": 1.0}}

@@ -13,8 +13,16 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.image_file import UnusableImage, decode_photograph, encode_jpeg, encode_png, read_image_file
+from splatnode.capture.image_file import (
+    UnusableImage,
+    decode_photograph,
+    encode_jpeg,
+    encode_png,
+    find_common_range,
+    read_image_file,
+)
 from splatnode.capture.lenses.undistort import without_distortion
+from splatnode.capture.value_range import ValueRange
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.formats.colmap import encode_colmap
 from splatnode.recon.result.export.formats.nerfstudio import encode_nerfstudio
@@ -33,8 +41,10 @@ def export(result: StoredResult) -> dict[str, bytes]:
     """images/, transforms.json and sparse/0/. Raises SceneFileError where a photograph is not to be had any more."""
     folders = photograph_folders(result.scene.parent)
     files, cameras = {}, []
+    found = [photograph_path(camera, folders) for camera in result.cameras()]
+    used = find_common_range([path for path in found if path is not None])
     for camera in result.cameras():
-        image = _photograph(camera, folders)
+        image = _photograph(camera, folders, used)
         name = camera.name if camera.name.lower().endswith((".png", *_JPEG)) else f"{camera.name}.png"
         files[f"images/{name}"] = _encoded(image, name)
         cameras.append(_of_full_size(replace(camera, name=name), *image.shape[1::-1]))
@@ -44,14 +54,14 @@ def export(result: StoredResult) -> dict[str, bytes]:
     return files | {"transforms.json": encode_nerfstudio(cameras, scale)}
 
 
-def _photograph(camera: CameraEstimate, folders: Sequence[Path]) -> npt.NDArray[np.uint8]:
+def _photograph(camera: CameraEstimate, folders: Sequence[Path], used: ValueRange | None) -> npt.NDArray[np.uint8]:
     """(H, W, 3) in full size, upright, without the distortion of its lens. Raises SceneFileError."""
     path = photograph_path(camera, folders)
     if path is None:
         places = " or ".join(str(folder) for folder in folders)
         raise SceneFileError(f"the photograph {camera.name} is not in {places} any more: put it back there")
     try:
-        image = without_distortion(decode_photograph(read_image_file(path))[0], camera.lens)
+        image = without_distortion(decode_photograph(read_image_file(path), used=used).image, camera.lens)
     except (UnusableImage, ValueError) as error:
         raise SceneFileError(f"{path}: {error}") from error
     height, width = image.shape[:2]

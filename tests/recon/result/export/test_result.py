@@ -13,9 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from splatnode.recon.result.export import ResultWriteError, remove_result, write_file, write_result
+from splatnode.recon.result.export import (
+    ResultWriteError,
+    export_scene,
+    remove_result,
+    write_beside,
+    write_file,
+    write_result,
+)
 from splatnode.recon.result.export import staged as staged_module
 from splatnode.recon.result.export.formats.ply import encode_ply
+from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.report import build_report
 from splatnode.recon.result.verdict import Code
 from tests.support.exported import make_gaussians, make_snapshot, write
@@ -207,3 +215,79 @@ def test_a_crafted_manifest_keeps_no_result_from_being_written(tmp_path, manifes
     (tmp_path / "manifest.json").write_bytes(manifest)
     written = json.loads(write(make_snapshot(), tmp_path).read_text())
     assert "scene.ply" in written["files"]
+
+
+def files_in(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+REFUSED = {"report.json", "manifest.json"}
+
+
+@pytest.mark.parametrize("publishable", [True, False])
+def test_exports_of_the_earlier_result_go_with_it_and_what_is_the_users_stays(tmp_path, publishable):
+    out = tmp_path / "out"
+    write(make_snapshot(), out)
+    fresh = files_in(out)
+    export_scene(out, "spz")
+    export_scene(out / "scene.ply", "splat", out / "for_the_web" / "mine.splat")
+    export_scene(out, "colmap", out / "dataset")
+    write_beside(out / "view", {"overview.png": b"a picture"}, of=out)
+    write_beside(out / "training", {"sparse/0/points.txt": b"points", "images/a.jpg": b"an image"}, of=out)
+    (out / "dataset" / "notes.txt").write_text("mine")
+    (out / "scene.rrd").write_text("mine, of that name")
+    exported = {"scene.spz", "for_the_web/mine.splat", "view/overview.png", "exports.json"}
+    exported |= {"training/sparse/0/points.txt", "training/images/a.jpg"}
+    exported |= {f"dataset/{name}.txt" for name in ("cameras", "images", "points3D")}
+    users = {"dataset/notes.txt", "scene.rrd"}
+    assert files_in(out) == fresh | exported | users
+    code = Code.OK if publishable else Code.NO_PARALLAX
+    write(replace(make_snapshot(code, publishable=publishable), gaussians=make_gaussians(seed=4)), out)
+    assert files_in(out) == (fresh if publishable else REFUSED) | users
+    assert not any((out / name).exists() for name in ("view", "for_the_web", "training"))
+
+
+def test_an_export_that_was_changed_by_hand_is_the_users(tmp_path):
+    write(make_snapshot(), tmp_path)
+    export_scene(tmp_path, "spz")
+    (tmp_path / "scene.spz").write_bytes(b"edited")
+    write(make_snapshot(Code.NO_PARALLAX, publishable=False), tmp_path)
+    assert files_in(tmp_path) == REFUSED | {"scene.spz"}
+
+
+def test_an_export_elsewhere_or_into_another_result_is_not_listed(tmp_path):
+    one, other = tmp_path / "one", tmp_path / "other"
+    write(make_snapshot(), one)
+    write(make_snapshot(), other)
+    export_scene(one, "spz", tmp_path / "shared" / "scene.spz")
+    export_scene(one, "spz", other / "of_one.spz")
+    assert not list(tmp_path.rglob("exports.json"))
+    write(make_snapshot(Code.NO_PARALLAX, publishable=False), other)
+    assert files_in(other) == REFUSED | {"of_one.spz"}
+
+
+def test_a_run_that_is_killed_between_renames_leaves_no_export_beside_the_new_scene(tmp_path, monkeypatch):
+    write(make_snapshot(), tmp_path)
+    fresh = files_in(tmp_path)
+    export_scene(tmp_path, "spz")
+    real = os.replace
+
+    def killed(source, target, **options):
+        if Path(target).name == "cameras.json":
+            raise KeyboardInterrupt
+        real(source, target, **options)
+
+    monkeypatch.setattr(os, "replace", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write(replace(make_snapshot(), gaussians=make_gaussians(seed=4)), tmp_path)
+    monkeypatch.undo()
+    with result_folder(tmp_path):
+        assert files_in(tmp_path) - {".splatnode.lock"} == fresh
+
+
+def test_exports_are_removed_with_a_provisional_result(tmp_path):
+    folder = tmp_path / "scene-provisional"
+    write(make_snapshot(), folder)
+    export_scene(folder, "spz")
+    remove_result(folder)
+    assert not folder.exists()
