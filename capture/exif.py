@@ -17,6 +17,8 @@ FOCAL_PLANE_X_RESOLUTION, FOCAL_PLANE_RESOLUTION_UNIT = 0xA20E, 0xA210
 FOCAL_LENGTH_35MM = 0xA405
 EXPOSURE_TIME, F_NUMBER = 0x829A, 0x829D  # seconds; focal length over aperture
 PHOTOGRAPHIC_SENSITIVITY = 0x8827  # ISO
+MAKE, MODEL, LENS_MODEL = 0x010F, 0x0110, 0xA434
+DIGITAL_ZOOM_RATIO = 0xA404
 
 Tags = Mapping[int, tuple[float, ...]]
 
@@ -79,6 +81,30 @@ def read_texts(tiff: bytes) -> dict[int, str]:
     return texts
 
 
+def camera_identity(tiff: bytes) -> str:
+    """Which camera took a photograph, through which lens, at which focal length and digital zoom; empty if not told.
+
+    Photographs of different identities share no lens. Those of one identity may.
+    """
+    order = _ORDERS.get(tiff[:4])
+    if order is None:
+        return ""
+    texts: dict[int, str] = dict(read_texts(tiff))
+    try:
+        for tag, kind, count, entry in _entries(tiff, struct.unpack_from(order + "I", tiff, 4)[0], order):
+            if tag in (MAKE, MODEL) and kind == _ASCII and 1 <= count <= _LONGEST_TEXT:
+                start = _start(tiff, entry, count, order)
+                texts[tag] = tiff[start : start + count].partition(b"\0")[0].decode("ascii", "replace")
+    except struct.error:
+        return ""
+    names = [texts.get(tag, "").strip() for tag in (MAKE, MODEL, LENS_MODEL)]
+    if not any(names):
+        return ""
+    tags = read_tags(tiff)
+    numbers = [f"{first(tags, tag) or 0.0:.3g}" for tag in (FOCAL_LENGTH, FOCAL_LENGTH_35MM, DIGITAL_ZOOM_RATIO)]
+    return "|".join([*names, *numbers])
+
+
 def _entries(tiff: bytes, offset: int, order: str) -> Iterator[tuple[int, int, int, int]]:
     """Tag, type, number of values and place of each entry of the directory at `offset`. Raises struct.error."""
     (entries,) = struct.unpack_from(order + "H", tiff, offset)
@@ -127,7 +153,7 @@ def _focal_from_sensor(tags: Tags, resized: float) -> float | None:
     mm_per_unit = _MM_PER_UNIT.get(int(first(tags, FOCAL_PLANE_RESOLUTION_UNIT) or 2))
     if not focal_mm or not per_unit or not mm_per_unit:
         return None
-    return focal_mm / mm_per_unit * per_unit * resized
+    return focal_mm / mm_per_unit * per_unit * resized * (first(tags, DIGITAL_ZOOM_RATIO) or 1.0)
 
 
 def first(tags: Tags, tag: int) -> float | None:

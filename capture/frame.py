@@ -97,6 +97,9 @@ class Frame:
     gravity: Gravity | None = None  # in its camera's frame; None: nobody knows
     right: RightImage | None = field(default=None, repr=False)  # of a stereo camera, whose left image is `image`
     exposure: ExposureSettings | None = None  # as its camera or its EXIF tells; None: nobody knows
+    camera: str = (
+        ""  # which camera took it through which lens, as EXIF tells: different ones share none; empty: unknown
+    )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", printable(self.name, LONGEST_NAME))
@@ -165,10 +168,11 @@ def framed(
     gravity: Gravity | None = None,
     right: RightImage | None = None,
     exposure: ExposureSettings | None = None,
+    camera: str = "",
 ) -> Frame | DroppedFrame:
     """What a camera or a file gave as a Frame; left out, with the reason, where it keeps a Frame's bounds not."""
     try:
-        came = given_pose, motion, gravity, right, exposure
+        came = given_pose, motion, gravity, right, exposure, camera
         return Frame(frame_id, name, stamp_ns, image, intrinsics, encoded, captured_at, mask, *came)
     except ValueError as error:
         return DroppedFrame(name, f"it cannot be used: {error}")
@@ -177,5 +181,5 @@ def framed(
 def renamed(frame: Frame, frame_id: int, name: str, stamp_ns: int) -> Frame | DroppedFrame:
     """The same image as another frame, which may be beyond a Frame's bounds."""
     known = frame.image, frame.intrinsics, frame.encoded, frame.captured_at, frame.mask
-    came = frame.given_pose, frame.motion, frame.gravity, frame.right, frame.exposure
+    came = frame.given_pose, frame.motion, frame.gravity, frame.right, frame.exposure, frame.camera
     return framed(frame_id, name, stamp_ns, *known, *came)

@@ -49,6 +49,7 @@ class DecodedImage(NamedTuple):
     captured_at: Stamp | None
     exposure: ExposureSettings | None
     mask: npt.NDArray[np.bool_] | None = None  # (H, W), False where alpha is 0; None: it hides nothing
+    camera: str = ""  # its identity, as `exif.camera_identity` has it
 
 
 def read_image_file(path: Path, max_pixels: int = MAX_PIXELS) -> bytes:
@@ -140,7 +141,8 @@ def _with_exif(image: npt.NDArray[np.uint8], tiff: bytes) -> DecodedImage:
     """The image (H, W, 3) RGB with what its EXIF tells, whose bytes begin with a TIFF header."""
     tags = exif.read_tags(tiff)
     intrinsics = exif.exif_intrinsics(tags, image.shape[1], image.shape[0])
-    return DecodedImage(image, intrinsics, exif_time(tiff), exif.exif_exposure(tags))
+    known = exif_time(tiff), exif.exif_exposure(tags)
+    return DecodedImage(image, intrinsics, *known, camera=exif.camera_identity(tiff))
 
 
 def _decode(header: ImageHeader, used: ValueRange | None) -> npt.NDArray[np.uint8]:

@@ -178,7 +178,9 @@ def _frames(
             stamp_ns = round(frame_id / config.frames_per_second * 1e9)
             # A file whose values are stretched is no file of this image: a recording would store it as it was.
             known = image, intrinsics, data if used is None else None, decoded.captured_at or name_time(name)
-            item = framed(frame_id, name, stamp_ns, *known, right=right, exposure=decoded.exposure)
+            item = framed(
+                frame_id, name, stamp_ns, *known, right=right, exposure=decoded.exposure, camera=decoded.camera
+            )
             item = with_transparency(item, decoded.mask)
             frame_id += isinstance(item, Frame)
             yield _with_pose(item, poses, config.poses)

@@ -172,7 +172,7 @@ def _decoded(name: str, data: bytes, written_at: Stamp, config: Config, frame_id
         intrinsics = config.intrinsics.resized(width, height)
     captured_at = decoded.captured_at or name_time(name) or written_at
     known = image, intrinsics, data if used is None else None, captured_at
-    item = framed(frame_id, name, time.monotonic_ns(), *known, exposure=decoded.exposure)
+    item = framed(frame_id, name, time.monotonic_ns(), *known, exposure=decoded.exposure, camera=decoded.camera)
     return with_transparency(item, decoded.mask)
 
 

@@ -47,7 +47,7 @@ class Grouping:
 
 
 def group(keyframes: Sequence[Keyframe], across_sizes: bool) -> Grouping:
-    """Frames of one size (landscape or portrait) and one nominal focal length share a lens.
+    """Frames of one camera, one size (landscape or portrait) and one nominal focal length share a lens.
 
     If `across_sizes`, frames of one shape do, whatever their size. Nominal focal lengths count over the longer side.
     """
@@ -67,6 +67,9 @@ def group(keyframes: Sequence[Keyframe], across_sizes: bool) -> Grouping:
 def _may_share(one: Keyframe, other: Keyframe, across_sizes: bool) -> bool:
     """Whether two frames may have been taken through one lens."""
     if _nominal(one) != _nominal(other):
+        return False
+    cameras = one.frame.camera, other.frame.camera
+    if all(cameras) and cameras[0] != cameras[1]:
         return False
     (long1, short1), (long2, short2) = (sorted(k.frame.image.shape[:2], reverse=True) for k in (one, other))
     if not across_sizes:
@@ -96,6 +99,8 @@ def candidates(
             found.append(Lens((scale * given.fx,), 0.0 if calibrated else config.exif_sigma))
             continue
         inside = [pair for key, pair in pairs.items() if key[0] in members and key[1] in members]
+        # A single image has no pair through its own lens alone: those with other images say roughly what it is.
+        inside = inside or [pair for key, pair in pairs.items() if key[0] in members or key[1] in members]
         ratios = focal.vote(inside, _NUM_CANDIDATES)
         found.append(Lens(tuple(ratio * grouping.longer_side for ratio in ratios), config.voted_sigma))
     return found

@@ -286,6 +286,23 @@ def test_focal_lengths_that_are_not_believed(tags, why):
     assert exif_intrinsics(read_tags(tiff({}, tags)), 64, 48) is None, why
 
 
+def test_photographs_tell_which_camera_took_them_and_how_far_it_zoomed(tmp_path):
+    told = {0x010F: "Maker", 0x0110: "Model"}
+    cameras = {}
+    for name, tags, exif_tags in (
+        ("wide", told, {0xA405: 28}),
+        ("wide_too", told, {0xA405: 28}),
+        ("zoomed", told, {0xA405: 28, 0xA404: (2, 1)}),
+        ("other", told | {0x0110: "Another"}, {0xA405: 28}),
+        ("unknown", {}, {0xA405: 28}),
+    ):
+        (folder := tmp_path / name).mkdir()
+        cameras[name] = read_frame(folder, "a.jpg", with_exif(encoded(), tags, exif_tags)).camera
+    assert cameras["wide"] == cameras["wide_too"] != ""
+    assert len({cameras["wide"], cameras["zoomed"], cameras["other"]}) == 3
+    assert cameras["unknown"] == ""
+
+
 def test_damaged_exif_is_ignored(tmp_path):
     broken = tiff({}, {0xA405: 28})[:-8]
     for data in (broken, b"MM\0*\xff\xff\xff\xff", b"nonsense"):

@@ -19,7 +19,8 @@ from splatnode.recon.evaluate.stability.outcome import compare
 from splatnode.recon.evaluate.stability.own_cameras import cameras_of
 from splatnode.recon.evaluate.stability.places import Photo
 from splatnode.recon.evaluate.truth import TrueCamera
-from splatnode.recon.registration import bundle
+from splatnode.recon.frames.keyframe import Features, Keyframe
+from splatnode.recon.registration import bundle, lenses
 from splatnode.recon.registration.register import register
 from tests.support.synthetic import view_graph
 
@@ -144,3 +145,11 @@ def test_what_is_not_refuted_widens_the_covariance():
     pairs = list(zip(wide.cameras, narrow.cameras, strict=True))
     assert all(one.centre_sigma_rel > 1.2 * other.centre_sigma_rel for one, other in pairs)
     assert all(one.focal_sigma > 1.2 * other.focal_sigma for one, other in pairs)
+
+
+def test_images_of_different_cameras_share_no_lens():
+    cameras = ("a", "a", "", "b", "b", "")
+    named = [replace(frame, camera=camera) for frame, camera in zip(frames(photographs()), cameras, strict=True)]
+    keyframes = [Keyframe(frame, frame.image, Features(*(np.zeros(0),) * 4)) for frame in named]
+    lens_of = lenses.group(keyframes, across_sizes=True).lens_of
+    assert lens_of[0] == lens_of[1] == lens_of[2] and lens_of[3] == lens_of[4] != lens_of[0]
