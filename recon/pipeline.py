@@ -45,7 +45,7 @@ def reconstruct(
     clock, numbers = Clock(), itertools.count(1)
     check_device(config)
     prior = load_prior(config)
-    estimate, dropped = _estimate_cameras(frames, prior, config, clock, tell)
+    estimate, dropped = estimate_frame_cameras(frames, prior, config, clock, tell)
     look = looked_at_first(estimate, config)
     clock.lap("points")
     if look is not None:
@@ -63,13 +63,14 @@ def estimate_frames(
     """Cameras, verdict and depth of all frames that show something new, and which frames were left out."""
     check_device(config)
     prior = load_prior(config)
-    estimate, dropped = _estimate_cameras(frames, prior, config, clock)
+    estimate, dropped = estimate_frame_cameras(frames, prior, config, clock)
     return _with_depth(estimate, prior, config, clock), dropped
 
 
-def _estimate_cameras(
+def estimate_frame_cameras(
     frames: Iterable[Frame | DroppedFrame], prior: Prior, config: Config, clock: Clock, tell: Tell = told_to_nobody
 ) -> tuple[Estimate, list[DroppedFrame]]:
+    """Cameras and verdict of all frames that show something new, and which frames were left out."""
     kept, dropped, rejected = screen_all(frames, config.screening)
     looked_through = counted(kept, tell, "finding points to match", len(kept), "photograph")
     keyframes, unusable = prepare_all(looked_through, config)

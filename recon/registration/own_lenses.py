@@ -67,7 +67,7 @@ class Freed:
     @property
     def refuted(self) -> Flags:
         """(C,) views that refute the common lens."""
-        return self.stays.any(1)
+        return np.asarray(self.stays.any(axis=1))
 
 
 def free(

@@ -64,7 +64,8 @@ def measure(
         ]
         focals = [float(np.sqrt(np.prod(cameras[k].focals))) for k in (i, j)]
         straight = replace(thinned, points1=focals[0] * rays[0], points2=focals[1] * rays[1])
-        rotation, direction, num_inliers = epipolar.relative_pose(straight, *focals, config.max_error_px * scale)
+        limit = config.max_error_px * scale
+        rotation, direction, num_inliers = epipolar.relative_pose(straight, focals[0], focals[1], limit)
         if num_inliers < MIN_INLIER_RATIO * len(thinned.matches):
             continue  # The pair has no rigid answer for these focal lengths; its inlier ratio says so, too.
         rotations[i, j] = rotation

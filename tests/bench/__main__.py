@@ -52,6 +52,8 @@ BENCHMARKS = {
         "metres",
         "motions",
         "consistent_depth",
+        "lens_assumptions",
+        "registrations",
     ),
     "speed": ("rasterize", "stereo", "growth", "throughput", "campaign"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),

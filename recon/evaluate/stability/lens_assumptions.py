@@ -1,4 +1,4 @@
-"""Row 23: images that break what a reconstruction assumes of lenses: one lens for all, square pixels, a centred crop.
+"""Row 31: images that break what a reconstruction assumes of lenses: one lens for all, square pixels, a centred crop.
 
 Each kind changes undistorted photographs and says which camera is true of what they then show. What a reconstruction is
 told stays as it was before the change, as EXIF and a calibration do.
@@ -229,7 +229,7 @@ def _row(kind: Kind) -> Row:
         photos = kind.change(with_intrinsics(sampler.photos(count), setting), sampler.rng)
         return either(photos, f"{kind.name}, {setting} told")
 
-    return Row(23, f"lens: {kind.name}", make)
+    return Row(31, f"lens: {kind.name}", make)
 
 
 ROWS = tuple(_row(kind) for kind in KINDS.values() if kind.name != "clean")

@@ -1,20 +1,32 @@
 """All rows, by number: every `Row` of the modules in `_FAMILIES`.
 
-A new row is one function in one of these files; a new file of rows is that file and its name in `_FAMILIES`.
+A new row is one function in one of these files; a new file of rows is that file and its name in `_FAMILIES`. Those of
+`lens_assumptions` are made from its kinds.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection
 
-from splatnode.recon.evaluate.stability import cameras, degenerate, imaging, lenses, mixtures, streams
+from splatnode.recon.evaluate.stability import (
+    cameras,
+    degenerate,
+    imaging,
+    lens_assumptions,
+    lenses,
+    mixtures,
+    streams,
+)
 from splatnode.recon.evaluate.stability.case import Row
 
 _FAMILIES = (cameras, degenerate, imaging, lenses, mixtures, streams)
 
 ROWS: tuple[Row, ...] = tuple(
     sorted(
-        (found for family in _FAMILIES for found in vars(family).values() if isinstance(found, Row)),
+        (
+            *(found for family in _FAMILIES for found in vars(family).values() if isinstance(found, Row)),
+            *lens_assumptions.ROWS,
+        ),
         key=lambda r: r.number,
     )
 )
