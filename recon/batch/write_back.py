@@ -17,7 +17,8 @@ from typing import Any
 
 from splatnode.capture import film
 from splatnode.capture.lerobot import data_set
-from splatnode.capture.logged.mcap import messages
+from splatnode.capture.logged.mcap import topics
+from splatnode.capture.logged.order import read_times
 from splatnode.capture.process.folders import LOCK
 from splatnode.capture.process.lock import Held, exclusive
 from splatnode.recon.batch.answer import Outcome
@@ -152,8 +153,9 @@ def _with_log(file: Path, parts: Sequence[tuple[str, Outcome]], out: Path, in_pl
 def _of_topic(file: Path, topic: str, row: Outcome, out: Path, names: Mapping[str, str]) -> Iterator[Message]:
     """The verdict with the first picture, and of each keyframe its pose and lens, at the time of its picture."""
     by_index = {_index(camera): camera for camera in _cameras(row, out)}
-    for index, message in enumerate(messages(file, {topic})):
-        ns = message.log_ns
+    logged = next((each for each in topics(file) if each.name == topic), None)
+    for index, time_of in enumerate(() if logged is None else read_times(file, logged)):
+        ns = time_of.log_ns
         if index == 0:
             level = _INFO if row.published else _WARNING
             said = {"message": f"{row.verdict}: {row.message}", "name": "splatnode", "file": "", "line": 0}
