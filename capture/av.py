@@ -20,6 +20,7 @@ import numpy.typing as npt
 from av.error import FFmpegError
 from av.sidedata.sidedata import Type
 from av.stream import Disposition
+from av.video.reformatter import VideoReformatter
 
 TOLERANCE_NS = 500_000  # by which a frame may be before a limit and counts as at it: containers round to milliseconds
 _CONTAINERS = (  # those that hold their own pictures; playlists, and lists of other files and addresses, are none
@@ -126,6 +127,9 @@ class Video:
     def __init__(self, file: Path, threads: int) -> None:
         """Raises NotReadable, and NoPictures where it is read and has no pictures that follow each other."""
         self._file, self._threads = file, threads
+        self._reformatter = VideoReformatter()  # one for all frames: each has threads and tables of its own
+        self._turned_shape: tuple[int, int, int] | None = None
+        self._matrix: npt.NDArray[np.int32] | None = None
         self.lost = 0  # packets so far that could not be decoded
         self.is_cut = False  # whether it ends before the frames that it states; known once its end was read
         self._open()
@@ -253,9 +257,24 @@ class Video:
         width = max(1, round(frame.width * aspect))
         for each in (frame.width, width):
             _check_size(each, frame.height, max_pixels)
-        rgb = frame.to_ndarray(format="rgb24", width=width, height=frame.height, interpolation="BICUBIC")
-        image = np.ascontiguousarray(_upright(rgb.astype(np.uint8, copy=False), _display_matrix(frame)))
+        size = {"width": width, "height": frame.height}
+        rgb = self._reformatter.reformat(frame, **size, format="rgb24", interpolation="BICUBIC", threads=1).to_ndarray()
+        image = np.ascontiguousarray(_upright(rgb.astype(np.uint8, copy=False), self._display_matrix(frame)))
         return Decoded(index, time_ns, image, float(aspect) if width != frame.width else 1.0)
+
+    def _display_matrix(self, frame: av.VideoFrame) -> npt.NDArray[np.int32] | None:
+        """(2, 2), by which a stored picture's right and down are turned to a player's; None: as they are stored.
+
+        It is looked up anew where the turn or the size is another: a frame that was asked for what lies beside it stays
+        in memory until Python looks for circles.
+        """
+        shape = frame.rotation, frame.width, frame.height
+        if shape != self._turned_shape:
+            beside: Any = frame.side_data  # which PyAV types as one of motion vectors alone
+            data = bytes(beside.get(Type.DISPLAYMATRIX, b""))
+            self._matrix = np.frombuffer(data, np.int32).reshape(3, 3)[:2, :2] if len(data) == _MATRIX_BYTES else None
+            self._turned_shape = shape
+        return self._matrix
 
     def _pixel_aspect(self) -> Fraction:
         """Width of a pixel over its height; 1 where the video tells none, or one that is not believed."""
@@ -283,13 +302,6 @@ def _is_cover(stream: av.VideoStream) -> bool:
 def _check_size(width: int, height: int, max_pixels: int) -> None:
     if width * height > max_pixels:
         raise TooLarge(width, height)
-
-
-def _display_matrix(frame: av.VideoFrame) -> npt.NDArray[np.int32] | None:
-    """(2, 2), by which a stored picture's right and down are turned to a player's; None: as they are stored."""
-    beside: Any = frame.side_data  # which PyAV types as one of motion vectors alone
-    data = bytes(beside.get(Type.DISPLAYMATRIX, b""))
-    return np.frombuffer(data, np.int32).reshape(3, 3)[:2, :2] if len(data) == _MATRIX_BYTES else None
 
 
 def _upright(image: npt.NDArray[np.uint8], matrix: npt.NDArray[np.int32] | None) -> npt.NDArray[np.uint8]:

@@ -25,7 +25,7 @@ _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes b
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     file: Path  # the video
-    every: Annotated[int, msgspec.Meta(ge=1)] = 1  # 3: every third frame is taken; the others are not decoded
+    every: Annotated[int, msgspec.Meta(ge=1)] = 1  # 3: every third frame is taken
     from_s: Annotated[float, msgspec.Meta(ge=0, le=1e9)] = 0.0  # where it begins, in seconds from the first frame
     to_s: Annotated[float, msgspec.Meta(gt=0, le=1e9)] | None = None  # where it ends, likewise; None: with the video
     max_pixels: MaxPixels = MAX_VIDEO_PIXELS  # of a frame, at most; the decoder's memory is bounded accordingly

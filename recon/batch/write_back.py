@@ -52,7 +52,7 @@ def write_back(rows: Iterable[Outcome], out: Path, in_place: bool) -> Iterator[W
     found: defaultdict[Path, list[tuple[str, Outcome]]] = defaultdict(list)
     for row in rows:
         file, part = film.file_and_part(Path(row.source))
-        if part and not row.failed:
+        if part and not row.failed and (file.is_dir() or file.suffix.lower() == film.MCAP):
             found[file].append((part, row))
     for file, parts in found.items():
         write = _with_log if file.suffix.lower() == film.MCAP else _into_data_set

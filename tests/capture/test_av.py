@@ -111,6 +111,14 @@ def test_a_part_is_decoded_from_the_key_frame_before_it(tmp_path):
     assert found == [14] and len(decodes) <= 8, "of 20 packets only those from the twelfth on"
 
 
+def test_a_long_video_stays_within_the_memory_of_its_decoder(tmp_path):
+    """Frames that have to be turned, too, of which PyAV keeps what was asked for beside them."""
+    count = 300
+    times_ms = [40 * index for index in range(count)]
+    file = turn(write_clip(tmp_path / "a.mp4", "libx264", level_images(count), times_ms), (0, 1, -1, 0))
+    assert [frame.index for frame in read(file)] == list(range(count))
+
+
 def test_every_third_frame_of_a_part(tmp_path):
     file = write_clip(tmp_path / "a.mp4", "libx264", level_images(COUNT), VARIABLE)
     assert [frame.index for frame in read(file, every=3)] == [0, 3, 6, 9, 12, 15, 18]
