@@ -163,6 +163,8 @@ class Video:
         options = {"format_whitelist": _CONTAINERS, "protocol_whitelist": "file"}
         try:
             self._container = av.open(str(self._file), options=options)
+        except MemoryError:
+            raise
         except (FFmpegError, OSError, ValueError) as error:
             raise NotReadable(str(error)) from error
         streams = [each for each in self._container.streams.video if not _is_cover(each)]

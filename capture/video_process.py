@@ -26,13 +26,7 @@ BYTES_A_PIXEL = 80  # of memory at most for the decoder: its frames in flight, i
 BASE_BYTES = 500_000_000  # further ones, whatever the size of a frame
 _MAX_THREADS = 8  # each has a frame of its own
 _MAX_NS = 2**63  # that is written; a crafted file may tell more
-_FRAME, _TOO_LARGE, _UNREADABLE, _NO_PICTURES, _END = (
-    b"F",
-    b"L",
-    b"U",
-    b"N",
-    b"E",
-)  # kinds of what the decoder's process says
+_FRAME, _TOO_LARGE, _NO_PICTURES, _END = b"F", b"L", b"N", b"E"  # kinds of what the decoder's process says
 _HEAD = struct.Struct("<cQQIId")  # kind, index, time in ns, width, height, pixel aspect; pixels follow those of a frame
 
 
@@ -67,6 +61,7 @@ class Span:
 def decoded(file: Path, every: int, max_pixels: int, span: Span = Span()) -> Iterator[VideoFrame]:
     """Yields every `every`-th frame of `span`, each of its own size. Those that cannot be decoded are left out.
 
+    Of what is no video that is read here there are none.
     Raises VideoError: after the frames, where some are missing or what follows cannot be read.
     """
     numbers = every, max_pixels, span.from_ns, -1 if span.to_ns is None else span.to_ns
@@ -95,10 +90,6 @@ def _received(stream: IO[bytes], max_pixels: int) -> Generator[VideoFrame, None,
         if kind == _END:
             _check_complete(num_lost=index, is_cut=bool(time_ns))
             return True
-        if kind == _UNREADABLE:
-            raise VideoError(
-                "its kind or its codec is not read, or it is damaged at its start; convert it to MP4 (H.264)"
-            )
         if kind == _NO_PICTURES:
             raise VideoError("it has no pictures that follow each other, but sound, data or a cover alone")
         if kind == _TOO_LARGE or width * height > max_pixels:
@@ -128,7 +119,7 @@ def main() -> None:
     try:
         video = Video(Path(file), threads=min(_MAX_THREADS, os.cpu_count() or 1))
     except (NotReadable, NoPictures) as error:
-        out.write(_HEAD.pack(_UNREADABLE if isinstance(error, NotReadable) else _NO_PICTURES, 0, 0, 0, 0, 1.0))
+        out.write(_HEAD.pack(_END if isinstance(error, NotReadable) else _NO_PICTURES, 0, 0, 0, 0, 1.0))
         return
     try:
         for frame in video.frames(from_ns, None if to_ns < 0 else to_ns, every, max_pixels):

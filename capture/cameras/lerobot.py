@@ -38,15 +38,15 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
     Raises UnusableDataSet, FileNotFoundError and ValueError where they cannot be had.
     """
     found = film(config.folder, config.part)
-    early_s = _EARLY / found.rate if found.rate else 0.0
     part = video.Config(
         file=found.video,
         max_pixels=config.max_pixels,
         intrinsics=config.intrinsics,
-        from_s=max(0.0, found.from_s - early_s),
-        to_s=found.to_s - early_s,
+        from_s=found.from_s,
+        to_s=found.to_s,
     )
-    return paced(_frames(video.stream(part), found), config.pace)
+    early_s = _EARLY / found.rate if found.rate else 0.0
+    return paced(_frames(video.stream(part, early_s), found), config.pace)
 
 
 def _frames(frames: Iterator[Frame | DroppedFrame], found: Film) -> Iterator[Frame | DroppedFrame]:

@@ -34,20 +34,22 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     intrinsics: Intrinsics | None = None
 
 
-def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
+def stream(config: Config, early_s: float = 0.0) -> Iterator[Frame | DroppedFrame]:
     """The frames at their times in the video; those that cannot be decoded are left out, and counted at the end.
 
+    A frame that is at most `early_s` before `from_s` or `to_s` counts as at it, for whoever knows these roughly.
     Raises FileNotFoundError, or ValueError where the file is no video that can be decoded, or the lens cannot be of
     its images. What goes wrong after a frame is named as a dropped frame, and ends the stream.
     """
     if not config.file.is_file():
         raise FileNotFoundError(f"no file {str(config.file)!r}; give a video, such as an MP4")
-    return paced(_frames(config), config.pace)
+    return paced(_frames(config, early_s), config.pace)
 
 
-def _frames(config: Config) -> Iterator[Frame | DroppedFrame]:
+def _frames(config: Config, early_s: float) -> Iterator[Frame | DroppedFrame]:
     frame_id = 0
-    span = Span(round(config.from_s * 1e9), None if config.to_s is None else round(config.to_s * 1e9))
+    from_ns = max(0, round((config.from_s - early_s) * 1e9))
+    span = Span(from_ns, None if config.to_s is None else max(0, round((config.to_s - early_s) * 1e9)))
     try:
         for found in decoded(config.file, config.every, config.max_pixels, span):
             if frame_id == 0:
@@ -59,10 +61,16 @@ def _frames(config: Config) -> Iterator[Frame | DroppedFrame]:
             raise VideoError(f"{str(config.file)!r} is no video that can be used: {error}") from error
         yield DroppedFrame(f"{_stem(config)}_rest", str(error))
     if frame_id == 0:
-        where = "" if span.is_all else f" between {span}"
         raise ValueError(
-            f"{str(config.file)!r} is no video that can be decoded, or has no frame{where}; convert it to MP4 (H.264)"
+            f"{str(config.file)!r} is no video that can be decoded, or has no frame{_where(config)}; convert it to MP4 "
+            "(H.264)"
         )
+
+
+def _where(config: Config) -> str:
+    if config.to_s is not None:
+        return f" between {config.from_s:g} and {config.to_s:g} s"
+    return f" from {config.from_s:g} s on" if config.from_s else ""
 
 
 def _begin(first: VideoFrame, config: Config) -> None:

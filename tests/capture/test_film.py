@@ -41,8 +41,10 @@ def test_what_is_no_range_of_seconds_is_refused(video, part):
 
 
 def test_a_part_without_a_frame_says_so(video):
-    with pytest.raises(ValueError, match=r"no frame between 0.5 s and 1 s"):
+    with pytest.raises(ValueError, match=r"no frame between 0.5 and 1 s; convert"):
         list(film.stream(Path(f"{video}#t=0.5,1")))
+    with pytest.raises(ValueError, match=r"no frame from 9 s on; convert"):
+        list(film.stream(Path(f"{video}#t=9")))
 
 
 def test_a_batch_and_an_audit_take_parts_of_a_video(video, tmp_path):
