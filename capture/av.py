@@ -90,7 +90,7 @@ class _Timeline:
     def place(self, pts: int | None, frame_ns: int) -> tuple[int, int]:
         """Returns the index and the time in ns of the next frame: indices grow, times never fall."""
         pts = self.waiting[0] if pts is None and self.waiting else pts
-        index, time_ns = self._following() if pts is None else self._timed(pts)
+        index, time_ns = self._place_behind() if pts is None else self._place_by_time(pts)
         if time_ns < self.last_ns - _MAX_DISORDER_NS:
             self.shift_ns += self.end_ns - time_ns
             time_ns = self.end_ns
@@ -100,7 +100,7 @@ class _Timeline:
         self.last_index, self.last_ns, self.end_ns = max(index, self.last_index + 1), time_ns, time_ns + frame_ns
         return self.last_index, time_ns
 
-    def _timed(self, pts: int) -> tuple[int, int]:
+    def _place_by_time(self, pts: int) -> tuple[int, int]:
         if self.begins is None:  # of the packets that were read before the first frame came, the earliest tells it
             self.begins = min([pts, *self.waiting[:1]])
         place = bisect_left(self.waiting, pts)
@@ -110,7 +110,7 @@ class _Timeline:
         self.before += taken
         return index, self._ns(pts - self.begins) + self.shift_ns
 
-    def _following(self) -> tuple[int, int]:
+    def _place_behind(self) -> tuple[int, int]:
         """A frame without a time is the next one: at the time that decoding had for it, or when the last one ends."""
         index = self.last_index + 1
         if self.begins is None and index < len(self.decoding_times):
@@ -146,9 +146,9 @@ class Video:
         """
         _check_size(self._stream.width, self._stream.height, max_pixels)
         from_ns, end_ns = max(0, from_ns - TOLERANCE_NS), None if to_ns is None else to_ns - TOLERANCE_NS
-        timeline, packets = self._sought(from_ns) if from_ns else (_Timeline(self._unit_s), self._packets())
+        timeline, packets = self._seek(from_ns) if from_ns else (_Timeline(self._unit_s), self._packets())
         first = None
-        for frame in self._decoded(packets, timeline):
+        for frame in self._decode(packets, timeline):
             index, time_ns = timeline.place(self._pts(frame), self._duration_ns(frame))
             if end_ns is not None and time_ns >= end_ns:
                 return
@@ -156,7 +156,7 @@ class Video:
                 continue
             first = index if first is None else first
             if (index - first) % every == 0:
-                yield self._finished(frame, index, time_ns, max_pixels)
+                yield self._convert(frame, index, time_ns, max_pixels)
         self.is_cut = self._ends_early(timeline)
 
     def _open(self) -> None:
@@ -198,7 +198,7 @@ class Video:
         if not packet.is_discard:
             timeline.add(self._pts(packet), packet.dts)
 
-    def _decoded(self, packets: Iterator[av.Packet], timeline: _Timeline) -> Iterator[av.VideoFrame]:
+    def _decode(self, packets: Iterator[av.Packet], timeline: _Timeline) -> Iterator[av.VideoFrame]:
         for packet in chain(packets, [None]):  # None: what the decoder still holds
             if packet is not None:
                 self._note(packet, timeline)
@@ -209,7 +209,7 @@ class Video:
                 continue
             yield from frames
 
-    def _sought(self, from_ns: int) -> tuple[_Timeline, Iterator[av.Packet]]:
+    def _seek(self, from_ns: int) -> tuple[_Timeline, Iterator[av.Packet]]:
         """Goes to the last key frame at `from_ns` or before; returns what is known there, and the packets from there.
 
         All packets before it are read and not decoded: they alone tell how many frames there are. Where a packet has no
@@ -254,14 +254,14 @@ class Video:
     def _duration_ns(self, frame: av.VideoFrame) -> int:
         return round(frame.duration * self._unit_s * 10**9) if frame.duration else self._frame_ns
 
-    def _finished(self, frame: av.VideoFrame, index: int, time_ns: int, max_pixels: int) -> Decoded:
+    def _convert(self, frame: av.VideoFrame, index: int, time_ns: int, max_pixels: int) -> Decoded:
         aspect = self._pixel_aspect()
         width = max(1, round(frame.width * aspect))
         for each in (frame.width, width):
             _check_size(each, frame.height, max_pixels)
         size = {"width": width, "height": frame.height}
         rgb = self._reformatter.reformat(frame, **size, format="rgb24", interpolation="BICUBIC", threads=1).to_ndarray()
-        image = np.ascontiguousarray(_upright(rgb.astype(np.uint8, copy=False), self._display_matrix(frame)))
+        image = np.ascontiguousarray(_turn_upright(rgb.astype(np.uint8, copy=False), self._display_matrix(frame)))
         return Decoded(index, time_ns, image, float(aspect) if width != frame.width else 1.0)
 
     def _display_matrix(self, frame: av.VideoFrame) -> npt.NDArray[np.int32] | None:
@@ -306,7 +306,7 @@ def _check_size(width: int, height: int, max_pixels: int) -> None:
         raise TooLarge(width, height)
 
 
-def _upright(image: npt.NDArray[np.uint8], matrix: npt.NDArray[np.int32] | None) -> npt.NDArray[np.uint8]:
+def _turn_upright(image: npt.NDArray[np.uint8], matrix: npt.NDArray[np.int32] | None) -> npt.NDArray[np.uint8]:
     """The image (H, W, 3) turned by the nearest quarter turn, and mirrored where the matrix does so."""
     if matrix is None or not matrix.any():
         return image

@@ -62,10 +62,10 @@ def camera(path: Path) -> tuple[str, dict[str, Any]]:
         return "mcap", {"file": file, "topic": part}
     if file.is_dir():
         return "lerobot", {"folder": file, "part": part}
-    return "video", {"file": file, **(_seconds(file, part) if part else {})}
+    return "video", {"file": file, **(_parse_seconds(file, part) if part else {})}
 
 
-def _seconds(file: Path, part: str) -> dict[str, float]:
+def _parse_seconds(file: Path, part: str) -> dict[str, float]:
     """From when to when a part of a video is. Raises ValueError."""
     found = _SECONDS.fullmatch(part)
     told = {} if found is None else {"from_s": found[1], "to_s": found[2]}

@@ -14,7 +14,7 @@ from splatnode.capture.image_file import MAX_PIXELS, MaxPixels
 from splatnode.capture.logged.calibration import calibration_topic, lens
 from splatnode.capture.logged.mcap import Message, Topic, UnusableLog, messages, topics
 from splatnode.capture.logged.message import Calibration, UnusableMessage
-from splatnode.capture.logged.order import MessageTime, messages_in_order, picture_in, read_times
+from splatnode.capture.logged.order import MessageTime, read_in_order, read_picture, read_times
 from splatnode.capture.logged.pixels import is_photograph, rgb
 from splatnode.capture.logged.schemas import CALIBRATIONS, PICTURES, READ
 from splatnode.capture.pace import Pace, paced
@@ -60,7 +60,7 @@ def _shows_photographs(file: Path, topic: Topic) -> bool:
     if first is None:
         return False
     try:
-        return is_photograph(picture_in(first))
+        return is_photograph(read_picture(first))
     except UnusableMessage:
         return True
 
@@ -86,7 +86,7 @@ def _frames(config: Config, topic: Topic) -> Iterator[Frame | DroppedFrame]:
     known = config.intrinsics or _lens(config.file, topic)
     index, told = 0, False
     try:
-        for message, time in messages_in_order(config.file, topic, read_times(config.file, topic)):
+        for message, time in read_in_order(config.file, topic, read_times(config.file, topic)):
             item = _frame(message, time, index, config, known)
             if isinstance(item, Frame) and known is not None and item.intrinsics is None and not told:
                 sizes = {"calibrated": f"{known.width}x{known.height}", "image": f"{item.width}x{item.height}"}
@@ -107,7 +107,7 @@ def _frame(
 ) -> Frame | DroppedFrame:
     name = f"{_stem(message.topic)}_{index:06d}.png"
     try:
-        picture = picture_in(message)
+        picture = read_picture(message)
         with foreign(UnusableMessage):
             image = rgb(picture, config.max_pixels)
     except UnusableMessage as error:
@@ -142,7 +142,7 @@ def _lens(file: Path, topic: Topic) -> Intrinsics | None:
 def _sensor(file: Path, topic: Topic) -> str:
     first = next(messages(file, {topic.name}), None)
     try:
-        return "" if first is None else picture_in(first).sensor
+        return "" if first is None else read_picture(first).sensor
     except UnusableMessage:
         return ""
 

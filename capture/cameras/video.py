@@ -62,12 +62,12 @@ def _frames(config: Config, early_s: float) -> Iterator[Frame | DroppedFrame]:
         yield DroppedFrame(f"{_stem(config)}_rest", str(error))
     if frame_id == 0:
         raise ValueError(
-            f"{str(config.file)!r} is no video that can be decoded, or has no frame{_where(config)}; convert it to MP4 "
-            "(H.264)"
+            f"{str(config.file)!r} is no video that can be decoded, or has no frame{_describe_range(config)}; convert it "
+            "to MP4 (H.264)"
         )
 
 
-def _where(config: Config) -> str:
+def _describe_range(config: Config) -> str:
     if config.to_s is not None:
         return f" between {config.from_s:g} and {config.to_s:g} s"
     return f" from {config.from_s:g} s on" if config.from_s else ""

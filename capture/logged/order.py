@@ -31,7 +31,7 @@ class MessageTime:
     captured_at: Stamp | None  # None: no clock can count so far
 
 
-def picture_in(message: Message) -> Picture:
+def read_picture(message: Message) -> Picture:
     """What a message of an image topic holds. Raises UnusableMessage."""
     with foreign(UnusableMessage):
         return PICTURES[message.topic.kind](message.data)
@@ -48,7 +48,7 @@ def read_times(file: Path, topic: Topic) -> tuple[MessageTime, ...]:
     with suppress(UnusableLog):
         for message in messages(file, {topic.name}):
             try:
-                told.append((message.log_ns, picture_in(message).captured_ns))
+                told.append((message.log_ns, read_picture(message).captured_ns))
             except UnusableMessage:
                 told.append((message.log_ns, None))
     headers = [header for _, header in told if header is not None]
@@ -66,7 +66,7 @@ def read_times(file: Path, topic: Topic) -> tuple[MessageTime, ...]:
     return tuple(sorted(found, key=lambda each: each.stream_ns))
 
 
-def messages_in_order(file: Path, topic: Topic, times: Sequence[MessageTime]) -> Iterator[tuple[Message, MessageTime]]:
+def read_in_order(file: Path, topic: Topic, times: Sequence[MessageTime]) -> Iterator[tuple[Message, MessageTime]]:
     """The messages of the topic in the order of `times`, which `read_times` gave.
 
     A file in order is read once. Of one in disorder as many messages wait in memory as there is room for; the others

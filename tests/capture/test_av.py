@@ -104,8 +104,8 @@ def test_a_part_is_decoded_from_the_key_frame_before_it(tmp_path):
     file = write_clip(tmp_path / "a.mp4", "libx264", level_images(COUNT), CONSTANT)
     video = Video(file, threads=1)
     decodes: list[Any] = []
-    plain = video._decoded
-    video._decoded = lambda packets, timeline: plain((decodes.append(p) or p for p in packets), timeline)  # type: ignore
+    plain = video._decode
+    video._decode = lambda packets, timeline: plain((decodes.append(p) or p for p in packets), timeline)  # type: ignore
     found = [frame.index for frame in video.frames(560_000_000, 600_000_000, 1, LIMIT)]
     video.close()
     assert found == [14] and len(decodes) <= 8, "of 20 packets only those from the twelfth on"
@@ -259,7 +259,7 @@ def test_a_list_of_other_files_is_no_video(tmp_path):
     assert read(tmp_path / "list.mp4") == []
 
 
-def placed(packets: list[Any], frames: list[int | None]) -> list[tuple[int, int]]:
+def place_frames(packets: list[Any], frames: list[int | None]) -> list[tuple[int, int]]:
     """The index and the time in ms of frames, of a timeline that knows these packets (pts, dts)."""
     timeline = _Timeline(Fraction(1, 1000))
     for pts, dts in packets:
@@ -268,25 +268,27 @@ def placed(packets: list[Any], frames: list[int | None]) -> list[tuple[int, int]
 
 
 def test_frames_of_one_time_have_their_own_numbers():
-    assert placed([(0, 0), (5, 5), (5, 5), (9, 9)], [0, 5, 5, 9]) == [(0, 0), (1, 5), (2, 5), (3, 9)]
+    assert place_frames([(0, 0), (5, 5), (5, 5), (9, 9)], [0, 5, 5, 9]) == [(0, 0), (1, 5), (2, 5), (3, 9)]
 
 
 def test_frames_without_times_have_those_of_decoding_or_of_the_rate():
-    assert placed([(None, 7), (None, 107), (None, 500)], [None] * 3) == [(0, 0), (1, 100), (2, 493)]
-    assert placed([(None, None)] * 3, [None] * 3) == [(0, 0), (1, 40), (2, 80)]
+    assert place_frames([(None, 7), (None, 107), (None, 500)], [None] * 3) == [(0, 0), (1, 100), (2, 493)]
+    assert place_frames([(None, None)] * 3, [None] * 3) == [(0, 0), (1, 40), (2, 80)]
 
 
 def test_a_clock_that_is_set_back_goes_on_from_the_last_frame():
-    assert [ms for _, ms in placed([(5000, 0), (6040, 1)], [5000, 6040, 0, 40])] == [0, 1040, 1080, 1120]
+    assert [ms for _, ms in place_frames([(5000, 0), (6040, 1)], [5000, 6040, 0, 40])] == [0, 1040, 1080, 1120]
 
 
 def test_times_in_a_wrong_order_never_fall_and_do_not_add_up():
     frames = [40, 120, 160, 80, 240, 200, 280]
-    found = placed([(pts, None) for pts in sorted(frames)], frames)
+    found = place_frames([(pts, None) for pts in sorted(frames)], frames)
     assert [ms for _, ms in found] == [0, 80, 120, 120, 200, 200, 240]
     assert len({index for index, _ in found}) == len(frames)
 
 
 def test_a_frame_whose_packet_comes_with_no_frame_leaves_its_number_free():
-    assert placed([(0, 0), (3, 1), (7, 2), (20, 3)], [0, 7, 20]) == [(0, 0), (2, 7), (3, 20)]
-    assert placed([(10, 0), (20, 1)], [20]) == [(1, 10)], "the first frame cannot be decoded, and is the beginning"
+    assert place_frames([(0, 0), (3, 1), (7, 2), (20, 3)], [0, 7, 20]) == [(0, 0), (2, 7), (3, 20)]
+    assert place_frames([(10, 0), (20, 1)], [20]) == [(1, 10)], (
+        "the first frame cannot be decoded, and is the beginning"
+    )

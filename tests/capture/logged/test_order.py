@@ -34,7 +34,7 @@ def log_of(file: Path, headers_ns: list[int], logged_ns: list[int], lie: list[in
     return write(file, told, log_ns=lambda place: logged_ns[lie[place]], **options)
 
 
-def seen(file: Path) -> list[tuple[int, int, Stamp | None]]:
+def read_frames(file: Path) -> list[tuple[int, int, Stamp | None]]:
     """The number, the time in the stream and the time of capture of each image, through the reader of `record`."""
     found = []
     with Reader(lambda: stream(Config(file)), live=False, config=Reading()) as reader:
@@ -53,28 +53,28 @@ def seen(file: Path) -> list[tuple[int, int, Stamp | None]]:
 @pytest.mark.parametrize("logged_ns", [UTC, [START_NS] * COUNT], ids=["logged apart", "one log time"])
 def test_the_headers_times_and_their_order(tmp_path, headers_ns, clock, logged_ns, lie, chunk_size):
     file = log_of(tmp_path / "a.mcap", headers_ns, logged_ns, lie, chunk_size=chunk_size)
-    assert seen(file) == [(index, ns, Stamp(ns, clock)) for index, ns in enumerate(headers_ns)]
+    assert read_frames(file) == [(index, ns, Stamp(ns, clock)) for index, ns in enumerate(headers_ns)]
 
 
 @pytest.mark.parametrize("lie", [None, DISORDER], ids=["in order", "mixed"])
 def test_where_no_header_tells_a_time_it_is_the_logs(tmp_path, lie):
     file = log_of(tmp_path / "a.mcap", [0] * COUNT, UTC, lie)
-    assert seen(file) == [(index, ns, Stamp(ns, Clock.UTC)) for index, ns in enumerate(UTC)]
+    assert read_frames(file) == [(index, ns, Stamp(ns, Clock.UTC)) for index, ns in enumerate(UTC)]
 
 
 def test_one_header_that_was_not_filled_in_has_the_logs_time(tmp_path):
     file = log_of(tmp_path / "a.mcap", [*UTC[:3], 0, *UTC[4:]], [ns + 5 for ns in UTC])
-    assert [ns for _, ns, _ in seen(file)] == [*UTC[:3], UTC[3] + 5, *UTC[4:]]
+    assert [ns for _, ns, _ in read_frames(file)] == [*UTC[:3], UTC[3] + 5, *UTC[4:]]
 
 
 def test_where_all_headers_tell_one_time_the_stream_has_the_logs(tmp_path):
     file = log_of(tmp_path / "a.mcap", [START_NS] * COUNT, UTC)
-    assert seen(file) == [(index, ns, Stamp(START_NS, Clock.UTC)) for index, ns in enumerate(UTC)]
+    assert read_frames(file) == [(index, ns, Stamp(START_NS, Clock.UTC)) for index, ns in enumerate(UTC)]
 
 
 def test_images_of_one_time_keep_the_order_of_the_file(tmp_path):
     file = log_of(tmp_path / "a.mcap", [0] * COUNT, [START_NS] * COUNT, DISORDER)
-    assert [number for number, *_ in seen(file)] == DISORDER
+    assert [number for number, *_ in read_frames(file)] == DISORDER
 
 
 def test_what_waits_takes_no_more_than_its_memory(tmp_path, monkeypatch):
@@ -85,7 +85,7 @@ def test_what_waits_takes_no_more_than_its_memory(tmp_path, monkeypatch):
     one = max(len(message.data) for message in plain(file, {"/image"}))
     monkeypatch.setattr(order, "_MAX_HELD_BYTES", 3 * one)
     monkeypatch.setattr(order, "messages", lambda *args: passes.append(1) or plain(*args))
-    assert [number for number, *_ in seen(file)] == list(range(COUNT))
+    assert [number for number, *_ in read_frames(file)] == list(range(COUNT))
     assert len(passes) == 1 + 2, "once for the times, and once for each four: three that wait, and one that comes"
 
 
