@@ -179,6 +179,7 @@ class Video:
         self._stream.codec_context.thread_type = "AUTO"
         self._num_packets, self._decoded_until = 0, 0  # of the pictures, and the dts of the last one
         self._is_avi = self._container.format.name == "avi"
+        self._has_pts = not (self._is_avi and self._stream.codec_context.has_b_frames)
         self._unit_s = self._stream.time_base or Fraction(1, 10**9)
         self._frame_ns = round(10**9 / (self._stream.guessed_rate or self._stream.average_rate or _DEFAULT_RATE))
 
@@ -189,7 +190,7 @@ class Video:
 
     def _pts(self, each: av.Packet | av.VideoFrame) -> int | None:
         """When it is shown; None where the container does not tell: an AVI has the times of decoding alone."""
-        return None if self._is_avi and self._stream.codec_context.has_b_frames else each.pts
+        return each.pts if self._has_pts else None
 
     def _note(self, packet: av.Packet, timeline: _Timeline) -> None:
         self._num_packets += 1
@@ -213,14 +214,14 @@ class Video:
         """Goes to the last key frame at `from_ns` or before; returns what is known there, and the packets from there.
 
         All packets before it are read and not decoded: they alone tell how many frames there are. Where a packet has no
-        time, or the way does not lead to that key frame, the packets are those from the beginning.
+        time, the clock is set back, or the way does not lead to that key frame, it begins at the beginning.
         """
         scan, limit = _Timeline(self._unit_s), Fraction(from_ns, 10**9) / self._unit_s
         key, num_before = None, 0
         for packet in self._packets():
+            decoded_until, pts = self._decoded_until, self._pts(packet)
             self._note(packet, scan)
-            pts = self._pts(packet)
-            if pts is None:
+            if pts is None or (decoded_until - self._decoded_until) * self._unit_s * 10**9 > _MAX_DISORDER_NS:
                 key = None
                 break
             begins = min([pts, *scan.waiting[:1]])

@@ -61,10 +61,8 @@ def _frames(config: Config, early_s: float) -> Iterator[Frame | DroppedFrame]:
             raise VideoError(f"{str(config.file)!r} is no video that can be used: {error}") from error
         yield DroppedFrame(f"{_stem(config)}_rest", str(error))
     if frame_id == 0:
-        raise ValueError(
-            f"{str(config.file)!r} is no video that can be decoded, or has no frame{_describe_range(config)}; convert it "
-            "to MP4 (H.264)"
-        )
+        lacking = f"is no video that can be decoded, or has no frame{_describe_range(config)}"
+        raise ValueError(f"{str(config.file)!r} {lacking}; convert it to MP4 (H.264)")
 
 
 def _describe_range(config: Config) -> str:

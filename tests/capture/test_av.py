@@ -40,7 +40,14 @@ VARIABLE = [
     9000,
 ]
 CODECS = {"libx264": "mp4", "libx265": "mp4", "libsvtav1": "mp4", "libvpx-vp9": "mp4", "mjpeg": "mov"}
-FURTHER = [("libx264", "mkv"), ("libx264", "ts"), ("libx264", "avi"), ("libvpx-vp9", "webm"), ("mjpeg", "avi")]
+FURTHER = [
+    ("libx264", "mkv"),
+    ("mpeg4", "avi"),
+    ("libx264", "ts"),
+    ("libx264", "avi"),
+    ("libvpx-vp9", "webm"),
+    ("mjpeg", "avi"),
+]
 
 
 def read(file: Path, from_s: float = 0.0, to_s: float | None = None, every: int = 1) -> list[VideoFrame]:
@@ -198,6 +205,23 @@ def test_a_stream_that_changes_its_size_gives_both_sizes(tmp_path):
     assert [frame.index for frame in found] == list(range(8))
     assert all(before.time_ns < after.time_ns for before, after in pairwise(found))
     assert np.allclose([brightness(frame) for frame in found], [level_of(i % 4, 4) for i in range(8)], atol=8)
+
+
+def test_joined_streams_go_on_where_the_clock_is_set_back(tmp_path):
+    times_ms = [100 * index for index in range(COUNT)]
+    clip = write_clip(tmp_path / "a.ts", "libx264", level_images(COUNT), times_ms).read_bytes()
+    file = tmp_path / "both.ts"
+    file.write_bytes(clip + clip)
+    found = read(file)
+    assert len(found) == 2 * COUNT and len({frame.index for frame in found}) == 2 * COUNT
+    assert [round(frame.time_ns / 1e6) for frame in found[:COUNT]] == times_ms
+    gaps = [after.time_ns - before.time_ns for before, after in pairwise(found)]
+    assert min(gaps) > 0 and sum(gaps) == pytest.approx(39 * 100_000_000, abs=100_000_000)
+    part = read(file, 2.95, 3.45)
+    assert [(frame.index, frame.time_ns) for frame in part] == [
+        (frame.index, frame.time_ns) for frame in found if 2.95 <= frame.time_ns / 1e9 < 3.45
+    ]
+    assert len(part) == 5
 
 
 def test_a_frame_that_cannot_be_decoded_leaves_a_gap_and_is_told(tmp_path):

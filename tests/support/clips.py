@@ -47,6 +47,7 @@ def write_clip(
     """Encodes images at times; H.264 and HEVC with frames that refer to later ones, and a key frame every six."""
     chosen = {
         "libx264": {"bf": "2", "g": "6", "sc_threshold": "0"},
+        "mpeg4": {"bf": "2", "g": "6"},
         "libx265": {"x265-params": "bframes=2:keyint=6:log-level=none"},
         "libsvtav1": {"preset": "12", "g": "6", "svtav1-params": "lp=1"},
         "libvpx-vp9": {"g": "6", "deadline": "realtime", "cpu-used": "8"},
@@ -55,6 +56,7 @@ def write_clip(
         stream: Any = container.add_stream(codec, rate=25, options={**chosen, **(options or {})})
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = "yuvj420p" if codec == "mjpeg" else "yuv420p"
+        stream.bit_rate = 4_000_000
         stream.codec_context.time_base = CLOCK
         if pixel_aspect is not None:
             stream.codec_context.sample_aspect_ratio = pixel_aspect
