@@ -1,11 +1,13 @@
 """A recording in a file, by its name: a video, an image topic of an MCAP file, or an episode of a LeRobot data set.
 
-film.mp4, drive.mcap#/front/image, pusht#episode_000003/observation.images.top
+film.mp4, film.mp4#t=10,20.5, drive.mcap#/front/image, pusht#episode_000003/observation.images.top
 """
 
 from __future__ import annotations
 
+import math
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,10 +16,13 @@ from urllib.parse import quote, unquote
 from splatnode.capture.cameras import lerobot, mcap, video
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lerobot.data_set import is_data_set
+from splatnode.capture.process.printable import printable
 
 MCAP = ".mcap"
 _MODULES = {"mcap": mcap, "lerobot": lerobot, "video": video}
 _MARK = "#"  # between a file and the part of it that is meant
+# Seconds of a video from its first frame, the first of which is in it, as W3C's Media Fragments have it: t=10,20.5
+_SECONDS = re.compile(r"t=(\d+(?:\.\d*)?)?(?:,(\d+(?:\.\d*)?))?", re.ASCII)
 
 
 def file_and_part(path: Path) -> tuple[Path, str]:
@@ -48,17 +53,29 @@ def is_film(path: Path) -> bool:
 
 
 def camera(path: Path) -> tuple[str, dict[str, Any]]:
-    """The kind of camera that gives its frames, and its configuration. Raises ValueError for a part of a video."""
+    """The kind of camera that gives its frames, and its configuration.
+
+    Raises ValueError for a part of a video that is no range of seconds.
+    """
     file, part = file_and_part(path)
     if file.suffix.lower() == MCAP:
         return "mcap", {"file": file, "topic": part}
     if file.is_dir():
         return "lerobot", {"folder": file, "part": part}
-    if part:
+    return "video", {"file": file, **(_parse_seconds(file, part) if part else {})}
+
+
+def _parse_seconds(file: Path, part: str) -> dict[str, float]:
+    """From when to when a part of a video is. Raises ValueError."""
+    found = _SECONDS.fullmatch(part)
+    told = {} if found is None else {"from_s": found[1], "to_s": found[2]}
+    span = {name: float(text) for name, text in told.items() if text}
+    if not span or span.get("from_s", 0.0) >= span.get("to_s", math.inf):
         raise ValueError(
-            f"{str(path)!r}: behind the # is a part of an MCAP file or of a LeRobot data set; {str(file)!r} is neither"
+            f"{printable(str(file))!r}: behind the # must be seconds of the video, the first before the last, such as "
+            f"#t=10,20.5, #t=10 or #t=,20.5; got {printable(part, 100)!r}. Of an MCAP file it is a topic"
         )
-    return "video", {"file": file}
+    return span
 
 
 def stream(path: Path) -> Iterator[Frame | DroppedFrame]:

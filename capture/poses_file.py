@@ -20,6 +20,7 @@ from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import printable
 from splatnode.capture.process.records import record_in
+from splatnode.capture.stamp import Clock
 
 Array = npt.NDArray[np.float64]
 
@@ -62,8 +63,10 @@ class Trajectory:
         """That of one frame, T_world_camera (4, 4); None where it has none."""
         if self.by_name:
             return self.by_name[known] if (known := self.names(frame.name)) else None
-        if frame.captured_at is not None and (found := self._at(frame.captured_at.ns / 1e9)) is not None:
-            return found
+        if frame.captured_at is not None:
+            found = self._at(frame.captured_at.ns / 1e9)
+            if found is not None or frame.captured_at.clock is Clock.RECORDING:
+                return found  # whole seconds of a recording are seconds, and no numbers of frames
         return self._at(float(frame.frame_id)) if _are_numbers(self.seconds) else None
 
     def names(self, photograph: str) -> str:
@@ -77,11 +80,7 @@ class Trajectory:
         nearest = min(near, key=lambda index: abs(self.seconds[index] - seconds))
         if abs(self.seconds[nearest] - seconds) < 1e-6:
             return self.Ts[nearest]
-        if (
-            len(near) < 2
-            or self.seconds[after] - self.seconds[after - 1] > _LONGEST_GAP_S
-            or _are_numbers(self.seconds)
-        ):
+        if len(near) < 2 or self.seconds[after] - self.seconds[after - 1] > _LONGEST_GAP_S:
             return self.Ts[nearest] if abs(self.seconds[nearest] - seconds) <= _NEAREST_S else None
         between, T = self.seconds[after - 1 : after + 1], np.eye(4)
         share = (seconds - between[0]) / (between[1] - between[0])

@@ -141,7 +141,10 @@ class Reader:
                 pause = min(2 * pause, self.config.longest_pause_s)
 
     def _numbered(self, count: int) -> Iterator[Frame | DroppedFrame | NothingNew]:
-        """The camera's frames from one opening to its loss. A frame whose stamp does not grow is dropped."""
+        """The camera's frames from one opening to its loss. A frame from before the last one is dropped.
+
+        Several frames of one time are frames of a recording, whose clock is coarse; a live camera has given one twice.
+        """
         newest_ns = -1
         stream = self._open_camera()
         try:
@@ -150,8 +153,10 @@ class Reader:
                     return
                 if not isinstance(item, Frame):
                     yield item
-                elif item.stamp_ns <= newest_ns:
+                elif item.stamp_ns < newest_ns:
                     yield DroppedFrame(item.name, f"its time stamp is {newest_ns - item.stamp_ns} ns before the last")
+                elif item.stamp_ns == newest_ns and self._live:
+                    yield DroppedFrame(item.name, "its time stamp is that of the last frame: the camera gave one twice")
                 else:
                     newest_ns = item.stamp_ns
                     yield replace(item, frame_id=count)

@@ -31,7 +31,7 @@ _MEANINGS = {
     Clock.UTC: "since 1970, UTC",
     Clock.LOCAL: "since 1970 by the camera's date and time, whose time zone is not known",
     Clock.FILE: "since 1970, UTC, when the file was last written",
-    Clock.RECORDING: "since the recording began",
+    Clock.RECORDING: "since the recording, or its simulation, began",
 }
 
 

@@ -20,10 +20,10 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         nargs="+",
         metavar="SOURCE",
-        help="a folder with photographs of one place, in any order, or some photographs of a folder, or a video, or an "
-        "image topic of an MCAP file (drive.mcap#/front/image), or an episode of a LeRobot data set (pusht#3/CAMERA), "
-        "or what `splatnode record` wrote; of a film, and of more than 30 photographs, keyframes are chosen as a live "
-        "camera's are",
+        help="a folder with photographs of one place, in any order, or some photographs of a folder, or a video, or "
+        "seconds of one (film.mp4#t=10,20.5), or an image topic of an MCAP file (drive.mcap#/front/image), or an "
+        "episode of a LeRobot data set (pusht#3/CAMERA), or what `splatnode record` wrote; of a film, and of more than "
+        "30 photographs, keyframes are chosen as a live camera's are",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the scene and its report go")
     add_way(parser)

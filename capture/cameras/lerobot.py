@@ -1,4 +1,4 @@
-"""What a camera saw in an episode of a LeRobot data set (v3.0), as a camera. Needs pyarrow; AV1, PyAV."""
+"""What a camera saw in an episode of a LeRobot data set (v3.0), as a camera. Needs pyarrow."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from splatnode.capture.stamp import Clock, Stamp
 from splatnode.capture.video_process import MAX_VIDEO_PIXELS
 
 _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the frame comes behind it
+_EARLY = 0.25  # of a frame: what comes earlier by less than the table says is an episode's first frame nevertheless
 _OFF = 0.75  # of a frame: a time may be off by less where the video's rate is not quite the data set's
 
 
@@ -27,7 +28,8 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     part: str  # the episode and the camera's key: 3/observation.images.top; of a data set with one camera, 3
     max_pixels: MaxPixels = MAX_VIDEO_PIXELS  # of a frame, at most; the decoder's memory is bounded accordingly
     pace: Pace = "fastest"  # recorded: at the pace of the video; fastest: as fast as frames are taken
-    intrinsics: Intrinsics | None = None  # the lens, of a calibration at the same aspect ratio
+    # The lens, of frames as they are shown: upright, of square pixels, at the same aspect ratio
+    intrinsics: Intrinsics | None = None
 
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
@@ -43,7 +45,8 @@ def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
         from_s=found.from_s,
         to_s=found.to_s,
     )
-    return paced(_frames(video.stream(part), found), config.pace)
+    early_s = _EARLY / found.rate if found.rate else 0.0
+    return paced(_frames(video.stream(part, early_s), found), config.pace)
 
 
 def _frames(frames: Iterator[Frame | DroppedFrame], found: Film) -> Iterator[Frame | DroppedFrame]:

@@ -13,18 +13,17 @@ from splatnode.capture.given_lens import same_aspect
 from splatnode.capture.image_file import MAX_PIXELS, MaxPixels
 from splatnode.capture.logged.calibration import calibration_topic, lens
 from splatnode.capture.logged.mcap import Message, Topic, UnusableLog, messages, topics
-from splatnode.capture.logged.message import Calibration, Picture, UnusableMessage
+from splatnode.capture.logged.message import Calibration, UnusableMessage
+from splatnode.capture.logged.order import MessageTime, read_in_order, read_picture, read_times
 from splatnode.capture.logged.pixels import is_photograph, rgb
 from splatnode.capture.logged.schemas import CALIBRATIONS, PICTURES, READ
 from splatnode.capture.pace import Pace, paced
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.printable import LONGEST_NAME, printable, printable_name
-from splatnode.capture.stamp import LARGEST_NS, Clock, Stamp
 
 log = logging.getLogger(__name__)
 
-_EARLIEST_UTC_NS = 946_684_800 * 10**9  # the year 2000: a smaller stamp is of a clock that began with the recording
 _LONGEST_STEM = LONGEST_NAME - 25  # characters: the number of the message comes behind it
 _NOT_PHOTOGRAPHS = "/compressedDepth"  # the end of a topic's name: depth that ROS packs into a PNG
 
@@ -38,7 +37,7 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def stream(config: Config) -> Iterator[Frame | DroppedFrame]:
-    """The images at the times at which they were logged, each with the lens that the file tells for its camera.
+    """The images in the order of their times, each with the lens that the file tells for its camera.
 
     Raises FileNotFoundError, or ValueError where the file or the topic cannot be used. What goes wrong after a frame
     is named as a dropped frame.
@@ -61,7 +60,7 @@ def _shows_photographs(file: Path, topic: Topic) -> bool:
     if first is None:
         return False
     try:
-        return is_photograph(_picture(first))
+        return is_photograph(read_picture(first))
     except UnusableMessage:
         return True
 
@@ -87,8 +86,8 @@ def _frames(config: Config, topic: Topic) -> Iterator[Frame | DroppedFrame]:
     known = config.intrinsics or _lens(config.file, topic)
     index, told = 0, False
     try:
-        for message in messages(config.file, {topic.name}):
-            item = _frame(message, index, config, known)
+        for message, time in read_in_order(config.file, topic, read_times(config.file, topic)):
+            item = _frame(message, time, index, config, known)
             if isinstance(item, Frame) and known is not None and item.intrinsics is None and not told:
                 sizes = {"calibrated": f"{known.width}x{known.height}", "image": f"{item.width}x{item.height}"}
                 event(log, logging.WARNING, "lens_of_another_size", topic=printable(topic.name), **sizes)
@@ -103,10 +102,12 @@ def _frames(config: Config, topic: Topic) -> Iterator[Frame | DroppedFrame]:
         raise ValueError(f"{str(config.file)!r} has no message of {printable(topic.name, LONGEST_NAME)}")
 
 
-def _frame(message: Message, index: int, config: Config, known: Intrinsics | None) -> Frame | DroppedFrame:
+def _frame(
+    message: Message, time: MessageTime, index: int, config: Config, known: Intrinsics | None
+) -> Frame | DroppedFrame:
     name = f"{_stem(message.topic)}_{index:06d}.png"
     try:
-        picture = _picture(message)
+        picture = read_picture(message)
         with foreign(UnusableMessage):
             image = rgb(picture, config.max_pixels)
     except UnusableMessage as error:
@@ -114,20 +115,7 @@ def _frame(message: Message, index: int, config: Config, known: Intrinsics | Non
     height, width = image.shape[:2]
     fits = known is not None and same_aspect(known, width, height)
     own = known.resized(width, height) if known is not None and fits else None
-    return framed(index, name, message.log_ns, image, own, captured_at=_captured_at(picture, message))
-
-
-def _captured_at(picture: Picture, message: Message) -> Stamp | None:
-    """By the clock of who took it, or wrote it down, whichever knows the time of day; else since an unknown time."""
-    for ns in (picture.captured_ns, message.log_ns):
-        if _EARLIEST_UTC_NS <= ns <= LARGEST_NS:
-            return Stamp(ns, Clock.UTC)
-    return Stamp(picture.captured_ns, Clock.RECORDING) if picture.captured_ns <= LARGEST_NS else None
-
-
-def _picture(message: Message) -> Picture:
-    with foreign(UnusableMessage):
-        return PICTURES[message.topic.kind](message.data)
+    return framed(index, name, time.stream_ns, image, own, captured_at=time.captured_at)
 
 
 def _lens(file: Path, topic: Topic) -> Intrinsics | None:
@@ -154,7 +142,7 @@ def _lens(file: Path, topic: Topic) -> Intrinsics | None:
 def _sensor(file: Path, topic: Topic) -> str:
     first = next(messages(file, {topic.name}), None)
     try:
-        return "" if first is None else _picture(first).sensor
+        return "" if first is None else read_picture(first).sensor
     except UnusableMessage:
         return ""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 # Import name -> distribution. An installation brings them all.
 REQUIRED = {
+    "av": "av",
     "cv2": "opencv-contrib-python-headless",
     "msgspec": "msgspec",
     "numpy": "numpy",
@@ -15,7 +16,6 @@ REQUIRED = {
 # Import name -> the extra that brings the package of that name.
 EXTRAS = {
     "PIL": "heic",
-    "av": "lerobot",
     "depthai": "oak",
     "gsplat": "cuda",
     "matplotlib": "bench",

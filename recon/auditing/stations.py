@@ -181,11 +181,11 @@ def _of_source(path: Path, named: Path) -> _Shot | _Unreadable:
         return _Unreadable(path.parts, f"{error.name} is not installed. {remedy(error.name or '')}")
     except (ValueError, OSError) as error:
         return _Unreadable(path.parts, str(error))
-    if part:
+    if part and file.suffix.lower() == film.MCAP:
         return _Shot(file.parts, printable_name(part), Film(path))
     if path == named:
         return _Shot(path.parts, _ONE_CAMERA, Film(path))
-    camera = frame_name(path) if path.is_dir() else _camera(path)
+    camera = frame_name(path) if path.is_dir() else _camera(file)
     return _Shot(path.parent.parts, camera, _of_camera(path) if path.is_dir() else Film(path))
 
 

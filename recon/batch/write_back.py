@@ -17,7 +17,8 @@ from typing import Any
 
 from splatnode.capture import film
 from splatnode.capture.lerobot import data_set
-from splatnode.capture.logged.mcap import messages
+from splatnode.capture.logged.mcap import topics
+from splatnode.capture.logged.order import read_times
 from splatnode.capture.process.folders import LOCK
 from splatnode.capture.process.lock import Held, exclusive
 from splatnode.recon.batch.answer import Outcome
@@ -51,7 +52,7 @@ def write_back(rows: Iterable[Outcome], out: Path, in_place: bool) -> Iterator[W
     found: defaultdict[Path, list[tuple[str, Outcome]]] = defaultdict(list)
     for row in rows:
         file, part = film.file_and_part(Path(row.source))
-        if part and not row.failed:
+        if part and not row.failed and (file.is_dir() or file.suffix.lower() == film.MCAP):
             found[file].append((part, row))
     for file, parts in found.items():
         write = _with_log if file.suffix.lower() == film.MCAP else _into_data_set
@@ -150,18 +151,26 @@ def _with_log(file: Path, parts: Sequence[tuple[str, Outcome]], out: Path, in_pl
 
 
 def _of_topic(file: Path, topic: str, row: Outcome, out: Path, names: Mapping[str, str]) -> Iterator[Message]:
-    """The verdict with the first picture, and of each keyframe its pose and lens, at the time of its picture."""
+    """The verdict with the first picture, and of each keyframe its pose and lens: logged when its picture was logged.
+
+    Their own time stamps are those of the pictures' headers, which a simulation may count from its beginning.
+    """
     by_index = {_index(camera): camera for camera in _cameras(row, out)}
-    for index, message in enumerate(messages(file, {topic})):
-        ns = message.log_ns
+    logged = next((each for each in topics(file) if each.name == topic), None)
+    for index, taken in enumerate(() if logged is None else read_times(file, logged)):
+        ns, stamp_ns = taken.log_ns, taken.log_ns if taken.captured_at is None else taken.captured_at.ns
         if index == 0:
             level = _INFO if row.published else _WARNING
             said = {"message": f"{row.verdict}: {row.message}", "name": "splatnode", "file": "", "line": 0}
-            yield names["verdict"], ns, {"timestamp": time(ns), "level": level, **said}
+            yield names["verdict"], ns, {"timestamp": time(stamp_ns), "level": level, **said}
         if (camera := by_index.get(index)) is not None:
-            placed = {"timestamp": time(ns), "frame_id": f"{topic}/{_WORLD}", "pose": pose(camera.T_world_camera)}
+            placed = {
+                "timestamp": time(stamp_ns),
+                "frame_id": f"{topic}/{_WORLD}",
+                "pose": pose(camera.T_world_camera),
+            }
             yield names["pose"], ns, placed
-            yield names["calibration"], ns, calibration(camera, ns, f"{topic}/{_CAMERA}")
+            yield names["calibration"], ns, calibration(camera, stamp_ns, f"{topic}/{_CAMERA}")
 
 
 def _cameras(row: Outcome, out: Path) -> Sequence[CameraEstimate]:

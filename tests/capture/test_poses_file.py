@@ -18,8 +18,8 @@ from tests.recon.metric.test_poses import NAMES, TRUE, scene
 SEEN = np.zeros((8, 8, 3), np.uint8)
 
 
-def frame(name: str, frame_id: int = 0, seconds: float | None = None) -> Frame:
-    stamp = None if seconds is None else Stamp(round(1e9 * seconds), Clock.UTC)
+def frame(name: str, frame_id: int = 0, seconds: float | None = None, clock: Clock = Clock.UTC) -> Frame:
+    stamp = None if seconds is None else Stamp(round(1e9 * seconds), clock)
     return Frame(frame_id, name, frame_id, SEEN, None, captured_at=stamp)
 
 
@@ -57,6 +57,17 @@ def test_times_between_two_poses_are_interpolated(tmp_path):
     assert list(found) == ["a.png", "b.png"]
     np.testing.assert_allclose(found["a.png"][:3, 3], [0.5, 0.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(found["a.png"][:2, 0], [np.cos(np.pi / 4), np.sin(np.pi / 4)], atol=1e-6)
+
+
+def test_whole_seconds_are_those_of_a_recording_and_else_may_number_the_frames(tmp_path):
+    """At ten frames a second the frame of .3 s is number 3, and not where the camera was at 3 s."""
+    file = tmp_path / "odometry.txt"
+    file.write_text("".join(f"{second} {second} 0 0 0 0 0 1\n" for second in range(5)))
+    timed = [frame(f"{number}.png", number, number / 10, Clock.RECORDING) for number in range(40)]
+    found = read_poses(file).of(timed)
+    np.testing.assert_allclose([T[0, 3] for T in found.values()], np.arange(40) / 10, atol=1e-9)
+    numbered = read_poses(file).of([frame("a.png", 3), frame("b.png", 4, 1.7e9)])
+    assert [T[0, 3] for T in numbered.values()] == [3.0, 4.0]
 
 
 def test_a_trajectory_may_name_photographs(tmp_path):

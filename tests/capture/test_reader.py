@@ -194,11 +194,20 @@ def test_a_camera_of_damaged_frames_alone_is_degraded_and_then_given_up(clock):
                 reader.next(60)
 
 
-def test_stamps_that_do_not_grow_cost_the_frame():
-    with Reader(recorded([frame(0, 50), frame(1, 50), frame(2, 40), frame(3, 60)]), False, QUICK) as reader:
-        first, second, third, fourth = read_all(reader)
-    assert [first.frame_id, fourth.frame_id] == [0, 1]
-    assert isinstance(second, DroppedFrame) and third == DroppedFrame("2", "its time stamp is 10 ns before the last")
+def test_a_frame_from_before_the_last_one_is_dropped():
+    with Reader(recorded([frame(0, 50), frame(1, 40), frame(2, 60)]), False, QUICK) as reader:
+        first, second, third = read_all(reader)
+    assert [first.frame_id, third.frame_id] == [0, 1]
+    assert second == DroppedFrame("1", "its time stamp is 10 ns before the last")
+
+
+def test_frames_of_one_time_are_kept_of_a_recording_and_given_twice_by_a_live_camera():
+    sent = [frame(0, 50), frame(1, 50)]
+    with Reader(recorded(sent), live=False, config=QUICK) as reader:
+        assert [(item.name, item.frame_id) for item in read_all(reader)] == [("0", 0), ("1", 1)]
+    with Reader(recorded(sent), live=True, config=QUICK) as reader:
+        _, second = read_all(reader)
+        assert second == DroppedFrame("1", "its time stamp is that of the last frame: the camera gave one twice")
 
 
 def test_other_errors_are_not_hidden():

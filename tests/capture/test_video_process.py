@@ -42,10 +42,11 @@ def test_every_crafted_video_is_refused_or_its_frames_have_one_size_in_bounded_m
     for reading in found.values():
         assert set(reading.outcome.split()) <= {"Frame", "DroppedFrame"}, reading
         assert reading.taken < MARGIN, reading
-    refused = {"large.avi", "hidden.avi", "png.avi", "fast.avi", "slow.avi", "raw.avi"}
-    refused |= {file.name for file in videos() if file.name.endswith(".mp4")} - {"photograph.mp4"}
+    refused = {"large.avi", "hidden.avi", "png.avi", "raw.avi"}
+    refused |= {file.name for file in videos() if file.name.endswith(".mp4")}
     assert {name for name, reading in found.items() if reading.outcome == "DroppedFrame"} >= refused
-    assert found["container.avi"].outcome == "Frame Frame Frame"
+    for name in ("container.avi", "fast.avi", "slow.avi"):  # of any size and rate that the container says
+        assert found[name].outcome == "Frame Frame Frame"
 
 
 def test_the_limit_is_named(tmp_path):
@@ -81,7 +82,9 @@ def test_a_decoder_that_ends_early_is_told_after_the_frames_before(tmp_path, mon
     assert items[2] == DroppedFrame("a_rest", "its decoder ended (-11)")
 
 
-@pytest.mark.parametrize(("span", "whole"), [(Span(), False), (Span(to_s=0.25), True)], ids=["all", "before the cut"])
+@pytest.mark.parametrize(
+    ("span", "whole"), [(Span(), False), (Span(to_ns=250_000_000), True)], ids=["all", "before the cut"]
+)
 def test_a_video_that_was_cut_is_told_after_its_frames(tmp_path, span, whole):
     writer = cv2.VideoWriter(str(tmp_path / "whole.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 20, (64, 48))
     for index in range(40):
@@ -112,7 +115,7 @@ def test_frames_pass_unchanged(tmp_path):
     for frame in frames:
         writer.write(frame)
     writer.release()
-    found = [frame.image for frame in decoded(tmp_path / "a.avi", 1, LIMIT)]
+    found = [frame.image[:, :, ::-1] for frame in decoded(tmp_path / "a.avi", 1, LIMIT)]
     np.testing.assert_array_equal(found, frames)
 
 

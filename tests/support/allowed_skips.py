@@ -30,7 +30,6 @@ ALLOWED = (
     AllowedSkip("api/test_window.py*", "needs viser", "its wheels could not be installed", "viser"),
     AllowedSkip("viewer/test_viser.py*", "needs viser", "its wheels could not be installed", "viser"),
     AllowedSkip("viewer/test_viser.py*", "needs a browser*", "its package could not be installed", "browser"),
-    AllowedSkip("capture/lerobot/test_data_set.py*", "needs PyAV", "its wheel could not be installed"),
     AllowedSkip("capture/logged/test_messages.py*", "needs *-*", "the schemas' own writers could not be installed"),
     AllowedSkip("recon/batch/test_ray.py*", "needs ray", "300 MB; test_remote.py has what a worker does"),
     AllowedSkip("recon/evaluate/test_ray.py*", "needs ray", "likewise; test_calls.py has what runs without a cluster"),

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
 import pyarrow.parquet as pq
+
+from tests.support.clips import scheduled_as_before
 
 RATE = 10  # frames a second
 
@@ -99,25 +100,10 @@ def _by_opencv(video: Path, images: Images, _codec: str) -> None:
 
 def _by_av(video: Path, images: Images, codec: str) -> None:
     """As LeRobot encodes: a key frame every second frame, 4:2:0, crf 30."""
-    import av
-
-    with _scheduled_as_before(), av.open(str(video), "w") as container:
+    with scheduled_as_before(), av.open(str(video), "w") as container:
         stream: Any = container.add_stream(codec, rate=RATE, options={"g": "2", "crf": "30"})
         stream.height, stream.width = images[0].shape[:2]
         stream.pix_fmt = "yuv420p"
         for image in images:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         container.mux(stream.encode(None))
-
-
-@contextlib.contextmanager
-def _scheduled_as_before() -> Iterator[None]:
-    """SVT-AV1, where it runs as root, gives the thread that encodes a priority before all others, for ever."""
-    if not hasattr(os, "sched_getscheduler"):
-        yield
-        return
-    before = os.sched_getscheduler(0), os.sched_getparam(0)
-    try:
-        yield
-    finally:
-        os.sched_setscheduler(0, *before)

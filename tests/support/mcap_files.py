@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,8 @@ STEP_NS = 100_000_000  # between messages
 Written = tuple[str, str, str, bytes, bytes]  # topic, schema's name and encoding, its definition, a message
 
 
-def write(file: Path, messages: Iterable[Written], **options: Any) -> Path:
-    """The messages, 0.1 s apart, in a file of mcap's own writer."""
+def write(file: Path, messages: Iterable[Written], log_ns: Callable[[int], int] | None = None, **options: Any) -> Path:
+    """The messages, 0.1 s apart or logged at `log_ns` of their numbers, in a file of mcap's own writer."""
     encodings = {"jsonschema": "json", "protobuf": "protobuf", "ros2msg": "cdr"}
     with file.open("wb") as stream:
         writer = Writer(stream, **options)
@@ -30,7 +30,7 @@ def write(file: Path, messages: Iterable[Written], **options: Any) -> Path:
             if topic not in channels:
                 known = writer.register_schema(schema, kind, definition)
                 channels[topic] = writer.register_channel(topic, encodings[kind], known)
-            at_ns = START_NS + STEP_NS * index
+            at_ns = START_NS + STEP_NS * index if log_ns is None else log_ns(index)
             writer.add_message(channels[topic], log_time=at_ns, publish_time=at_ns, data=data)
         writer.finish()
     return file
@@ -41,9 +41,13 @@ def jpeg(image: npt.NDArray[np.uint8]) -> bytes:
     return cv2.imencode(".jpg", image[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes()
 
 
-def compressed(topic: str, image: npt.NDArray[np.uint8] | bytes, sensor: str = "") -> Written:
+def compressed(
+    topic: str, image: npt.NDArray[np.uint8] | bytes, sensor: str = "", header_ns: int | None = None
+) -> Written:
     data = image if isinstance(image, bytes) else jpeg(image)
-    return as_json(topic, "CompressedImage", {"data": _base64(data), "format": "jpeg", "frame_id": sensor})
+    told = {"data": _base64(data), "format": "jpeg", "frame_id": sensor}
+    stamp = {} if header_ns is None else {"timestamp": {"sec": header_ns // 10**9, "nsec": header_ns % 10**9}}
+    return as_json(topic, "CompressedImage", {**told, **stamp})
 
 
 def raw(topic: str, width: int, height: int, encoding: str, step: int, data: bytes, sensor: str = "") -> Written:

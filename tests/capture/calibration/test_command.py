@@ -180,7 +180,7 @@ def test_a_film_is_named_as_for_replay(tmp_path, capsys):
     assert command._is_moving(camera) and command._is_moving(command._config(film, []).camera)
     assert not command._is_moving(command._config(tmp_path, []).camera)
     code, told = refusal(capsys, tmp_path / "film.mp4#3", "--out", tmp_path / "lens.yaml")
-    assert code == 2 and "a part of an MCAP file or of a LeRobot data set" in told
+    assert code == 2 and "behind the # must be seconds of the video" in told
 
 
 def test_photographs_without_the_board_are_refused(tmp_path, capsys):

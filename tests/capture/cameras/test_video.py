@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from fractions import Fraction
 from typing import Any
 
 import cv2
@@ -14,6 +15,7 @@ from splatnode.capture.cameras.video import Config, stream
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.pace import paced
 from splatnode.capture.stamp import Clock, Stamp
+from tests.support.clips import level_images, turn, write_clip, write_sound
 
 
 @pytest.fixture(scope="module")
@@ -40,6 +42,51 @@ def test_frames_at_their_times(walk):
 def test_a_lens_of_another_aspect_ratio_is_refused(walk):
     with pytest.raises(ValueError, match="aspect ratio, got those of 320 x 180 for 160 x 120"):
         list(stream(Config(walk, intrinsics=Intrinsics(320, 180, 300.0, 300.0, 160.0, 90.0, "calibration"))))
+
+
+def test_a_lens_is_that_of_frames_as_they_are_shown(tmp_path, caplog):
+    """Of pixels that are not square it has the width that frames get, and of a video on its side its upright size."""
+    file = write_clip(tmp_path / "a.mp4", "libx264", level_images(2), [0, 40], pixel_aspect=Fraction(4, 3))
+    shown = Intrinsics(256, 128, 300.0, 300.0, 128.0, 64.0, "calibration")
+    frames: list[Any] = list(stream(Config(file, intrinsics=shown)))
+    assert [(frame.width, frame.height) for frame in frames] == [(128, 64)] * 2
+    assert [frame.intrinsics for frame in frames] == [shown.resized(128, 64)] * 2
+    assert "event=pixels_made_square" in caplog.text and "1.333 times as wide as high" in caplog.text
+    stored = Intrinsics(96, 64, 100.0, 100.0, 48.0, 32.0, "calibration")
+    with pytest.raises(ValueError, match="aspect ratio, got those of 96 x 64 for 128 x 64"):
+        list(stream(Config(file, intrinsics=stored)))
+    turn(file, (0, 1, -1, 0))
+    with pytest.raises(ValueError, match="aspect ratio, got those of 256 x 128 for 64 x 128"):
+        list(stream(Config(file, intrinsics=shown)))
+
+
+def test_where_the_size_changes_the_lens_is_that_of_frames_of_its_shape(tmp_path):
+    """A frame of another shape has none: nobody knows what was cut off."""
+    clips = [
+        write_clip(tmp_path / f"{index}.h264", "libx264", level_images(2, size), [0, 40])
+        for index, size in enumerate([(96, 64), (48, 32), (64, 64)])
+    ]
+    file = tmp_path / "a.h264"
+    file.write_bytes(b"".join(clip.read_bytes() for clip in clips))
+    lens = Intrinsics(96, 64, 100.0, 100.0, 48.0, 32.0, "calibration")
+    frames: list[Any] = list(stream(Config(file, intrinsics=lens)))
+    assert [(frame.width, frame.height) for frame in frames[::2]] == [(96, 64), (48, 32), (64, 64)]
+    assert [frame.intrinsics for frame in frames[::2]] == [lens, lens.resized(48, 32), None]
+    assert len({frame.name for frame in frames}) == 6
+
+
+def test_damage_is_named_behind_the_frames(tmp_path):
+    file = write_clip(tmp_path / "a.avi", "mjpeg", level_images(20), [40 * index for index in range(20)])
+    data = file.read_bytes()
+    file.write_bytes(data[: data.index(b"idx1") * 6 // 10])
+    *frames, last = stream(Config(file))
+    assert 2 < len(frames) < 18 and all(isinstance(frame, Frame) for frame in frames)
+    assert last == DroppedFrame("a_rest", "it ends before the frames that it states: it is cut, or damaged there")
+
+
+def test_sound_alone_says_so(tmp_path):
+    with pytest.raises(ValueError, match=r"a.m4a' is no video that can be used: it has no pictures that follow each"):
+        list(stream(Config(write_sound(tmp_path / "a.m4a"))))
 
 
 def test_some_of_the_frames(walk):

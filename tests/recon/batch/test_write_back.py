@@ -126,6 +126,25 @@ def test_a_log_gets_another_one_beside_it(tmp_path, drive):
     assert [recording.name for recording in recordings([tmp_path], tmp_path / "out")] == ["drive_a", "drive_b"]
 
 
+def test_a_log_in_disorder_gets_each_pose_with_its_picture(tmp_path):
+    """The pictures of a simulation lie as 2, 0, 1: numbers 0 and 2 are the second and the first of the file."""
+    headers_ns = [200_000_000, 0, 100_000_000]
+    told = [mcap_files.compressed("/a", PICTURE, header_ns=ns) for ns in headers_ns]
+    drive = mcap_files.write(tmp_path / "drive.mcap", told)
+    assert ran(tmp_path, drive) == EXIT_GOOD
+    with (tmp_path / "drive.splatnode.mcap").open("rb") as stream:
+        found = [(channel.topic, message.log_time - mcap_files.START_NS, json.loads(message.data)["timestamp"])
+                 for _, channel, message in make_reader(stream).iter_messages()]  # fmt: skip
+    first, second = {"sec": 0, "nsec": 0}, {"sec": 0, "nsec": 200_000_000}
+    assert found == [
+        ("/a/splatnode/pose", 0, second),
+        ("/a/splatnode/calibration", 0, second),
+        ("/a/splatnode/verdict", mcap_files.STEP_NS, first),
+        ("/a/splatnode/pose", mcap_files.STEP_NS, first),
+        ("/a/splatnode/calibration", mcap_files.STEP_NS, first),
+    ]
+
+
 def test_what_cannot_be_written_is_said_and_the_rest_goes_on(tmp_path, data_set, drive, capsys):
     (tmp_path / "drive.splatnode.mcap").mkdir()
     out = tmp_path / "out"
