@@ -122,7 +122,7 @@ def _measured(before: Placed, own: npt.NDArray[np.int64], shifts: Array) -> Moti
     start, seen = before.camera, before.seen.of(own)
     pixels = start.project(seen.points)[0] + shifts
     exact = replace(seen, pixels=pixels, covariances=np.zeros_like(seen.covariances))
-    lens = replace(start.lens, log_focal_sigma=0.0, radial_sigma=0.0, shift_sigma=0.0)
+    lens = replace(start.lens, log_focal_sigma=0.0, radial_sigma=0.0, shift_sigma=0.0, log_aspect_sigma=0.0)
     fit = refined(start, lens, exact, _LEAST_NOISE * max(before.size))
     if not np.isfinite(fit.covariance).all():
         return None
