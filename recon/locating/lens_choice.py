@@ -30,6 +30,8 @@ _REFUTED_SHAPE_SIGMAS = 3.0  # likewise of the radial coefficient and the aspect
 # What was assumed is taken to be known no better than this share of what the free lens leaves open.
 _SHARE_OPEN = 0.6
 _MIN_AGREEMENT = 0.8  # of the points that agree with a free lens, those that must agree with the assumed one
+_MOST_GIVEN_LOG, _MOST_GIVEN_SHIFT = 0.03, 0.02  # and of a given lens, no worse than this: it is known, not assumed
+_CLEARLY_MORE = 1.05  # times as many points must agree with another camera, where an assumed lens has one
 _SUBSET = 500  # correspondences with which lenses of all focal lengths are tried
 _SUBSET_ITERATIONS = 1_500  # of RANSAC with each of these
 _LONGER_ITERATIONS = 3_000  # and with all correspondences: they do for 13 % inliers
@@ -59,7 +61,7 @@ def search(judged: Judged, assumed: Sequence[Assumed], others: Sequence[Lens]) -
     few = known.of(np.random.default_rng(0).permutation(len(known))[:_SUBSET])
     most = min(settings.iterations, _SUBSET_ITERATIONS)
     found += [posing.searched(few, lens, scale, settings, most) for lens in others]
-    return _best_first(judged, found)
+    return _best_first(judged, found, len(tried))
 
 
 def search_longer(judged: Judged, lenses: Sequence[Lens]) -> list[CameraModel]:
@@ -69,10 +71,14 @@ def search_longer(judged: Judged, lenses: Sequence[Lens]) -> list[CameraModel]:
     return _best_first(judged, found)
 
 
-def _best_first(judged: Judged, found: Sequence[CameraModel | None]) -> list[CameraModel]:
-    there, limit_px = [camera for camera in found if camera is not None], judged.settings.search_px * judged.scale
-    counts = [int(posing.agreement(camera, judged.known, limit_px).sum()) for camera in there]
-    return [there[i] for i in np.argsort(counts, kind="stable")[::-1]]
+def _best_first(judged: Judged, found: Sequence[CameraModel | None], preferred: int = 0) -> list[CameraModel]:
+    """Those that there are, by how many correspondences agree; the first `preferred` ones before equals."""
+    limit_px, ranked = judged.settings.search_px * judged.scale, list[tuple[float, CameraModel]]()
+    for number, camera in enumerate(found):
+        if camera is not None:
+            count = int(posing.agreement(camera, judged.known, limit_px).sum())
+            ranked.append((count * (_CLEARLY_MORE if number < preferred else 1.0), camera))
+    return [camera for _, camera in sorted(ranked, key=lambda each: -each[0])]
 
 
 def choose_lens(judged: Judged, cameras: Sequence[CameraModel], assumed: Sequence[Assumed]) -> Chosen | None:
@@ -86,7 +92,10 @@ def choose_lens(judged: Judged, cameras: Sequence[CameraModel], assumed: Sequenc
     starts = [(int(wide.agreeing.sum()), camera, wide) for camera, wide in found if wide is not None]
     if not starts:
         return None
-    _, camera, wide = max(starts, key=lambda start: start[0])
+    count, camera, wide = starts[0]
+    for start in starts[1:]:
+        if start[0] > _CLEARLY_MORE * count:
+            count, camera, wide = start
     shaped, usual = _test_shape(wide, _nearest(assumed, wide) or candidates.usual(camera.lens, side), side)
     prior = replace(candidates.free(camera.lens, side).with_shape_of(shaped), shift=np.zeros(2))
     free = judged.settled(camera if usual else wide.fit.camera, prior)
@@ -95,7 +104,7 @@ def choose_lens(judged: Judged, cameras: Sequence[CameraModel], assumed: Sequenc
     rivals = tuple(each for _, _, each in starts if each is not wide)
     order = sorted(assumed, key=lambda each: (each.source is not LensSource.SCENE, _log_focal_apart(each.lens, free)))
     for each in order if usual else ():
-        kept = _keep(each, free, shaped)
+        kept = _keep(each, free, shaped, side)
         chosen = None if kept is None else _settle_with(judged, free, each, kept)
         if chosen is not None and chosen.posed.agreeing.sum() >= _MIN_AGREEMENT * free.agreeing.sum():
             return replace(chosen, rivals=rivals)
@@ -145,18 +154,21 @@ def _widen(sigma: float, open_sigma: float, most: float) -> float:
     return float(min(max(sigma, _SHARE_OPEN * open_sigma), max(sigma, most)))
 
 
-def _keep(each: Assumed, free: Posed, shaped: Lens) -> Lens | None:
+def _keep(each: Assumed, free: Posed, shaped: Lens, side: int) -> Lens | None:
     """The assumed lens with the sigmas that the image leaves to it; None where the free lens refutes it."""
     lens, found, sigmas = each.lens, free.fit.camera.lens, _sigmas(free)
     apart = np.array([np.log(found.focal / lens.focal), *(found.shift - lens.shift)])
     limits = _REFUTED_SIGMAS * np.hypot(sigmas[[0, 2, 3]], lens.sigmas[[0, 2, 3]])
     if not (np.abs(apart) <= limits).all():
         return None
+    most = free.prior.log_focal_sigma, free.prior.shift_sigma
+    if each.exact:
+        most = _MOST_GIVEN_LOG, _MOST_GIVEN_SHIFT * side
     return replace(
         lens.with_shape_of(shaped),
         radial=lens.radial,
-        log_focal_sigma=_widen(lens.log_focal_sigma, sigmas[0], free.prior.log_focal_sigma),
-        shift_sigma=_widen(lens.shift_sigma, float(sigmas[2:4].max()), free.prior.shift_sigma),
+        log_focal_sigma=_widen(lens.log_focal_sigma, sigmas[0], most[0]),
+        shift_sigma=_widen(lens.shift_sigma, float(sigmas[2:4].max()), most[1]),
     )
 
 
