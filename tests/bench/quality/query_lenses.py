@@ -140,6 +140,7 @@ def summary(found: Sequence[Trial]) -> dict[str, object]:
     bar = [t for t in found if t.warp in BAR and not t.told]
     zoomed = [t for t in bar if t.warp.startswith("zoom")]
     there = [t for t in zoomed if (t.scene, t.image) in findable]
+    others = [t for t in found if (t.warp not in BAR or t.told) and (t.warp, t.told) != (CLEAN, "")]
     placed = [t for t in found if t.outcome == "placed" and t.pose]
     kinds = dict.fromkeys((t.warp, t.told) for t in found)
     return {
@@ -151,8 +152,9 @@ def summary(found: Sequence[Trial]) -> dict[str, object]:
         "zoomed_findable_placed": sum(t.outcome == "placed" for t in there),
         "clean": len(clean),
         "clean_placed": len(findable),
-        "others": sum(t.warp not in BAR and (t.warp, t.told) != (CLEAN, "") for t in found),
-        "others_wrong": sum(t.wrong for t in found if t not in bar),
+        "clean_wrong": sum(t.wrong for t in clean.values()),
+        "others": len(others),
+        "others_wrong": sum(t.wrong for t in others),
         "within": {
             kind: sum((getattr(t, error) or 0.0) <= (getattr(t, bound) or 0.0) + 1e-6 for t in placed) / len(placed)
             for kind, error, bound in (
@@ -209,10 +211,17 @@ def main() -> None:
     parser.add_argument("--told", action="store_true", help="also with the lens stated")
     parser.add_argument("--shared", type=Path, default=Path("../shared"), help="folder with scenes/")
     parser.add_argument("--cache", type=Path, help="folder that keeps the scenes' landmarks")
+    parser.add_argument("--join", type=Path, nargs="+", help="join the files of runs of some scenes each; run nothing")
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     args = parser.parse_args()
+    if args.join is not None:
+        runs = [json.loads(path.read_text()) for path in args.join]
+        joined = [Trial(**trial) for run in runs for trial in run["trials"]]
+        _write(args.out, joined, "; ".join(run["command"] for run in runs), runs[0]["commit"])
+        return
     cv2.setNumThreads(1)
     set_threads(1)
+    command = shlex.join(["python", "-m", "tests.bench", "query_lenses", *sys.argv[1:]])
     views = CHOSEN_ON | LEFT_OUT
     found: list[Trial] = []
     for name in args.scenes or views:
@@ -225,22 +234,22 @@ def main() -> None:
         names = load_split(folder, list(scene.paths), views[name]).test
         chosen = [names[i] for i in np.linspace(0, len(names) - 1, min(args.images, len(names))).round().astype(int)]
         found += trials(scene, landmarks, chosen, ("", "exif", "given") if args.told else ("",))
-        _write(args.out, found)
+        _write(args.out, found, command, head_commit())
         print(name, json.dumps(summary([t for t in found if t.scene == name])), flush=True)
     print(json.dumps(summary(found)))
 
 
-def _write(path: Path, found: Sequence[Trial]) -> None:
+def _write(path: Path, found: Sequence[Trial], command: str, commit: str) -> None:
     halves = {
         "all": found,
         "chosen_on": [t for t in found if t.scene in CHOSEN_ON],
         "left_out": [t for t in found if t.scene in LEFT_OUT],
     }
-    head = {"command": shlex.join(["python", "-m", "tests.bench", "query_lenses", *sys.argv[1:]]),
-            "commit": head_commit()}  # fmt: skip
     summaries = {half: summary(part) for half, part in halves.items() if part}
     rows = [asdict(trial) for trial in found]
-    path.write_text(json.dumps({**head, "summary": summaries, "trials": rows}, indent=1) + "\n")
+    path.write_text(
+        json.dumps({"command": command, "commit": commit, "summary": summaries, "trials": rows}, indent=1) + "\n"
+    )
 
 
 if __name__ == "__main__":
