@@ -7,6 +7,7 @@ landmark that both show, is explained by a turn and a shift of the camera.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -83,17 +84,27 @@ class Motion:
 
 
 def motion(before: Placed, after: Placed) -> Motion:
-    """How the camera of the photograph `before` moved until `after`, if both are of one camera with one lens."""
+    """How the camera of the photograph `before` moved until `after`; both are of one camera.
+
+    Where it has another lens since, as once it zoomed, what each photograph says by itself is compared.
+    """
     own, other = _common(before, after)
     T = np.linalg.inv(before.camera.T_world_camera) @ after.camera.T_world_camera
     apart = before.located.covariance + _carried(after.located.covariance, T)
-    if len(own) >= MIN_COMMON and before.size == after.size:
+    if len(own) >= MIN_COMMON and before.size == after.size and _same_lens(before, after):
         measured = _measured(before, own, after.seen.pixels[other] - before.seen.pixels[own])
         if measured is not None:
             depth = float(np.median(before.camera.project(before.seen.points[own])[1]))
             otherwise = _seen_otherwise(measured, min(depth, before.spread))
             return replace(measured, covariance=measured.covariance + otherwise**2 * apart)
     return Motion(T, apart, 0)
+
+
+def _same_lens(before: Placed, after: Placed) -> bool:
+    """Whether the focal lengths differ by no more than their bounds allow."""
+    first, second = (np.diag(each.located.K)[:2] for each in (before, after))
+    bounds = [math.log1p(each.located.claim.focal_percent / 100.0) for each in (before, after)]
+    return bool(np.abs(np.log(second / first)).max() <= math.hypot(*bounds))
 
 
 def _seen_otherwise(motion: Motion, reach: float) -> float:
@@ -122,7 +133,7 @@ def _measured(before: Placed, own: npt.NDArray[np.int64], shifts: Array) -> Moti
     start, seen = before.camera, before.seen.of(own)
     pixels = start.project(seen.points)[0] + shifts
     exact = replace(seen, pixels=pixels, covariances=np.zeros_like(seen.covariances))
-    lens = replace(start.lens, log_focal_sigma=0.0, radial_sigma=0.0, shift_sigma=0.0)
+    lens = replace(start.lens, log_focal_sigma=0.0, radial_sigma=0.0, shift_sigma=0.0, log_aspect_sigma=0.0)
     fit = refined(start, lens, exact, _LEAST_NOISE * max(before.size))
     if not np.isfinite(fit.covariance).all():
         return None

@@ -13,7 +13,8 @@ from splatnode.recon.geometry import without_distortion as straight
 
 Array = npt.NDArray[np.float64]
 
-NUM_PARAMETERS = 10  # a small turn (3) and move (3) of the world in the camera, log focal, first radial, shift (2)
+# A small turn (3) and move (3) of the world in the camera, log focal, first radial, shift (2), log aspect.
+NUM_PARAMETERS = 11
 POSE = 6  # of them, the pose's
 PINHOLE = 0.0, 0.0  # its radial coefficients
 _MIN_DEPTH = 1e-9
@@ -23,22 +24,52 @@ _MIN_DEPTH = 1e-9
 class Lens:
     """A lens with what is known of it: standard deviations; 0 where a number is certain."""
 
-    focal: float  # pixels
+    focal: float  # pixels, the geometric mean of those across and down
     radial: tuple[float, float]  # radial coefficients, as recon/registration/bundle.py has them; the second is held
     shift: Array  # (2,) of the principal point, pixels
     log_focal_sigma: float
     radial_sigma: float  # of the first
     shift_sigma: float  # pixels
+    log_aspect: float = 0.0  # logarithm of the focal length across over that down
+    log_aspect_sigma: float = 0.0
 
     @property
     def values(self) -> Array:
-        """(4,) as parameters."""
-        return np.array([np.log(self.focal), self.radial[0], *self.shift])
+        """(5,) as parameters."""
+        return np.array([np.log(self.focal), self.radial[0], *self.shift, self.log_aspect])
 
     @property
     def sigmas(self) -> Array:
-        """(4,)"""
-        return np.array([self.log_focal_sigma, self.radial_sigma, self.shift_sigma, self.shift_sigma])
+        """(5,)"""
+        return np.array(
+            [self.log_focal_sigma, self.radial_sigma, self.shift_sigma, self.shift_sigma, self.log_aspect_sigma]
+        )
+
+    @property
+    def focals(self) -> Array:
+        """(2,) focal lengths across and down, pixels."""
+        half = 0.5 * self.log_aspect
+        return self.focal * np.exp([half, -half])
+
+    def with_shape_of(self, other: Lens) -> Lens:
+        """This lens with the radial coefficients and the aspect of `other`, known as well as these are."""
+        return replace(
+            self,
+            radial=other.radial,
+            radial_sigma=other.radial_sigma,
+            log_aspect=other.log_aspect,
+            log_aspect_sigma=other.log_aspect_sigma,
+        )
+
+    def with_sigmas_of(self, other: Lens) -> Lens:
+        """This lens, known as well as `other`."""
+        return replace(
+            self,
+            log_focal_sigma=other.log_focal_sigma,
+            radial_sigma=other.radial_sigma,
+            shift_sigma=other.shift_sigma,
+            log_aspect_sigma=other.log_aspect_sigma,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +90,8 @@ class CameraModel:
                 lens,
                 focal=lens.focal * float(np.exp(step[6])),
                 radial=(lens.radial[0] + float(step[7]), lens.radial[1]),
-                shift=lens.shift + step[8:],
+                shift=lens.shift + step[8:10],
+                log_aspect=lens.log_aspect + float(step[10]),
             ),
         )
 
@@ -80,7 +112,7 @@ class CameraModel:
         in_camera = points @ self.rotation.T + self.translation
         rays = in_camera[:, :2] / _safe(in_camera[:, 2])[:, None]
         bent = distortion((rays**2).sum(1), np.array(self.lens.radial))
-        return self.lens.focal * bent[:, None] * rays + self.lens.shift, in_camera[:, 2]
+        return self.lens.focals * bent[:, None] * rays + self.lens.shift, in_camera[:, 2]
 
     def derivatives(self, points: Array) -> tuple[Array, Array]:
         """Of the pixels of points (M, 3): (M, 2, NUM_PARAMETERS) by the parameters, (M, 2, 3) by the points."""
@@ -88,25 +120,27 @@ class CameraModel:
         turned = np.ascontiguousarray((points @ self.rotation.T).T)
         z = _safe(turned[2] + self.translation[2])
         x, y = (turned[0] + self.translation[0]) / z, (turned[1] + self.translation[1]) / z
-        focal, (first, second), squared = self.lens.focal, self.lens.radial, x * x + y * y
-        scaled = focal * distortion(squared, np.array(self.lens.radial))
-        twice = 2.0 * focal * (first + 2.0 * second * squared)
+        (across, down), (first, second), squared = self.lens.focals, self.lens.radial, x * x + y * y
+        bent = distortion(squared, np.array(self.lens.radial))
+        twice = 2.0 * (first + 2.0 * second * squared)
         # By the ray (x, y), which is the point over its depth; then by the point in the camera.
-        xx, xy, yy = scaled + twice * x * x, twice * x * y, scaled + twice * y * y
-        by_camera = np.stack([[xx, xy, -(xx * x + xy * y)], [xy, yy, -(xy * x + yy * y)]]) / z  # (2, 3, M)
+        xx, yy = across * (bent + twice * x * x), down * (bent + twice * y * y)
+        xy, yx = across * twice * x * y, down * twice * x * y
+        by_camera = np.stack([[xx, xy, -(xx * x + xy * y)], [yx, yy, -(yx * x + yy * y)]]) / z  # (2, 3, M)
         by_parameters = np.zeros((2, NUM_PARAMETERS, len(points)))
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # turned x by_camera
             by_parameters[:, i] = turned[j] * by_camera[:, k] - turned[k] * by_camera[:, j]
         by_parameters[:, 3:POSE] = by_camera
-        by_parameters[:, 6] = scaled * x, scaled * y
-        by_parameters[:, 7] = focal * squared * x, focal * squared * y
+        by_parameters[:, 6] = across * bent * x, down * bent * y
+        by_parameters[:, 7] = across * squared * x, down * squared * y
         by_parameters[0, 8] = by_parameters[1, 9] = 1.0
+        by_parameters[:, 10] = 0.5 * by_parameters[0, 6], -0.5 * by_parameters[1, 6]
         return by_parameters.transpose(2, 0, 1), (self.rotation.T @ by_camera).transpose(2, 0, 1)
 
 
 def without_distortion(pixels: Array, lens: Lens) -> Array:
-    """(M, 2) where a pinhole of the same focal length would see what `lens` sees at `pixels` (M, 2)."""
-    distorted = (pixels - lens.shift) / lens.focal
+    """(M, 2) where a pinhole of the same focal length sees what `lens` sees at `pixels` (M, 2)."""
+    distorted = (pixels - lens.shift) / lens.focals
     return lens.focal * straight(distorted, np.array(lens.radial))
 
 

@@ -1,34 +1,71 @@
-"""The lenses that a photograph may have been taken with, the likeliest first."""
+"""The lenses that a query image may have been taken with: what is known or assumed of each, and any other lens."""
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.frame import Intrinsics
 from splatnode.recon.locating.camera_model import PINHOLE, Lens
+from splatnode.recon.locating.outcome import NORMAL_95, LensSource, Located
 from splatnode.recon.result.landmarks import KnownLenses
 
 Array = npt.NDArray[np.float64]
 
 # What is not known of a lens, as in recon/registration (lenses.py, finishing.py); lengths over the longer side.
-_EXIF_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA = 0.05, 0.02, 0.004
+_EXIF_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA, _ASPECT_SIGMA = 0.05, 0.02, 0.004, 0.001
 _SAME_LENS_SIGMA, _SAME_RADIAL_SIGMA = 0.01, 0.005  # focusing changes the lens of one camera
-_FREE_SIGMA = 0.3  # of log focal, of a lens of which nothing is known
-_CROP_SIGMA = 0.2  # of the principal point of a picture that was cropped
-_FOCALS = np.geomspace(0.45, 3.2, 9)  # over the longer side, 96 to 18 degrees of view: steps of 28 %
-_SAME_SHAPE = 0.01  # largest difference of two pictures' height over width
+# A calibration is right to these; with them an image is asked whether it is of that lens.
+_GIVEN_SIGMA, _GIVEN_RADIAL_SIGMA, _GIVEN_SHIFT_SIGMA = 0.003, 0.005, 0.002
+# Of a lens of which nothing is known: log focal, first radial coefficient, principal point, log aspect. An image that
+# was cropped has its principal point anywhere, one of pixels that are not square any aspect.
+_FREE_SIGMA, _FREE_RADIAL_SIGMA, _FREE_SHIFT_SIGMA, _FREE_ASPECT_SIGMA = 0.3, 0.1, 0.2, 0.15
+_FOCALS = np.geomspace(0.45, 4.1, 10)  # over the longer side, 96 to 14 degrees of view: steps of 28 %
+_LOG_ASPECTS = -0.29, -0.14, 0.14, 0.29  # 3 : 4 to 4 : 3, as where a recording's pixels are taken for square
+_SAME_SHAPE = 0.01  # largest difference of two images' height over width
 _SAME_FOCAL = 0.15  # of log focals: an EXIF focal length that may be of the result's own lens
 _TOLD_APART = 0.002  # log focals of a result's lenses that are tried one by one
 
 
+@dataclass(frozen=True, eq=False)
+class Assumed:
+    """A lens that an image is assumed to have, until its points say otherwise."""
+
+    lens: Lens  # with the sigmas by which the assumption is tested
+    source: LensSource
+
+    @property
+    def exact(self) -> bool:
+        """Whether the lens stays as it is, where the image does not contradict it."""
+        return self.source is LensSource.GIVEN
+
+
 def given(intrinsics: Intrinsics) -> Lens | None:
-    """The lens of a photograph without distortion that came with trusted intrinsics; None where they are not."""
+    """The lens of an image without distortion that came with trusted intrinsics; None where they are not."""
     return Lens(intrinsics.fx, PINHOLE, np.zeros(2), 0.0, 0.0, 0.0) if intrinsics.source != "exif" else None
 
 
+def assume(lenses: KnownLenses, width: int, height: int, intrinsics: Intrinsics | None) -> list[Assumed]:
+    """What may be assumed of an image's lens, the surest first; nothing where nothing is known.
+
+    A lens that is given is all that is assumed. Otherwise the result's own lenses come first, then what EXIF states.
+    """
+    side = max(width, height)
+    if intrinsics is not None and (certain := given(intrinsics)) is not None:
+        sigmas = _GIVEN_SIGMA, _GIVEN_RADIAL_SIGMA, _GIVEN_SHIFT_SIGMA * side
+        tested = Lens(certain.focal, PINHOLE, np.zeros(2), *sigmas, log_aspect_sigma=_ASPECT_SIGMA)
+        return [Assumed(tested, LensSource.GIVEN)]
+    found = [Assumed(lens, LensSource.SCENE) for lens in own(lenses, width, height, intrinsics)]
+    stated = [] if intrinsics is None else [Assumed(nominal(intrinsics, side), LensSource.EXIF)]
+    return found + stated
+
+
 def own(lenses: KnownLenses, width: int, height: int, intrinsics: Intrinsics | None) -> list[Lens]:
-    """Those of the result's own lenses that took pictures of this shape, upright or not."""
+    """Those of the result's own lenses that took images of this shape, upright or not."""
     side, found = max(width, height), list[Lens]()
     shape = height / width
     for focal, radial, shift, known in zip(lenses.focals, lenses.radials, lenses.shifts, lenses.shapes, strict=True):
@@ -41,36 +78,67 @@ def own(lenses: KnownLenses, width: int, height: int, intrinsics: Intrinsics | N
             continue
         moved = shift * side if upright else np.zeros(2)
         sigmas = _SAME_LENS_SIGMA, _SAME_RADIAL_SIGMA, _SHIFT_SIGMA * side
-        found.append(Lens(float(focal) * side, (float(radial[0]), float(radial[1])), moved, *sigmas))
+        found.append(
+            Lens(float(focal) * side, (float(radial[0]), float(radial[1])), moved, *sigmas, 0.0, _ASPECT_SIGMA)
+        )
     return found
 
 
-def continued(focal: float, log_sigma: float, shift: Array, lenses: KnownLenses, width: int, height: int) -> Lens:
-    """That of the photograph before, of the same camera and size: `focal` and `shift` in pixels, as it was found.
-
-    `log_sigma` is how well the logarithm of the focal length is known. Its radial coefficients are those of
-    the result's lens nearest to it, if that took pictures of this shape.
-    """
-    side = max(width, height)
-    alike = own(lenses, width, height, Intrinsics(width, height, focal, focal, width / 2, height / 2, source="exif"))
-    nearest = min(alike, key=lambda lens: abs(np.log(lens.focal / focal)), default=None)
-    radial, sigma = (PINHOLE, _RADIAL_SIGMA) if nearest is None else (nearest.radial, _SAME_RADIAL_SIGMA)
-    return Lens(focal, radial, shift, max(log_sigma, _SAME_LENS_SIGMA), sigma, _SHIFT_SIGMA * side)
+def carry_over(before: Located, principal: Array, side: int) -> Assumed:
+    """The lens that was found of the image before, of the same camera and size; `principal` is the nominal one."""
+    focals = np.diag(before.K)[:2]
+    log_sigma = math.log1p(before.claim.focal_percent / 100.0) / NORMAL_95
+    lens = Lens(
+        float(np.sqrt(focals.prod())),
+        before.distortion,
+        before.K[:2, 2] - principal,
+        max(log_sigma, _SAME_LENS_SIGMA),
+        _SAME_RADIAL_SIGMA,
+        _SHIFT_SIGMA * side,
+        float(np.log(focals[0] / focals[1])),
+        _ASPECT_SIGMA,
+    )
+    return Assumed(lens, before.lens)
 
 
 def nominal(intrinsics: Intrinsics, side: int) -> Lens:
     """The lens that EXIF tells, which is right to a few per cent."""
-    return Lens(intrinsics.fx, PINHOLE, np.zeros(2), _EXIF_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side)
+    sigmas = _EXIF_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side
+    return Lens(intrinsics.fx, PINHOLE, np.zeros(2), *sigmas, 0.0, _ASPECT_SIGMA)
 
 
-def any_lens(side: int) -> list[Lens]:
-    """Focal lengths from wide to long, each with what lies between it and the next."""
-    return [
-        Lens(float(focal) * side, PINHOLE, np.zeros(2), _FREE_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side)
-        for focal in _FOCALS
-    ]
+def usual(lens: Lens, side: int) -> Lens:
+    """A lens of any focal length near that of `lens` with what most lenses have: little of all else."""
+    sigmas = _FREE_SIGMA, _RADIAL_SIGMA, _SHIFT_SIGMA * side
+    return Lens(lens.focal, PINHOLE, np.zeros(2), *sigmas, 0.0, _ASPECT_SIGMA)
 
 
-def cropped(lens: Lens, side: int) -> Lens:
-    """Any lens near this one, of a picture that may be a part of what the camera saw."""
-    return Lens(lens.focal, lens.radial, lens.shift, _FREE_SIGMA, _RADIAL_SIGMA, _CROP_SIGMA * side)
+def any_lens(side: int, assumed: Sequence[Assumed]) -> list[Lens]:
+    """Lenses from wide to long, each with what lies between it and the next, bent as the first that is assumed."""
+    radial = assumed[0].lens.radial if assumed else PINHOLE
+    return [free(Lens(float(focal), radial, np.zeros(2), 0.0, 0.0, 0.0), side) for focal in side * _FOCALS]
+
+
+def stretched_lenses(side: int) -> list[Lens]:
+    """As `any_lens`, of images whose pixels are not square."""
+    return [replace(lens, log_aspect=log_aspect) for log_aspect in _LOG_ASPECTS for lens in any_lens(side, ())]
+
+
+def free(lens: Lens, side: int) -> Lens:
+    """Any lens near this one, of an image that may be a part of what the camera saw, or stretched."""
+    return replace(
+        lens,
+        log_focal_sigma=_FREE_SIGMA,
+        radial_sigma=_FREE_RADIAL_SIGMA,
+        shift_sigma=_FREE_SHIFT_SIGMA * side,
+        log_aspect_sigma=_FREE_ASPECT_SIGMA,
+    )
+
+
+def focals_apart(assumed: Sequence[Assumed], least: float) -> list[Lens]:
+    """Those of the lenses whose focal lengths differ by more than `least`, in logarithms."""
+    found = list[Lens]()
+    for each in assumed:
+        if all(abs(np.log(each.lens.focal / lens.focal)) > least for lens in found):
+            found.append(each.lens)
+    return found

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +13,7 @@ from splatnode.recon.frames.keyframe import REFERENCE_SIDE
 from splatnode.recon.locating import posing
 from splatnode.recon.locating.camera_model import CameraModel, Lens
 from splatnode.recon.locating.correspondences import Correspondences
+from splatnode.recon.locating.outcome import LensSource
 from splatnode.recon.locating.posing import Posed
 from splatnode.recon.matching.two_view import log10_number_of_false_alarms
 
@@ -34,9 +36,14 @@ class Judged:
     settings: posing.Config
 
     @property
+    def side(self) -> int:
+        """The longer side, pixels."""
+        return max(self.width, self.height)
+
+    @property
     def scale(self) -> float:
         """Pixels for one at REFERENCE_SIDE."""
-        return max(self.width, self.height) / REFERENCE_SIDE
+        return self.side / REFERENCE_SIDE
 
     @property
     def noise_px(self) -> float:
@@ -51,10 +58,10 @@ class Judged:
         """The camera refined, with its inliers found again."""
         return posing.settled(camera, self.known, lens, self.scale, self.noise_px, self.settings)
 
-    def case(self, posed: Posed | None) -> Case:
+    def case(self, posed: Posed | None, source: LensSource = LensSource.FREE, rivals: Sequence[Posed] = ()) -> Case:
         limit_px = self.settings.max_error_px * self.scale
         log10_nfa = 0.0 if posed is None else _log10_nfa(self.known, posed, limit_px, self.width * self.height)
-        return Case(self, posed, log10_nfa)
+        return Case(self, posed, log10_nfa, source, tuple(rivals))
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +71,8 @@ class Case:
     by: Judged
     posed: Posed | None  # None: there is none
     log10_nfa: float  # log10 of the expected number of cameras that chance gives so much agreement
+    source: LensSource  # of the camera's lens
+    rivals: tuple[Posed, ...] = ()  # cameras with other lenses that were found, too
 
     @property
     def known(self) -> Correspondences:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -11,11 +12,13 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from splatnode.recon.locating import posing
-from splatnode.recon.locating.camera_model import CameraModel
-from splatnode.recon.locating.case import Case
-from splatnode.recon.locating.outcome import Claim, NotLocated, Reason
-from splatnode.recon.locating.refinement import pose_covariance, refined
+from splatnode.recon.locating import candidates, posing
+from splatnode.recon.locating.camera_model import CameraModel, Lens
+from splatnode.recon.locating.case import Case, Judged
+from splatnode.recon.locating.lens_choice import search
+from splatnode.recon.locating.outcome import Claim, LensSource, NotLocated, Reason
+from splatnode.recon.locating.refinement import Fit, pose_covariance, refined
+from splatnode.recon.verification import reflection
 
 Array = npt.NDArray[np.float64]
 
@@ -26,8 +29,14 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_share_of_picture: float = 0.04  # that their hull covers: less may be a thing that stood elsewhere
     max_elsewhere: float = 0.5  # agreement with a second camera, over that with the first
     max_apart: float = 4.0  # standard deviations between what two halves of the picture say of the camera
+    mirror: reflection.Config = reflection.Config()  # of the test whether it was turned left to right
+    max_mirror_gain: float = 0.05  # of matches, in logarithms, once it is turned left to right; right ones have below 0
+    max_rival: float = 0.8  # agreement with a camera of another lens, over that with the first
     focal_range: tuple[float, float] = (0.3, 6.0)  # over the longer side: 118 to 10 degrees of view
+    crops: tuple[float, float] = (0.6, 5.0)  # what a border, or cropping, may make of a focal length that is stated
     max_shift: float = 0.5  # of the principal point, over the longer side: it is in the picture, or was before a crop
+    max_log_aspect: float = 0.7  # of the focal length across over that down: 2
+    max_radial: float = 0.5  # the first coefficient of a lens that bends lines; beyond, it is a fisheye
     max_rotation_deg: float = 5.0  # of the claim; beyond, a camera is far off (recon/evaluate/stability/claim.py)
     max_centre_percent: float = 10.0  # likewise
 
@@ -79,6 +88,29 @@ def too_rough(claim: Claim, config: Config) -> NotLocated | None:
     )
 
 
+def contradicts_statement(lens: Lens, stated_focal: float, config: Config) -> NotLocated | None:
+    """Where neither cropping nor a border makes the lens of an image for which a focal length is stated, in pixels."""
+    least, most = config.crops
+    if least <= lens.focal / stated_focal <= most:
+        return None
+    return NotLocated(
+        Reason.LENS,
+        f"its points ask for a focal length of {lens.focal:.4g} pixels, where {stated_focal:.4g} are stated.",
+        "Give the lens of this image, or none.",
+    )
+
+
+def mirrored(gain: float, config: Config) -> NotLocated | None:
+    """Where the image matches the scene better turned left to right: `gain` of `measure_mirror_gain`."""
+    if gain <= config.max_mirror_gain:
+        return None
+    return NotLocated(
+        Reason.MIRRORED,
+        f"turned left to right it has {100 * math.expm1(gain):.0f} % more matches with the scene.",
+        "Give the image as the camera took it; many front cameras and web conferences mirror theirs.",
+    )
+
+
 def _by_chance(case: Case, config: Config) -> NotLocated | None:
     enough = case.num_independent >= config.min_points and case.log10_nfa <= config.max_log10_nfa
     return None if enough else nothing_found(case)
@@ -108,43 +140,75 @@ def _with_an_impossible_lens(case: Case, config: Config) -> NotLocated | None:
     lens, side = case.posed.fit.camera.lens, max(case.by.width, case.by.height)
     least, most = config.focal_range
     shift = float(np.linalg.norm(lens.shift)) / side
-    if least <= lens.focal / side <= most and shift <= config.max_shift:
+    usual = abs(lens.log_aspect) <= config.max_log_aspect and abs(lens.radial[0]) <= config.max_radial
+    if least <= lens.focal / side <= most and shift <= config.max_shift and usual:
         return None
     return NotLocated(
         Reason.LENS,
-        f"it would take a focal length of {lens.focal / side:.2g} times the longer side, and a lens that looks "
-        f"{100 * shift:.0f} % of it beside the middle.",
+        f"it would take a focal length of {lens.focal / side:.2g} times the longer side, a lens that looks "
+        f"{100 * shift:.0f} % of it beside the middle, pixels {math.exp(lens.log_aspect):.2g} times as high as wide, "
+        f"and a radial coefficient of {lens.radial[0]:.2g}.",
         "Give the photograph as the camera made it, not cropped, or its calibration.",
     )
 
 
 def _as_well_elsewhere(case: Case, config: Config) -> NotLocated | None:
-    """Whether what disagrees with the camera agrees with another one."""
+    """Whether what disagrees with the camera agrees with another one.
+
+    Of an image with a lens of its own the other one may have any lens, too: the parts of a collage have several.
+    """
     assert case.posed is not None
-    fit = case.posed.fit
-    explained = np.isin(case.known.feature_of, case.agreeing.feature_of)
-    lens = fit.camera.lens
-    start = posing.searched(case.known.of(~explained), lens, case.by.scale, case.by.settings)
-    found = start and case.by.settled(start, lens)
-    if found is None or _near(fit.camera, found.fit.camera, case.by.unit):
-        return None
-    count = int(found.agreeing.sum())
+    camera = case.posed.fit.camera
+    lens, explained = camera.lens, np.isin(case.known.feature_of, case.agreeing.feature_of)
+    rest = replace(case.by, known=case.known.of(~explained))
+    starts, by = [posing.searched(rest.known, lens, rest.scale, rest.settings)], case.by
+    if case.source is LensSource.FREE:
+        starts += search(rest, (), candidates.any_lens(rest.side, ()))[:1]
+        # A free lens could reach the points of the first camera from elsewhere.
+        lens, by = candidates.free(lens, rest.side), rest
+    found = [posed for start in starts if start is not None and (posed := by.settled(start, lens)) is not None]
+    apart = [int(each.agreeing.sum()) for each in found if not _near(camera, each.fit.camera, case.by)]
+    count = max(apart, default=0)
     if count <= max(config.max_elsewhere * len(case.agreeing), config.min_points):
         return None
+    return _elsewhere(case, count)
+
+
+def _elsewhere(case: Case, count: int) -> NotLocated:
     return NotLocated(
         Reason.ELSEWHERE,
-        f"{len(case.agreeing)} points agree with one camera and {count} with another one: the scene repeats itself.",
-        "Take it so that something is in it which the scene has once.",
+        f"{len(case.agreeing)} points agree with one camera and {count} with another one: the scene repeats itself, "
+        "or the image has several parts.",
+        "Take it so that something is in it which the scene has once, and give it as the camera made it.",
     )
 
 
+def _as_well_with_another_lens(case: Case, config: Config) -> NotLocated | None:
+    """Whether a camera of another lens, which was found on the way, explains nearly as much.
+
+    One that lies apart by no more than its own uncertainty is none: then the covariance tells what is left open.
+    """
+    assert case.posed is not None
+    fit = case.posed.fit
+    apart = [
+        int(each.agreeing.sum())
+        for each in case.rivals
+        if not _near(fit.camera, each.fit.camera, case.by) and _sigmas_apart(fit, each.fit) > config.max_apart
+    ]
+    if max(apart, default=0) <= config.max_rival * len(case.agreeing):
+        return None
+    return _elsewhere(case, max(apart))
+
+
 _NEAR_DEG, _NEAR_SHARE = 5.0, 0.1  # two cameras nearer than this, of the distance to the scene, are one
+_NEAR_SHIFT = 0.1  # likewise of their principal points, over the longer side
 
 
-def _near(one: CameraModel, other: CameraModel, unit: float) -> bool:
+def _near(one: CameraModel, other: CameraModel, by: Judged) -> bool:
     turn = np.degrees(Rotation.from_matrix(one.rotation @ other.rotation.T).magnitude())
     apart = np.linalg.norm(one.T_world_camera[:3, 3] - other.T_world_camera[:3, 3])
-    return bool(turn < _NEAR_DEG and apart < _NEAR_SHARE * unit)
+    shift = np.linalg.norm(one.lens.shift - other.lens.shift)
+    return bool(turn < _NEAR_DEG and apart < _NEAR_SHARE * by.unit and shift < _NEAR_SHIFT * by.side)
 
 
 def _halves_disagree(case: Case, config: Config) -> NotLocated | None:
@@ -155,14 +219,7 @@ def _halves_disagree(case: Case, config: Config) -> NotLocated | None:
     for axis in (0, 1):
         first = agreeing.pixels[:, axis] < np.median(agreeing.pixels[:, axis])
         halves = [refined(fit.camera, fit.camera.lens, agreeing.of(half), case.by.noise_px) for half in (first, ~first)]
-        T1, T2 = (half.camera.T_world_camera for half in halves)
-        between = np.linalg.inv(T1) @ T2
-        turn = np.array([between[2, 1] - between[1, 2], between[0, 2] - between[2, 0], between[1, 0] - between[0, 1]])
-        apart = np.concatenate([between[:3, 3], turn / 2.0])
-        covariance = sum(pose_covariance(half.camera, half.covariance) for half in halves)
-        known = np.isfinite(covariance).all()  # what is not known fails
-        squared = float(apart @ np.linalg.pinv(covariance, hermitian=True) @ apart) if known else math.inf
-        farthest = max(farthest, math.sqrt(max(squared, 0.0) / 6.0))
+        farthest = max(farthest, _sigmas_apart(*halves))
     if farthest <= config.max_apart:
         return None
     return NotLocated(
@@ -172,11 +229,24 @@ def _halves_disagree(case: Case, config: Config) -> NotLocated | None:
     )
 
 
+def _sigmas_apart(one: Fit, other: Fit) -> float:
+    """How far two cameras lie apart, in standard deviations; infinite where these are not known."""
+    between = np.linalg.inv(one.camera.T_world_camera) @ other.camera.T_world_camera
+    turn = Rotation.from_matrix(between[:3, :3]).as_rotvec()
+    apart = np.concatenate([between[:3, 3], turn])
+    covariance = sum(pose_covariance(fit.camera, fit.covariance) for fit in (one, other))
+    if not np.isfinite(covariance).all():
+        return math.inf
+    squared = float(apart @ np.linalg.pinv(covariance, hermitian=True) @ apart)
+    return math.sqrt(max(squared, 0.0) / len(apart))
+
+
 _CHECKS: tuple[Check, ...] = (
     _by_chance,
     _with_an_impossible_lens,
     _in_one_patch,
     _as_well_elsewhere,
+    _as_well_with_another_lens,
     _halves_disagree,
 )
 _WHETHER_FOUND: tuple[Check, ...] = (_by_chance, _as_well_elsewhere)

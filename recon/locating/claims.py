@@ -7,8 +7,9 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.recon.locating.camera_model import POSE
 from splatnode.recon.locating.correspondences import Correspondences
-from splatnode.recon.locating.outcome import Claim
+from splatnode.recon.locating.outcome import NORMAL_95, Claim
 from splatnode.recon.locating.posing import Posed
 from splatnode.recon.locating.refinement import pose_covariance
 from splatnode.recon.result.bounds import length_95
@@ -17,12 +18,13 @@ from splatnode.recon.result.landmarks import Landmarks
 Array = npt.NDArray[np.float64]
 
 _BALL_95 = 2.7955  # radius that holds 95 % of a normal distribution with sigma 1 in three dimensions
-NORMAL_95 = 1.96  # and in one
 _MOST_LOG_FOCAL = math.log(10.0)  # who knows the focal length no better knows nothing
 
 
-def claimed(posed: Posed, known: Correspondences, landmarks: Landmarks) -> tuple[Claim, Array]:
-    """The claim, and the covariance (6, 6) of a small motion in the camera's frame: translation, then turn.
+def claimed(posed: Posed, known: Correspondences, landmarks: Landmarks, side: int) -> tuple[Claim, Array]:
+    """The claim of an image whose longer side has `side` pixels.
+
+    And the covariance (6, 6) of a small motion in the camera's frame: translation, then turn.
 
     The scene around the camera is as wrong as its cameras there: as those whose photographs it shares points with.
     """
@@ -32,11 +34,21 @@ def claimed(posed: Posed, known: Correspondences, landmarks: Landmarks) -> tuple
     move = np.sqrt(shares @ landmarks.centre_bounds**2) / _BALL_95
     covariance = pose_covariance(posed.fit.camera, posed.fit.covariance) + np.diag([move**2] * 3 + [turn**2] * 3)
     centre = length_95(covariance[:3, :3])
-    focal = NORMAL_95 * math.sqrt(max(posed.fit.covariance[6, 6], 0.0))
+    of_scene = 0.0 if landmarks.focal_bounds is None else np.sqrt(shares @ (landmarks.focal_bounds / 100.0) ** 2)
+    of_lens = posed.fit.covariance[POSE:, POSE:]
     claim = Claim(
         rotation_deg=math.degrees(length_95(covariance[3:, 3:])),
         centre=centre,
         centre_percent=100.0 * centre / landmarks.unit,
-        focal_percent=100.0 * math.expm1(min(focal, _MOST_LOG_FOCAL)),
+        focal_percent=100.0 * math.expm1(min(math.hypot(_log_focal_bound(of_lens), of_scene), _MOST_LOG_FOCAL)),
+        principal_percent=100.0 * length_95(of_lens[2:4, 2:4]) / side,
     )
     return claim, covariance
+
+
+def _log_focal_bound(of_lens: Array) -> float:
+    """95 % bound of the logarithms of the focal lengths across and down, from the covariance (5, 5) of the lens."""
+    variances = [
+        np.array([1.0, half]) @ of_lens[np.ix_([0, 4], [0, 4])] @ np.array([1.0, half]) for half in (0.5, -0.5)
+    ]
+    return NORMAL_95 * math.sqrt(max(*variances, 0.0))

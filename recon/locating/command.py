@@ -60,4 +60,5 @@ def _record(found: Located | NotLocated | DroppedFrame, frame: Frame | DroppedFr
     assert isinstance(frame, Frame)  # it was located
     arrays = {name: getattr(found, name).tolist() for name in ("T_world_camera", "K", "covariance")}
     size = {"width": frame.width, "height": frame.height}
-    return {"placed": True, **arrays, **size, "claim": asdict(found.claim), "points": found.num_points}
+    lens = {"lens": found.lens.value, "distortion": list(found.distortion)}
+    return {"placed": True, **arrays, **size, **lens, "claim": asdict(found.claim), "points": found.num_points}

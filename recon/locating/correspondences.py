@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.recon.frames.keyframe import Features
+from splatnode.recon.frames.keyframe import PLAIN, Features
 from splatnode.recon.locating.camera_model import CameraModel
 from splatnode.recon.matching import nearest_neighbours
 from splatnode.recon.result.landmarks import Landmarks
+from splatnode.recon.verification.reflection import Config, mirrored_descriptors
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -84,6 +85,22 @@ def correspondences(
         ours.append(features.point_of[matches[:, 0]])
         theirs.append(own[matches[:, 1]])
     return _each_once(np.concatenate(ours), np.concatenate(theirs), features.points - principal, landmarks)
+
+
+def measure_mirror_gain(features: Features, landmarks: Landmarks, config: Config) -> float:
+    """How much better the plain `features` match the scene when the image is turned left to right.
+
+    It is the logarithm of the matches mirrored over those as it is (recon/verification/reflection.py), each with those
+    images of the scene with which it has most. In a symmetric place these are not the same.
+    """
+    plain = features.of_tilt(PLAIN).descriptors[: config.num_features]
+    counts = np.zeros((len(landmarks.names), 2))  # as it is, and mirrored
+    for photograph in range(len(counts)):
+        theirs = landmarks.descriptors[landmarks.photograph_of == photograph]
+        for way, ours in enumerate((plain, mirrored_descriptors(plain))):
+            counts[photograph, way] = len(nearest_neighbours.match(theirs, ours, config.nearest_neighbours))
+    as_it_is, mirrored = np.sort(counts, axis=0)[-config.partners :].mean(0) + config.by_chance
+    return float(np.log(mirrored / as_it_is))
 
 
 def _in_view(landmarks: Landmarks, principal: Array, near: Near) -> tuple[Flags, Array]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -11,11 +10,12 @@ import numpy.typing as npt
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.recon.frames.keyframe import Features, longer_side, principal_point
 from splatnode.recon.locating import candidates, checks, posing
-from splatnode.recon.locating.camera_model import CameraModel, Lens
+from splatnode.recon.locating.camera_model import CameraModel
+from splatnode.recon.locating.candidates import Assumed
 from splatnode.recon.locating.case import Case, Judged
-from splatnode.recon.locating.claims import NORMAL_95
 from splatnode.recon.locating.correspondences import Near, correspondences
-from splatnode.recon.locating.locate import Config, Photograph, Placed, claimed, described, locate, of_its_lens
+from splatnode.recon.locating.lens_choice import choose_lens, search
+from splatnode.recon.locating.locate import REACH, Config, Photograph, Placed, claimed, described, locate
 from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.matching import features
 from splatnode.recon.result.landmarks import Landmarks
@@ -28,7 +28,6 @@ QUICK = Config(
     posing=posing.Config(iterations=2_000, rounds=2),
 )
 _STRONGEST = 1500  # features by which the camera is found at first
-_REACH = 0.02  # of the longer side: how far from where that camera sees it a landmark is then looked for
 
 
 def follow(
@@ -55,33 +54,35 @@ def followed(
     near: Located | Array,
     config: Config = QUICK,
 ) -> Placed | NotLocated | None:
-    """As `follow`, near to that camera alone. None where nothing is known of the lens, or no camera is found.
+    """As `follow`, near to that camera alone. None where no camera is found, or its lens is not what was assumed.
 
     First the strongest features are compared with the landmarks that the camera sees, and what is found is judged as
     any photograph. Then all features are compared with the landmarks where the camera that was found sees them.
     """
     frame, all_features = photograph.frame, photograph.features
     principal, size, side = principal_point(frame), (frame.width, frame.height), longer_side(frame)
-    lenses = _lenses(near, landmarks, frame)
-    if not lenses:
+    assumed = _assume(near, landmarks, frame)
+    if not assumed:
         return None
     T_world_camera = near.T_world_camera if isinstance(near, Located) else near
     rotation = T_world_camera[:3, :3].T
-    rough = Near(CameraModel(rotation, -rotation @ T_world_camera[:3, 3], lenses[0]), size)
+    rough = Near(CameraModel(rotation, -rotation @ T_world_camera[:3, 3], assumed[0].lens), size)
     known = correspondences(_strongest(all_features), principal, landmarks, config.neighbours, rough)
     judged = Judged(known, *size, landmarks.noise_px, landmarks.unit, config.posing)
-    first = judged.case(judged.posed(*lenses))
-    if first.posed is None or checks.refused_as_chance(first, config.checks) is not None:
+    chosen = choose_lens(judged, search(judged, assumed, candidates.any_lens(side, assumed)), assumed)
+    if chosen is None or not chosen.as_assumed:
         return None
-    exact = Near(first.posed.fit.camera, size, _REACH * side)
+    first = judged.case(chosen.posed, chosen.source)
+    if checks.refused_as_chance(first, config.checks) is not None:
+        return None
+    exact = Near(chosen.posed.fit.camera, size, REACH * side)
     known = correspondences(all_features, principal, landmarks, config.neighbours, exact)
     judged = replace(judged, known=known)
-    case = Case(judged, judged.settled(first.posed.fit.camera, first.posed.prior), first.log10_nfa)
-    if case.posed is None or len(case.agreeing) < len(first.agreeing):
+    chosen = choose_lens(judged, [chosen.posed.fit.camera], assumed)
+    if chosen is None or not chosen.as_assumed or chosen.posed.agreeing.sum() < len(first.agreeing):
         return None
-    if lenses[0].log_focal_sigma > 0 and not of_its_lens(case, side):
-        return None
-    return checks.refused_as_wrong(case, config.checks) or claimed(case, frame, landmarks, config)
+    case = Case(judged, chosen.posed, first.log10_nfa, chosen.source, chosen.rivals)
+    return checks.refused_as_wrong(case, config.checks) or claimed(case, photograph, landmarks, config)
 
 
 def _strongest(found: Features) -> Features:
@@ -90,15 +91,9 @@ def _strongest(found: Features) -> Features:
     return Features(found.points[few], found.descriptors[few], found.point_of[few], found.tilt[few])
 
 
-def _lenses(near: Located | Array, landmarks: Landmarks, frame: Frame) -> list[Lens]:
-    """What the photograph may have been taken with, the likeliest first."""
-    given, size = frame.intrinsics, (frame.width, frame.height)
-    certain = None if given is None else candidates.given(given)
-    if certain is not None:
-        return [certain]
-    if isinstance(near, Located):
-        shift = near.K[:2, 2] - principal_point(frame)
-        focal, sigma = float(near.K[0, 0]), math.log1p(near.claim.focal_percent / 100.0) / NORMAL_95
-        return [candidates.continued(focal, sigma, shift, landmarks.lenses, *size)]
-    own = candidates.own(landmarks.lenses, *size, given)
-    return own or ([] if given is None else [candidates.nominal(given, longer_side(frame))])
+def _assume(near: Located | Array, landmarks: Landmarks, frame: Frame) -> list[Assumed]:
+    """What is assumed of the image's lens: what is given, that of the image before, or what any image may have."""
+    assumed = candidates.assume(landmarks.lenses, frame.width, frame.height, frame.intrinsics)
+    if not isinstance(near, Located) or (assumed and assumed[0].exact):
+        return assumed
+    return [candidates.carry_over(near, principal_point(frame), longer_side(frame))]

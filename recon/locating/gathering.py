@@ -21,7 +21,7 @@ from splatnode.recon.result.landmarks_file import DESCRIPTORS_A_PHOTOGRAPH, MOST
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
 
-_UNKNOWN_DEG, _UNKNOWN_SHARE = 180.0, 1.0  # bounds of a camera of which nothing is claimed
+_UNKNOWN_DEG, _UNKNOWN_SHARE, _UNKNOWN_PERCENT = 180.0, 1.0, 100.0  # bounds of a camera of which nothing is claimed
 _SAME_PX = 1e-6  # between an observation and the feature that it is of
 _LEAST_CURVATURE = 1e-9  # of a point's information, relative to the largest: what is flatter is not known
 
@@ -53,6 +53,7 @@ def gathered(graph: ViewGraph, registration: Registration, bounds: Mapping[str, 
         rotation_bounds=np.array([_UNKNOWN_DEG if each is None else each.rotation_deg for each in known]),
         centre_bounds=np.array([_UNKNOWN_SHARE if each is None else each.centre for each in known]),
         noise_px=noise_px,
+        focal_bounds=np.array([_UNKNOWN_PERCENT if each is None else each.focal_percent for each in known]),
     )
 
 

@@ -6,8 +6,8 @@ speaks against it is asked (checks.py): being wrong is worse than refusing.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -15,23 +15,27 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import Frame, Intrinsics
 from splatnode.capture.lenses.undistort import undistorted
-from splatnode.recon.frames.keyframe import Features, longer_side, principal_point
+from splatnode.recon.frames.keyframe import Features, principal_point
 from splatnode.recon.geometry import spread
 from splatnode.recon.locating import candidates, checks, claims, posing
-from splatnode.recon.locating.camera_model import CameraModel, Lens
+from splatnode.recon.locating.camera_model import CameraModel
+from splatnode.recon.locating.candidates import Assumed
 from splatnode.recon.locating.case import Case, Judged
-from splatnode.recon.locating.correspondences import Correspondences, correspondences
-from splatnode.recon.locating.outcome import Located, NotLocated
-from splatnode.recon.locating.refinement import Fit, refined
+from splatnode.recon.locating.correspondences import Correspondences, Near, correspondences, measure_mirror_gain
+from splatnode.recon.locating.lens_choice import choose_lens, search, search_longer
+from splatnode.recon.locating.outcome import Located, NotLocated, Reason
 from splatnode.recon.matching import features, nearest_neighbours
 from splatnode.recon.result.landmarks import Landmarks
 
 Array = npt.NDArray[np.float64]
 
-# A lens is what it was taken for where, once it is free, it moves by no more than so many standard deviations, or so
-# much: of the logarithm of the focal length, and of the longer side for the principal point.
-_SAME_LENS_SIGMAS, _SAME_LENS_LOG, _SAME_LENS_SHIFT = 3.0, 0.02, 0.012
-_AMPLE_NFA = -30.0  # log10: so surely is no pose of another lens needed
+_AMPLE_GUIDED = 300  # points that agree: with fewer, landmarks are looked for again
+_MAX_GUIDED_BY_CHANCE = 0.1  # of what agrees then
+REACH = 0.02  # of the longer side: how far from where a camera sees it a landmark is looked for
+_AMPLE_NFA, _AMPLE_POINTS = -30.0, 100  # log10, and points that agree: so surely is no longer search needed
+
+# What the parts of an image say whose pixels are not square; then so many times as many points must agree.
+_OF_STRETCHED, _MORE_STRETCHED = (Reason.ELSEWHERE, Reason.INCONSISTENT), 1.25
 
 
 class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -99,67 +103,77 @@ def placed(landmarks: Landmarks, photograph: Photograph, config: Config = Config
     """As `locate`, with the landmarks that the photograph shows."""
     frame = photograph.frame
     known = correspondences(photograph.features, principal_point(frame), landmarks, config.neighbours)
-    case = _case(known, frame, landmarks, config)
-    return checks.refused(case, config.checks) or claimed(case, frame, landmarks, config)
+    judged = Judged(known, frame.width, frame.height, landmarks.noise_px, landmarks.unit, config.posing)
+    assumed = candidates.assume(landmarks.lenses, frame.width, frame.height, frame.intrinsics)
+    case = _case(judged, assumed)
+    refusal = checks.refused(case, config.checks)
+    if refusal is not None and refusal.code in _OF_STRETCHED:
+        stretched = case_of(judged, search(judged, (), candidates.stretched_lenses(judged.side)), assumed)
+        if len(stretched.agreeing) > _MORE_STRETCHED * len(case.agreeing):
+            case, refusal = stretched, checks.refused(stretched, config.checks)
+    if refusal is not None:
+        return refusal
+    if len(case.agreeing) < _AMPLE_GUIDED:
+        case = guide(case, photograph, landmarks, assumed, config)
+        refusal = checks.refused_as_wrong(case, config.checks)
+    return refusal or claimed(case, photograph, landmarks, config)
 
 
-def claimed(case: Case, frame: Frame, landmarks: Landmarks, config: Config) -> Placed | NotLocated:
-    """The camera of the photograph `frame` that no check refuses, with what is claimed of it."""
+def guide(case: Case, photograph: Photograph, landmarks: Landmarks, assumed: Sequence[Assumed], config: Config) -> Case:
+    """The case with more points: each landmark is looked for again near to where the camera that was found sees it.
+
+    As it is where chance would be too much of these. Whether the camera was found at all the first points tell.
+    """
+    assert case.posed is not None
+    by, camera, principal = case.by, case.posed.fit.camera, principal_point(photograph.frame)
+    near = Near(camera, (by.width, by.height), REACH * by.side)
+    judged = replace(by, known=correspondences(photograph.features, principal, landmarks, config.neighbours, near))
+    chosen = choose_lens(judged, [camera], assumed)
+    count = 0 if chosen is None else int(chosen.posed.agreeing.sum())
+    by_chance = (by.settings.max_error_px * by.scale / (REACH * by.side)) ** 2 * (len(judged.known) - count)
+    if chosen is None or count <= len(case.agreeing) or by_chance > _MAX_GUIDED_BY_CHANCE * count:
+        return case
+    return Case(judged, chosen.posed, case.log10_nfa, chosen.source)
+
+
+def claimed(case: Case, photograph: Photograph, landmarks: Landmarks, config: Config) -> Placed | NotLocated:
+    """The camera of the photograph, which no check refuses, with what is claimed of it; a refusal where it is mirrored.
+
+    The last check is here, since it compares all features once more.
+    """
     assert case.posed is not None  # a check refuses it
-    claim, covariance = claims.claimed(case.posed, case.known, landmarks)
+    frame, mirror = photograph.frame, config.checks.mirror
+    if frame.intrinsics is not None:
+        refusal = checks.contradicts_statement(case.posed.fit.camera.lens, frame.intrinsics.fx, config.checks)
+        if refusal is not None:
+            return refusal
+    refusal = checks.mirrored(measure_mirror_gain(photograph.features, landmarks, mirror), config.checks)
+    if refusal is not None:
+        return refusal
+    claim, covariance = claims.claimed(case.posed, case.known, landmarks, max(frame.width, frame.height))
     refusal = checks.too_rough(claim, config.checks)
     if refusal is not None:
         return refusal
     camera = case.posed.fit.camera
-    K = np.diag([camera.lens.focal, camera.lens.focal, 1.0])
+    K = np.diag([*camera.lens.focals, 1.0])
     K[:2, 2] = principal_point(frame) + camera.lens.shift
-    at = Located(camera.T_world_camera, K, covariance, claim, int(case.posed.agreeing.sum()), landmarks.metric)
+    count, metric = int(case.posed.agreeing.sum()), landmarks.metric
+    at = Located(camera.T_world_camera, K, covariance, claim, count, metric, case.source, camera.lens.radial)
     apart = spread(landmarks.Ts_world_camera[:, :3, 3])
     return Placed(at, camera, case.agreeing, (frame.width, frame.height), apart)
 
 
-def _case(known: Correspondences, frame: Frame, landmarks: Landmarks, config: Config) -> Case:
-    """The best camera, of the likeliest lens that explains enough."""
-    side, given = longer_side(frame), frame.intrinsics
-    judged = Judged(known, frame.width, frame.height, landmarks.noise_px, landmarks.unit, config.posing)
-    certain = None if given is None else candidates.given(given)
-    if certain is not None:
-        return judged.case(judged.posed(certain))
-    best = judged.case(None)
-    for lens in candidates.own(landmarks.lenses, frame.width, frame.height, given):
-        found = judged.case(judged.posed(lens))
-        if found.log10_nfa < best.log10_nfa and as_uncropped(found, judged, side) is found:
-            best = found
-    if best.log10_nfa < _AMPLE_NFA:
+def _case(judged: Judged, assumed: Sequence[Assumed]) -> Case:
+    """The best camera: quickly, and where too little agrees with it for a sure answer, by a longer search."""
+    others = candidates.any_lens(judged.side, assumed)
+    best = case_of(judged, search(judged, assumed, others), assumed)
+    if best.log10_nfa < _AMPLE_NFA and len(best.agreeing) >= _AMPLE_POINTS:
         return best
-    others = candidates.any_lens(side) if given is None else [candidates.nominal(given, side)]
-    found = judged.case(judged.posed(*others))
-    return min(best, as_uncropped(found, judged, side), key=lambda each: each.log10_nfa)
+    longer = case_of(judged, search_longer(judged, others), assumed)
+    return min(best, longer, key=lambda each: each.log10_nfa)
 
 
-def as_uncropped(found: Case, judged: Judged, side: int) -> Case:
-    """The case as it is; or, where its lens does not stay what it is once it is free, with a free lens.
-
-    Such a picture is of another lens, or a part of what its camera saw.
-    """
-    if found.posed is None:
-        return found
-    again = judged.settled(found.posed.fit.camera, candidates.cropped(found.posed.fit.camera.lens, side))
-    return found if again is None or _same_lens(found.posed.prior, again.fit, side) else judged.case(again)
-
-
-def of_its_lens(case: Case, side: int) -> bool:
-    """Whether the lens stays what it was taken for once it is free, by what agrees with the camera."""
-    assert case.posed is not None
-    camera, by = case.posed.fit.camera, case.by
-    free = refined(camera, candidates.cropped(camera.lens, side), case.agreeing, by.noise_px)
-    return _same_lens(case.posed.prior, free, side)
-
-
-def _same_lens(prior: Lens, fit: Fit, side: int) -> bool:
-    free, sigmas = fit.camera.lens, _SAME_LENS_SIGMAS * np.sqrt(np.diag(fit.covariance)[6:])
-    of_focal = abs(math.log(free.focal / prior.focal)) / max(
-        _SAME_LENS_LOG, _SAME_LENS_SIGMAS * prior.log_focal_sigma, sigmas[0]
-    )
-    of_shift = np.abs(free.shift - prior.shift) / np.maximum(_SAME_LENS_SHIFT * side, sigmas[2:])
-    return bool(max(of_focal, *of_shift) < 1.0)
+def case_of(judged: Judged, cameras: Sequence[CameraModel], assumed: Sequence[Assumed]) -> Case:
+    """The case of the best of the `cameras`, with the lens that its points leave to it."""
+    chosen = choose_lens(judged, cameras, assumed)
+    return judged.case(None) if chosen is None else judged.case(chosen.posed, chosen.source, chosen.rivals)

@@ -10,6 +10,8 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
+NORMAL_95 = 1.96  # standard deviations within which 95 % of a normal distribution lie
+
 
 class Reason(str, Enum):
     """Why a photograph was not placed."""
@@ -18,8 +20,18 @@ class Reason(str, Enum):
     ONE_PATCH = "ONE_PATCH"  # all that agrees lies in one spot
     ELSEWHERE = "ELSEWHERE"  # another place in the scene explains it nearly as well
     INCONSISTENT = "INCONSISTENT"  # its parts say different things
+    MIRRORED = "MIRRORED"  # turned left to right it looks more like the scene
     LENS = "LENS"  # it takes a lens that no camera has
     UNCERTAIN = "UNCERTAIN"  # where it was taken is known too roughly
+
+
+class LensSource(str, Enum):
+    """The lens with which an image was placed."""
+
+    SCENE = "scene"  # one of the lenses of the scene's own images
+    GIVEN = "given"  # the lens that was given
+    EXIF = "exif"  # the focal length that EXIF or an angle of view states, refined
+    FREE = "free"  # its own, estimated from its points: nothing was known, or they contradict what was
 
 
 @dataclass(frozen=True)
@@ -29,7 +41,8 @@ class Claim:
     rotation_deg: float  # degrees
     centre: float  # in the unit of the result: metres where it is metric
     centre_percent: float  # the same, of the distance to the scene: the median depth of its points
-    focal_percent: float  # of the focal length
+    focal_percent: float  # of the focal lengths across and down
+    principal_percent: float = 0.0  # of the principal point, over the longer side of the image
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +55,8 @@ class Located:
     claim: Claim  # how wrong it may be
     num_points: int  # of the scene that agree with it
     metric: bool  # lengths are metres
+    lens: LensSource = LensSource.SCENE  # with which it was placed
+    distortion: tuple[float, float] = (0.0, 0.0)  # k1, k2 of that lens; (0, 0): a pinhole
 
     @property
     def sentence(self) -> str:
@@ -51,15 +66,22 @@ class Located:
         length = f"{claim.centre:.2g} m" if self.metric else f"{claim.centre_percent:.2g} % of the distance"
         return (
             f"placed at ({x:.4g}, {y:.4g}, {z:.4g}){unit}, known to {claim.rotation_deg:.2g} degrees and {length}; "
-            f"{self.num_points} points agree"
+            f"{self.num_points} points agree{self._lens_sentence}"
         )
+
+    @property
+    def _lens_sentence(self) -> str:
+        if self.lens is not LensSource.FREE:
+            return ""
+        focal, percent = self.K[0, 0], self.claim.focal_percent
+        return f"; its lens is its own, no known one: focal length {focal:.4g} pixels, known to {percent:.2g} %"
 
 
 @dataclass(frozen=True)
 class NotLocated:
     """Why a photograph was not placed, and what to do."""
 
-    code: Reason  # NOT_FOUND, ONE_PATCH, ELSEWHERE, INCONSISTENT, LENS or UNCERTAIN
+    code: Reason  # NOT_FOUND, ONE_PATCH, ELSEWHERE, INCONSISTENT, MIRRORED, LENS or UNCERTAIN
     message: str  # why, in a sentence
     advice: str  # what to do
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
@@ -86,7 +86,7 @@ def settled(
         agreeing = agreement(camera, known, limit_px * scale)
         if agreeing.sum() <= _SAMPLE:
             return None
-        fit = refined(camera, lens, known.of(agreeing), noise_px)
+        fit = refined(replace(camera, lens=camera.lens.with_sigmas_of(lens)), lens, known.of(agreeing), noise_px)
         camera = fit.camera
     assert fit is not None
     return Posed(fit, lens, agreement(camera, known, config.max_error_px * scale))

@@ -42,6 +42,7 @@ class Landmarks:
     noise_px: float  # standard deviation of an observation's error, pixels at REFERENCE_SIDE
     unit: float = 1.0  # the median depth of the scene's points: metres where the result is metric
     metric: bool = False  # lengths are metres
+    focal_bounds: Array | None = None  # (C,) 95 % bounds of the focal lengths, percent; None: an earlier file has none
 
     def moved(self, scale: float, rotation: Array, translation: Array, *, metric: bool = False) -> Landmarks:
         """The same in the world to which x -> scale * rotation @ x + translation leads.

@@ -28,19 +28,21 @@ _ROWS, _COLUMNS = np.triu_indices(3)  # of a symmetric matrix, which is kept by 
 def encode_landmarks(landmarks: Landmarks) -> bytes:
     """landmarks.npz: NumPy arrays, which `numpy.load(..., allow_pickle=False)` reads."""
     lenses, file = landmarks.lenses, io.BytesIO()
-    np.savez_compressed(
-        file,
-        points=landmarks.points.astype(np.float32),
-        covariances=landmarks.covariances[:, _ROWS, _COLUMNS].astype(np.float32),
-        descriptors=landmarks.descriptors,
-        point_of=landmarks.point_of.astype(np.uint32),
-        photograph_of=landmarks.photograph_of.astype(np.uint16),
-        names=np.array([name.encode() for name in landmarks.names], np.bytes_),
-        Ts_world_camera=landmarks.Ts_world_camera,
-        lenses=np.column_stack([lenses.focals, lenses.radials, lenses.shifts, lenses.shapes]),
-        bounds=np.column_stack([landmarks.rotation_bounds, landmarks.centre_bounds]),
-        scale=np.array([landmarks.noise_px, landmarks.unit, float(landmarks.metric)]),
-    )
+    arrays: dict[str, Any] = {
+        "points": landmarks.points.astype(np.float32),
+        "covariances": landmarks.covariances[:, _ROWS, _COLUMNS].astype(np.float32),
+        "descriptors": landmarks.descriptors,
+        "point_of": landmarks.point_of.astype(np.uint32),
+        "photograph_of": landmarks.photograph_of.astype(np.uint16),
+        "names": np.array([name.encode() for name in landmarks.names], np.bytes_),
+        "Ts_world_camera": landmarks.Ts_world_camera,
+        "lenses": np.column_stack([lenses.focals, lenses.radials, lenses.shifts, lenses.shapes]),
+        "bounds": np.column_stack([landmarks.rotation_bounds, landmarks.centre_bounds]),
+        "scale": np.array([landmarks.noise_px, landmarks.unit, float(landmarks.metric)]),
+    }
+    if landmarks.focal_bounds is not None:
+        arrays[_FOCAL_BOUNDS] = landmarks.focal_bounds
+    np.savez_compressed(file, **arrays)
     return file.getvalue()
 
 
@@ -61,12 +63,13 @@ def decode_landmarks(data: bytes, name: str = LANDMARKS) -> Landmarks:
     """Reads landmarks.npz. Raises SceneFileError, which names the file as `name`, where it is something else."""
     with foreign(SceneFileError, name):
         with opened(data, MOST_BYTES, name, "landmarks") as arrays:
-            found = {key: arrays[key] for key in _SHAPES}
+            found = {key: arrays[key] for key in _SHAPES if key != _FOCAL_BOUNDS or key in arrays}
         found["lenses"] = _with_second_radial(found["lenses"])
         _check(found, name)
         return _decoded(found)
 
 
+_FOCAL_BOUNDS = "focal_bounds"  # that an earlier splatnode did not write
 _SHAPES: dict[str, tuple[str, str, tuple[int, ...]]] = {  # kind, what its first axis counts, the other axes
     "points": ("f", "P", (3,)),
     "covariances": ("f", "P", (6,)),
@@ -78,6 +81,7 @@ _SHAPES: dict[str, tuple[str, str, tuple[int, ...]]] = {  # kind, what its first
     "lenses": ("f", "C", (6,)),
     "bounds": ("f", "C", (2,)),
     "scale": ("f", "three", ()),
+    _FOCAL_BOUNDS: ("f", "C", ()),
 }
 
 
@@ -89,8 +93,8 @@ def _with_second_radial(lenses: npt.NDArray[Any]) -> npt.NDArray[Any]:
 def _check(found: dict[str, npt.NDArray[Any]], name: str) -> None:
     """Raises SceneFileError where shapes, types or numbers are not those of a file of ours."""
     counts: dict[str, int] = {"three": 3}
-    for key, (kind, count, rest) in _SHAPES.items():
-        array = found[key]
+    for key, array in found.items():
+        kind, count, rest = _SHAPES[key]
         known = counts.setdefault(count, len(array) if array.ndim else 0)
         if array.dtype.kind != kind or array.ndim != 1 + len(rest) or array.shape != (known, *rest):
             raise SceneFileError(f"{name}: {key} must be {('?', *rest)} of kind {kind!r}, got {array.shape}")
@@ -104,7 +108,8 @@ def _check(found: dict[str, npt.NDArray[Any]], name: str) -> None:
         problem = camera_problem(T_world_camera, np.diag([lens[0], lens[0], 1.0]), 1, 1)
         if problem:
             raise SceneFileError(f"{name}: {problem}")
-    if (found["lenses"][:, [0, 5]] <= 0).any() or (found["scale"][:2] <= 0).any() or (found["bounds"] < 0).any():
+    bounds = np.column_stack([found["bounds"], found.get(_FOCAL_BOUNDS, np.zeros(counts["C"]))])
+    if (found["lenses"][:, [0, 5]] <= 0).any() or (found["scale"][:2] <= 0).any() or (bounds < 0).any():
         raise SceneFileError(f"{name}: focal lengths, shapes, bounds and units must be positive")
 
 
@@ -130,6 +135,7 @@ def _decoded(found: dict[str, npt.NDArray[Any]]) -> Landmarks:
         noise_px,
         unit,
         bool(metric),
+        found.get(_FOCAL_BOUNDS),
     )
 
 

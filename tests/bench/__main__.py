@@ -36,6 +36,7 @@ BENCHMARKS = {
         "spz",
         "needles",
         "locate",
+        "query_lenses",
         "audit",
         "race",
         "movers",

@@ -81,6 +81,7 @@ def make_landmarks() -> Landmarks:
         rotation_bounds=np.array([0.3, 0.5]),
         centre_bounds=np.array([0.01, 0.02]),
         noise_px=0.4,
+        focal_bounds=np.array([1.0, 2.0]),
     )
 
 

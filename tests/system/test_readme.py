@@ -671,6 +671,40 @@ def test_photographs_of_other_scenes():
     says(f"near to the one before | {median(frames):.2f} in the median, {max(frames):.2f} at most; {len(frames)} of")
 
 
+QUERIES = {
+    "zoomed 1.02 to 1.3 times": [f"zoom {factor}" for factor in (1.02, 1.05, 1.1, 1.2, 1.3)],
+    "zoomed 1.6 and 2 times": ["zoom 1.6", "zoom 2.0"],
+    "zoomed 2.5 and 3 times": ["zoom 2.5", "zoom 3.0"],
+    "cropped to 80 %, in the middle and at a corner": ["cut middle 0.8", "cut corner 0.8", "crop corner 0.8"],
+    "mirrored": ["mirror"],
+    "with black borders, at 75 %": ["letterbox 0.75"],
+    "stretched by 1.1, squeezed to 75 %": ["stretch 1.1", "squeeze 0.75"],
+    "bent by k1 of −.15 and .1": ["bend -0.15", "bend 0.1"],
+    "blurred by motion over 2 % of the width": ["blur 0.02"],
+    "halves that changed places": ["collage"],
+    "as they are": ["clean"],
+    "as they are, with EXIF": ["clean exif"],
+    "as they are, with the lens given": ["clean given"],
+    "zoomed 1.1, 1.3 and 2 times, with EXIF of the whole": ["zoom 1.1 exif", "zoom 1.3 exif", "zoom 2.0 exif"],
+    "the same, with the lens of the whole given": ["zoom 1.1 given", "zoom 1.3 given", "zoom 2.0 given"],
+}  # fmt: skip
+
+
+def test_query_images_of_another_lens():
+    sums = raw("query_lenses")["summary"]
+    for words, warps in QUERIES.items():
+        cells = [sum(sums["all"]["kinds"][warp][count] for warp in warps) for count in ("queries", "placed", "wrong")]
+        says(f"| {words} | {cells[0]} | {cells[1]} | {cells[2]} |")
+    every, halves = sums["all"], (sums["chosen_on"], sums["left_out"])
+    says(f"Of {every['queries']} zoomed, cropped and mirrored queries {every['wrong']} were wrong")
+    wrong, placed = ([half[key] for half in halves] for key in ("wrong", "zoomed_placed"))
+    shares = [100 * half["zoomed_placed"] / half["zoomed"] for half in halves]
+    says(f"{wrong[0]} on the scenes that thresholds were chosen on and {wrong[1]} on the others")
+    says(f"placed are {placed[0]} ({shares[0]:.0f} %) and {placed[1]} ({shares[1]:.0f} %)")
+    within = [100 * every["within"][kind] for kind in ("rotation", "centre", "focal")]
+    says(f"{within[0]:.0f} % of the rotations, {within[1]:.0f} % of the centres and {within[2]:.0f} % of the focal")
+
+
 MAPPED = {
     "built-in capture": "built-in capture, 3 places",
     "building": "built-in building, 2 rooms",

@@ -281,7 +281,7 @@ def _write(
     strangers: Sequence[Stranger],
     frames: Sequence[FollowingFrame],
 ) -> None:
-    head = {"command": shlex.join(["python", "-m", "tests.bench", "locate", *sys.argv[1:]]), "commit": _commit()}
+    head = {"command": shlex.join(["python", "-m", "tests.bench", "locate", *sys.argv[1:]]), "commit": head_commit()}
     rows = {
         "trials": [asdict(trial) for trial in own],
         "strangers": [asdict(pair) for pair in strangers],
@@ -305,7 +305,7 @@ def _strangers(
                     yield Stranger(other, of, name, {of, other} <= COURTYARD, found, following)
 
 
-def _commit() -> str:
+def head_commit() -> str:
     head = ["git", "rev-parse", "--short=7", "HEAD"]
     return subprocess.run(head, cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
 

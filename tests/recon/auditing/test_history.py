@@ -71,6 +71,15 @@ def test_a_move_is_measured(turn, shift):
     assert found.degrees_sigma < 0.1 and found.distance_sigma < 0.003
 
 
+def test_a_camera_that_zoomed_has_not_moved():
+    T = rigid((3.0, -5.0, 2.0), LEFT)
+    before, after = placed(T, 1), placed(T, 2)
+    zoomed = replace(after.seen, pixels=1.3 * after.seen.pixels)
+    located = replace(after.located, K=np.diag([1.3, 1.3, 1.0]))
+    found = motion(before, replace(after, seen=zoomed, located=located))
+    assert found.common == 0 and not found.significant  # by their common points it moved forward by a third
+
+
 def test_a_move_is_known_the_less_the_closer_the_cameras_of_the_scene_stand_together():
     T = rigid((3.0, -5.0, 2.0), LEFT)
     move = rigid((0.0, 1.0, 0.0), (0.03, 0.0, 0.0))

@@ -60,7 +60,7 @@ def test_pixels_without_distortion_are_those_of_a_pinhole():
 
 
 def test_the_camera_is_found_again_from_nearby():
-    step = np.array([0.02, -0.01, 0.015, 0.05, -0.03, 0.04, 0, 0, 0, 0])
+    step = np.array([0.02, -0.01, 0.015, 0.05, -0.03, 0.04, 0, 0, 0, 0, 0])
     fit = refined(CAMERA.moved(step), CAMERA.lens, seen(0.0, 0), 0.5)
     assert np.allclose(fit.camera.T_world_camera, CAMERA.T_world_camera, atol=1e-6)
 

@@ -44,6 +44,7 @@ def test_a_folder_of_photographs_is_placed(result, photographs, tmp_path, capsys
     first = told["photographs"][0]
     assert first["placed"] and np.shape(first["T_world_camera"]) == (4, 4) and np.shape(first["covariance"]) == (6, 6)
     assert first["width"] == PLACE.width and first["claim"]["rotation_deg"] > 0 and first["points"] > 100
+    assert first["lens"] == "scene" and len(first["distortion"]) == 2 and first["claim"]["principal_percent"] > 0
 
 
 def test_one_that_is_refused_is_told_with_its_reason_and_the_exit_code(result, photographs, tmp_path, capsys):

@@ -65,3 +65,9 @@ def test_a_refused_estimate_has_none():
     estimate = known_place().estimate
     refused = replace(estimate, verdict=replace(estimate.verdict, publishable=False))
     assert refused.landmarks is None and refused.conclusion_to_save.landmarks is None
+
+
+def test_the_bounds_of_the_focal_lengths_are_those_of_the_cameras():
+    place = known_place()
+    bounds = [place.estimate.bounds[name].focal_percent for name in place.landmarks.names]
+    assert place.landmarks.focal_bounds is not None and np.allclose(place.landmarks.focal_bounds, bounds)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import zipfile
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -41,6 +41,11 @@ def test_what_was_written_is_read(landmarks):
             assert one == other, field.name
 
 
+def test_a_file_from_before_focal_lengths_had_bounds_is_read(landmarks):
+    found = decode_landmarks(encode_landmarks(replace(landmarks, focal_bounds=None)))
+    assert found.focal_bounds is None and len(found.points) == 5
+
+
 def test_it_moves_into_another_world(landmarks):
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     moved = landmarks.moved(2.0, turn, np.array([1.0, 2.0, 3.0]))
@@ -64,6 +69,8 @@ def test_it_moves_into_another_world(landmarks):
         ({"descriptors": np.zeros((9, 128), np.uint16)}, "bytes"),
         ({"scale": np.array([0.4, 0.0, 0.0])}, "positive"),
         ({"bounds": np.full((2, 2), -1.0)}, "positive"),
+        ({"focal_bounds": np.full(2, -1.0)}, "positive"),
+        ({"focal_bounds": np.full(3, 1.0)}, "focal_bounds must be"),
         ({"Ts_world_camera": np.tile(2.0 * np.eye(4), (2, 1, 1))}, "rigid motion"),
         ({"covariances": np.full((5, 6), 1e30)}, "within"),
         ({"names": np.array([{}, {}], object)}, "damaged"),

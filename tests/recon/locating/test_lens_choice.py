@@ -1,0 +1,220 @@
+"""A query image of another lens than was assumed is placed with its own one, or refused; never with a wrong one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from splatnode.capture.frame import Intrinsics
+from splatnode.recon.frames.keyframe import Features
+from splatnode.recon.locating import posing
+from splatnode.recon.locating.camera_model import PINHOLE, CameraModel, Lens
+from splatnode.recon.locating.candidates import Assumed, any_lens, assume
+from splatnode.recon.locating.case import Judged
+from splatnode.recon.locating.correspondences import Correspondences, measure_mirror_gain
+from splatnode.recon.locating.follow import follow
+from splatnode.recon.locating.lens_choice import Chosen, choose_lens, search
+from splatnode.recon.locating.locate import described, locate
+from splatnode.recon.locating.outcome import LensSource, Located, NotLocated, Reason
+from splatnode.recon.result.landmarks import KnownLenses, Landmarks
+from splatnode.recon.verification import reflection
+from tests.bench.quality.query_warps import WARPS, Query
+from tests.support.located import PLACE, errors, known_place, photograph
+
+WIDTH, HEIGHT, FOCAL = 1024, 768, 900.0
+MIRROR = np.diag([-1.0, 1.0, 1.0])
+
+
+def warped(index: int, warp: str) -> tuple[Query, Located | NotLocated, tuple]:
+    image, camera = photograph(index)
+    query = WARPS[warp](image, camera[1], index)
+    return query, locate(known_place().landmarks, query.image), camera
+
+
+def assert_right(query: Query, found: Located | NotLocated, camera: tuple) -> None:
+    """Placed, within its bounds, with the focal lengths and the principal point that the image has."""
+    assert isinstance(found, Located)
+    degrees, percent = errors(found, camera)
+    assert degrees <= found.claim.rotation_deg and percent <= found.claim.centre_percent
+    assert query.K is not None
+    off = np.abs(np.log(np.diag(found.K)[:2] / np.diag(query.K)[:2]))
+    assert off.max() <= np.log1p(found.claim.focal_percent / 100.0)
+    shift = np.linalg.norm(found.K[:2, 2] - query.K[:2, 2]) / max(query.image.shape)
+    assert 100.0 * shift <= found.claim.principal_percent
+
+
+@pytest.mark.parametrize("index, factor", [(0, 1.05), (2, 1.3), (0, 2.0), (1, 2.0), (2, 2.0), (0, 2.5)])
+def test_a_zoomed_image_is_placed_with_a_lens_of_its_own(index, factor):
+    query, found, camera = warped(index, f"zoom {factor}")
+    assert_right(query, found, camera)
+    assert isinstance(found, Located) and found.lens is LensSource.FREE
+    assert "its lens is its own" in found.sentence
+
+
+@pytest.mark.parametrize("warp", ["crop corner 0.8", "cut middle 0.8", "cut corner 0.8", "letterbox 0.75"])
+def test_a_part_of_an_image_is_placed_with_the_principal_point_where_the_whole_has_it(warp):
+    query, found, camera = warped(2, warp)
+    assert_right(query, found, camera)
+
+
+@pytest.mark.parametrize("warp", ["stretch 1.1", "squeeze 0.75"])
+def test_an_image_whose_pixels_are_not_square_is_placed_with_two_focal_lengths(warp):
+    query, found, camera = warped(2, warp)
+    assert_right(query, found, camera)
+    assert isinstance(found, Located) and abs(found.K[0, 0] / found.K[1, 1] - 1.0) > 0.05
+
+
+def test_a_lens_that_bends_lines_is_estimated():
+    query, found, camera = warped(1, "bend -0.15")
+    assert_right(query, found, camera)
+    assert isinstance(found, Located) and found.distortion[0] == pytest.approx(-0.15, abs=0.03)
+
+
+def test_the_scenes_own_lens_is_named_where_the_image_does_not_contradict_it():
+    found = locate(known_place().landmarks, photograph(1)[0])
+    assert isinstance(found, Located) and found.lens is LensSource.SCENE
+    assert "its lens is its own" not in found.sentence
+
+
+@pytest.mark.parametrize("source", ["exif", "given"])
+def test_a_lens_that_is_stated_is_tested(source):
+    image, camera = photograph(0)
+    K = camera[1]
+    stated = Intrinsics(PLACE.width, PLACE.height, K[0, 0], K[1, 1], K[0, 2], K[1, 2], source)
+    query = WARPS["zoom 1.3"](image, K, 0)
+    found = locate(known_place().landmarks, query.image, stated)
+    assert_right(query, found, camera)
+    assert isinstance(found, Located) and found.lens is LensSource.FREE  # the statement is of the whole image
+    right = locate(known_place().landmarks, image, stated)
+    assert isinstance(right, Located) and right.lens in (LensSource.SCENE, LensSource.GIVEN)
+
+
+def test_a_lens_that_no_crop_makes_of_the_stated_one_is_refused():
+    image, camera = photograph(0)
+    focal = 2.0 * camera[1][0, 0]
+    stated = Intrinsics(PLACE.width, PLACE.height, focal, focal, PLACE.width / 2, PLACE.height / 2, "exif")
+    found = locate(known_place().landmarks, image, stated)
+    assert isinstance(found, NotLocated) and found.code is Reason.LENS and "are stated" in found.message
+
+
+def test_an_image_that_follows_another_may_zoom():
+    image, camera = photograph(1)
+    before = locate(known_place().landmarks, photograph(0)[0])
+    assert isinstance(before, Located)
+    query = WARPS["zoom 1.6"](image, camera[1], 1)
+    found = follow(known_place().landmarks, query.image, before)
+    assert_right(query, found, camera)
+    assert isinstance(found, Located)
+    next_image, next_camera = photograph(2)
+    again = WARPS["zoom 1.6"](next_image, next_camera[1], 2)
+    assert_right(again, follow(known_place().landmarks, again.image, found), next_camera)
+
+
+def symmetric(landmarks: Landmarks, share: float) -> Landmarks:
+    """The scene with that share of its points a second time, mirrored left to right, as other images show them."""
+    points = np.arange(len(landmarks.points))
+    twice = np.random.default_rng(0).random(len(points)) < share
+    kept = twice[landmarks.point_of]
+    number = len(points) + np.cumsum(twice) - 1
+    Ts = landmarks.Ts_world_camera.copy()
+    Ts[:, :3, :3] = MIRROR @ Ts[:, :3, :3] @ MIRROR
+    Ts[:, :3, 3] = Ts[:, :3, 3] @ MIRROR
+    lenses = landmarks.lenses
+    return replace(
+        landmarks,
+        points=np.concatenate([landmarks.points, landmarks.points[twice] @ MIRROR]),
+        covariances=np.concatenate([landmarks.covariances, MIRROR @ landmarks.covariances[twice] @ MIRROR]),
+        descriptors=np.concatenate(
+            [landmarks.descriptors, reflection.mirrored_descriptors(landmarks.descriptors[kept])]
+        ),
+        point_of=np.concatenate([landmarks.point_of, number[landmarks.point_of[kept]]]),
+        photograph_of=np.concatenate([landmarks.photograph_of, len(landmarks.names) + landmarks.photograph_of[kept]]),
+        names=landmarks.names + tuple(f"mirrored {name}" for name in landmarks.names),
+        Ts_world_camera=np.concatenate([landmarks.Ts_world_camera, Ts]),
+        lenses=KnownLenses(*(np.concatenate([each, each]) for each in vars(lenses).values())),
+        rotation_bounds=np.tile(landmarks.rotation_bounds, 2),
+        centre_bounds=np.tile(landmarks.centre_bounds, 2),
+        focal_bounds=None if landmarks.focal_bounds is None else np.tile(landmarks.focal_bounds, 2),
+    )
+
+
+def test_a_mirrored_image_of_a_symmetric_place_is_refused():
+    image, camera = photograph(2)
+    scene = symmetric(known_place().landmarks, 0.4)
+    mirrored = locate(scene, np.ascontiguousarray(image[:, ::-1]))
+    assert isinstance(mirrored, NotLocated) and mirrored.code is Reason.MIRRORED
+    found = locate(scene, image)
+    assert isinstance(found, Located) and max(errors(found, camera)) < 1.0
+
+
+def test_the_gain_of_mirroring_is_above_0_for_mirrored_images_alone():
+    image, _ = photograph(2)
+    features = described(image).features
+    turned = Features(
+        features.points, reflection.mirrored_descriptors(features.descriptors), features.point_of, features.tilt
+    )
+    gains = [measure_mirror_gain(each, known_place().landmarks, reflection.Config()) for each in (features, turned)]
+    assert gains[0] < -0.3 and gains[1] == pytest.approx(-gains[0])
+
+
+def seen(lens: Lens, relief: float, count: int = 600, noise_px: float = 0.5) -> Correspondences:
+    """Points at depth 4, and before and behind it by `relief`, all over the image of a camera with this lens."""
+    draw = np.random.default_rng(1)
+    wanted = draw.uniform(-0.5, 0.5, (count, 2)) * [WIDTH, HEIGHT]
+    depth = 4.0 + relief * draw.uniform(-1.0, 1.0, (count, 1))
+    points = np.column_stack([wanted / lens.focal, np.ones(count)]) * depth
+    pixels, _ = CameraModel(np.eye(3), np.zeros(3), lens).project(points)
+    index = np.arange(count)
+    along = points / np.linalg.norm(points, axis=1, keepdims=True)
+    noisy = pixels + draw.normal(0.0, noise_px, pixels.shape)
+    return Correspondences(noisy, index, points, np.zeros((count, 3, 3)), index, np.zeros(count, int), along)
+
+
+def chosen_of(known: Correspondences, assumed: list[Assumed]) -> Chosen:
+    judged = Judged(known, WIDTH, HEIGHT, 0.5, 4.0, posing.Config())
+    chosen = choose_lens(judged, search(judged, assumed, any_lens(judged.side, assumed)), assumed)
+    assert chosen is not None
+    return chosen
+
+
+def own(focal: float) -> list[Assumed]:
+    one = np.ones(1)
+    lenses = KnownLenses(focal / WIDTH * one, np.zeros((1, 2)), np.zeros((1, 2)), HEIGHT / WIDTH * one)
+    return assume(lenses, WIDTH, HEIGHT, None)
+
+
+def focal_sigmas(chosen: Chosen, focal: float) -> tuple[float, float]:
+    """The error of the logarithm of the focal length, and its standard deviation."""
+    sigma = float(np.sqrt(chosen.posed.fit.covariance[6, 6]))
+    return abs(np.log(chosen.posed.fit.camera.lens.focal / focal)), sigma
+
+
+def test_before_a_scene_with_depth_an_assumed_lens_is_refuted_and_the_right_one_found():
+    lens = Lens(FOCAL, PINHOLE, np.zeros(2), 0.0, 0.0, 0.0)
+    known = seen(lens, relief=2.0)
+    assert chosen_of(known, own(FOCAL)).source is LensSource.SCENE
+    other = chosen_of(known, own(FOCAL / 1.1))
+    error, sigma = focal_sigmas(other, FOCAL)
+    assert other.source is LensSource.FREE and error < 2.0 * sigma < 0.03
+
+
+def test_before_a_plane_nothing_confirms_a_lens_and_the_covariance_says_so():
+    """Focal length and distance trade off there: the assumed lens stays, and counts as hardly known."""
+    lens = Lens(FOCAL, PINHOLE, np.zeros(2), 0.0, 0.0, 0.0)
+    flat, deep = (chosen_of(seen(lens, relief), own(FOCAL)) for relief in (0.0, 2.0))
+    assert focal_sigmas(flat, FOCAL)[1] > 5.0 * focal_sigmas(deep, FOCAL)[1]
+    for factor in (1.02, 1.05, 1.1, 1.2):
+        wrong = chosen_of(seen(lens, 0.0), own(FOCAL / factor))
+        error, sigma = focal_sigmas(wrong, FOCAL)
+        assert error < 2.5 * 1.96 * sigma
+
+
+def test_a_given_lens_that_fits_stays_as_it_is_and_is_not_taken_for_exact():
+    lens = Lens(FOCAL, PINHOLE, np.zeros(2), 0.0, 0.0, 0.0)
+    given = Intrinsics(WIDTH, HEIGHT, FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, "given")
+    nothing = KnownLenses(np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
+    chosen = chosen_of(seen(lens, 1.0), assume(nothing, WIDTH, HEIGHT, given))
+    assert chosen.source is LensSource.GIVEN and chosen.posed.fit.camera.lens.focal == pytest.approx(FOCAL)
+    assert focal_sigmas(chosen, FOCAL)[1] > 0.001
