@@ -19,7 +19,7 @@ from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.checkpoint.stored_frame import StoredFrame
 from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
 from splatnode.recon.frames.keyframe import Keyframe
-from splatnode.recon.pipeline import prepare
+from splatnode.recon.preparation import prepare
 
 log = logging.getLogger(__name__)
 

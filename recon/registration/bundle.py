@@ -127,7 +127,7 @@ class LensPrior:
                     deviations = np.maximum(own[chosen, k], _MIN_OWN_SIGMA) ** 2
                     shared = self.common.sigmas[chosen[0], k] ** 2
                     covariance = np.diag(deviations) + shared
-                    information[np.ix_(chosen, [k], chosen, [k])] = np.linalg.inv(covariance)[:, None, :, None]
+                    information[chosen[:, None], k, chosen[None], k] = np.linalg.inv(covariance)
         return information.reshape(count * _LENS, count * _LENS)
 
     @staticmethod

@@ -54,7 +54,7 @@ def as_avif(orientation: int, pixels: np.ndarray | None = None) -> bytes:
 
 @pytest.mark.parametrize("data", [TURNED, as_avif(6)], ids=["heic", "avif"])
 def test_what_the_file_and_its_exif_both_turn_is_turned_once(data):
-    image, intrinsics, captured_at, exposure, _ = decode_photograph(data)
+    image, intrinsics, captured_at, exposure, *_ = decode_photograph(data)
     assert exposure == (None if data is TURNED else ExposureSettings(0.008, 400.0))
     assert image.shape == (80, 60, 3) and image.dtype == np.uint8
     np.testing.assert_allclose(corners(image), [BLUE, RED, YELLOW, GREEN], atol=12)

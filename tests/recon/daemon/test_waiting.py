@@ -28,7 +28,7 @@ from splatnode.recon.daemon.status import State
 from splatnode.recon.daemon.worker import Worker
 from splatnode.recon.incremental import IncrementalReconstruction
 from splatnode.recon.ladder.ladder import fallback_key
-from splatnode.recon.pipeline import prepare
+from splatnode.recon.preparation import prepare
 from tests.capture.messaging.test_sockets import wait_for
 from tests.recon.daemon.test_daemon import PATIENCE_S, config, index, running
 from tests.support.synthetic import SMALL, photographs, places

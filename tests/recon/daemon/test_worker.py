@@ -16,7 +16,7 @@ from splatnode.recon.daemon import worker
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
 from splatnode.recon.daemon.inbox import Arrived, Inbox, LeftOut
-from splatnode.recon.pipeline import prepare
+from splatnode.recon.preparation import prepare
 
 
 @pytest.mark.parametrize(("asked", "seconds"), [(None, worker.LADDER_S), (20.0, 20.0)])
