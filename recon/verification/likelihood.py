@@ -73,7 +73,7 @@ def measures(evidence: Evidence, model: ClaimModel) -> dict[str, float]:
         "mirrored_cost": _log_clipped(evidence.mirrored_cost, 0.8, 10.0),
         "reflection": _clipped(evidence.reflection.gain, 0.1, 1.0),
         "directions": _log_clipped(evidence.cycles.direction_sigmas, 1.0, 30.0),
-        "own_lenses": float(np.mean([camera.own_lens for camera in cameras])),
+        "own_lens": float(any(camera.own_lens for camera in cameras)),
         "rotation_bound": _log_clipped(max(each.rotation_deg for each in bounds.values()), 0.3, 30.0),
         "travel_bound": _log_clipped(travel_percent(bounds, evidence), 0.5, 100.0),
     }

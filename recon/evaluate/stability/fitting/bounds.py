@@ -16,7 +16,7 @@ from splatnode.recon.verification.errors import Errors
 Array = npt.NDArray[np.float64]
 
 # Of the errors that are fitted: a little more than the 95 % that are claimed, for further scenes differ.
-QUANTILE = 0.955
+QUANTILE = 0.978
 RIDGE = 1e-3  # penalty of squared powers, for each camera: where two sources say the same, both count alike
 MIN_OWN_LENSES = 50  # cameras of sets with own lenses, from which on they have a factor of their own
 NEGLIGIBLE = 1e-6  # a smaller power is 0
@@ -35,11 +35,16 @@ class _Line:
     link: float
     count: int
     own_lens: bool  # of any camera of its set
+    broken: bool  # what its set takes for granted of lenses, on purpose
 
 
 def fit(samples: Sequence[Sample]) -> ClaimModel:
-    """From registrations that are not grossly wrong, each scene with the square root of its number of cameras."""
-    usable = [sample for sample in samples if not sample.gross]
+    """From registrations that are not grossly wrong, each scene with the square root of its number of cameras.
+
+    Sets that break what is assumed of lenses say how much wider bounds are where an image has a lens of its own, and
+    nothing else: where nothing tells that they do, they look like any other.
+    """
+    usable = [sample for sample in samples if not sample.gross and (sample.own_lens or not sample.broken)]
     return ClaimModel(
         rotation=_fitted(_lines(usable, "rotation"), FLOORS["rotation"]),
         centre=_fitted(_lines(usable, "centre"), FLOORS["centre"], link=True),
@@ -51,7 +56,7 @@ def _lines(samples: Sequence[Sample], kind: str) -> list[_Line]:
     lines = []
     for sample in samples:
         count, link = len(sample.evidence.cameras), sample.evidence.weakest_link.inlier_ratio
-        of_set = link, count, any(camera.own_lens for camera in sample.evidence.cameras)
+        of_set = link, count, sample.own_lens, sample.broken
         for camera in sample.evidence.cameras:
             found = sample.errors[camera.name]
             if kind == "rotation":
@@ -72,6 +77,8 @@ def _fitted(lines: Sequence[_Line], floor: float, profile: bool = False, link: b
     More of a source never narrows a bound, and more explained matches never widen it. The profile counts if `profile`
     (it bounds rotations and centres from below as it is), the weakest link if `link`.
     """
+    whole = lines
+    lines = [line for line in whole if not line.broken]
     scenes = np.array([line.scene for line in lines])
     weights = np.array([1.0 / np.sqrt((scenes == scene).sum()) for scene in scenes])
     wanted = np.log(np.hypot([line.error for line in lines], floor / 3.0))
@@ -94,8 +101,14 @@ def _fitted(lines: Sequence[_Line], floor: float, profile: bool = False, link: b
     of_common = _quantile(left[~own], weights[~own], QUANTILE)
     found = dict(zip(used, powers[1:], strict=True))
     found |= {"factor": np.exp(powers[0] + of_common), "floor": floor}
-    if own.sum() >= MIN_OWN_LENSES:
-        found["own_lens"] = max(1.0, np.exp(_quantile(left[own], weights[own], QUANTILE) - of_common))
+    mixed = [line for line in whole if line.own_lens]
+    if len(mixed) >= MIN_OWN_LENSES:
+        columns = np.array([_logarithms(line, floor) for line in mixed]) * np.array(
+            [float(each) for each in used.values()]
+        )
+        errors = np.log(np.hypot([line.error for line in mixed], floor / 3.0))
+        beyond = errors - np.column_stack([np.ones(len(mixed)), columns]) @ powers
+        found["own_lens"] = max(1.0, np.exp(_quantile(beyond, np.ones(len(mixed)), QUANTILE) - of_common))
     return BoundModel(**{name: float(f"{number:.3g}") for name, number in found.items()})
 
 

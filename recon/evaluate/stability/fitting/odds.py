@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.optimize import minimize
 
-from splatnode.recon.evaluate.stability.fitting.judge import passes_limits, wrong
+from splatnode.recon.evaluate.stability.fitting.judge import beyond_claim, passes_limits, wrong
 from splatnode.recon.evaluate.stability.fitting.samples import Sample
 from splatnode.recon.verification.claims import ClaimModel
 from splatnode.recon.verification.likelihood import OddsModel, Term, measures
@@ -24,7 +24,7 @@ FOR = (
     "coverage",
     "mirrored_cost",
 )
-AGAINST = ("flat_patch", "reflection", "directions", "own_lenses", "rotation_bound", "travel_bound")
+AGAINST = ("flat_patch", "reflection", "directions", "rotation_bound", "travel_bound")
 SIGNS = {**dict.fromkeys(FOR, 1), **dict.fromkeys(AGAINST, -1)}
 WRONG_WEIGHT = 4.0  # of a wrong registration beside a right one: there are fewer, and each counts more
 RIDGE = 0.02  # penalty of squared slopes (in standard deviations), for each registration and slope
@@ -32,21 +32,35 @@ MARGIN = 0.5  # nats by which the best wrong registration stays refused: others 
 
 
 def fit(samples: Sequence[Sample], claim_model: ClaimModel) -> OddsModel:
-    """The prior is such that no wrong registration is published whose scene was left out when it was judged."""
+    """The prior is such that no registration beyond its claim is published whose scene was left out when it was judged.
+
+    So is what a lens of its own counts, with the sets that break what is assumed of lenses: where an image has one,
+    more must speak for the poses. Sets that break it and do not show it look like any other, and set no prior.
+    """
     claims_alone = Numbers(claim_model, OddsModel(0.0, {}))
     known = [sample for sample in samples if sample.right or wrong(sample, claims_alone)]
+    known = [sample for sample in known if sample.own_lens or not sample.broken]
     table = np.array([[measures(sample.evidence, claim_model)[name] for name in SIGNS] for sample in known])
     right = np.array([sample.right for sample in known])
     scenes = np.array([sample.scene for sample in known])
     limits = np.array([passes_limits(sample, claims_alone) for sample in known])
+    beyond = np.array([beyond_claim(sample, claims_alone) for sample in known])
+    own, broken = (np.array([getattr(sample, name) for sample in known]) for name in ("own_lens", "broken"))
     left_out = np.zeros(len(known))
     for scene in np.unique(scenes):
-        rest = scenes != scene
-        left_out[~rest] = _total(_regression(table[rest], right[rest]), table[~rest])
-    whole = _regression(table, right)
-    doubted = left_out[~right & limits]
-    highest = float(doubted.max()) if len(doubted) else 0.0
-    return OddsModel(float(f"{whole.prior - max(0.0, highest + MARGIN):.3g}"), whole.terms)
+        rest = (scenes != scene) & ~broken
+        left_out[scenes == scene] = _total(_regression(table[rest], right[rest]), table[scenes == scene])
+    whole = _regression(table[~broken], right[~broken])
+    doubted = ~right & limits & beyond
+    lower = _lower(left_out[doubted & ~own])
+    of_own = max(0.0, _lower(left_out[doubted & own]) - lower)
+    terms = {**whole.terms, "own_lens": Term(0.0, -float(f"{of_own:.3g}"))}
+    return OddsModel(float(f"{whole.prior - lower:.3g}"), terms)
+
+
+def _lower(doubted: Array) -> float:
+    """By how much log odds must be lowered for none of these to be published."""
+    return max(0.0, float(doubted.max()) + MARGIN) if len(doubted) else 0.0
 
 
 def _regression(table: Array, right: npt.NDArray[np.bool_]) -> OddsModel:

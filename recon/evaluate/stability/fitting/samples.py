@@ -16,6 +16,7 @@ from splatnode.recon.evaluate.stability.windows.row import OURS, Row
 from splatnode.recon.result.verdict import Code
 from splatnode.recon.verification.evidence import Evidence
 
+CLEAN = "clean"  # the kind of trials of `lens_assumptions` that break nothing
 GROSS_SPREAD_PCT = 20.0  # of the true centres' spread
 
 
@@ -30,12 +31,18 @@ class Sample:
     stood_still: bool  # the pairs alone refused it: the camera only turned, or not even that
     evidence: Evidence
     errors: Mapping[str, CameraError]  # by camera; of those that have a true one
+    broken: bool = False  # its images break what is assumed of lenses, on purpose: a trial of `lens_assumptions`
     told: bool = False  # what EXIF or a calibration says of the lens came with the photographs of a window
 
     @property
     def pair(self) -> bool:
         """Two cameras have numbers of their own."""
         return len(self.evidence.cameras) == 2
+
+    @property
+    def own_lens(self) -> bool:
+        """Whether any image has a lens that is not what it was taken for."""
+        return any(camera.own_lens for camera in self.evidence.cameras)
 
     @property
     def together(self) -> bool:
@@ -92,7 +99,11 @@ def _of_trials(trials: list[dict]) -> Iterator[Sample]:
             evidence = _evidence(trial["evidence"])
             scene = trial["note"].split(",")[0].split(" and ")[0]
             still, errors = _still(trial["published"], trial["verdict"]), _errors(trial["errors"])
-            yield Sample(scene, len(evidence.cameras), False, True, still, evidence, errors)
+            yield Sample(scene, len(evidence.cameras), False, True, still, evidence, errors, broken=_is_broken(trial))
+
+
+def _is_broken(trial: dict) -> bool:
+    return trial.get("kind", CLEAN) != CLEAN
 
 
 def _still(published: bool, verdict: str) -> bool:
