@@ -40,7 +40,7 @@ FITTED = Fitted(
                 inlier_ratio=0.0,
                 link=0.0,
                 count=0.215,
-                own_lens=11.6,
+                own_lens=4.0,
             ),
         ),
         odds=OddsModel(

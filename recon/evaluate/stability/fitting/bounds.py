@@ -19,6 +19,8 @@ Array = npt.NDArray[np.float64]
 QUANTILE = 0.978
 RIDGE = 1e-3  # penalty of squared powers, for each camera: where two sources say the same, both count alike
 MIN_OWN_LENSES = 50  # cameras of sets with own lenses, from which on they have a factor of their own
+# Largest such factor: with more, all of these sets would be called rough for the few in which one more lens went unseen
+MAX_OWN_LENS = 4.0
 NEGLIGIBLE = 1e-6  # a smaller power is 0
 # Errors are not told from these: true cameras are no better known. Degrees, of the distance, of log focal.
 FLOORS = {"rotation": 0.1, "centre": 2e-4, "focal": 2e-3}
@@ -108,7 +110,8 @@ def _fitted(lines: Sequence[_Line], floor: float, profile: bool = False, link: b
         )
         errors = np.log(np.hypot([line.error for line in mixed], floor / 3.0))
         beyond = errors - np.column_stack([np.ones(len(mixed)), columns]) @ powers
-        found["own_lens"] = max(1.0, np.exp(_quantile(beyond, np.ones(len(mixed)), QUANTILE) - of_common))
+        wider = np.exp(_quantile(beyond, np.ones(len(mixed)), QUANTILE) - of_common)
+        found["own_lens"] = float(np.clip(wider, 1.0, MAX_OWN_LENS))
     return BoundModel(**{name: float(f"{number:.3g}") for name, number in found.items()})
 
 
