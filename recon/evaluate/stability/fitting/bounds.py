@@ -16,7 +16,7 @@ from splatnode.recon.verification.errors import Errors
 Array = npt.NDArray[np.float64]
 
 # Of the errors that are fitted: more than the 95 % that are claimed, so that bounds hold scene by scene, on others, too
-QUANTILE = 0.978
+QUANTILE = 0.96
 RIDGE = 1e-3  # penalty of squared powers, for each camera: where two sources say the same, both count alike
 MIN_OWN_LENSES = 50  # cameras of sets with own lenses, from which on they have a factor of their own
 # Largest such factor: with more, all of these sets would be called rough for the few in which one more lens went unseen
