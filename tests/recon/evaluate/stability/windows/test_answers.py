@@ -45,7 +45,7 @@ def window(place: Place, start: int, stride: int, count: int = 3) -> Window:
 
 def answered(place: Place, each: Window, known: dict[Key, bytes], config: Config, **asked) -> Answer:
     """What splatnode answers; what it finds is known from then on."""
-    answer, found = ours.answered(place, each, config, asked.get("fresh", False), False, known)
+    answer, found = ours.answered(place, each, config, asked.get("fresh", False), "nothing", known)
     known |= found
     return answer
 

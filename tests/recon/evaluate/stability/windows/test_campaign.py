@@ -100,7 +100,7 @@ def note(place: Place, window: Window) -> list[str]:
     return path.read_text().splitlines()
 
 
-def first_broken(place, window, config, fresh, given_lens, known):
+def first_broken(place, window, config, fresh, told, known):
     if len(note(place, window)) == 1:
         raise ValueError("worse luck")
     return Answer(NOTHING, seconds=1.0, fresh_seconds=1.0 if fresh else None), {}
@@ -142,19 +142,19 @@ def test_windows_with_a_given_lens_and_without_are_not_mixed(tmp_path, monkeypat
         yield from on.answers(take, limits, folder)
 
     rows = run_windows(plan, places, tmp_path, "command", replace(on, answers=noted))
-    assert json.loads(as_it_works[0])["given_lens"] is False, "the file says of what the journal is"
+    assert json.loads(as_it_works[0])["told"] == "nothing", "the file says of what the journal is"
     before = (tmp_path / "windows.json").read_bytes()
-    with pytest.raises(ValueError, match=r"windows\.json holds windows without --given-lens"):
-        run_windows(replace(plan, given_lens=True), places, tmp_path, "command", on)
+    with pytest.raises(ValueError, match=r"windows\.json holds windows with --told nothing"):
+        run_windows(replace(plan, told="given"), places, tmp_path, "command", on)
     assert (tmp_path / "windows.json").read_bytes() == before
     (tmp_path / "windows.json").write_bytes(as_it_works[0])  # as a killed process leaves it: all is in the journal
     (tmp_path / "windows.jsonl").write_text(f"{json.dumps(json.loads(before)['rows'][1])}\n")
-    with pytest.raises(ValueError, match="without --given-lens"):
-        run_windows(replace(plan, given_lens=True), places, tmp_path, "command", on)
+    with pytest.raises(ValueError, match="with --told nothing"):
+        run_windows(replace(plan, told="given"), places, tmp_path, "command", on)
     assert run_windows(plan, places, tmp_path, "command", on)[1] == rows[1]
 
 
-def befallen(place, window, config, fresh, given_lens, known):
+def befallen(place, window, config, fresh, told, known):
     """What befalls a window is told by its stride: 1 raises, 2 ends its process, 3 hangs."""
     if window.stride == 1:
         raise FloatingPointError("worse luck")
@@ -188,7 +188,7 @@ with engine(1, None) as on:
 """
 
 
-def slow(place, window, config, fresh, given_lens, known):
+def slow(place, window, config, fresh, told, known):
     if len(note(place, window)) == 3:
         time.sleep(600)
     return Answer(NOTHING), {}
