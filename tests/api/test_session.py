@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -221,3 +222,21 @@ def test_motions_and_gravity_that_are_none_are_said(arrays):
 def test_a_limit_on_the_seconds_is_refused():
     with pytest.raises(ValueError, match="a session has no budget_s"):
         splatnode.Session(config={"budget_s": 30})
+
+
+def test_an_image_that_zooms_in_the_middle_of_a_session_gets_a_lens_of_its_own(arrays):
+    """Provisionally when it comes, and in the end."""
+    height, width = arrays[0].shape[:2]
+    across, down = round(width / 1.3), round(height / 1.3)
+    left, top = (width - across) // 2, (height - down) // 2
+    zoomed = cv2.resize(
+        arrays[3][top : top + down, left : left + across], (width, height), interpolation=cv2.INTER_CUBIC
+    )
+    with splatnode.Session(config=QUICK, seed=0, every_frame=True) as session:
+        images = [*arrays[:3], zoomed]
+        results = [session.add(image).result for image in images]
+        finished = session.finish()
+    for result in (results[-1], finished):
+        assert len(result.cameras) == 4
+        *others, own = (float(camera.K[0, 0]) for camera in result.cameras)
+        assert own == pytest.approx(1.3 * np.median(others), rel=0.05)
