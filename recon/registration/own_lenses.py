@@ -41,11 +41,11 @@ class Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shift_sigma: float = 0.0015  # of the principal point, as a share of the longer side
     radial_sigma: float = 0.01  # of the first radial coefficient
     aspect_sigma: float = 0.003  # of the log aspect that all images of a group have in common
-    # The same where the search for deviations begins
-    widest_focal: float = 0.3
-    widest_shift: float = 0.1
-    widest_radial: float = 0.1
-    widest_aspect: float = 0.3
+    # The same where the search for deviations begins, in which all of them are free
+    widest_focal: float = 0.3  # of log focal
+    widest_shift: float = 0.1  # of the principal point, as a share of the longer side
+    widest_radial: float = 0.1  # of the first radial coefficient
+    widest_aspect: float = 0.3  # of the log aspect that all images of a group have in common
     # A deviation of at least so many standard errors stays
     refuted_at: float = 4.25
     # Of what all images have in common where it is given: calibrations differ by as much

@@ -11,6 +11,8 @@ from splatnode.recon.geometry import spread
 from splatnode.recon.registration.register import Registration
 from splatnode.recon.verification import focal_profile, jackknife, principal_point, refit
 
+# Aligned patches make sigmas smaller, but not the part that is of lenses, which may differ from image to image
+LEAST_SHARPER = 0.5
 MIN_SIGMA = 1e-9  # a smaller one counts as this where ratios are taken
 
 
@@ -105,7 +107,8 @@ def continued_focals(registration: Registration, known: Mapping[int, Errors]) ->
 
 
 def _continued(sigmas: Mapping[int, float], known: Mapping[int, Errors]) -> dict[int, Errors]:
-    sharper = min(1.0, float(np.median([of.sigma / max(sigmas[index], MIN_SIGMA) for index, of in known.items()])))
+    ratios = [of.sigma / max(sigmas[index], MIN_SIGMA) for index, of in known.items()]
+    sharper = float(np.clip(np.median(ratios), LEAST_SHARPER, 1.0))
     largest = Errors(*(max(getattr(of, part) for of in known.values()) for part in ("sigma", "regions", "profile")))
     found = {}
     for index, sigma in sigmas.items():

@@ -65,4 +65,5 @@ def test_of_a_real_room_at_most_the_views_that_overlap_are_placed(shared):
     """Views 0, 5, 6 and 7 show the bed; views 1 to 4 show other walls and overlap with nothing, or hardly."""
     _, _, verdict = real(shared, "hard_room_lowoverlap")
     missing = {f"no_overlap_{index}.jpg" for index in (2, 3, 4, 5)}
-    assert not verdict.publishable or (verdict.code == Code.OK_PARTIAL and missing <= set(verdict.frames))
+    in_part = verdict.code in (Code.OK_PARTIAL, Code.OK_ROUGH)
+    assert not verdict.publishable or (in_part and missing <= set(verdict.frames))

@@ -17,5 +17,6 @@ def test_names_and_ports_stay():
         "recon.control": 6,
         "capture.control": 7,
         "recon.map": 8,
+        "recon.depth": 10,
     }
     assert services.RECON_SCENE.requests == Service("recon.scene.requests", services.Pattern.STATE, 4)
