@@ -47,11 +47,11 @@ OTHERS = (
 
 def plan(place_windows: partial[list[Window]]) -> Iterator[tuple[Window, ours.Told]]:
     """The windows of a place and what is told, in an order in which they share most of what was found."""
-    asked: list[tuple[Window, ours.Told]] = []
-    for window in place_windows(2, counts=(2, 3, 6, 12)):
-        asked.append((window, "nothing"))
-    for window in [*place_windows(2, counts=(3,)), *place_windows(1, counts=(6, 12))]:
-        asked += [(window, "exif"), (window, "given")]
+    tellings: tuple[ours.Told, ...] = ("nothing", "exif", "given")
+    nothing, *something = tellings
+    asked = [(window, nothing) for window in place_windows(2, counts=(2, 3, 6, 12))]
+    some = [*place_windows(2, counts=(3,)), *place_windows(1, counts=(6, 12))]
+    asked += [(window, told) for window in some for told in something]
     yield from sorted(asked, key=lambda each: (each[0].count, each[0].stride, each[0].start, each[1]))
 
 
