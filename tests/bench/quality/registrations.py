@@ -47,8 +47,8 @@ OTHERS = (
 
 def plan(place_windows: partial[list[Window]]) -> Iterator[tuple[Window, ours.Told]]:
     """The windows of a place and what is told, in an order in which they share most of what was found."""
-    tellings: tuple[ours.Told, ...] = ("nothing", "exif", "given")
-    nothing, *something = tellings
+    nothing: ours.Told = "nothing"
+    something: tuple[ours.Told, ...] = ("exif", "given")
     asked = [(window, nothing) for window in place_windows(2, counts=(2, 3, 6, 12))]
     some = [*place_windows(2, counts=(3,)), *place_windows(1, counts=(6, 12))]
     asked += [(window, told) for window in some for told in something]
