@@ -47,12 +47,12 @@ OTHERS = (
 
 def plan(place_windows: partial[list[Window]]) -> Iterator[tuple[Window, ours.Told]]:
     """The windows of a place and what is told, in an order in which they share most of what was found."""
-    nothing: ours.Told = "nothing"
     something: tuple[ours.Told, ...] = ("exif", "given")
-    asked = [(window, nothing) for window in place_windows(2, counts=(2, 3, 6, 12))]
-    some = [*place_windows(2, counts=(3,)), *place_windows(1, counts=(6, 12))]
-    asked += [(window, told) for window in some for told in something]
-    yield from sorted(asked, key=lambda each: (each[0].count, each[0].stride, each[0].start, each[1]))
+    asked: list[tuple[Window, ours.Told]] = [(window, "nothing") for window in place_windows(2, counts=(2, 3, 6, 12))]
+    for window in [*place_windows(2, counts=(3,)), *place_windows(1, counts=(6, 12))]:
+        asked.extend((window, told) for told in something)
+    asked.sort(key=lambda each: (each[0].count, each[0].stride, each[0].start, each[1]))
+    yield from asked
 
 
 def of_scene(scene: Path, out: Path) -> list[dict[str, Any]]:
