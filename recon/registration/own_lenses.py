@@ -134,11 +134,11 @@ def split(
 ) -> tuple[MappingProblem, PartialMap]:
     """Both, with lenses of their own for the refuted views, and everything where the freed map has it."""
     (views,) = np.nonzero(freed.refuted)
-    groups, before, found = partial.estimate.lens_of_camera, partial.estimate, freed.estimate
+    groups, found = partial.estimate.lens_of_camera, freed.estimate
     lens_of = groups.copy()
     lens_of[views] = len(problem.lenses) + np.arange(len(views))
     # What a group has in common is taken where it may change.
-    common = _parameters(before)
+    common = _parameters(partial.estimate)
     sigmas = partial.prior.own_sigmas
     for view in partial.registered:
         group = groups[view]
@@ -149,7 +149,7 @@ def split(
             if freed.prior.common is not None:
                 sigmas[group, 3:] = np.maximum(sigmas[group, 3:], freed.prior.common.sigmas[view, 3:])
     of_views = _parameters(found)[views]
-    own = np.maximum(freed.prior.own_sigmas[views], np.abs(of_views - [[1, 0, 0, 0, 0, 0]] * of_views))
+    own = np.maximum(freed.prior.own_sigmas[views], np.abs(of_views))
     own[:, _FOCAL] = _OWN_SIGMA
     sides = np.array([problem.views[view].longer_side for view in views], np.float64)
     floors = _sigmas(config.focal_sigma, config.shift_sigma, config.radial_sigma, sides, config.aspect_sigma)
@@ -162,8 +162,8 @@ def split(
         shifts=values[:, _SHIFT],
         log_aspects=values[:, _ASPECT],
     )
-    before = partial.prior.ties
-    to, tied = (np.full(len(common), -1), np.zeros_like(common)) if before is None else (before.to, before.sigmas)
+    known = partial.prior.ties
+    to, tied = (np.full(len(common), -1), np.zeros_like(common)) if known is None else (known.to, known.sigmas)
     ties = bundle.Ties(
         to=np.concatenate([to, groups[views]]),
         sigmas=np.concatenate([tied, np.where(freed.stays[views], _WIDER * freed.widths[views], floors)]),
