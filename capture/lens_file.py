@@ -1,4 +1,4 @@
-"""A lens in a file: YAML as a camera's configuration has it, COLMAP's cameras.txt, or a camchain of Kalibr.
+"""Lenses in a file: YAML as a camera's configuration has it, a model of COLMAP, or a camchain of Kalibr.
 
 Sources of the formats: COLMAP's page on its output (text), Kalibr's wiki on its YAML formats.
 """
@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import msgspec
 
+from splatnode.capture.colmap_images import binary_images, text_images
 from splatnode.capture.frame import Intrinsics
+from splatnode.capture.given_lens import ALL, Lenses
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.config_text import MAX_BYTES, ConfigError, parse_yaml
 from splatnode.capture.process.foreign import foreign
@@ -41,7 +43,26 @@ class UnusableLens(ValueError):
 
 
 def read_lens(path: Path) -> Intrinsics:
-    """The lens that a file gives; `source` is "calibration" unless the file says otherwise. Raises UnusableLens."""
+    """Returns the one lens that a file gives. Raises UnusableLens, also where it gives several."""
+    lenses = read_lenses(path).by_key
+    if len(lenses) > 1:
+        raise UnusableLens(
+            f"{printable(str(path))} must be of one camera here, it has {', '.join(map(printable, list(lenses)[:5]))}; "
+            "leave the one that took the photographs"
+        )
+    return next(iter(lenses.values()))
+
+
+def read_lenses(path: Path) -> Lenses:
+    """Returns the lenses that a file gives, by the images or cameras that they are of; one lens alone is of all.
+
+    `path` is YAML with a lens, or with `cameras`: a mapping of images, cameras or patterns to lenses; cameras.txt of
+    COLMAP, or the folder of a model, whose images.txt or images.bin says which camera took which image; or a camchain
+    of Kalibr, whose cameras are called cam0, cam1 and so on. `source` of each is "calibration" unless the file says
+    otherwise. Raises UnusableLens.
+    """
+    if path.is_dir():
+        path = path / "cameras.txt"
     shown = printable(str(path))
     try:
         text = read_bounded(path, MAX_BYTES, UnusableLens, shown).decode("utf-8-sig")
@@ -50,13 +71,13 @@ def read_lens(path: Path) -> Intrinsics:
     except UnicodeDecodeError as error:
         raise UnusableLens(f"{shown} is no text; it must give {_READ}") from error
     with foreign(UnusableLens, shown):
-        return _in_text(shown, text)
+        return _parse(path, shown, text)
 
 
-def _in_text(shown: str, text: str) -> Intrinsics:
+def _parse(path: Path, shown: str, text: str) -> Lenses:
     lines = [line.split() for line in text.splitlines() if line.strip() and not line.startswith("#")]
     if lines and all(len(words) > 4 and words[0].isdigit() and words[1].isupper() for words in lines):
-        return _of_colmap(shown, lines)
+        return _parse_colmap(path, shown, lines)
     if text.startswith("%YAML:"):
         raise UnusableLens(
             f"{shown} is a file of OpenCV's own format, which is not read; it must give {_READ}. Of OpenCV's camera "
@@ -69,10 +90,23 @@ def _in_text(shown: str, text: str) -> Intrinsics:
     if not isinstance(content, dict):
         raise UnusableLens(f"{shown} must give {_READ}; it holds no keys and values")
     cameras = {name: each for name, each in content.items() if isinstance(each, dict) and "camera_model" in each}
-    return _of_kalibr(shown, cameras) if cameras else _of_ours(shown, content)
+    if cameras:
+        return _name_lenses({str(name): _parse_kalibr(shown, name, each) for name, each in cameras.items()})
+    several = content.get("cameras")
+    if isinstance(several, dict) and several and all(isinstance(each, dict) for each in several.values()):
+        return Lenses({str(name): _parse_own(f"{shown}: {printable(name)}", each) for name, each in several.items()})
+    return Lenses({ALL: _parse_own(shown, content)})
 
 
-def _of_ours(shown: str, content: Mapping[str, Any]) -> Intrinsics:
+def _name_lenses(lenses: Mapping[str, Intrinsics]) -> Lenses:
+    """The lenses by their keys; a single one is of all images."""
+    return Lenses(lenses if len(lenses) > 1 else {ALL: next(iter(lenses.values()))})
+
+
+def _parse_own(shown: str, content: Mapping[str, Any]) -> Intrinsics:
+    """A lens, also below `intrinsics` or `camera`, as the configuration of a capture has it."""
+    nested = content.get("camera")
+    content = nested if isinstance(nested, dict) and "intrinsics" in nested else content
     told = content.get("intrinsics", content)
     told = {"source": "calibration", **told} if isinstance(told, dict) else told
     known = {field.name for field in dataclasses.fields(Intrinsics)}
@@ -87,14 +121,34 @@ def _of_ours(shown: str, content: Mapping[str, Any]) -> Intrinsics:
     return lens
 
 
-def _of_colmap(shown: str, lines: Sequence[Sequence[str]]) -> Intrinsics:
-    lenses = {tuple(words[1:]) for words in lines}
-    if len(lenses) > 1:
-        raise UnusableLens(
-            f"{shown} must be of one camera, it has {len(lenses)} that differ; leave the line of the one that took "
-            "the photographs"
-        )
-    ((model, width, height, *numbers),) = lenses
+def _parse_colmap(path: Path, shown: str, lines: Sequence[Sequence[str]]) -> Lenses:
+    """Lenses by camera id; by the images' names where cameras differ, as the model's images say."""
+    if len({tuple(words[1:]) for words in lines}) == 1:
+        return Lenses({ALL: _parse_colmap_lens(shown, lines[0])})
+    lenses = {int(words[0]): _parse_colmap_lens(shown, words) for words in lines}
+    for name, parse in (("images.txt", lambda data: text_images(data.decode())), ("images.bin", binary_images)):
+        beside = path.parent / name
+        if beside.is_file():
+            data = read_bounded(beside, MAX_BYTES, UnusableLens, printable(str(beside)))
+            with foreign(UnusableLens, printable(str(beside))):
+                taken = {row.name: row.camera_id for row in parse(data)}
+            if lost := sorted(set(taken.values()) - set(lenses)):
+                raise UnusableLens(f"{shown} must have all cameras of {name}, it lacks {lost[:5]}")
+            return Lenses(_shorten_names({name: lenses[camera] for name, camera in taken.items()}))
+    raise UnusableLens(
+        f"{shown} has {len(lenses)} cameras that differ, and no images.txt or images.bin beside it says which of them "
+        "took which photograph; put one there, or leave the line of the one that took the photographs"
+    )
+
+
+def _shorten_names(lenses: Mapping[str, Intrinsics]) -> dict[str, Intrinsics]:
+    """The lenses by the names of images without their folders, where these are all different."""
+    short = {PurePosixPath(name).name: lens for name, lens in lenses.items()}
+    return short if len(short) == len(lenses) else dict(lenses)
+
+
+def _parse_colmap_lens(shown: str, words: Sequence[str]) -> Intrinsics:
+    _, model, width, height, *numbers = words
     if model not in _COLMAP:
         raise UnusableLens(f"{shown}: the lens must be one of {', '.join(_COLMAP)}, got {printable(model, 40)}")
     kind, names = _COLMAP[model][0], _COLMAP[model][1].split()
@@ -112,13 +166,7 @@ def _of_colmap(shown: str, lines: Sequence[Sequence[str]]) -> Intrinsics:
     return _lens(shown, *size, fx, fy, given["cx"], given["cy"], "calibration", terms, kind)
 
 
-def _of_kalibr(shown: str, cameras: Mapping[str, Mapping[str, Any]]) -> Intrinsics:
-    if len(cameras) > 1:
-        raise UnusableLens(
-            f"{shown} must be of one camera, it has {', '.join(map(printable, cameras))}; leave the one that took the "
-            "photographs"
-        )
-    ((name, given),) = cameras.items()
+def _parse_kalibr(shown: str, name: object, given: Mapping[str, Any]) -> Intrinsics:
     projection, bending = given["camera_model"], given.get("distortion_model", "none")
     if projection != "pinhole" or str(bending) not in _KALIBR:
         raise UnusableLens(

@@ -16,8 +16,8 @@ from torch import Tensor
 
 from splatnode.capture.cameras import folder, synthetic
 from splatnode.capture.choosing import THINNED
-from splatnode.capture.frame import Intrinsics
-from splatnode.capture.lens_file import read_lens
+from splatnode.capture.given_lens import Lenses
+from splatnode.capture.lens_file import read_lenses
 from splatnode.capture.poses_file import poses_of, read_poses
 from splatnode.capture.process.config import read_yaml
 from splatnode.capture.process.progress import Step, Tell, telling
@@ -66,7 +66,7 @@ def replay(args: argparse.Namespace) -> int:
     """Reconstructs a folder of photographs, some photographs of one, a recording, or a video."""
     config = _config(args)
     path, listed = asked_for(args.source)
-    request = Request(path, listed, args.views, args.frames or (), args.every_frame, args.masks, _lens(args))
+    request = Request(path, listed, args.views, args.frames or (), args.every_frame, args.masks, _lenses(args))
     _check_apart(args.out, path)
     if not args.map and is_whole(args.out):
         raise ValueError(f"{args.out} holds the scenes of a map or of a node ({FILE}); give another --out")
@@ -229,9 +229,9 @@ def _known_of_metres(args: argparse.Namespace, given: Source) -> Evidence:
     return Evidence(poses=poses, pairs=pairs)
 
 
-def _lens(args: argparse.Namespace) -> Intrinsics | None:
-    """The lens that is given for all photographs."""
-    return None if args.intrinsics is None else read_lens(args.intrinsics)
+def _lenses(args: argparse.Namespace) -> Lenses | None:
+    """The lenses that are given for photographs."""
+    return None if args.intrinsics is None else read_lenses(args.intrinsics)
 
 
 def _config(args: argparse.Namespace) -> Config:

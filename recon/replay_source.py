@@ -9,7 +9,6 @@ import hashlib
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -18,8 +17,8 @@ import numpy as np
 from splatnode.capture import film
 from splatnode.capture.cameras import folder
 from splatnode.capture.choosing import THINNED, Choice, choose
-from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.given_lens import check_fits, seen_through
+from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.given_lens import Lenses, describe_image
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.lerobot import data_set
 from splatnode.capture.masks import Find, all_masked, in_files
@@ -47,7 +46,7 @@ class Request:
     frames: tuple[str, ...] = ()  # those of the folder with these names
     every_frame: bool = False  # all that are sharp and no copies
     masks: Path | None = None  # a folder of masks, or one for all; None: photographs are used whole
-    lens: Intrinsics | None = None  # of all photographs of its aspect ratio, in place of what their EXIF tells
+    lenses: Lenses | None = None  # in place of what EXIF tells
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +81,7 @@ class Recording:
     listed: tuple[str, ...]  # the photographs of the folder that were named; none: all
     choice: Choice
     masks: Path | None = None
-    lens: Intrinsics | None = None
+    lenses: Lenses | None = None
 
     @property
     def is_film(self) -> bool:
@@ -97,8 +96,8 @@ class Recording:
         known = [str(self.path.resolve()), written_ns, self.choice.names, config]
         if self.masks is not None:
             known.append(str(self.masks.resolve()))
-        if self.lens is not None:
-            known.append(self.lens)
+        if self.lenses is not None:
+            known.append(self.lenses)
         return hashlib.sha256(msgspec.json.encode(known)).hexdigest()[:32]
 
     def frames(self) -> Iterator[Frame | DroppedFrame]:
@@ -106,8 +105,8 @@ class Recording:
         names = set(self.choice.names)
         streamed = _stream(self.path, self.listed)
         chosen = (each for each in streamed if isinstance(each, DroppedFrame) or each.name in names)
-        if self.lens is not None:
-            chosen = map(partial(seen_through, known=self.lens), chosen)
+        if self.lenses is not None:
+            chosen = map(self.lenses.apply, chosen)
         return chosen if self.masks is None else all_masked(chosen, in_files(self.masks))
 
 
@@ -145,12 +144,12 @@ def at_hand(
 def recording(request: Request, tell: Tell = told_to_nobody) -> Recording:
     """As `source`, without a limit to the number of keyframes."""
     _check_there(request.source)
-    sizes: set[tuple[int, int]] = set()
-    looked_through = _noted(_looked_through(request, tell), sizes)
+    images: set[tuple[str, str, int, int]] = set()
+    looked_through = _noted(_looked_through(request, tell), images)
     choice = choose(looked_through, _selection(request), Limits(), None, _what(request))
-    if request.lens is not None:
-        check_fits(request.lens, sizes)
-    return Recording(request.source, request.listed, choice, request.masks, request.lens)
+    if request.lenses is not None:
+        request.lenses.check(images)
+    return Recording(request.source, request.listed, choice, request.masks, request.lenses)
 
 
 def source(request: Request, tell: Tell = told_to_nobody) -> Source:
@@ -160,10 +159,15 @@ def source(request: Request, tell: Tell = told_to_nobody) -> Source:
     """
     _check_there(request.source)
     found = _unmasked(request, tell)
-    if request.lens is not None:
-        check_fits(request.lens, found.sizes)
-        found = replace(found, frames=tuple(seen_through(each, request.lens) for each in found.frames))
+    if request.lenses is not None:
+        found = with_lenses(found, request.lenses)
     return found if request.masks is None else with_masks(found, in_files(request.masks), tell)
+
+
+def with_lenses(given: Source, lenses: Lenses) -> Source:
+    """Returns the frames, each with its lens. Raises ValueError where a lens is of none of them."""
+    lenses.check(describe_image(each) for each in given.frames if isinstance(each, Frame))
+    return replace(given, frames=tuple(map(lenses.apply, given.frames)))
 
 
 def with_masks(given: Source, find: Find, tell: Tell = told_to_nobody) -> Source:
@@ -222,11 +226,13 @@ def _looked_through(request: Request, tell: Tell) -> Iterator[Frame | DroppedFra
     return counted(_stream(request.source, request.listed), tell, doing, of, _what(request))
 
 
-def _noted(frames: Iterator[Frame | DroppedFrame], sizes: set[tuple[int, int]]) -> Iterator[Frame | DroppedFrame]:
-    """The frames, whose sizes are added to `sizes` as they pass."""
+def _noted(
+    frames: Iterator[Frame | DroppedFrame], images: set[tuple[str, str, int, int]]
+) -> Iterator[Frame | DroppedFrame]:
+    """The frames, whose names, cameras and sizes are added to `images` as they pass."""
     for each in frames:
         if isinstance(each, Frame):
-            sizes.add((each.width, each.height))
+            images.add(describe_image(each))
         yield each
 
 

@@ -36,8 +36,8 @@ def _arguments(parser: argparse.ArgumentParser) -> None:
         "--calibration",
         type=Path,
         metavar="FILE",
-        help="the lens of all photographs: YAML as a camera's configuration has it, COLMAP's cameras.txt, or Kalibr's "
-        "camchain",
+        help="the lens of all photographs, or one of each image or camera: YAML as a camera's configuration has it, a "
+        "model of COLMAP (its folder, or cameras.txt), or Kalibr's camchain",
     )
     parser.add_argument("--view", action="store_true", help="watch it in a window (the run does not wait for it)")
     chosen = parser.add_mutually_exclusive_group()

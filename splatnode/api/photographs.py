@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike, fspath
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -15,13 +14,13 @@ from splatnode.capture.cameras.folder import SUFFIXES, frame_name, in_words_of_r
 from splatnode.capture.exif import exif_exposure, exif_intrinsics, read_tags
 from splatnode.capture.exif_time import exif_time
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
-from splatnode.capture.given_lens import check_fits, seen_through
+from splatnode.capture.given_lens import ALL, Lenses, find_key
 from splatnode.capture.masks import masked
 from splatnode.capture.orientation import ORIENTATION, upright
 from splatnode.capture.process.progress import Tell
 from splatnode.capture.stamp import Stamp
 from splatnode.capture.value_range import Extent, ValueRange, find_range, measure_extent, to_eight_bits
-from splatnode.recon.replay_source import Request, Source, asked_for, at_hand, source
+from splatnode.recon.replay_source import Request, Source, asked_for, at_hand, source, with_lenses
 
 STEP_NS = 100_000_000  # between two photographs that have no time, as in a folder
 _EXIF = b"Exif\0\0"  # before the TIFF structure
@@ -30,6 +29,7 @@ _EXIF = b"Exif\0\0"  # before the TIFF structure
 Picture: TypeAlias = Any
 Images: TypeAlias = "str | PathLike[str] | Picture | Sequence[str | PathLike[str]] | Sequence[Picture]"
 Lens: TypeAlias = "Intrinsics | npt.NDArray[np.floating]"
+LensChoice: TypeAlias = "Lens | Sequence[Lens | None] | Mapping[str, Lens]"
 
 
 def photographs(images: Images, views: int | None, every_frame: bool, tell: Tell) -> Source:
@@ -114,19 +114,38 @@ def pixels(picture: Picture, used: ValueRange | None = None) -> npt.NDArray[np.u
     return np.array(colours, np.uint8, order="C")
 
 
-def with_lens(given: Source, lens: Lens | None) -> Source:
-    """The frames with this lens, where their aspect ratio is its images', in place of what their EXIF tells.
+def with_lens(given: Source, lens: LensChoice | None, images: Images) -> Source:
+    """Returns the frames with their lenses in place of what their EXIF tells.
 
-    A matrix (3, 3) is a pinhole's, for photographs of the first one's size. Raises TypeError, ValueError.
+    One lens is of all frames of its aspect ratio; a mapping is of images, cameras or patterns, as `Lenses` has it; a
+    list has one of each listed image, or None. A matrix (3, 3) is a pinhole's, for photographs of the size of the first
+    that it is of. Raises TypeError, ValueError.
     """
-    if lens is None:
-        return given
     frames = [each for each in given.frames if isinstance(each, Frame)]
-    if not frames:
+    if lens is None or not frames:
         return given
-    known = intrinsics_of(lens, frames[0].width, frames[0].height)
-    check_fits(known, given.sizes)
-    return replace(given, frames=tuple(seen_through(each, known) for each in given.frames))
+    known = _key_lenses(lens, images)
+    by_key: dict[str, Intrinsics] = {}
+    for key, each in known.items():
+        of_lens = (frame for frame in frames if find_key(known, frame.name, frame.camera) == key)
+        first = next(of_lens, frames[0])
+        by_key[key] = intrinsics_of(each, first.width, first.height)
+    return with_lenses(given, Lenses(by_key))
+
+
+def _key_lenses(lens: Any, images: Images) -> Mapping[str, Lens]:
+    """Returns lenses as they may be given by their keys."""
+    if isinstance(lens, Mapping):
+        if not lens or not all(isinstance(key, str) for key in lens):
+            raise TypeError("intrinsics by name must have names of photographs, cameras or patterns as its keys")
+        return lens
+    listed = isinstance(lens, (list, tuple)) or (isinstance(lens, np.ndarray) and lens.ndim != 2)
+    if not listed or np.shape(lens) == (3, 3):
+        return {ALL: cast(Lens, lens)}
+    names = names_of(images)
+    if len(lens) != len(names):
+        raise ValueError(f"intrinsics must be one lens, or as many as there are images, {len(names)}; got {len(lens)}")
+    return {name: each for name, each in zip(names, lens, strict=True) if each is not None}
 
 
 def intrinsics_of(lens: Lens, width: int, height: int) -> Intrinsics:

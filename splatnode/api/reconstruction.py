@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.api.masks import Masks, finder
-from splatnode.api.photographs import Images, Lens, lenses, photographs, with_lens
+from splatnode.api.photographs import Images, LensChoice, lenses, photographs, with_lens
 from splatnode.api.poses import Poses, poses_given, sigmas_of
 from splatnode.api.result import Result, result_of
 from splatnode.api.scale import Scale, metric_changes, pairs_given
@@ -26,7 +26,7 @@ Changes = Mapping[str, Any] | str | PathLike[str]
 def reconstruct(
     images: Images,
     *,
-    intrinsics: Lens | None = None,
+    intrinsics: LensChoice | None = None,
     poses: Poses | None = None,
     poses_sigma: tuple[float, float] | None = None,
     masks: Masks | None = None,
@@ -50,7 +50,9 @@ def reconstruct(
       uint8 RGB, or PIL images. Grey becomes RGB, where alpha is 0 there is no photograph. Of a film, and of more
       than 30 photographs, keyframes are chosen.
     - `intrinsics`: the lens of all photographs of its aspect ratio: `Intrinsics`, or K (3, 3) in pixels of the
-      photographs without distortion. None: what EXIF tells, else it is estimated.
+      photographs without distortion; or a list of these, one of each photograph (None: not known); or a mapping of
+      them by photograph, by camera with which names begin, or by pattern: `{"left": a, "right": b}`. None: what EXIF
+      tells, else it is estimated.
     - `poses`: T_world_camera (4, 4) in metres that others estimated: by the photographs' names, in the order of a list
       (None: not known), or a file as `--poses` reads it. They give metres and the world's axes; one that does not fit
       is left out and named. `poses_sigma`: standard deviations of a position, metres, and an orientation, degrees.
@@ -76,7 +78,7 @@ def reconstruct(
     check_count("threads", threads)
     source = photographs(images, views, every_frame, telling)
     source = source if masks is None else with_masks(source, finder(masks, images), telling)
-    source = with_lens(source, intrinsics)
+    source = with_lens(source, intrinsics, images)
     flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma)}
     chosen = configured(preset, config, flags, scale, of_pictures=source.photographs is None)
     check_baseline(chosen, source)

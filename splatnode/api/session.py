@@ -16,6 +16,7 @@ from splatnode.api.scale import Scale, is_stereo
 from splatnode.capture.frame import Frame
 from splatnode.capture.given_lens import check_fits, seen_through
 from splatnode.capture.motion import Motion
+from splatnode.capture.process.printable import LONGEST_NAME, printable
 from splatnode.capture.process.progress import Tell, told_to_nobody
 from splatnode.capture.quality import Limits
 from splatnode.capture.right_image import Baseline, RightImage, grey
@@ -92,6 +93,8 @@ class Session:
         *,
         name: str | None = None,
         captured_at: Stamp | None = None,
+        intrinsics: Lens | None = None,
+        camera: str | None = None,
         pose: npt.ArrayLike | None = None,
         pose_sigma: tuple[float, float] | None = None,
         motion: npt.ArrayLike | None = None,
@@ -103,14 +106,16 @@ class Session:
     ) -> Update:
         """Shows the session a photograph: a NumPy array (H, W, 3) uint8 RGB, or a PIL image.
 
-        `pose` is where odometry or a tracker says that its camera was, T_world_camera (4, 4) in metres, all in one
-        world, and `pose_sigma` how unsure that is, metres and degrees; default: what `config` says. Two poses or more
-        give the scene metres and their axes. `motion` is how wheels or an IMU say that the camera has moved since the
-        photograph that was given before, whether that was taken or not: T_previous_current (4, 4), metres;
-        `motion_sigma`, metres and degrees, is of this motion alone. One or more give metres. `gravity` (3,) is the
-        direction of down in the camera's frame, `gravity_sigma` in degrees; it gives `Result.map` its up. `right` is
-        what the right half of a stereo camera saw at that moment, rectified, of the image's size, and `baseline_m` how
-        far it stands from the left one, metres: such pairs give the scene metres, too.
+        `intrinsics` is this photograph's lens, in place of the session's, and `camera` the name of the camera that
+        took it: photographs of different cameras share no lens. `pose` is where odometry or a tracker says that its
+        camera was, T_world_camera (4, 4) in metres, all in one world, and `pose_sigma` how unsure that is, metres and
+        degrees; default: what `config` says. Two poses or more give the scene metres and their axes. `motion` is how
+        wheels or an IMU say that the camera has moved since the photograph that was given before, whether that was
+        taken or not: T_previous_current (4, 4), metres; `motion_sigma`, metres and degrees, is of this motion alone.
+        One or more give metres. `gravity` (3,) is the direction of down in the camera's frame, `gravity_sigma` in
+        degrees; it gives `Result.map` its up. `right` is what the right half of a stereo camera saw at that moment,
+        rectified, of the image's size, and `baseline_m` how far it stands from the left one, metres: such pairs give
+        the scene metres, too.
 
         Returns what became of the photograph once the scene has grown, which takes seconds where it is taken, and
         milliseconds where it is not. Raises TypeError and ValueError where it is no image, its pose, motion, gravity or
@@ -120,7 +125,7 @@ class Session:
         with self._lock, limits.at_most(self._threads):
             work = self._open()
             number = len(self._given)
-            frame = self._framed(image, number, name or f"{number:04d}.png", captured_at)
+            frame = self._framed(image, number, name or f"{number:04d}.png", captured_at, intrinsics, camera)
             if frame.name in self._given:
                 raise ValueError(f"name must be new for each photograph; {frame.name!r} was given before")
             given = pose_of(pose, pose_sigma, self._config.metric)
@@ -183,8 +188,15 @@ class Session:
         work.estimate_soon()
         return work.snapshot()
 
-    def _framed(self, image: Picture, number: int, name: str, captured_at: Stamp | None) -> Frame:
+    def _framed(
+        self, image: Picture, number: int, name: str, captured_at: Stamp | None, lens: Lens | None, camera: str | None
+    ) -> Frame:
         made = frame(image, number, name, time.monotonic_ns(), captured_at)
+        made = made if camera is None else replace(made, camera=printable(camera, LONGEST_NAME))
+        if lens is not None:
+            known = intrinsics_of(lens, made.width, made.height)
+            check_fits(known, [(made.width, made.height)])
+            return seen_through(made, known)
         if self._lens is None:
             return made
         sizes = [*self._sizes, (made.width, made.height)]

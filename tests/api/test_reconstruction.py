@@ -7,6 +7,7 @@ import pickle
 import signal
 from concurrent.futures import ThreadPoolExecutor
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -15,6 +16,7 @@ import splatnode
 from splatnode import command_line
 from splatnode.capture.image_file import encode_png
 from splatnode.recon import core
+from splatnode.recon.geometry import umeyama
 from tests.api.conftest import QUICK, SMALL
 from tests.support.synthetic import errors
 
@@ -116,6 +118,37 @@ def test_a_lens_that_was_given_is_used_and_told(result, arrays):
     assert result.cameras[0].lens is None
     wide = splatnode.Intrinsics(640, 480, 600, 600, 320, 240, "calibration", distortion=(-0.002, 0.0, 0.0, 0.0))
     assert splatnode.reconstruct(arrays, config=QUICK, intrinsics=wide).cameras[0].lens == wide.resized(320, 240)
+
+
+@pytest.mark.parametrize("by_name", [False, True], ids=["a list", "by name"])
+def test_photographs_of_two_cameras_get_their_lenses(result, arrays, by_name):
+    """Every second photograph is an enlargement, as of another camera: with both lenses told, cameras stay right."""
+    K = result.cameras[0].K
+    near = np.diag([1.25, 1.25, 1.0]) @ K
+    near[:2, 2] -= 0.125 * np.array([320, 240])
+    images = [cv2.resize(each[24:216, 32:288], (320, 240)) if i % 2 else each for i, each in enumerate(arrays)]
+    lenses = {f"{i:04d}.png": near if i % 2 else K for i in range(len(images))} if by_name else [
+        near if i % 2 else K for i in range(len(images))
+    ]  # fmt: skip
+    made = splatnode.reconstruct(images, config=QUICK, intrinsics=lenses)
+    assert made.verdict.publishable and len(made.cameras) == len(arrays)
+    assert [camera.lens.fx / K[0, 0] for camera in made.cameras] == pytest.approx([1.0, 1.25] * (len(arrays) // 2))
+    centres = np.stack([camera.centre for camera in made.cameras])
+    known = np.stack([camera.centre for camera in result.cameras])
+    assert np.linalg.norm(umeyama(centres, known)(centres) - known, axis=1).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    ("lenses", "kind", "said"),
+    [
+        ([np.eye(3)], ValueError, "one lens, or as many as there are images, 4; got 1"),
+        ({"left": np.eye(3)}, ValueError, "a lens of 'left', which is no photograph's"),
+        ({0: np.eye(3)}, TypeError, "names of photographs, cameras or patterns as its keys"),
+    ],
+)
+def test_lenses_that_are_of_no_photograph_are_refused(arrays, lenses, kind, said):
+    with pytest.raises(kind, match=said):
+        splatnode.reconstruct(arrays, config=QUICK, intrinsics=lenses)
 
 
 def test_what_is_left_out_is_named(arrays, tmp_path):

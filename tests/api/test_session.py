@@ -240,3 +240,17 @@ def test_an_image_that_zooms_in_the_middle_of_a_session_gets_a_lens_of_its_own(a
         assert len(result.cameras) == 4
         *others, own = (float(camera.K[0, 0]) for camera in result.cameras)
         assert own == pytest.approx(1.3 * np.median(others), rel=0.05)
+
+
+def test_a_photograph_may_have_its_own_lens_and_camera(arrays):
+    K, wide = (
+        np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]]),
+        splatnode.Intrinsics(320, 240, 200, 200, 160, 120, "given"),
+    )
+    with splatnode.Session(config=QUICK, intrinsics=K) as session:
+        session.add(arrays[0], name="a.png")
+        session.add(arrays[1], name="b.png", intrinsics=wide, camera="gripper")
+        with pytest.raises(ValueError, match="got those of 100 x 100 for 320 x 240"):
+            session.add(arrays[2], intrinsics=splatnode.Intrinsics(100, 100, 90, 90, 50, 50, "given"))
+        frames = [session._frames[name] for name in ("a.png", "b.png")]
+    assert [(each.intrinsics.fx, each.camera) for each in frames] == [(300, ""), (200, "gripper")]

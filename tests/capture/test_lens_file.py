@@ -3,7 +3,7 @@
 import pytest
 
 from splatnode.capture.frame import Intrinsics
-from splatnode.capture.lens_file import UnusableLens, read_lens
+from splatnode.capture.lens_file import UnusableLens, read_lens, read_lenses
 
 KALIBR = """cam0:
   cam_overlaps: []
@@ -64,6 +64,38 @@ def test_of_a_configuration(tmp_path):
     assert lens_in(tmp_path, "intrinsics: " + OWN + ", source: given}").source == "given"
 
 
+IMAGES = "# Image list\n1 1 0 0 0 0 0 0 1 left/a.jpg\n\n2 1 0 0 0 0 0 0 2 right/b.jpg\n1.0 2.0 -1\n"
+TWO = "1 PINHOLE 640 480 500 500 320 240\n2 OPENCV_FISHEYE 64 48 50 50 32 24 .1 0 0 0\n"
+
+
+def test_of_a_model_whose_images_say_which_camera_took_them(tmp_path):
+    (tmp_path / "cameras.txt").write_text(TWO)
+    (tmp_path / "images.txt").write_text(IMAGES)
+    for path in (tmp_path, tmp_path / "cameras.txt"):
+        assert {key: (lens.fx, lens.model) for key, lens in read_lenses(path).by_key.items()} == {
+            "a.jpg": (500, "opencv"),
+            "b.jpg": (50, "fisheye"),
+        }
+    (tmp_path / "images.txt").write_text(IMAGES.replace(" 2 right", " 3 right"))
+    with pytest.raises(UnusableLens, match=r"must have all cameras of images.txt, it lacks \[3\]"):
+        read_lenses(tmp_path)
+
+
+def test_of_several_cameras_by_name(tmp_path):
+    path = tmp_path / "lens.yaml"
+    one = KALIBR.format(projection="pinhole", bending="radtan")
+    path.write_text(one + one.replace("cam0:", "cam1:").replace("461.6", "300.5"))
+    lenses = read_lenses(path)
+    assert [lenses.by_key[lenses.find_key(name)].fx for name in ("cam0/1.png", "cam1_1.png")] == [461.6, 300.5]
+    assert lenses.find_key("cam10_1.png") is None and lenses.find_key("x.png", camera="cam1") == "cam1"
+    path.write_text("cameras: {'left*': " + OWN + "}, right: {intrinsics: " + OWN + "}}}")
+    assert list(read_lenses(path).by_key) == ["left*", "right"]
+    with pytest.raises(UnusableLens, match="of one camera here, it has left\\*, right"):
+        read_lens(path)
+    path.write_text("camera: {kind: v4l2, intrinsics: " + OWN + "}}")
+    assert read_lens(path).fy == 501
+
+
 BAD = {
     "no text": (b"\xff\xfe\x00", "is no text"),
     "nothing": (b"", "holds no keys"),
@@ -74,13 +106,19 @@ BAD = {
     "OpenCV's": (b"%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n", "OpenCV's own format"),
     "FOV": (b"1 FOV 640 480 500 500 320 240 0.9", "must be one of SIMPLE_PINHOLE.*got FOV"),
     "short": (b"1 OPENCV 640 480 500 500 320 240 0.9", r"OPENCV must have 8 numbers \(fx fy .*got 5"),
-    "two": (b"1 PINHOLE 640 480 500 500 320 240\n2 PINHOLE 64 48 50 50 32 24", "of one camera, it has 2"),
+    "two": (
+        b"1 PINHOLE 640 480 500 500 320 240\n2 PINHOLE 64 48 50 50 32 24",
+        "has 2 cameras that differ, and no images",
+    ),
     "words": (b"1 PINHOLE 640 480 a b c d", "must have a size in pixels and numbers"),
     "no size": (b"1 PINHOLE 640 0 500 500 320 240", "sizes and focal lengths above 0"),
     "omni": (KALIBR.format(projection="omni", bending="radtan").encode(), "camera_model pinhole .*got omni"),
     "fov": (KALIBR.format(projection="pinhole", bending="fov").encode(), "got pinhole and fov"),
     "half": (b"cam0: {camera_model: pinhole, distortion_model: radtan}", "must have resolution"),
-    "stereo": (b"cam0: {camera_model: pinhole}\ncam1: {camera_model: pinhole}", "one camera, it has cam0, cam1"),
+    "stereo, of nothing": (
+        b"cam0: {camera_model: pinhole}\ncam1: {camera_model: pinhole}",
+        "cam0 must have resolution",
+    ),
 }
 
 

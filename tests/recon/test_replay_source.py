@@ -12,6 +12,7 @@ import pytest
 
 from splatnode.capture.cameras import synthetic
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
+from splatnode.capture.given_lens import ALL, Lenses
 from splatnode.capture.image_file import decode_image, encode_png
 from splatnode.recon import replay_source
 from splatnode.recon.config import Config
@@ -212,12 +213,27 @@ def test_a_lens_is_of_all_photographs_or_refused(walk, tmp_path):
     folder = folder_of(walk[:3], tmp_path / "few")
     height, width = walk[0].shape[:2]
     lens = Intrinsics(2 * width, 2 * height, 900, 900, width, height, "calibration", (0.1,), "fisheye")
-    given = source(Request(folder, lens=lens)).frames
-    of_map = recording(Request(folder, lens=lens))
+    given = source(Request(folder, lenses=Lenses({ALL: lens}))).frames
+    of_map = recording(Request(folder, lenses=Lenses({ALL: lens})))
     for frames in (given, of_map.frames()):
         known = {frame.intrinsics for frame in frames if isinstance(frame, Frame)}
         assert known == {lens.resized(width, height)}
     assert of_map.identity(Config()) != recording(Request(folder)).identity(Config())
     for read in (source, recording):
         with pytest.raises(ValueError, match="photographs' aspect ratio, got those of 500 x 100"):
-            read(Request(folder, lens=replace(lens, width=500, height=100)))
+            read(Request(folder, lenses=Lenses({ALL: replace(lens, width=500, height=100)})))
+
+
+def test_each_camera_gets_its_lens(walk, tmp_path):
+    folder = folder_of(walk[:4], tmp_path / "few")
+    height, width = walk[0].shape[:2]
+    one = Intrinsics(width, height, 300, 300, width / 2, height / 2, "calibration")
+    other = replace(one, fx=400, fy=400)
+    first, *_, last = sorted(path.name for path in folder.iterdir())
+    given = Request(folder, lenses=Lenses({first: one, "*.png": other}))
+    for frames in (source(given).frames, recording(given).frames()):
+        known = {frame.name: (frame.intrinsics, frame.camera) for frame in frames if isinstance(frame, Frame)}
+        assert known[first] == (one, first) and (last not in known or known[last] == (other, "*.png"))
+    for read in (source, recording):
+        with pytest.raises(ValueError, match=r"a lens of 'left', which is no photograph's: they are called 000"):
+            read(Request(folder, lenses=Lenses({"left": one, "*": other})))
