@@ -28,7 +28,7 @@ def localised(
     if isinstance(image, (str, PathLike)) and not Path(image).is_file():
         raise FileNotFoundError(f"no photograph {str(image)!r}; give a file, or a picture")
     expected = _expected(near)
-    given = with_lens(photographs([image], None, False, told_to_nobody), lens).frames
+    given = with_lens(photographs([image], None, False, told_to_nobody), lens, [image]).frames
     (frame, *_) = given
     if not isinstance(frame, Frame):
         raise ValueError(f"image {frame.name} cannot be read: {frame.reason}")
