@@ -6,12 +6,12 @@ The call lies in a folder, `called` is the process, and the answer lies in the s
 from __future__ import annotations
 
 import pickle
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from splatnode.capture.process import python
 from splatnode.recon.jobs.child import Child, End
 
 CALL, ANSWER, ERROR, LOG = "call", "answer", "error.txt", "log"  # files of a call's folder
@@ -35,9 +35,9 @@ class Answer:
 
 
 def packed(work: Work) -> bytes:
-    """A call for any machine with this splatnode: where modules are found, the function's module, the function."""
+    """A call for any machine with this splatnode: where the function's module is found, its name, the function."""
     module = getattr(work, "func", work).__module__
-    return b"".join(map(pickle.dumps, (sys.path, module, work)))
+    return b"".join(map(pickle.dumps, (python.place_of(module), module, work)))
 
 
 def laid_down(call: bytes, folder: Path) -> Path:
@@ -49,7 +49,7 @@ def laid_down(call: bytes, folder: Path) -> Path:
 
 def begun(folder: Path, cores: Sequence[int]) -> Child:
     """A fresh process that makes the call of a folder on `cores`. Raises OSError."""
-    return Child.started([sys.executable, "-m", "splatnode.recon.jobs.called", str(folder)], folder / LOG, cores)
+    return Child.started(python.command("splatnode.recon.jobs.called", str(folder)), folder / LOG, cores)
 
 
 def answer_of(folder: Path, end: End) -> Answer:

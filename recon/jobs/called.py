@@ -1,4 +1,4 @@
-"""The process of a call: `python -m splatnode.recon.jobs.called FOLDER` makes the call that lies there and answers."""
+"""The process of a call: this module, with a folder, makes the call that lies there and answers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,9 @@ def answered(folder: Path) -> int:
 
 def module_of(call: IO[bytes]) -> str:
     """The name of the module of a call, which is found from here on; the function comes next in the file."""
-    sys.path += [place for place in pickle.load(call) if place not in sys.path]
+    place = pickle.load(call)
+    if place is not None and place not in sys.path:
+        sys.path.append(place)
     return pickle.load(call)
 
 

@@ -1,4 +1,4 @@
-"""A process that others are copies of: `python -m splatnode.recon.jobs.template` makes a copy for each call.
+"""A process that others are copies of: this module makes a copy of its process for each call.
 
 What a call imports is imported here once, so that a copy has it at once; with torch that saves seconds. Each line of
 standard input is a folder with a call and the cores for it, in JSON. Each line of standard output is the number of a
