@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from splatnode.capture.process import python
+from splatnode.capture.process.private import private_folder
 from splatnode.recon.jobs.child import Child, End
 
 CALL, ANSWER, ERROR, LOG = "call", "answer", "error.txt", "log"  # files of a call's folder
@@ -41,8 +42,8 @@ def packed(work: Work) -> bytes:
 
 
 def laid_down(call: bytes, folder: Path) -> Path:
-    """Makes the folder of a `packed` call. Raises OSError."""
-    folder.mkdir(parents=True)
+    """Makes the folder of a `packed` call, for this user alone. Raises OSError, NotPrivate where it cannot be."""
+    private_folder(folder, "--out or $TMPDIR", ours=True)
     (folder / CALL).write_bytes(call)
     return folder
 
@@ -53,7 +54,7 @@ def begun(folder: Path, cores: Sequence[int]) -> Child:
 
 
 def answer_of(folder: Path, end: End) -> Answer:
-    """The answer of a call whose process has ended."""
+    """The answer of a call whose process has ended; nobody else can put one into the folder of `laid_down`."""
     if end.exit_code == 0 and (folder / ANSWER).exists():
         return Answer((folder / ANSWER).read_bytes(), "", end)
     if (folder / ERROR).exists():

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Protocol
 
 from splatnode.capture.process import python
+from splatnode.capture.process.durable import open_itself
 from splatnode.recon.jobs import launch
 from splatnode.recon.jobs.memory import tree_mb
 
@@ -69,7 +70,7 @@ class Child:
     @classmethod
     def started(cls, command: Sequence[str], log: Path, cores: Sequence[int]) -> Child:
         """Starts it on `cores`; what it prints goes into `log`. Raises OSError."""
-        with log.open("wb") as printed:
+        with open_itself(log, "wb") as printed:
             process = subprocess.Popen(
                 launched(command, cores),
                 stdin=subprocess.DEVNULL,

@@ -19,6 +19,7 @@ import traceback
 from pathlib import Path
 from typing import IO, NoReturn
 
+from splatnode.capture.process.private import check_only_ours
 from splatnode.recon.jobs.call import CALL, LOG
 from splatnode.recon.jobs.called import RAISED, answered, module_of
 from splatnode.recon.jobs.launch import end_with
@@ -56,6 +57,7 @@ def main() -> None:
 def _copy(folder: Path, cores: list[int]) -> int:
     """The number of the copy that makes the call of `folder` on `cores`."""
     with contextlib.suppress(Exception), (folder / CALL).open("rb") as call:  # the copy tells what fails
+        check_only_ours(folder)
         importlib.import_module(module_of(call))
     me = os.getpid()
     if (pid := os.fork()) == 0:
