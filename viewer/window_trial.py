@@ -5,7 +5,7 @@ import os
 
 def main() -> None:
     """Ends this process."""
-    from open3d.visualization import gui, rendering
+    from open3d.visualization import gui, rendering  # pyright: ignore[reportMissingImports]
 
     app = gui.Application.instance
     app.initialize()

@@ -58,7 +58,7 @@ def _write(folder: Path, place: synthetic.Config, cameras: Mapping[str, syntheti
 
     synthetic.solids(place)  # or each thread would make it
     files = each(png, cameras.values(), range(first, first + len(cameras)))
-    write_files(folder / "images", dict(zip(cameras, files, strict=True)))
+    write_files(folder, {f"images/{name}": file for name, file in zip(cameras, files, strict=True)})
 
 
 def largest_capture_bytes(place: synthetic.Config) -> int:

@@ -10,6 +10,7 @@ import sys
 import pytest
 
 import splatnode
+import splatnode.capture as capture_room
 from splatnode.capture.process import python
 from tests.support.hostile_folder import MODULES, make_hostile
 
@@ -29,7 +30,7 @@ def test_it_runs_no_module_of_the_current_folder_and_finds_our_splatnode(tmp_pat
     done = subprocess.run(python.command("told", "a b", "-x"), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     package, capture, arguments, path, isolated = json.loads(done.stdout)
-    assert package == splatnode.__file__ and capture == splatnode.capture.__path__[0]
+    assert package == splatnode.__file__ and capture == capture_room.__path__[0]
     assert arguments == ["a b", "-x"] and isolated == 1 and not trace.exists()
     assert str(tmp_path / "user") in path and not {"", ".", str(tmp_path / "photos")} & set(path)
 
