@@ -28,7 +28,7 @@ from splatnode.capture.image_file import MAX_PIXELS, UnusableImage, decode_image
 from splatnode.capture.left_out import or_left_out, or_none
 from splatnode.capture.motion import Motion
 from splatnode.capture.process.bounded_file import read_bounded
-from splatnode.capture.process.durable import open_itself, sync_folder
+from splatnode.capture.process.durable import sync_folder
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import LONGEST_NAME, is_printable, marked_name, printable
 from splatnode.capture.process.records import record_in
@@ -146,8 +146,8 @@ def _write(path: Path, content: bytes) -> str:
     """Whole or not at all; gives the content's SHA-256. Raises OSError that names the file."""
     temporary = path.with_name(f".{path.name}.tmp")
     try:
-        with open_itself(temporary, "wb") as file:
-            file.write(content)
+        temporary.touch(exist_ok=False)  # not what a link of that name leads to
+        temporary.write_bytes(content)
         temporary.replace(path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
