@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from splatnode.capture.image_header import MAX_SIDE, UnusableImage
 from splatnode.capture.pi_heif import HEADER
-from splatnode.capture.process import apart
+from splatnode.capture.process import python
 from splatnode.capture.process.packages import remedy
 
 SUFFIXES = {".heic", ".heif", ".hif", ".avif"}
@@ -70,7 +70,7 @@ def decode(data: bytes, max_pixels: int) -> HeifImage:
         raise UnusableImage(f"HEIC and AVIF need a further package. {needed}")
     check_whole(data)
     child = subprocess.Popen(
-        apart.command("splatnode.capture.pi_heif", str(max_pixels)),
+        python.command("splatnode.capture.pi_heif", str(max_pixels)),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,  # what a decoder says of a stranger's file is a stranger's text

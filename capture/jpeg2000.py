@@ -74,3 +74,7 @@ def main() -> None:
         raise SystemExit(1)
     height, width = image.shape[:2]
     sys.stdout.buffer.write(_SIZE.pack(width, height) + cv2.cvtColor(image, cv2.COLOR_BGR2RGB).tobytes())
+
+
+if __name__ == "__main__":
+    main()

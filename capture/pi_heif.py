@@ -38,3 +38,7 @@ def main() -> None:
         exif = image.info.get("exif") or b""
     sys.stdout.buffer.write(HEADER.pack(upright.width, upright.height, len(exif)) + exif)
     sys.stdout.buffer.write(upright.tobytes())
+
+
+if __name__ == "__main__":
+    main()

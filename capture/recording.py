@@ -146,6 +146,7 @@ def _write(path: Path, content: bytes) -> str:
     """Whole or not at all; gives the content's SHA-256. Raises OSError that names the file."""
     temporary = path.with_name(f".{path.name}.tmp")
     try:
+        temporary.touch(exist_ok=False)  # not what a link of that name leads to
         temporary.write_bytes(content)
         temporary.replace(path)
     except OSError as error:

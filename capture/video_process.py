@@ -19,7 +19,7 @@ from typing import IO
 import numpy as np
 import numpy.typing as npt
 
-from splatnode.capture.process import apart
+from splatnode.capture.process import apart, python
 
 MAX_VIDEO_PIXELS = 36_000_000  # of a frame: 8192 x 4320
 BYTES_A_PIXEL = 80  # of memory at most for the decoder: its frames in flight, in colour, and what it refers to
@@ -65,7 +65,7 @@ def decoded(file: Path, every: int, max_pixels: int, span: Span = Span()) -> Ite
     Raises VideoError: after the frames, where some are missing or what follows cannot be read.
     """
     numbers = every, max_pixels, span.from_ns, -1 if span.to_ns is None else span.to_ns
-    command = apart.command(__name__, os.fsdecode(file.absolute()), *map(str, numbers))
+    command = python.command("splatnode.capture.video_process", os.fsdecode(file.absolute()), *map(str, numbers))
     child = subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
@@ -132,3 +132,7 @@ def main() -> None:
         out.write(_HEAD.pack(_TOO_LARGE, 0, 0, error.width, error.height, 1.0))
     finally:
         video.close()
+
+
+if __name__ == "__main__":
+    main()

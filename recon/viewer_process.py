@@ -5,16 +5,16 @@ from __future__ import annotations
 import contextlib
 import json
 import subprocess
-import sys
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from splatnode.capture.messaging.network import Network
 from splatnode.capture.messaging.services import RECON_DEPTH, RECON_SCENE
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
+from splatnode.capture.process import python
 from splatnode.recon.result.depth_message import depth_header
 from splatnode.recon.result.message import to_message
 from splatnode.recon.result.snapshot import Snapshot
@@ -25,17 +25,19 @@ _SERVE_S = 0.05
 
 
 @contextlib.contextmanager
-def viewer(pictures: Path, command: tuple[str, ...] = (sys.executable, "-m", "splatnode", "view")) -> Iterator[Show]:
+def viewer(pictures: Path, command: Sequence[str] | None = None) -> Iterator[Show]:
     """Starts a viewer and gives the function that shows it a snapshot; at the end, waits until it is closed.
 
     Showing never waits: a snapshot that the viewer has not taken is replaced by the next. Where no window can be
     opened, the viewer keeps a picture in the folder `pictures` up to date and closes itself after the last snapshot.
+    `command` begins a viewer; None: the verb view.
     """
+    begin = command or python.command("splatnode", "view")
     with tempfile.TemporaryDirectory(prefix="splatnode-") as folder:
         config = Path(folder, "node.yaml")
         config.write_text(json.dumps({"network": {"directory": folder}}))  # YAML, whatever the folder's name is
         with _Stage(Network(directory=Path(folder))) as stage:
-            child = subprocess.Popen([*command, str(config), "--until-final", "--out", str(pictures)])
+            child = subprocess.Popen([*begin, str(config), "--until-final", "--out", str(pictures)])
             try:
                 yield stage.show
                 child.wait()

@@ -4,7 +4,8 @@ The names below are for your own program. Each is loaded when it is first used: 
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+
+TYPE_CHECKING = False  # to a type checker it is true; `typing` would take time
 
 if TYPE_CHECKING:
     from splatnode.api.camera import Camera

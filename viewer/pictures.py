@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.process.progress import Step, Tell, counted, told_to_nobody
-from splatnode.recon.result.export import ResultWriteError, write_beside, write_file
+from splatnode.recon.result.export import ResultWriteError, write_beside, write_files
 from splatnode.recon.result.export.manifest import LIVE_PICTURE
 from splatnode.viewer import words
 from splatnode.viewer.analysis import Analysis, analyse
@@ -126,7 +126,7 @@ def keep_picture(
     for moment in _moments(source, say):
         started = time.perf_counter()
         picture = overview_picture(analyse(moment), width, height)
-        write_file(folder / LIVE_PICTURE, encode_png(picture))
+        write_files(folder, {LIVE_PICTURE: encode_png(picture)})
         line = words.verdict_lines(moment)[0]
         say(f"{folder / LIVE_PICTURE}: {line} ({time.perf_counter() - started:.1f} s)")
         if until_final and moment.snapshot.final:

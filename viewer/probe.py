@@ -9,26 +9,13 @@ from __future__ import annotations
 import importlib.util
 import re
 import subprocess
-import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+from splatnode.capture.process import python
 
 TIMEOUT_S = 60.0
 _SOFTWARE = ("llvmpipe", "lavapipe", "swiftshader", "software")
-
-_TRIAL = """
-from open3d.visualization import gui, rendering
-app = gui.Application.instance
-app.initialize()
-window = app.create_window("splatnode", 64, 64)
-widget = gui.SceneWidget()
-widget.scene = rendering.Open3DScene(window.renderer)
-window.add_child(widget)
-for _ in range(3):
-    app.run_one_tick()
-print("splatnode-window-opened", flush=True)
-import os
-os._exit(0)
-"""
 
 
 @dataclass(frozen=True)
@@ -43,10 +30,11 @@ class Probe:
         return (1120, 700) if self.software else (1280, 800)
 
 
-def probe_window(command: tuple[str, ...] = (sys.executable, "-c", _TRIAL), timeout_s: float = TIMEOUT_S) -> Probe:
-    """Tries to open a window in a child process. It never raises for what it finds."""
+def probe_window(command: Sequence[str] | None = None, timeout_s: float = TIMEOUT_S) -> Probe:
+    """Tries to open a window in a child process: `command`; None: `window_trial`. It never raises for what it finds."""
+    trial = command or python.command("splatnode.viewer.window_trial")
     try:
-        child = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=timeout_s)
+        child = subprocess.run(trial, capture_output=True, text=True, errors="replace", timeout=timeout_s)
     except subprocess.TimeoutExpired:
         return Probe(False, False, f"opening a window took more than {timeout_s:.0f} s")
     output = child.stdout + child.stderr

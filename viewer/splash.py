@@ -8,8 +8,9 @@ from __future__ import annotations
 import contextlib
 import os
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
+
+from splatnode.capture.process import python
 
 SAYS = "splatnode is opening its window ..."
 _SIZE = 420, 120  # pixels
@@ -19,7 +20,7 @@ _LOOKS_EVERY_MS = 200  # whether the viewer is still there
 @contextlib.contextmanager
 def splash() -> Iterator[Callable[[], None]]:
     """Shows the splash until what it yields is called, or until the end."""
-    command = [sys.executable, "-m", "splatnode.viewer.splash"]
+    command = python.command("splatnode.viewer.splash")
     child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def close() -> None:

@@ -16,7 +16,7 @@ import open3d as o3d  # pyright: ignore[reportMissingImports]
 from open3d.visualization import gui  # pyright: ignore[reportMissingImports]
 
 from splatnode.capture.image_file import encode_png
-from splatnode.recon.result.export import ResultWriteError, write_file
+from splatnode.recon.result.export import ResultWriteError, write_files
 from splatnode.viewer import words
 from splatnode.viewer.editing import EditError
 from splatnode.viewer.help_sheet import HelpSheet
@@ -213,5 +213,5 @@ class _Window:
         self._stage.take_image(self._session, self._guarded(lambda image: self._save(path, image)))
 
     def _save(self, path: Path, image: Image) -> None:
-        write_file(path, encode_png(image))
+        write_files(path.parent, {path.name: encode_png(image)})
         self._notice = f"saved {path}"

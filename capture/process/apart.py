@@ -5,22 +5,14 @@ from __future__ import annotations
 import contextlib
 import resource
 import subprocess
-import sys
 
-
-def command(module: str, *arguments: str) -> list[str]:
-    """The command of a process that runs `main()` of `module`, with these arguments in its sys.argv.
-
-    Its path of modules is ours, and not the folder in which we happen to be.
-    """
-    code = f"import sys; sys.path[:] = {sys.path!r}; from {module} import main; main()"
-    return [sys.executable, "-I", "-c", code, *arguments]
+from splatnode.capture.process import python
 
 
 def answer(module: str, data: bytes, most: int, *arguments: str) -> tuple[bytes, int]:
-    """What the process of `command` writes, `most` bytes of it, once it has read `data`; and how it ended."""
+    """What the process of a module writes, `most` bytes of it, once it has read `data`; and how it ended."""
     child = subprocess.Popen(
-        command(module, *arguments),
+        python.command(module, *arguments),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,  # what a decoder says of a stranger's file is a stranger's text

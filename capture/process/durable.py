@@ -1,13 +1,15 @@
-"""Files of this user alone that are whole or not there, also after a power cut."""
+"""Files that are whole or not there, also after a power cut; and files that no link leads to."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import stat
 import uuid
 from collections.abc import Iterable
 from pathlib import Path
+from typing import IO, Any
 
 from splatnode.capture.process.private import create_own
 
@@ -31,6 +33,20 @@ def write_whole(path: Path, content: Iterable[bytes | memoryview]) -> None:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
+
+
+def open_itself(path: Path, mode: str, **options: Any) -> IO[Any]:
+    """Opens a file to write into it as `open` does, but not one that a link in its place names. Raises OSError."""
+    try:
+        return open(path, mode, opener=_open_no_link, **options)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        raise OSError(error.errno, "a link lies where this file belongs; remove it", str(path)) from error
+
+
+def _open_no_link(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def remove_leftovers(folder: Path) -> None:

@@ -6,6 +6,7 @@ import hashlib
 
 LONGEST_NAME = 255  # characters, as of a file
 LONGEST_TEXT = 1000  # characters of a message
+_FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")  # the last: as wide as a word
 
 
 def printable(text: object, longest: int = LONGEST_TEXT) -> str:
@@ -55,3 +56,8 @@ def escaped(text: str) -> str:
 
 def _escape(letter: str) -> str:
     return letter.encode("unicode_escape").decode()
+
+
+def cell(value: object) -> object:
+    """`value` for a table that a spreadsheet may open: text that it would compute, such as =1+1, gets a quote."""
+    return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value

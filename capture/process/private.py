@@ -10,6 +10,7 @@ import logging
 import os
 import re
 import stat
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -52,10 +53,32 @@ def private_folder(folder: Path, instead: str, *, ours: bool) -> None:
             )
 
 
+def check_way(folder: Path, instead: str = "") -> None:
+    """Raises NotPrivate where another user could make the way to `folder` lead elsewhere, as sshd's StrictModes does.
+
+    Each folder above it must be root's or this user's, and no group and nobody else may write there, unless it is
+    sticky. So must each above what a link on the way leads to. What is not there yet is no hindrance. The text says
+    what to run, and what to set `instead`.
+    """
+    _check_steps(Path.cwd() / folder, instead, is_end=True)
+
+
 def check_only_ours(folder: Path) -> None:
     """Raises NotPrivate where another user could change what lies in `folder`, OSError where it is none."""
+    check_way(folder)
     with _open(os.path.realpath(folder), _FOLDER) as descriptor:
         _check_owner(os.fstat(descriptor), folder)
+
+
+@contextlib.contextmanager
+def temporary_folder(prefix: str) -> Iterator[Path]:
+    """A folder among the system's temporary ones, which is removed at the end, and which this user alone can change.
+
+    Raises NotPrivate, OSError.
+    """
+    with tempfile.TemporaryDirectory(prefix=prefix) as name:
+        check_way(Path(name), "$TMPDIR")
+        yield Path(name)
 
 
 def read_own(path: Path, most_bytes: int, *, only_ours: bool = False) -> bytes:
@@ -63,6 +86,8 @@ def read_own(path: Path, most_bytes: int, *, only_ours: bool = False) -> bytes:
 
     `only_ours`: raises NotPrivate where another user could change it.
     """
+    if only_ours:
+        check_way(path.parent)
     if not stat.S_ISREG(os.lstat(path).st_mode):  # before it is opened: a device may begin to work
         raise StrayFile(f"{_shown(path)} is no regular file")
     with open(os.open(path, os.O_RDONLY | _FILE), "rb", buffering=0) as file:
@@ -122,7 +147,7 @@ def _check_owner(found: os.stat_result, path: Path) -> None:
 @contextlib.contextmanager
 def _opened_folder(folder: Path, instead: str) -> Iterator[int]:
     """A descriptor of the folder, which is made where it is missing."""
-    _check_way(Path.cwd() / folder, instead)
+    check_way(folder, instead)
     missing = [each for each in (folder, *folder.parents) if not os.path.lexists(each)]
     for each in reversed(missing):
         with contextlib.suppress(FileExistsError):  # another process has just made it
@@ -147,29 +172,33 @@ def _open(path: Path | str, flags: int) -> Iterator[int]:
         os.close(descriptor)
 
 
-def _check_way(folder: Path, instead: str) -> None:
-    """Raises NotPrivate where another user could make the way to `folder` lead elsewhere."""
+def _check_step(each: Path, instead: str, is_end: bool) -> bool:
+    """Whether the way goes on behind `each`. Raises NotPrivate; what may be done with an end, its caller checks."""
+    try:
+        found = os.lstat(each)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    is_link = stat.S_ISLNK(found.st_mode)
+    others_write = bool(found.st_mode & _OTHERS_WRITE) and not found.st_mode & stat.S_ISVTX
+    bad_mode = others_write and not is_link and not is_end
+    is_anothers = found.st_uid not in (0, os.geteuid())
+    if is_anothers or bad_mode:
+        shown, me, mode = _shown(each), os.geteuid(), stat.S_IMODE(found.st_mode)
+        run = [f"chown {'-h ' * is_link}{me} {shown}"] * is_anothers + [f"chmod go-w {shown}"] * bad_mode
+        raise NotPrivate(
+            f"{shown} must be of root or of user {me}, and nobody else may write there unless it is sticky as /tmp is, "
+            f"but it is of user {found.st_uid} with mode {mode:04o}: look what lies there, then run: {'; '.join(run)}"
+            f"{f'. Or set {instead} to a folder of your own' if instead else ''}"
+        )
+    if is_link and os.path.exists(each):  # and is no circle
+        _check_steps(Path(os.path.realpath(each.parent), os.readlink(each)), instead, is_end)
+    return True
+
+
+def _check_steps(folder: Path, instead: str, is_end: bool) -> None:
     for each in (*reversed(folder.parents), folder):
-        try:
-            found = os.lstat(each)
-        except (FileNotFoundError, NotADirectoryError):
+        if not _check_step(each, instead, is_end and each == folder):
             return
-        if stat.S_ISLNK(found.st_mode):
-            if found.st_uid not in (0, os.geteuid()):
-                raise NotPrivate(
-                    f"{_shown(each)} is a link of user {found.st_uid}, who could let it lead anywhere. "
-                    f"Set {instead} to a folder of your own"
-                )
-            target = Path(os.path.realpath(each.parent), os.readlink(each))
-            if target.exists():  # and is no circle
-                _check_way(target, instead)
-        elif not stat.S_ISDIR(found.st_mode) and found.st_uid not in (0, os.geteuid()):
-            raise NotPrivate(_of_another(each, found, instead))
-        elif found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX and each != folder:
-            raise NotPrivate(
-                f"every user may rename what lies in {_shown(each)}. Run: chmod o-w {_shown(each)}, or set {instead} "
-                "to a folder elsewhere"
-            )
 
 
 def _of_another(path: Path, found: os.stat_result, instead: str) -> str:

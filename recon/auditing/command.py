@@ -13,7 +13,7 @@ from splatnode.recon.auditing.stations import recordings
 from splatnode.recon.auditing.table import heading, lines, summary, values
 from splatnode.recon.auditing.taken import one_each
 from splatnode.recon.locating.photographs import check_lens
-from splatnode.recon.result.export.staged import json_bytes, write_files
+from splatnode.recon.result.export.staged import json_bytes, write_file
 from splatnode.recon.result.landmarks_file import read_landmarks
 
 EXIT_GOOD, EXIT_NOTHING = 0, 65
@@ -34,6 +34,6 @@ def audit(args: argparse.Namespace) -> int:
     say(summary(found))
     for path, content in ((args.json, json_bytes(values(found))), (args.picture, picture(found))):
         if path is not None:
-            write_files(path.parent, {path.name: content})
+            write_file(path, content)
             say(f"results: {path}")
     return EXIT_GOOD if found.compared else EXIT_NOTHING

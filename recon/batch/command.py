@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
+from splatnode.capture.process import python
 from splatnode.capture.process.folders import LOCK
 from splatnode.capture.process.packages import remedy
 from splatnode.capture.process.printable import printable
@@ -55,7 +55,7 @@ def batch(args: argparse.Namespace) -> int:
 
 def replay(options: Sequence[str], recording: Recording, folder: Path) -> Sequence[str]:
     """The command that reconstructs a recording, on whatever machine this is called."""
-    return [sys.executable, "-m", "splatnode", "replay", recording.source, "--out", str(folder), *options]
+    return python.command("splatnode", "replay", recording.source, "--out", str(folder), *options)
 
 
 def run_batch(args: argparse.Namespace, found: list[Recording], work: Work, told_command: list[str]) -> int:

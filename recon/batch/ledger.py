@@ -16,6 +16,7 @@ from typing import IO, NamedTuple
 
 import msgspec
 
+from splatnode.capture.process.durable import open_itself
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.printable import printable
 from splatnode.capture.process.records import record_of
@@ -52,7 +53,7 @@ class Ledger:
     def __init__(self, folder: Path, command: Sequence[str]) -> None:
         """Opens the ledger of `folder`, or begins one. Raises OtherBatch, OSError."""
         self.path = folder / LEDGER
-        self._file: IO[bytes] = self.path.open("a+b")
+        self._file: IO[bytes] = open_itself(self.path, "a+b")
         self._last: dict[Key, _Last] = {}
         try:
             self._open(list(command))

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.process.durable import sync_folder
-from splatnode.capture.process.printable import escaped
+from splatnode.capture.process.printable import cell, escaped
 from splatnode.recon.batch.answer import Outcome
 
 CSV, PARQUET = "batch.csv", "batch.parquet"
@@ -20,12 +20,12 @@ BEING_WRITTEN = ".partial"  # the end of the hidden name under which a file is w
 
 
 def write_csv(path: Path, rows: Iterable[Outcome]) -> None:
-    """What is not known is empty. Raises OSError."""
+    """What is not known is empty; text is what a spreadsheet takes for text. Raises OSError."""
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         for row in rows:
-            writer.writerow(msgspec.structs.astuple(shown(row)))
+            writer.writerow(map(cell, msgspec.structs.astuple(shown(row))))
 
 
 def write_parquet(path: Path, rows: Iterable[Outcome]) -> None:
@@ -43,9 +43,11 @@ def shown(row: Outcome) -> Outcome:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file that takes the place of `path` at the end, and is on the disk then; else it is removed."""
+    """A new file that takes the place of `path` at the end, and is on the disk then; else it is removed."""
     temporary = path.with_name(f".{path.name}{BEING_WRITTEN}")
+    temporary.unlink(missing_ok=True)
     try:
+        temporary.touch(exist_ok=False)  # what the name led to, if it was a link, stays as it is
         yield temporary
         with temporary.open("rb") as file:
             os.fsync(file.fileno())

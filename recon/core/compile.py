@@ -86,7 +86,8 @@ def find_compiler() -> list[str] | None:
 
 def find_zig() -> list[str] | None:
     """The command of the C++ compiler that PyPI carries, which compiles for every target, or None."""
-    return [sys.executable, "-m", "ziglang", "c++"] if importlib.util.find_spec("ziglang") else None
+    found = importlib.util.find_spec("ziglang")
+    return [str(Path(found.origin).with_name("zig")), "c++"] if found and found.origin else None  # as its -m does
 
 
 def platform_tag(target: Target | None = None) -> str:
@@ -139,7 +140,7 @@ def _is_current(library: Path, digest: str) -> bool:
 
 def _digest(compiler: list[str], files: list[Path]) -> str:
     """Changes when a library would. Zig is the same wherever it is installed (a build environment, a virtual one)."""
-    command = compiler[compiler.index("ziglang") :] if _is_zig(compiler) else compiler
+    command = ["ziglang", *compiler[1:]] if _is_zig(compiler) else compiler
     digest = hashlib.sha256(repr((command, FLAGS, LINK_FLAGS, INSTRUCTION_SETS, OLDEST_GLIBC)).encode())
     for path in files:
         digest.update(path.name.encode() + path.read_bytes())
@@ -171,7 +172,7 @@ def _build(
 
 
 def _is_zig(compiler: list[str]) -> bool:
-    return "ziglang" in compiler
+    return any("ziglang" in (part, Path(part).parent.name) for part in compiler)
 
 
 def _zig_flags(flags: list[str], target: Target | None = None) -> list[str]:

@@ -7,7 +7,6 @@ must need no newer system than their names say, as auditwheel sees it.
 
 from __future__ import annotations
 
-import os
 import shutil
 import subprocess
 import sys
@@ -16,12 +15,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatnode.recon.core.compile import TARGETS, find_compiler, machine
+from splatnode.capture.process import python
+from splatnode.recon.core.compile import TARGETS, find_compiler, find_zig, machine
 from splatnode.recon.core.trial import Trial, TrialFailed, try_artefact
-from splatnode.recon.core.wheels import ROOT, asked_for, build_wheel
+from splatnode.recon.core.wheels import FROM_COPY, ROOT, asked_for, build_wheel
 
 _NOT_PACKED = (".*", "out", "build", "dist", "docs", "__pycache__", "*.egg-info", "_core_*")
-_BUILD_SDIST = "import sys; from splatnode.recon.core import backend; print(backend.build_sdist(sys.argv[1]))"
+_BUILD_SDIST = f"{FROM_COPY}; from splatnode.recon.core import backend; print(backend.build_sdist(sys.argv[2]))"
 _HEADINGS = ("artefact", "size", "installed", "in", "demo")
 _NO_TRIAL = "not for this machine"
 
@@ -72,9 +72,8 @@ def build_sdist(out: Path) -> Path:
     with tempfile.TemporaryDirectory(prefix="splatnode-sdist-") as folder:
         copy = Path(folder) / "splatnode"
         shutil.copytree(ROOT, copy, symlinks=True, ignore=shutil.ignore_patterns(*_NOT_PACKED))
-        command = [sys.executable, "-c", _BUILD_SDIST, str(out.resolve())]
-        environment = {**os.environ, "PYTHONPATH": str(copy)}
-        result = subprocess.run(command, cwd=copy, env=environment, capture_output=True, text=True)
+        command = python.isolated("-c", _BUILD_SDIST, str(copy), str(out.resolve()))
+        result = subprocess.run(command, cwd=copy, capture_output=True, text=True)
     if result.returncode != 0:
         raise RuntimeError(f"the sdist was not built:\n{result.stderr[-4000:]}")
     return out / result.stdout.splitlines()[-1]
@@ -91,7 +90,8 @@ def least_system(said: str) -> str:
 
 def check_tag(wheel: Path) -> None:
     """Raises RuntimeError where a wheel for Linux needs a newer system than its name says, or cannot be judged."""
-    result = subprocess.run([sys.executable, "-m", "auditwheel", "show", str(wheel)], capture_output=True, text=True)
+    command = python.isolated("-m", "auditwheel", "show", str(wheel))
+    result = subprocess.run(command, capture_output=True, text=True)
     if result.returncode != 0:
         raise RuntimeError(f"auditwheel cannot read {wheel.name}: {result.stderr[-1000:]}")
     if not wheel.stem.endswith(deserved := least_system(result.stdout)):
@@ -124,7 +124,7 @@ def _sdist_rows(out: Path) -> list[Row]:
     sdist = build_sdist(out)
     rows = [on_trial(f"{sdist.name}, compiler of PyPI", sdist, compiler=False)]
     compiler = find_compiler()
-    if compiler is None or "ziglang" in compiler:
+    if compiler is None or compiler == find_zig():
         remark = "no compiler is installed here"
         return [*rows, Row(f"{sdist.name}, compiler installed", sdist.stat().st_size, None, remark, good=True)]
     return [*rows, on_trial(f"{sdist.name}, {compiler[0]}", sdist)]

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from splatnode.capture.process import python
 
 _OURS = ("PYTHON", "SPLATNODE", "VIRTUAL_ENV")  # how variables begin that would tell the environment of this one
 _LAST = 2000  # characters of what a program said that failed
@@ -37,9 +38,9 @@ def try_artefact(artefact: Path, constraints: Path, folder: Path, compiler: bool
     environment = folder / "environment"
     programs = environment / "bin"
     variables = clean(os.environ, None if compiler else programs)
-    _run([sys.executable, "-m", "venv", str(environment)], folder, variables)
+    _run(python.isolated("-m", "venv", str(environment)), folder, variables)
     before, began_s = size_of(environment), time.monotonic()
-    pip = [str(programs / "python"), "-m", "pip", "install", "--quiet", "-c", str(constraints)]
+    pip = [str(programs / "python"), "-I", "-m", "pip", "install", "--quiet", "-c", str(constraints)]
     _run([*pip, str(artefact)], folder, variables)
     install_s, installed_bytes = time.monotonic() - began_s, size_of(environment) - before
     _run([str(programs / "splatnode"), "config", "--write", "configs"], folder, variables)

@@ -7,7 +7,6 @@ others, goes through the build backend. Wheels are tied to a platform but to no 
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 import subprocess
 import sys
@@ -15,14 +14,16 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
+from splatnode.capture.process import python
 from splatnode.recon.core.compile import HERE, TARGETS
 
 ROOT = HERE.parents[1]
 _PACKED = ("capture", "configs", "recon", "splatnode", "viewer", "pyproject.toml", "README.md", "LICENSE")
-_BUILD = """
-import sys
+FROM_COPY = "import sys; sys.path.insert(0, sys.argv[1])"  # of the project, whose backend is the one that builds
+_BUILD = f"""
+{FROM_COPY}
 from splatnode.recon.core import backend
-print(backend.build_wheel(sys.argv[1], {"target": sys.argv[2]}))
+print(backend.build_wheel(sys.argv[2], {{"target": sys.argv[3]}}))
 """
 
 
@@ -37,9 +38,8 @@ def build_wheel(target: str, out: Path) -> Path:
     with tempfile.TemporaryDirectory(prefix="splatnode-wheel-") as folder:
         for name in _PACKED:
             _copy(ROOT / name, Path(folder) / name)
-        command = [sys.executable, "-c", _BUILD, str(out.resolve()), target]
-        environment = {**os.environ, "PYTHONPATH": folder}
-        result = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+        command = python.isolated("-c", _BUILD, folder, str(out.resolve()), target)
+        result = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     if result.returncode != 0:
         raise RuntimeError(f"the wheel for {target} was not built:\n{result.stderr[-4000:]}")
     return out / result.stdout.splitlines()[-1]

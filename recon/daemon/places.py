@@ -18,7 +18,7 @@ from splatnode.capture.process.records import record_in
 from splatnode.recon.daemon.atlas.links import Cameras, Kind, Link, carried, link
 from splatnode.recon.daemon.atlas.pose_graph import Pose, optimised
 from splatnode.recon.daemon.status import PlaceStatus
-from splatnode.recon.result.export import SceneFileError, read_cameras, write_file
+from splatnode.recon.result.export import SceneFileError, read_cameras, write_files
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.snapshot import Snapshot
@@ -230,5 +230,5 @@ class Places:
 
     def _write(self, index: _Index) -> None:
         if index != self._index:
-            write_file(self._path, json_bytes(msgspec.to_builtins(index)))
+            write_files(self._path.parent, {self._path.name: json_bytes(msgspec.to_builtins(index))})
             self._index = index

@@ -9,7 +9,7 @@ from splatnode.capture.cameras import synthetic
 from splatnode.capture.image_file import encode_png
 from splatnode.recon.evaluate.splits import Split
 from splatnode.recon.result.export.cameras import encode_cameras
-from splatnode.recon.result.export.staged import write_file, write_files
+from splatnode.recon.result.export.staged import write_files
 from splatnode.recon.result.snapshot import CameraEstimate
 from splatnode.recon.workers import each
 
@@ -39,7 +39,7 @@ def write_held_out(folder: Path, place: synthetic.Config) -> None:
         CameraEstimate(name, number, T_world_camera, K, place.width, place.height)
         for number, (name, (T_world_camera, K)) in enumerate({**training, **testing}.items())
     ]
-    write_file(folder / "cameras.json", encode_cameras(cameras))
+    write_files(folder, {"cameras.json": encode_cameras(cameras)})
 
 
 def _training(place: synthetic.Config) -> dict[str, synthetic.Camera]:
@@ -58,7 +58,7 @@ def _write(folder: Path, place: synthetic.Config, cameras: Mapping[str, syntheti
 
     synthetic.solids(place)  # or each thread would make it
     files = each(png, cameras.values(), range(first, first + len(cameras)))
-    write_files(folder / "images", dict(zip(cameras, files, strict=True)))
+    write_files(folder, {f"images/{name}": file for name, file in zip(cameras, files, strict=True)})
 
 
 def largest_capture_bytes(place: synthetic.Config) -> int:

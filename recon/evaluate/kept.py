@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
+from splatnode.capture.process.durable import open_itself
+
 WRITE_EVERY_S = 5.0  # the whole, at most so often,
 _SHARE = 20.0  # and so seldom that writing it takes at most this part of the time: 1 / 20
 
@@ -23,7 +25,7 @@ class Kept:
     def __init__(self, journal: Path, write: Callable[[], None]) -> None:
         """`write` writes the whole, with all that was added. Raises OSError where there can be no journal."""
         self._path, self._write = journal, write
-        self._file: IO[bytes] = journal.open("a+b")
+        self._file: IO[bytes] = open_itself(journal, "a+b")
         self._unwritten, self._next_s = 0, time.monotonic() + WRITE_EVERY_S
 
     def left(self) -> list[Any]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import pickle
-import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatnode.capture.process.private import temporary_folder
 from splatnode.recon.evaluate.protocol import STAGES
 from splatnode.recon.evaluate.timing import Timing, timing
 from splatnode.recon.jobs.alone import Moment as Since
@@ -43,13 +43,13 @@ def run_to_its_end(
     It is meant for a process of its own, whose memory is the run's. The clock runs only while the reconstruction works,
     not while a moment is saved; moments lie on the disk meanwhile. What the reconstruction raises is its error.
     """
-    with tempfile.TemporaryDirectory(prefix="splatnode-bench-") as name:
+    with temporary_folder("splatnode-bench-") as folder:
         error = None
         try:
-            _run_and_save(reconstruct, checkpoints, spent_s, Path(name))
+            _run_and_save(reconstruct, checkpoints, spent_s, folder)
         except Exception:
             error = traceback.format_exc()
-        moments = tuple(pickle.loads(path.read_bytes()) for path in sorted(Path(name).iterdir()))
+        moments = tuple(pickle.loads(path.read_bytes()) for path in sorted(folder.iterdir()))
     if error is None and not moments:
         error = "the reconstruction gave no snapshot"
     return RunOutcome(moments, error)

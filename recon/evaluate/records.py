@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 
+from splatnode.capture.process.printable import cell
 from splatnode.recon.evaluate.json_file import read_json
 from splatnode.recon.evaluate.protocol import FAILED, Row, Settings
 from splatnode.recon.evaluate.splits import Split
@@ -111,5 +112,5 @@ def _csv(records: Sequence[Mapping[str, Any]]) -> bytes:
     columns = dict.fromkeys(name for row in flat for name in row)
     writer = csv.DictWriter(text, list(columns), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(flat)
+    writer.writerows({name: cell(value) for name, value in row.items()} for row in flat)
     return text.getvalue().encode()

@@ -6,12 +6,13 @@ The call lies in a folder, `called` is the process, and the answer lies in the s
 from __future__ import annotations
 
 import pickle
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from splatnode.capture.process import python
+from splatnode.capture.process.private import private_folder
 from splatnode.recon.jobs.child import Child, End
 
 CALL, ANSWER, ERROR, LOG = "call", "answer", "error.txt", "log"  # files of a call's folder
@@ -35,25 +36,25 @@ class Answer:
 
 
 def packed(work: Work) -> bytes:
-    """A call for any machine with this splatnode: where modules are found, the function's module, the function."""
+    """A call for any machine with this splatnode: where the function's module is found, its name, the function."""
     module = getattr(work, "func", work).__module__
-    return b"".join(map(pickle.dumps, (sys.path, module, work)))
+    return b"".join(map(pickle.dumps, (python.place_of(module), module, work)))
 
 
 def laid_down(call: bytes, folder: Path) -> Path:
-    """Makes the folder of a `packed` call. Raises OSError."""
-    folder.mkdir(parents=True)
+    """Makes the folder of a `packed` call, for this user alone. Raises OSError, NotPrivate where it cannot be."""
+    private_folder(folder, "--out or $TMPDIR", ours=True)
     (folder / CALL).write_bytes(call)
     return folder
 
 
 def begun(folder: Path, cores: Sequence[int]) -> Child:
     """A fresh process that makes the call of a folder on `cores`. Raises OSError."""
-    return Child.started([sys.executable, "-m", "splatnode.recon.jobs.called", str(folder)], folder / LOG, cores)
+    return Child.started(python.command("splatnode.recon.jobs.called", str(folder)), folder / LOG, cores)
 
 
 def answer_of(folder: Path, end: End) -> Answer:
-    """The answer of a call whose process has ended."""
+    """The answer of a call whose process has ended; nobody else can put one into the folder of `laid_down`."""
     if end.exit_code == 0 and (folder / ANSWER).exists():
         return Answer((folder / ANSWER).read_bytes(), "", end)
     if (folder / ERROR).exists():

@@ -1,4 +1,4 @@
-"""The process of a call: `python -m splatnode.recon.jobs.called FOLDER` makes the call that lies there and answers."""
+"""The process of a call: this module, with a folder, makes the call that lies there and answers."""
 
 from __future__ import annotations
 
@@ -9,13 +9,18 @@ import traceback
 from pathlib import Path
 from typing import IO
 
+from splatnode.capture.process.private import check_only_ours
 from splatnode.recon.jobs.call import ANSWER, CALL, ERROR
 
 RAISED = 1  # the exit code where the function raised
 
 
 def answered(folder: Path) -> int:
-    """Makes the call and leaves the answer, or what was raised; returns the exit code."""
+    """Makes the call and leaves the answer, or what was raised; returns the exit code.
+
+    Raises NotPrivate for a call that another user could have put there.
+    """
+    check_only_ours(folder)
     with (folder / CALL).open("rb") as call:
         module_of(call)
         try:
@@ -31,7 +36,9 @@ def answered(folder: Path) -> int:
 
 def module_of(call: IO[bytes]) -> str:
     """The name of the module of a call, which is found from here on; the function comes next in the file."""
-    sys.path += [place for place in pickle.load(call) if place not in sys.path]
+    place = pickle.load(call)
+    if place is not None and place not in sys.path:
+        sys.path.append(place)
     return pickle.load(call)
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import contextlib
 import itertools
 import shutil
-import tempfile
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from splatnode.capture.process.private import NotPrivate, check_only_ours, private_folder, temporary_folder
 from splatnode.recon.jobs.call import Answer, answer_of, begun, laid_down
 from splatnode.recon.jobs.child import NOT_RUN, Limits, finished
 from splatnode.recon.jobs.copies import copying
@@ -45,10 +45,22 @@ class Engine:
 
 @contextlib.contextmanager
 def work_folder(out: Path) -> Iterator[Path]:
-    """A hidden folder in `out`, which this process holds, for what is under way: empty, and removed at the end."""
+    """An empty folder of this user alone for what is under way in `out`, which this process holds; removed at the end.
+
+    Calls are pickles: whoever could put one there could run anything as this user. So it is a hidden folder in `out`
+    where nobody else can change what lies there, else one among temporary files. Raises NotPrivate, OSError.
+    """
     folder = out / ".calls"
     shutil.rmtree(folder, ignore_errors=True)  # of a driver that was killed
-    folder.mkdir(parents=True)
+    try:
+        check_only_ours(out)
+    except NotPrivate:
+        with temporary_folder("splatnode-calls-") as instead:
+            yield instead
+        return
+    if folder.is_symlink():
+        folder.unlink()
+    private_folder(folder, "--out", ours=True)
     try:
         yield folder
     finally:
@@ -125,6 +137,6 @@ def run_here(call: bytes, limits: Limits, version: str) -> Answer:
     """
     if (other := other_version(version)) is not None:
         return Answer(None, other, NOT_RUN)
-    with tempfile.TemporaryDirectory(prefix="splatnode-call-") as name, free_core() as core:
-        place = laid_down(call, Path(name, "0"))
+    with temporary_folder("splatnode-call-") as folder, free_core() as core:
+        place = laid_down(call, folder / "0")
         return answer_of(place, finished(begun(place, (core,)), limits))

@@ -6,13 +6,14 @@ import contextlib
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from splatnode.capture.process import python
+from splatnode.capture.process.durable import open_itself
 from splatnode.recon.jobs import launch
 from splatnode.recon.jobs.memory import tree_mb
 
@@ -69,7 +70,7 @@ class Child:
     @classmethod
     def started(cls, command: Sequence[str], log: Path, cores: Sequence[int]) -> Child:
         """Starts it on `cores`; what it prints goes into `log`. Raises OSError."""
-        with log.open("wb") as printed:
+        with open_itself(log, "wb") as printed:
             process = subprocess.Popen(
                 launched(command, cores),
                 stdin=subprocess.DEVNULL,
@@ -110,7 +111,7 @@ class Child:
 def launched(command: Sequence[str], cores: Sequence[int]) -> list[str]:
     """The command that runs `command` on `cores` until this process ends: see `launch`."""
     told = [launch.__file__, str(os.getpid()), ",".join(map(str, cores))]
-    return [sys.executable, "-I", "-S", *told, *command]
+    return python.isolated("-S", *told, *command)
 
 
 def finished(child: Child, limits: Limits) -> End:

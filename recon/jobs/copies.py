@@ -7,10 +7,10 @@ import json
 import select
 import signal
 import subprocess
-import sys
 from collections.abc import Generator, Sequence
 from pathlib import Path
 
+from splatnode.capture.process import python
 from splatnode.recon.jobs.call import LOG, begun
 from splatnode.recon.jobs.child import Child, launched
 
@@ -53,7 +53,7 @@ class _Template:
 
     def __init__(self, cores: Sequence[int]) -> None:
         self._process = subprocess.Popen(
-            launched([sys.executable, "-m", "splatnode.recon.jobs.template"], cores),
+            launched(python.command("splatnode.recon.jobs.template"), cores),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,

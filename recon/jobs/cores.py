@@ -9,6 +9,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from splatnode.capture.process.private import private_folder
+
 
 def usable_cores() -> tuple[int, ...]:
     """Their numbers, rising."""
@@ -28,7 +30,7 @@ def free_core() -> Iterator[int]:
     """A core that no other work is on, of whatever worker of this user; where none is, the one with this turn."""
     cores = usable_cores()
     folder = Path(tempfile.gettempdir(), f"splatnode-cores-{os.getuid()}")
-    folder.mkdir(mode=0o700, exist_ok=True)
+    private_folder(folder, "$TMPDIR", ours=True)
     for core in cores:
         with (folder / str(core)).open("w") as lock:
             try:

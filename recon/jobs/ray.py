@@ -27,6 +27,7 @@ R = TypeVar("R")
 _REPEATS = 5  # of a call whose worker or machine was lost
 _WAITING = 2  # calls that are handed over, for each core of the cluster
 _WAIT_S = 1.0  # between looks at how many cores there are
+_NO_MODULES = "/"  # is there on every machine, and nobody but root puts a module there
 _ANSWER_S = 5.0  # in which a machine answers; Ray itself tries for two minutes
 
 
@@ -43,7 +44,10 @@ class NoCluster(ConnectionError):
 
 @contextlib.contextmanager
 def joined(address: str, cores: int | None) -> Iterator[None]:
-    """This process as a driver of the cluster at `address`; "": of one begun here, with `cores`. Raises NoCluster."""
+    """This process as a driver of the cluster at `address`; "": of one begun here, with `cores`. Raises NoCluster.
+
+    Ray's workers look for modules in the folder in which the driver is when it joins: not among the photographs, so.
+    """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to anybody
     quiet: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
     if address:
@@ -52,7 +56,11 @@ def joined(address: str, cores: int | None) -> Iterator[None]:
         how = {"address": "local", "num_cpus": cores, "include_dashboard": False}
     try:
         _check_answers(address)
-        with contextlib.redirect_stderr(beneath(sys.stderr)), contextlib.redirect_stdout(beneath(sys.stdout)):
+        with (
+            contextlib.redirect_stderr(beneath(sys.stderr)),
+            contextlib.redirect_stdout(beneath(sys.stdout)),
+            _in_folder(_NO_MODULES),
+        ):
             ray.init(**how, **quiet)  # which wants streams with descriptors
     except Exception as error:  # a node that does not come up in time is no more than that to Ray
         where = printable(address or "this machine", 200)
@@ -81,15 +89,28 @@ def mapped(
     running: dict[Any, T] = {}
     while True:
         while len(running) < _at_a_time(most) and (item := take()) is not None:
-            running[run.remote(function, item)] = item
+            running[run.remote(function, item, os.getcwd())] = item
         if not running:
             return
         for reference in ray.wait(list(running), num_returns=1, timeout=_WAIT_S)[0]:
             yield running.pop(reference), _result(reference)
 
 
-def _applied(function: Callable[[T], R], item: T) -> R:
+def _applied(function: Callable[[T], R], item: T, folder: str) -> R:
+    """In the driver's `folder`, where this machine has it: a path may be relative to that."""
+    with contextlib.suppress(OSError):
+        os.chdir(folder)
     return function(item)
+
+
+@contextlib.contextmanager
+def _in_folder(folder: str) -> Iterator[None]:
+    before = os.getcwd()
+    try:
+        os.chdir(folder)
+        yield
+    finally:
+        os.chdir(before)
 
 
 def _check_answers(address: str) -> None:

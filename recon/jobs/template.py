@@ -1,4 +1,4 @@
-"""A process that others are copies of: `python -m splatnode.recon.jobs.template` makes a copy for each call.
+"""A process that others are copies of: this module makes a copy of its process for each call.
 
 What a call imports is imported here once, so that a copy has it at once; with torch that saves seconds. Each line of
 standard input is a folder with a call and the cores for it, in JSON. Each line of standard output is the number of a
@@ -19,6 +19,7 @@ import traceback
 from pathlib import Path
 from typing import IO, NoReturn
 
+from splatnode.capture.process.private import check_only_ours
 from splatnode.recon.jobs.call import CALL, LOG
 from splatnode.recon.jobs.called import RAISED, answered, module_of
 from splatnode.recon.jobs.launch import end_with
@@ -56,6 +57,7 @@ def main() -> None:
 def _copy(folder: Path, cores: list[int]) -> int:
     """The number of the copy that makes the call of `folder` on `cores`."""
     with contextlib.suppress(Exception), (folder / CALL).open("rb") as call:  # the copy tells what fails
+        check_only_ours(folder)
         importlib.import_module(module_of(call))
     me = os.getpid()
     if (pid := os.fork()) == 0:

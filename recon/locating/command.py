@@ -12,7 +12,7 @@ from splatnode.capture.process.terminal import say
 from splatnode.recon.locating.locate import described, located
 from splatnode.recon.locating.outcome import Located, NotLocated
 from splatnode.recon.locating.photographs import assumed_lens, check_lens, photographs
-from splatnode.recon.result.export.staged import json_bytes, write_files
+from splatnode.recon.result.export.staged import json_bytes, write_file
 from splatnode.recon.result.landmarks import Landmarks
 from splatnode.recon.result.landmarks_file import read_landmarks
 
@@ -38,7 +38,7 @@ def locate(args: argparse.Namespace) -> int:
     say(f"{len(records) - refused} of {len(records)} photographs were placed in {args.result}")
     if args.json is not None:
         told = {"result": str(args.result), "scale": "metric" if landmarks.metric else "relative"}
-        write_files(args.json.parent, {args.json.name: json_bytes({**told, "photographs": records})})
+        write_file(args.json, json_bytes({**told, "photographs": records}))
         say(f"results: {args.json}")
     return EXIT_REFUSED if refused else EXIT_GOOD
 

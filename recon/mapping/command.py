@@ -28,7 +28,7 @@ from splatnode.recon.mapping.scenes import (
 )
 from splatnode.recon.merging.command import EXIT_GOOD, EXIT_REFUSED, Reports, most, write_maps
 from splatnode.recon.replay_source import IMAGES, Recording, Request, recording
-from splatnode.recon.result.export import read_cameras, remove_result, write_file
+from splatnode.recon.result.export import read_cameras, remove_result, write_files
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.staged import json_bytes
 from splatnode.recon.result.folder import result_folder
@@ -56,7 +56,7 @@ def replay_map(args: argparse.Namespace, request: Request, config: Config) -> in
         progress("")
         reports = write_maps(args.out, args.out, partial(most, args), quiet=args.json)
         report = _report(source, args.out, reports, time.monotonic() - began_s)
-        write_file(args.out / "report.json", json_bytes(report))
+        write_files(args.out, {"report.json": json_bytes(report)})
         remove_checkpoint(args.out)
     if args.json:
         print(json.dumps(report))
@@ -100,8 +100,7 @@ def _kept(source: Recording, out: Path) -> Iterator[Frame | DroppedFrame]:
     for frame in source.frames():
         path = out / IMAGES / frame.name
         if isinstance(frame, Frame) and not path.exists():
-            path.parent.mkdir(exist_ok=True)
-            write_file(path, encode_png(frame.image))
+            write_files(out, {f"{IMAGES}/{frame.name}": encode_png(frame.image)})
         yield frame
 
 

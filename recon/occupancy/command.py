@@ -22,8 +22,9 @@ def map_result(args: argparse.Namespace) -> int:
     """Says what is known and how up was found; raises NoMap, with the exit code of a refusal, where there is no map."""
     snapshot = read_to_map(args.result)
     with waiting("looking through the place"):
+        folder = args.out or _beside(args.result)
         made = occupancy_map(snapshot, args.voxel, None if args.up is None else np.array(args.up))
-        written = made.save(args.out or args.result / MAPS, args.band)
+        written = made.save(folder, args.band)
     x, y, z = made.states.shape
     shares = ", ".join(f"{100 * share:.1f} % {name.replace('_', ' ')}" for name, share in made.shares.items())
     say(f"{x} x {y} x {z} voxels of {made.voxel:.3g}, {made.scale.sentence}: {shares}")
@@ -33,6 +34,13 @@ def map_result(args: argparse.Namespace) -> int:
     for path in written:
         say(path)
     return 0
+
+
+def _beside(result: Path) -> Path:
+    """The folder of maps in a result. Raises ValueError for a link, which may be of whoever made the result."""
+    if (folder := result / MAPS).is_symlink():
+        raise ValueError(f"{folder} must be no link; remove it, or name a folder with --out")
+    return folder
 
 
 def read_to_map(folder: Path) -> Snapshot:

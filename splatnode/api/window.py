@@ -15,6 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
+from splatnode.capture.process import python
 from splatnode.capture.process.packages import remedy
 from splatnode.viewer.probe import open3d_installed, probe_window
 
@@ -23,8 +24,7 @@ if TYPE_CHECKING:
 
 Viewer = Literal["open3d", "rerun", "browser", "viser"]
 
-VIEW = (sys.executable, "-m", "splatnode", "view")
-RERUN = (sys.executable, "-m", "rerun", "--bind", "127.0.0.1", "--port", "auto")  # by itself it listens everywhere
+_RERUN = ("rerun", "--bind", "127.0.0.1", "--port", "auto")  # by itself it listens everywhere
 _OPTIONS = {"open3d": (), "browser": ("--web",), "viser": ("--viser",)}  # of `splatnode view`
 _IN_BROWSER = ("browser", "viser")
 _ELSEWHERE = "In a browser: result.show('browser')"
@@ -53,9 +53,9 @@ def show(
     with tempfile.TemporaryDirectory(prefix="splatnode-") as folder:
         shown = result.save(folder)
         if viewer == "rerun":
-            _run((*(command or RERUN), str(_recorded(shown))), opened=None)
+            _run((*(command or python.command(*_RERUN)), str(_recorded(shown))), opened=None)
         else:
-            whole = (*(command or VIEW), *_OPTIONS[viewer], *options, folder)
+            whole = (*(command or python.command("splatnode", "view")), *_OPTIONS[viewer], *options, folder)
             _run(whole, opened if viewer in _IN_BROWSER else None)
 
 

@@ -56,7 +56,7 @@ def test_the_site_is_built_or_shown_to_this_machine_alone(calls):
 def test_an_environment_that_is_set_up_is_left_alone(calls):
     assert any("pip install" in line for line in calls("demo"))
     again = calls("demo")
-    assert not any("pip install" in line for line in again) and again[-1] == "-m splatnode demo"
+    assert not any("pip install" in line for line in again) and again[-1] == "-I -m splatnode demo"
 
 
 def test_without_a_verb_it_says_what_there_is():
@@ -134,3 +134,10 @@ def test_an_index_that_lacks_the_version_costs_nothing_unless_it_was_asked_for(t
 def test_a_choice_that_is_none_is_told(torch_from):
     done, asked = torch_from(choice="gpu")
     assert done.returncode == 69 and not asked and "SPLATNODE_TORCH must be cpu or default, is gpu" in done.stderr
+
+
+@pytest.mark.parametrize("arguments", [["demo"], ["replay", "a", "--view"], ["bench"], ["wheels"], ["release"]])
+def test_no_python_runs_what_lies_in_the_current_folder(calls, arguments):
+    """A folder of photographs may hold pip.py. `test`, `check` and `docs` are run in the checkout."""
+    told = [line for line in calls(*arguments) if line.startswith("-")]  # the others go on with what -c is told
+    assert len(told) > 2 and all(line.startswith("-I ") for line in told)

@@ -22,7 +22,7 @@ from splatnode.recon.evaluate.timing import check_same_cores
 from splatnode.recon.jobs.call import packed
 from splatnode.recon.jobs.calls import Engine, Task, work_folder
 from splatnode.recon.jobs.child import Limits
-from splatnode.recon.result.export.staged import json_bytes, write_file
+from splatnode.recon.result.export.staged import json_bytes, write_files
 from splatnode.recon.result.folder import result_folder
 
 logger = logging.getLogger(__name__)
@@ -78,7 +78,7 @@ def run_campaign(plan: Plan, places: Places, out: Path, command: str, engine: En
 
 def _write(path: Path, plan: Plan, trials: Sequence[Mapping], circumstances: Mapping) -> None:
     ordered = sorted(trials, key=lambda t: (plan_order(plan, t["method"]), *_key(t)))
-    write_file(path, json_bytes({"trials": ordered, **report(ordered), **circumstances}))
+    write_files(path.parent, {path.name: json_bytes({"trials": ordered, **report(ordered), **circumstances})})
 
 
 def _line(trial: Trial) -> str:

@@ -17,7 +17,7 @@ from matplotlib.patches import Patch, Rectangle
 from splatnode.recon.evaluate.json_file import read_json
 from splatnode.recon.evaluate.stability.case import Demand
 from splatnode.recon.evaluate.stability.outcome import Outcome
-from splatnode.recon.result.export.staged import write_file
+from splatnode.recon.result.export.staged import write_files
 
 _INK, _MUTED, _GRID = "#222222", "#6B6B6B", "#E4E4E4"
 # Blue is right and vermilion is dangerous, as in the charts of the benchmark: told apart with any colour vision.
@@ -48,7 +48,7 @@ def draw(stability_json: Path, out: Path) -> Path:
         raise ValueError(f"{stability_json} must have a trial to draw, it has none")
     buffer = io.BytesIO()
     figure_of(content).savefig(buffer, format="png", facecolor="white")
-    write_file(out / "stability.png", buffer.getvalue())
+    write_files(out, {"stability.png": buffer.getvalue()})
     return out / "stability.png"
 
 

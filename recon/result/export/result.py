@@ -78,6 +78,8 @@ def write_beside(path: Path, contents: Mapping[str, bytes], of: Path) -> None:
     Raises ResultWriteError.
     """
     folder = Path(os.path.realpath(of if of.is_dir() else of.parent))
+    if path.is_dir():
+        path = Path(os.path.realpath(path))  # the user's own link
     target = Path(os.path.realpath(path.parent)) / path.name
     if not (target.is_relative_to(folder) and digests(folder / MANIFEST)):
         write_files(path.parent, {os.path.normpath(f"{path.name}/{name}"): data for name, data in contents.items()})

@@ -15,8 +15,9 @@ import json
 import os
 import re
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import msgspec
@@ -50,31 +51,40 @@ class _Staged:
     """A file on its way: on the disk under a temporary name, which is locked as long as its writer lives."""
 
     name: str
-    target: Path  # what a link names is written, as if it were opened
+    target: Path
     temporary: Path
     linked: bool  # whether `target` is elsewhere than its name says
+
+
+_Place = Callable[[str, str], _Staged]  # of a name, and of the mark of what is being written
 
 
 def write_files(folder: Path, contents: Mapping[str, bytes], superseded: Mapping[str, str] | None = None) -> None:
     """Writes `contents` (by path relative to `folder`), which are renamed in their order once all are on the disk.
 
+    Whoever made `folder` may have put a link there, to a file that is none of his: a file takes the place of a link,
+    and nothing is written into a folder that is reached by one.
     Files of `superseded` (SHA-256 by path) are removed then, if they are unchanged and inside `folder`. Raises
     ResultWriteError when one cannot be written (no space, no permission); the temporary files are gone then and every
     file that was there before is as it was.
     """
+    _write(folder, contents, superseded or {}, partial(_placed, folder))
+
+
+def write_file(path: Path, content: bytes) -> None:
+    """One file that the user named, whole or not at all; a link of that name is followed. Raises ResultWriteError."""
+    _write(path.parent, {path.name: content}, {}, partial(_led_to, path.parent))
+
+
+def _write(folder: Path, contents: Mapping[str, bytes], superseded: Mapping[str, str], place: _Place) -> None:
     with contextlib.ExitStack() as resources:  # folders that it makes and that stay empty are removed at the end
         try:
             completed(folder, {(folder / name).parent for name in contents})
-            _write_files(folder, contents, superseded or {}, resources)
+            _write_files(folder, contents, superseded, place, resources)
         except ResultWriteError:
             raise
         except OSError as error:
             raise ResultWriteError(error.errno, explanation(error, folder, contents)) from error
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """One file, whole or not at all. Raises ResultWriteError."""
-    write_files(path.parent, {path.name: content})
 
 
 def completed(folder: Path, parents: Iterable[Path] = ()) -> None:
@@ -113,11 +123,15 @@ def explanation(error: OSError, folder: Path, contents: Mapping[str, bytes] | No
 
 
 def _write_files(
-    folder: Path, contents: Mapping[str, bytes], superseded: Mapping[str, str], resources: contextlib.ExitStack
+    folder: Path,
+    contents: Mapping[str, bytes],
+    superseded: Mapping[str, str],
+    place: _Place,
+    resources: contextlib.ExitStack,
 ) -> None:
     mark = uuid.uuid4().hex[:12]
     note, noted = folder / f".{mark}.renaming", len(contents) + len(superseded) > 1
-    staged = [_placed(folder, name, mark) for name in contents]
+    staged = [place(name, mark) for name in contents]
     temporary = [each.temporary for each in staged]
     try:
         for each, content in zip(staged, contents.values(), strict=True):
@@ -150,12 +164,27 @@ def _unfinished(error: OSError, folder: Path) -> str:
 
 
 def _placed(folder: Path, name: str, mark: str) -> _Staged:
+    """Where `name` says, whatever link is there."""
+    if not _is_inside(folder, name):
+        raise OSError(errno.ELOOP, f"{name} would be reached by a link, or lie outside; remove the link")
+    target = Path(os.path.realpath((folder / name).parent), os.path.basename(name))
+    if not target.is_symlink():
+        _check_replaceable(target, name)
+    return _Staged(name, target, _temporary(target, mark), linked=False)
+
+
+def _led_to(folder: Path, name: str, mark: str) -> _Staged:
+    """Where `name` leads, as if it were opened."""
     target = Path(os.path.realpath(folder / name))
+    _check_replaceable(target, name)
+    return _Staged(name, target, _temporary(target, mark), linked=target != Path(os.path.realpath(folder), name))
+
+
+def _check_replaceable(target: Path, name: str) -> None:
     if target.is_dir():
         raise IsADirectoryError(errno.EISDIR, f"{name} is a folder")
     if target.exists() and not target.is_file():  # root could replace /dev/null
         raise FileExistsError(errno.EEXIST, f"{name} is a device or a pipe, not a file")
-    return _Staged(name, target, _temporary(target, mark), linked=target != Path(os.path.realpath(folder), name))
 
 
 def _temporary(target: Path, mark: str) -> Path:

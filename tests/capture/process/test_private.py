@@ -6,12 +6,23 @@ import logging
 import os
 import re
 import stat
+import tempfile
 
 import pytest
 
-from splatnode.capture.process.durable import write_whole
+from splatnode.capture.process.durable import open_itself, write_whole
 from splatnode.capture.process.lock import exclusive
-from splatnode.capture.process.private import NotPrivate, StrayFile, own_files, private_folder, read_own
+from splatnode.capture.process.private import (
+    NotPrivate,
+    StrayFile,
+    check_only_ours,
+    check_way,
+    own_files,
+    private_folder,
+    read_own,
+    temporary_folder,
+)
+from tests.support.second_user import OTHER, as_other, shared_tmp  # noqa: F401  a fixture
 from tests.support.strays import STRAYS
 
 INSTEAD = "network.directory"
@@ -62,11 +73,75 @@ def test_a_folder_into_which_everybody_could_write_is_looked_through_first(tmp_p
 def test_a_way_that_everybody_may_change_is_no_way(tmp_path):
     (tmp_path / "open").mkdir()
     (tmp_path / "open").chmod(0o777)
-    with pytest.raises(NotPrivate, match=f"chmod o-w {tmp_path / 'open'}"):
+    with pytest.raises(NotPrivate, match=f"chmod go-w {tmp_path / 'open'}"):
         private_folder(tmp_path / "open" / "spool", INSTEAD, ours=True)
     assert not list((tmp_path / "open").iterdir())
     (tmp_path / "open").chmod(0o1777)  # as /tmp is: nobody can rename what is another one's
     private_folder(tmp_path / "open" / "spool", INSTEAD, ours=True)
+
+
+MODES = {0o775: "chmod go-w", 0o757: "chmod go-w", 0o2770: "chmod go-w", 0o1777: None, 0o1775: None, 0o755: None}
+
+
+@pytest.mark.parametrize("where", ["folder", "above a folder", "behind a link", "above what a link leads to"])
+@pytest.mark.parametrize(("found", "remedy"), MODES.items(), ids=[f"{each:04o}" for each in MODES])
+def test_a_way_is_taken_as_sshd_takes_one(tmp_path, where, found, remedy):
+    """Every folder on it, and on that to which a link leads, is closed to a group and to others, or sticky."""
+    way = tmp_path / "way"
+    (way / "a" / "b").mkdir(parents=True, mode=0o700)
+    (tmp_path / "link").symlink_to(way / "a")
+    spool = (tmp_path / "link" / "b" if "link" in where else way / "a" / "b") / "spool"
+    changed = {"folder": way / "a" / "b", "behind a link": way / "a"}.get(where, way)
+    changed.chmod(found)
+    uses = (
+        lambda: private_folder(spool, INSTEAD, ours=True),
+        lambda: check_way(spool),
+        lambda: check_only_ours(spool),
+        lambda: read_own(spool / "file", 10, only_ours=True),
+    )
+    if remedy is None:
+        uses[0]()
+        write_whole(spool / "file", [b"content"])
+        for use in uses[1:]:
+            use()
+        return
+    for use in uses:
+        with pytest.raises(NotPrivate, match=f"{changed} must be .* mode {found:04o}: .*run: {remedy} {changed}"):
+            use()
+    os.system(f"{remedy} {changed}")
+    uses[0]()
+
+
+def test_a_way_of_another_user_is_none(shared_tmp):  # noqa: F811
+    as_other("os.mkdir(sys.argv[1], 0o755)", shared_tmp / "theirs")
+    as_other("os.symlink(sys.argv[1], sys.argv[2])", "/", shared_tmp / "link")
+    for name, remedy in {"theirs": "chown", "link": "chown -h"}.items():
+        with pytest.raises(NotPrivate, match=f"user {OTHER} .*run: {remedy} {os.geteuid()} {shared_tmp / name}"):
+            private_folder(shared_tmp / name / "tmp" / "spool", INSTEAD, ours=True)
+
+
+def test_temporary_files_lie_where_nobody_else_can_change_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with temporary_folder("a-") as folder:
+        assert mode(folder) == 0o700
+    assert not folder.exists()
+    tmp_path.chmod(0o777)
+    with pytest.raises(NotPrivate, match=r"chmod go-w.*\$TMPDIR"), temporary_folder("a-"):
+        pass
+    tmp_path.chmod(0o1777)
+    with temporary_folder("a-") as folder:
+        assert folder.is_dir()
+
+
+@pytest.mark.parametrize("opens", ["wb", "a+b", "w"])
+def test_a_link_is_not_written_through(tmp_path, opens):
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "link").symlink_to(tmp_path / "mine")
+    with pytest.raises(OSError, match="a link lies where this file belongs; remove it"):
+        open_itself(tmp_path / "link", opens)
+    with open_itself(tmp_path / "new", opens) as file:
+        file.write("a" if opens == "w" else b"a")
+    assert (tmp_path / "mine").read_text() == "mine" and (tmp_path / "new").read_text() == "a"
 
 
 def test_own_links_are_followed(tmp_path):

@@ -12,10 +12,14 @@ import pytest
 
 import splatnode.recon.batch
 from splatnode import command_line
+from splatnode.capture.process.printable import cell
+from splatnode.recon.batch.answer import without_answer
 from splatnode.recon.batch.command import EXIT_GOOD, EXIT_SOME_FAILED, run_batch
-from splatnode.recon.batch.ledger import LEDGER, OtherBatch
+from splatnode.recon.batch.ledger import LEDGER, Ledger, OtherBatch
 from splatnode.recon.batch.sources import Recording
+from splatnode.recon.batch.tables import CSV, write_csv
 from splatnode.recon.batch.verb import replay_options
+from splatnode.recon.jobs.child import NOT_RUN
 from tests.support.recordings import GOOD, REFUSED, options, simulated
 from tests.support.synthetic import photographs
 
@@ -172,3 +176,25 @@ def test_folders_of_photographs_become_results(tmp_path, capsys):
     page = (out / "index.html").read_text()
     assert len(re.findall('src="data:image/jpeg;base64,', page)) == 2
     assert float(rows["place"]["seconds"]) > float(rows["place"]["reconstruction_s"]) > 0
+
+
+@pytest.mark.parametrize("name", ["=1+1", "+1", "-1", "@SUM(1)", "\t=1"])
+def test_a_table_has_no_formula(tmp_path, name):
+    write_csv(tmp_path / CSV, [without_answer(Recording(name, "/a"), NOT_RUN, "=cmd()")])
+    with (tmp_path / CSV).open(newline="", encoding="utf-8") as file:
+        (row,) = csv.DictReader(file)
+    assert row["name"] == f"'{name}" and row["message"] == "'=cmd()" and row["source"] == "/a"
+    assert cell(-0.5) == -0.5 and cell("a-1") == "a-1"
+
+
+def test_a_table_and_the_ledger_are_written_through_no_link(tmp_path):
+    out, mine = tmp_path / "out", tmp_path / "mine"
+    mine.write_text("mine")
+    out.mkdir()
+    for name in (CSV, f".{CSV}.partial", LEDGER):
+        (out / name).symlink_to(mine)
+    write_csv(out / CSV, [])
+    assert not (out / CSV).is_symlink() and (out / CSV).read_text().startswith("name,")
+    with pytest.raises(OSError, match="remove it"):
+        Ledger(out, ["act"])
+    assert mine.read_text() == "mine"

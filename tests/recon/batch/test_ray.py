@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import socket
 from importlib import import_module
 from pathlib import Path
@@ -12,7 +13,10 @@ from splatnode.batch import reconstruct_dataset, recordings
 from splatnode.recon.batch.command import EXIT_SOME_FAILED, run_batch
 from splatnode.recon.batch.remote import Job, run_recording
 from splatnode.recon.batch.sources import Recording
+from splatnode.recon.jobs.call import packed
+from splatnode.recon.jobs.calls import Task, engine
 from splatnode.recon.jobs.child import Limits
+from tests.support.hostile_folder import make_hostile
 from tests.support.recordings import GOOD, REFUSED, options, simulated
 from tests.support.synthetic import photographs
 
@@ -26,6 +30,16 @@ def test_a_batch_is_as_on_one_machine(tmp_path, capsys):
     assert "FAILED: 1; NO_OVERLAP: 1; OK: 1" in capsys.readouterr().out
     there = {path.name for path in out.iterdir()}
     assert there == {"good", "no", "bad.log", "batch.csv", "batch.jsonl", "batch.parquet", "index.html"}
+
+
+def test_workers_run_no_module_of_the_current_folder(tmp_path, monkeypatch):
+    """Ray adds the driver's folder to the places of modules of its workers."""
+    trace = make_hostile(tmp_path / "photos")
+    monkeypatch.chdir(tmp_path / "photos")
+    tasks = iter([Task("cwd", packed(os.getcwd))])
+    with engine(1, "") as on:
+        ((_, answer),) = on.answers(lambda: next(tasks, None), Limits(), tmp_path / "calls")
+    assert answer.value() == str(tmp_path / "photos") and not trace.exists()
 
 
 def test_more_memory_than_a_machine_has_is_told_in_place_of_waiting(tmp_path):

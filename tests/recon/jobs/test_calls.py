@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import stat
 import sys
 import time
 from collections.abc import Callable
@@ -12,11 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from splatnode.recon.jobs.call import Answer, packed
+from splatnode.capture.process import python
+from splatnode.recon.jobs.call import ANSWER, CALL, Answer, begun, laid_down, packed
 from splatnode.recon.jobs.calls import Engine, Task, engine, one_at_a_time, run_here, work_folder
-from splatnode.recon.jobs.child import NOT_RUN, Limits
+from splatnode.recon.jobs.child import NOT_RUN, Child, Limits, finished
 from splatnode.recon.jobs.cores import usable_cores
 from splatnode.recon.jobs.version import own_version
+from tests.support.second_user import OTHER, as_other, shared_tmp  # noqa: F401  a fixture
 
 
 def answers(on: Engine, folder: Path, limits: Limits, **works: Callable[[], object]) -> dict[str, Answer]:
@@ -99,6 +102,58 @@ def test_what_a_killed_driver_left_is_removed(tmp_path):
     with work_folder(tmp_path) as folder:
         assert answers(one_at_a_time(), folder, Limits(), new=partial(abs, -1))["new"].value() == 1
     assert not any(tmp_path.iterdir())
+
+
+def evil(trace: Path) -> bytes:
+    return packed(partial(trace.write_text, "run"))
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o2775])
+def test_where_others_may_change_the_results_calls_lie_elsewhere(tmp_path, mode):
+    """A member of the folder's group has put a call where calls were made before, and an answer."""
+    out, trace = tmp_path / "out", tmp_path / "trace"
+    for planted in (out / ".calls" / "0", out / ".calls" / "calls" / "0"):
+        planted.mkdir(parents=True)
+        (planted / CALL).write_bytes(evil(trace))
+        (planted / ANSWER).write_bytes(evil(trace))
+    out.chmod(mode)
+    with work_folder(out) as folder, engine(1, None) as on:
+        assert not folder.is_relative_to(out) and stat.S_IMODE(folder.stat().st_mode) == 0o700
+        assert answers(on, folder / "calls", Limits(), good=partial(divmod, 7, 2))["good"].value() == (3, 1)
+    assert not folder.exists() and not trace.exists()
+
+
+def test_calls_lie_among_the_results_where_nobody_else_may_change_them(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / ".calls").symlink_to("elsewhere")
+    before = os.umask(0)
+    try:
+        with work_folder(tmp_path) as folder, engine(1, None) as on:
+            assert folder == tmp_path / ".calls" and not folder.is_symlink()
+            assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+            assert answers(on, folder / "calls", Limits(), good=partial(divmod, 7, 2))["good"].value() == (3, 1)
+    finally:
+        os.umask(before)
+    assert not any((tmp_path / "elsewhere").iterdir())
+
+
+@pytest.mark.parametrize("open_to", [".", ".."])
+def test_a_call_that_another_user_could_have_put_there_is_not_made(tmp_path, open_to):
+    trace, folder = tmp_path / "trace", laid_down(evil(tmp_path / "trace"), tmp_path / "calls" / "0")
+    os.chmod(folder / open_to, 0o770)
+    end = finished(begun(folder, usable_cores()), Limits())
+    assert end.exit_code != 0 and "chmod go-w" in end.reason and not trace.exists()
+
+
+def test_a_call_of_another_user_is_not_made(shared_tmp):  # noqa: F811
+    folder, trace = shared_tmp / "0", shared_tmp / "trace"
+    plants = "os.mkdir(sys.argv[1], 0o755); open(sys.argv[1] + '/call', 'wb').write(bytes.fromhex(sys.argv[2]))"
+    assert as_other(plants, folder, evil(trace).hex()).returncode == 0
+    end = finished(
+        Child.started(python.command("splatnode.recon.jobs.called", str(folder)), shared_tmp / "log", usable_cores()),
+        Limits(),
+    )
+    assert end.exit_code != 0 and f"of user {OTHER}" in end.reason and not trace.exists()
 
 
 def test_more_cores_than_there_are_are_refused():

@@ -35,6 +35,22 @@ def test_a_map_is_written_beside_the_scene(result, capsys):
         assert np.allclose(arrays["origin"] / arrays["voxel"], np.round(arrays["origin"] / arrays["voxel"]))
 
 
+def test_a_map_goes_through_no_link_of_whoever_made_the_result(tmp_path, capsys):
+    result, mine, elsewhere = tmp_path / "result", tmp_path / "mine", tmp_path / "elsewhere"
+    finish(room_snapshot(), result, seed=0, preset_name="fast")
+    mine.write_text("mine")
+    elsewhere.mkdir()
+    (result / "occupancy").symlink_to(elsewhere)
+    assert command_line.main(["map", str(result), "--voxel", "0.2"]) == 2
+    assert "must be no link; remove it" in capsys.readouterr().err and not any(elsewhere.iterdir())
+    (result / "occupancy").unlink()
+    (result / "occupancy").mkdir()
+    for name in ALWAYS:
+        (result / "occupancy" / name).symlink_to(mine)
+    assert command_line.main(["map", str(result), "--voxel", "0.2"]) == 0
+    assert mine.read_text() == "mine" and not any(path.is_symlink() for path in (result / "occupancy").iterdir())
+
+
 def test_without_a_band_there_is_nothing_for_nav2(result, tmp_path, capsys):
     assert (
         command_line.main(["map", str(result), "--out", str(tmp_path), "--voxel", "0.05", "--up", "0", "0", "1"]) == 0

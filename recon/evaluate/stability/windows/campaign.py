@@ -27,7 +27,7 @@ from splatnode.recon.evaluate.timing import check_same_cores
 from splatnode.recon.jobs.call import Work, packed
 from splatnode.recon.jobs.calls import Engine, Task, work_folder
 from splatnode.recon.jobs.child import Limits
-from splatnode.recon.result.export.staged import json_bytes, write_file
+from splatnode.recon.result.export.staged import json_bytes, write_files
 from splatnode.recon.result.folder import result_folder
 
 logger = logging.getLogger(__name__)
@@ -159,4 +159,4 @@ def _write(path: Path, plan: Plan, rows: dict[Key, Row], asked: Sequence[Key], c
         "summary": summarise(ordered),
         "rows": [{**asdict(row), "right": row.right, "found": row.found.value} for row in ordered],
     }
-    write_file(path, json_bytes(content))
+    write_files(path.parent, {path.name: json_bytes(content)})

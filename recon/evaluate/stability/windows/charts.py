@@ -19,7 +19,7 @@ from matplotlib.ticker import NullLocator, PercentFormatter
 from splatnode.recon.evaluate.stability.windows.campaign import read_rows
 from splatnode.recon.evaluate.stability.windows.row import Found, Row
 from splatnode.recon.evaluate.stability.windows.summary import by_angle, by_count, by_method, within
-from splatnode.recon.result.export.staged import write_file
+from splatnode.recon.result.export.staged import write_files
 
 _INK, _MUTED, _GRID = "#222222", "#6B6B6B", "#E4E4E4"
 # Blue is right and vermilion is dangerous, as in the other charts: told apart with any colour vision.
@@ -52,7 +52,7 @@ def draw(rows: Sequence[Row], out: Path) -> list[str]:
     for name, figure in figures.items():
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", facecolor="white")
-        write_file(out / name, buffer.getvalue())
+        write_files(out, {name: buffer.getvalue()})
     return list(figures)
 
 

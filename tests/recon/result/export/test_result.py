@@ -19,6 +19,7 @@ from splatnode.recon.result.export import (
     remove_result,
     write_beside,
     write_file,
+    write_files,
     write_result,
 )
 from splatnode.recon.result.export import staged as staged_module
@@ -137,6 +138,27 @@ def test_a_device_or_a_pipe_is_not_replaced_and_a_link_is_followed(tmp_path):
     (tmp_path / "link").symlink_to(tmp_path / "real")
     write_file(tmp_path / "link", b"new")
     assert (tmp_path / "link").is_symlink() and (tmp_path / "real").read_bytes() == b"new"
+
+
+def test_a_result_goes_through_no_link_that_somebody_put_into_its_folder(tmp_path):
+    """The folder may be a stranger's, who knows how the files of a result are called."""
+    outside, elsewhere, out = tmp_path / "outside", tmp_path / "elsewhere", tmp_path / "out"
+    outside.write_text("mine")
+    elsewhere.mkdir()
+    out.mkdir()
+    (out / "a.npz").symlink_to(outside)
+    (out / "b.npz").symlink_to("nothing")
+    write_files(out, {"a.npz": b"new", "b.npz": b"new"})
+    assert outside.read_text() == "mine" and not (out / "nothing").exists()
+    assert all((out / name).read_bytes() == b"new" and not (out / name).is_symlink() for name in ("a.npz", "b.npz"))
+    (out / "maps").symlink_to(elsewhere)
+    for name in ("maps/a.npz", "../outside", str(outside)):
+        with pytest.raises(ResultWriteError, match="remove the link"):
+            write_files(out, {name: b"new"})
+    assert outside.read_text() == "mine" and not any(elsewhere.iterdir())
+    (tmp_path / "my results").symlink_to(out)  # the user's own, which he names
+    write_files(tmp_path / "my results", {"a.npz": b"newer"})
+    assert (out / "a.npz").read_bytes() == b"newer"
 
 
 def test_file_in_place_of_the_folder_is_a_clear_error(tmp_path):
