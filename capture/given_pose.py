@@ -61,7 +61,7 @@ def rigid_problem(numbers: Sequence[float]) -> str:
 def are_rigid(matrices: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     """(N,): of which of the (N, 4, 4), metres, `rigid_problem` has surely nothing to say; quickly, of many at once."""
     flat = matrices.reshape(-1, 16)
-    within = np.isfinite(flat).all(1) & (np.abs(flat) <= LARGEST_M).all(1)
+    within = np.all(np.isfinite(flat) & (np.abs(flat) <= LARGEST_M), axis=1)
     rotations = np.where(within[:, None, None], matrices[:, :3, :3], 0.0)
     off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
     in_place = np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(1) <= _SURELY * _EXACT

@@ -242,10 +242,10 @@ def _check(names: Sequence[str], Ts: Array) -> None:
     """Raises ValueError where one of the Ts (M, 4, 4) is no rigid motion of finite numbers."""
     in_place = Ts.copy()
     in_place[:, :3, 3] = 0.0
-    is_near = (np.abs(Ts[:, :3, 3]) <= _FARTHEST_M).all(1)  # of NaN it is not said
+    is_near = np.all(np.abs(Ts[:, :3, 3]) <= _FARTHEST_M, axis=1)  # of NaN it is not said
     for index in np.flatnonzero(~(are_rigid(in_place) & is_near)):
         problem = rigid_problem(in_place[index].ravel().tolist())
         if not is_near[index]:
             problem = f"at finite coordinates within {_FARTHEST_M:g} m"
         if problem:
-            raise ValueError(f"the pose of {printable(names[index], 100)} must be {problem}")
+            raise ValueError(f"the pose of {printable(names[int(index)], 100)} must be {problem}")
