@@ -20,7 +20,18 @@ class ImageRow(NamedTuple):
 
 def content_lines(text: str) -> Iterator[str]:
     """The lines of a text file of a model, without its comments."""
-    return (line for line in text.splitlines() if not line.startswith("#"))
+    return (line for line in each_line(text) if not line.startswith("#"))
+
+
+def each_line(text: str) -> Iterator[str]:
+    """The lines of a text, one after the other: a list of all, which may be empty ones, takes far more memory."""
+    end_of_line = "\n" if "\n" in text else "\r"
+    start = 0
+    while start < len(text):
+        end = text.find(end_of_line, start)
+        end = len(text) if end < 0 else end
+        yield text[start:end].rstrip("\r")
+        start = end + 1
 
 
 def text_images(text: str) -> Iterator[ImageRow]:

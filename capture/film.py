@@ -5,6 +5,7 @@ film.mp4, film.mp4#t=10,20.5, drive.mcap#/front/image, pusht#episode_000003/obse
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import re
@@ -30,14 +31,24 @@ def file_and_part(path: Path) -> tuple[Path, str]:
 
     A file whose own name has a # is itself.
     """
-    if path.exists():
+    if _is_there(path):
         return path, ""
     text = str(path)
     for place in (place for place, letter in enumerate(text) if letter == _MARK):
         file = Path(text[:place])
-        if file.is_file() or is_data_set(file):
+        if _is_there(file) and (file.is_file() or is_data_set(file)):
             return file, unquote(text[place + 1 :])
     return path, ""
+
+
+def _is_there(path: Path) -> bool:
+    """Whether a path leads somewhere; one that is too long for the system does not."""
+    try:
+        return path.exists()
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        return False
 
 
 def part_of(file: Path, part: str) -> Path:
@@ -49,7 +60,7 @@ def part_of(file: Path, part: str) -> Path:
 def is_film(path: Path) -> bool:
     """Whether this is a file, or a part of one or of a data set, and not a folder."""
     file, part = file_and_part(path)
-    return bool(part) or file.is_file()
+    return bool(part) or (_is_there(file) and file.is_file())
 
 
 def camera(path: Path) -> tuple[str, dict[str, Any]]:

@@ -15,6 +15,7 @@ LARGEST_M = 1e6  # of a coordinate, and of its standard deviation
 SIGMA_M, SIGMA_DEG = 0.01, 2.0  # standard deviations where nobody tells any
 _RIGID = 1e-2  # largest difference of a rotation times its transpose from the identity
 _EXACT = 1e-6  # by which the last row may differ from 0 0 0 1
+_SURELY = 0.999  # of a limit: within it, whatever the order in which it is computed
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,16 @@ def rigid_problem(numbers: Sequence[float]) -> str:
     if turned or np.abs(matrix[3] - [0.0, 0.0, 0.0, 1.0]).max() > _EXACT:
         return "a rigid motion: a rotation, a translation, and 0 0 0 1"
     return ""
+
+
+def are_rigid(matrices: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+    """(N,): of which of the (N, 4, 4), metres, `rigid_problem` has surely nothing to say; quickly, of many at once."""
+    flat = matrices.reshape(-1, 16)
+    within = np.all(np.isfinite(flat) & (np.abs(flat) <= LARGEST_M), axis=1)
+    rotations = np.where(within[:, None, None], matrices[:, :3, :3], 0.0)
+    off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
+    in_place = np.abs(matrices[:, 3] - [0.0, 0.0, 0.0, 1.0]).max(1) <= _SURELY * _EXACT
+    return within & (off <= _SURELY * _RIGID) & (np.linalg.det(rotations) > 0) & in_place
 
 
 def given_pose(

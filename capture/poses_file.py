@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from array import array
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Annotated
 
@@ -13,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation, Slerp
 
-from splatnode.capture.colmap_images import ImageRow, binary_images, text_images
+from splatnode.capture.colmap_images import ImageRow, binary_images, each_line, text_images
 from splatnode.capture.frame import DroppedFrame, Frame
-from splatnode.capture.given_pose import rigid_problem
+from splatnode.capture.given_pose import are_rigid, rigid_problem
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import printable
@@ -25,6 +27,7 @@ from splatnode.capture.stamp import Clock
 Array = npt.NDArray[np.float64]
 
 _MAX_BYTES = 200_000_000
+MOST_POSES = 1_000_000  # of a file: those of five hours at 60 a second
 _LONGEST_GAP_S = 1.0  # between two poses, over which a time between them is interpolated
 _NEAREST_S = 0.02  # of a time to the one pose that counts where there is none on its other side
 _FARTHEST_M = 1e9  # of a coordinate
@@ -67,7 +70,12 @@ class Trajectory:
             found = self._at(frame.captured_at.ns / 1e9)
             if found is not None or frame.captured_at.clock is Clock.RECORDING:
                 return found  # whole seconds of a recording are seconds, and no numbers of frames
-        return self._at(float(frame.frame_id)) if _are_numbers(self.seconds) else None
+        return self._at(float(frame.frame_id)) if self._are_numbers else None
+
+    @cached_property
+    def _are_numbers(self) -> bool:
+        """Whether the times are the numbers of frames, as where nobody knows when they were taken."""
+        return bool((self.seconds == np.floor(self.seconds)).all() and (self.seconds < 1e6).all())
 
     def names(self, photograph: str) -> str:
         """The name by which it knows the photograph, which may lack the suffix; empty where it does not."""
@@ -87,11 +95,6 @@ class Trajectory:
         T[:3, :3] = Slerp([0.0, 1.0], Rotation.from_matrix(self.Ts[after - 1 : after + 1, :3, :3]))(share).as_matrix()
         T[:3, 3] = (1.0 - share) * self.Ts[after - 1, :3, 3] + share * self.Ts[after, :3, 3]
         return T
-
-
-def _are_numbers(seconds: Array) -> bool:
-    """Whether the times are the numbers of frames, as where nobody knows when they were taken."""
-    return bool((seconds == np.floor(seconds)).all() and (seconds < 1e6).all())
 
 
 def poses_of(trajectory: Trajectory, frames: Sequence[Frame | DroppedFrame], where: str) -> dict[str, Array]:
@@ -142,73 +145,107 @@ def read_poses(path: Path) -> Trajectory:
 def _read(path: Path, data: bytes) -> Trajectory:
     if path.suffix == ".json":
         content = record_in(data, _Transforms)
-        return named((each.file_path, np.array(each.transform_matrix) @ _OPENGL) for each in content.frames)
+        _check_count(len(content.frames))
+        matrices = np.array([each.transform_matrix for each in content.frames], np.float64).reshape(-1, 4, 4)
+        return _named([each.file_path for each in content.frames], matrices @ _OPENGL)
     if path.suffix == ".bin":
-        return named(_of_colmap(binary_images(data)))
+        return _of_colmap(binary_images(data))
     text = data.decode()
     if path.name.startswith("images"):
-        return named(_of_colmap(text_images(text)))
+        return _of_colmap(text_images(text))
     return _tum(text)
 
 
 def named(poses: Iterable[tuple[str, Array]]) -> Trajectory:
     """Poses by the names of their photographs. Raises ValueError where one is no rigid motion or comes twice."""
-    by_name: dict[str, Array] = {}
+    names, matrices = [], []
     for name, T in poses:
-        name = PurePosixPath(name).name
+        names.append(name)
+        matrices.append(np.asarray(T, np.float64))
+    return _named(names, np.stack(matrices) if matrices else np.zeros((0, 4, 4)))
+
+
+def _named(paths: Sequence[str], Ts: Array) -> Trajectory:
+    """As `named`; Ts (M, 4, 4)."""
+    names = [PurePosixPath(path).name for path in paths]
+    if not names:
+        raise ValueError("it holds no poses")
+    by_name: dict[str, Array] = {}
+    for name, T in zip(names, Ts, strict=True):
         if name in by_name:
             raise ValueError(f"there are two poses of {printable(name, 100)}")
-        by_name[name] = _checked(name, T)
-    if not by_name:
-        raise ValueError("it holds no poses")
+        by_name[name] = T
+    _check(names, Ts)
     return Trajectory(by_name)
 
 
-def _of_colmap(rows: Iterable[ImageRow]) -> Iterator[tuple[str, Array]]:
+def _of_colmap(rows: Iterable[ImageRow]) -> Trajectory:
+    names, numbers = [], array("d")
     for name, motion, _ in rows:
-        T_camera_world = _motion(motion[4:], motion[:4])
-        yield name, np.asarray(np.linalg.inv(_checked(name, T_camera_world)), np.float64)
+        _add(names, name)
+        numbers.extend((*motion[4:], *motion[:4]))
+    Ts_camera_world = _motions(numbers)
+    _check(names, Ts_camera_world)
+    return _named(names, np.asarray(np.linalg.inv(Ts_camera_world), np.float64))
 
 
 def _tum(text: str) -> Trajectory:
-    rows = [line.split() for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    if not rows or any(len(row) != 8 for row in rows):
-        raise ValueError("each line must have eight values")
-    motions = [(row[0], _checked(row[0], _of_tum(row[1:]))) for row in rows]
+    names, numbers = [], array("d")
+    for line in each_line(text):
+        if line.strip() and not line.lstrip().startswith("#"):
+            name, *motion = line.split(maxsplit=8)
+            if len(motion) != 7:
+                raise ValueError("each line must have eight values")
+            x, y, z, qx, qy, qz, qw = map(float, motion)
+            _add(names, name)
+            numbers.extend((x, y, z, qw, qx, qy, qz))
+    if not names:
+        raise ValueError("each line must have eight values, and there must be one")
+    Ts = _motions(numbers)
     try:
-        seconds = np.array([float(name) for name, _ in motions])
+        seconds = np.array([float(name) for name in names])
     except ValueError:  # names of photographs in place of times
-        return named(motions)
+        return _named(names, Ts)
+    _check(names, Ts)
     if not np.isfinite(seconds).all():
         raise ValueError("times must be finite")
     order = np.argsort(seconds, kind="stable")
-    return Trajectory(seconds=seconds[order], Ts=np.stack([motions[index][1] for index in order]))
+    return Trajectory(seconds=seconds[order], Ts=Ts[order])
 
 
-def _of_tum(row: Sequence[str]) -> Array:
-    x, y, z, qx, qy, qz, qw = map(float, row)
-    return _motion((x, y, z), (qw, qx, qy, qz))
+def _add(names: list[str], name: str) -> None:
+    names.append(name)
+    _check_count(len(names))
 
 
-def _motion(translation: Sequence[float], quat: Sequence[float]) -> Array:
-    T = np.eye(4)
-    T[:3, 3] = translation
-    w, x, y, z = quat
-    length = float(np.linalg.norm(quat))
-    # A quaternion of zeros is no rotation, which is found when it is checked.
-    usable = np.isfinite(length) and length > 0
-    T[:3, :3] = Rotation.from_quat(np.array([x, y, z, w]) / length).as_matrix() if usable else np.nan
-    return T
+def _check_count(count: int) -> None:
+    if count > MOST_POSES:
+        raise ValueError(f"at most {MOST_POSES} poses are read, and there are more; leave some out")
 
 
-def _checked(name: str, T: Array) -> Array:
-    """Raises ValueError where it is no rigid motion of finite numbers."""
-    T = np.asarray(T, np.float64)
-    in_place = T.copy()
-    in_place[:3, 3] = 0.0
-    problem = rigid_problem(in_place.ravel().tolist())
-    if not (np.abs(T[:3, 3]) <= _FARTHEST_M).all():  # NaN, too
-        problem = f"at finite coordinates within {_FARTHEST_M:g} m"
-    if problem:
-        raise ValueError(f"the pose of {printable(name, 100)} must be {problem}")
-    return T
+def _motions(numbers: Sequence[float]) -> Array:
+    """(M, 4, 4) of seven numbers each: a translation and a quaternion wxyz. NaN where that is no rotation."""
+    rows = np.array(numbers, np.float64).reshape(-1, 7)
+    Ts = np.tile(np.eye(4), (len(rows), 1, 1))
+    Ts[:, :3, 3] = rows[:, :3]
+    with np.errstate(all="ignore"):
+        lengths = np.linalg.norm(rows[:, 3:], axis=1)
+        usable = np.isfinite(lengths) & (lengths > 0)
+        quats = np.where(usable[:, None], rows[:, 3:] / lengths[:, None], [1.0, 0.0, 0.0, 0.0])
+    if len(rows):
+        Ts[:, :3, :3] = Rotation.from_quat(quats[:, [1, 2, 3, 0]]).as_matrix()
+    Ts[~usable, :3, :3] = np.nan
+    return Ts
+
+
+def _check(names: Sequence[str], Ts: Array) -> None:
+    """Raises ValueError where one of the Ts (M, 4, 4) is no rigid motion of finite numbers."""
+    in_place = Ts.copy()
+    in_place[:, :3, 3] = 0.0
+    is_near = np.all(np.abs(Ts[:, :3, 3]) <= _FARTHEST_M, axis=1)  # of NaN it is not said
+    for index in np.flatnonzero(~(are_rigid(in_place) & is_near)):
+        problem = rigid_problem(in_place[index].ravel().tolist())
+        if not is_near[index]:
+            problem = f"at finite coordinates within {_FARTHEST_M:g} m"
+        if problem:
+            raise ValueError(f"the pose of {printable(names[int(index)], 100)} must be {problem}")

@@ -35,7 +35,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 # So do OpenBLAS's, over matrices of three columns that one thread is through with before the others wake.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # What OpenCV warns of, a damaged photograph, is said with the name of that photograph.
-os.environ.setdefault("OPENCV_LOG_LEVEL", "ERROR")
+# Its lines have what a stranger's file says, which its exceptions say, too.
+os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
 
 _NOBODY_READS = 128 + signal.SIGPIPE  # as a shell says of a program that a closed pipe ended
 

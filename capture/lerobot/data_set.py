@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator
+import math
+import re
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from types import ModuleType
 from typing import Any
 
 import msgspec
 
+from splatnode.capture.lerobot import tables
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import printable
@@ -21,7 +21,11 @@ INFO, EPISODES = Path("meta", "info.json"), Path("meta", "episodes")
 _MOST_BYTES = 10_000_000  # of info.json
 _MOST_RATE = 1000  # frames a second, as of a video
 _NUMBER = "episode_index"  # the column
+_MOST_NUMBER = 10**9  # of an episode, a chunk or a file
 _NAMED = "episode_"  # before an episode's number, in the name of a part
+_LONGEST = 1000  # characters of video_path, and of a camera's key in it
+_LONGEST_PATH = 4000  # of the two together
+_FIELD = re.compile(r"\{(video_key|chunk_index|file_index)(?::0?([0-9]{1,2})d)?\}")
 
 
 class UnusableDataSet(ValueError):
@@ -108,15 +112,14 @@ def film(folder: Path, part: str) -> Film:
     number, key = episode_and_camera(folder, info, part)
     shown = _shown(folder)
     wanted = tuple(f"videos/{key}/{name}" for name in ("chunk_index", "file_index", "from_timestamp", "to_timestamp"))
-    with _reading(folder) as (tables, files):
-        row = tables.row(files, _NUMBER, number, wanted)
-    if row is None:
+    found = tables.row(_files(folder), _NUMBER, number, wanted, UnusableDataSet, _where(folder))
+    if found is None:
         raise UnusableDataSet(f"{shown} has no episode {number}; it has {len(set(_numbers(folder)))} episodes")
-    chunk, file, from_s, to_s = (row.get(name) for name in wanted)
-    if chunk is None or file is None or from_s is None or to_s is None or to_s <= from_s:
+    chunk, file, from_s, to_s = found
+    if not all(map(math.isfinite, found)) or to_s <= from_s:
         raise UnusableDataSet(f"{shown}: episode {number} has no images of {printable(key)}")
-    video = folder / _video(info, key, int(chunk), int(file))
-    return Film(number, key, video, float(from_s), float(to_s), info.fps if 0 < info.fps <= _MOST_RATE else 0.0)
+    video = folder / _video(info, key, _whole(chunk, "chunk_index"), _whole(file, "file_index"))
+    return Film(number, key, video, from_s, to_s, info.fps if 0 < info.fps <= _MOST_RATE else 0.0)
 
 
 def episode_and_camera(folder: Path, info: Info, part: str) -> tuple[int, str]:
@@ -124,7 +127,8 @@ def episode_and_camera(folder: Path, info: Info, part: str) -> tuple[int, str]:
     said, _, key = part.partition("/")
     number = said.removeprefix(_NAMED)
     key = key or (info.cameras[0] if len(info.cameras) == 1 else "")
-    if not number.isascii() or not number.isdecimal() or key not in info.cameras:
+    is_number = number.isascii() and number.isdecimal() and len(number) <= len(str(_MOST_NUMBER))
+    if not is_number or key not in info.cameras:
         cameras = printable(", ".join(info.cameras))
         raise UnusableDataSet(
             f"{_shown(folder)}: behind the # must be an episode and a camera, as "
@@ -135,43 +139,64 @@ def episode_and_camera(folder: Path, info: Info, part: str) -> tuple[int, str]:
 
 def _numbers(folder: Path) -> list[int]:
     """Of the episodes. Raises UnusableDataSet where there are none."""
-    with _reading(folder) as (tables, files):
-        numbers = [int(number) for number in tables.column(files, _NUMBER)]
-        if not numbers:
-            raise UnusableDataSet(
-                f"{_shown(folder)} must have a row for each episode in {EPISODES}/*/*.parquet; what is there has no "
-                "rows: record an episode first"
-            )
-    return numbers
+    numbers = tables.column(_files(folder), _NUMBER, UnusableDataSet, _where(folder))
+    if not len(numbers):
+        raise UnusableDataSet(
+            f"{_shown(folder)} must have a row for each episode in {EPISODES}/*/*.parquet; what is there has no "
+            "rows: record an episode first"
+        )
+    return [_whole(number, _NUMBER) for number in numbers]
 
 
-@contextlib.contextmanager
-def _reading(folder: Path) -> Iterator[tuple[ModuleType, list[Path]]]:
-    """What reads tables, and the files of meta/episodes; what fails with these is told of them."""
-    shown = _shown(folder)
-    try:
-        from splatnode.capture.lerobot import pyarrow  # takes half a second, and is an extra
-    except ModuleNotFoundError as error:
-        said = f"{shown} is a LeRobot data set, and its tables are read with {error.name}, which is not installed"
-        raise ModuleNotFoundError(said, name=error.name) from error
+def _whole(number: float, name: str) -> int:
+    if not 0 <= number <= _MOST_NUMBER or number != math.floor(number):
+        raise UnusableDataSet(f"{name} must be a whole number of 0 to {_MOST_NUMBER}, it is {number:g}")
+    return int(number)
+
+
+def _files(folder: Path) -> list[Path]:
+    """Those of meta/episodes. Raises UnusableDataSet where there are none."""
     files = sorted((folder / EPISODES).glob("*/*.parquet"))
     if not files:
         raise UnusableDataSet(
-            f"{shown} must have a row for each episode in {EPISODES}/*/*.parquet; there are no such files: copy or "
-            "download the whole data set, or record an episode first"
+            f"{_shown(folder)} must have a row for each episode in {EPISODES}/*/*.parquet; there are no such files: "
+            "copy or download the whole data set, or record an episode first"
         )
-    with foreign(UnusableDataSet, f"{shown}: {EPISODES}"):
-        yield pyarrow, files
+    return files
 
 
 def _shown(folder: Path) -> str:
     return f"{printable(str(folder))!r}"
 
 
+def _where(folder: Path) -> str:
+    return f"{_shown(folder)}: {EPISODES}"
+
+
 def _video(info: Info, key: str, chunk: int, file: int) -> PurePosixPath:
     """The path in the data set, which leads nowhere else."""
-    with foreign(UnusableDataSet, "video_path"):
-        path = PurePosixPath(str(info.video_path).format(video_key=key, chunk_index=chunk, file_index=file))
-    if path.is_absolute() or ".." in path.parts:
+    path = PurePosixPath(video_path(info.video_path or "", key, chunk, file))
+    if path.is_absolute() or ".." in path.parts or not str(path).isprintable():
         raise UnusableDataSet(f"video_path must lead to a file of the data set, it leads to {printable(path, 200)!r}")
     return path
+
+
+def video_path(template: str, key: str, chunk: int, file: int) -> str:
+    """The template of a data set with its fields filled in; it is a stranger's text, and no format of Python's.
+
+    It may have the fields of LeRobot alone, {video_key}, {chunk_index:03d} and {file_index:03d}, with widths of at most
+    two digits. Raises UnusableDataSet.
+    """
+    if max(len(template), len(key)) > _LONGEST:
+        longest = max(len(template), len(key))
+        raise UnusableDataSet(f"video_path and a camera's key have at most {_LONGEST} characters, here {longest}")
+    if set("{}") & set(_FIELD.sub("", template)):
+        raise UnusableDataSet(
+            "video_path must have the fields {video_key}, {chunk_index:03d} and {file_index:03d} and no others, "
+            f"it is {printable(template, 200)!r}"
+        )
+    values = {"video_key": key, "chunk_index": str(chunk), "file_index": str(file)}
+    found = _FIELD.sub(lambda field: values[field[1]].rjust(int(field[2] or 0), "0"), template)
+    if len(found) > _LONGEST_PATH:
+        raise UnusableDataSet(f"video_path must lead to a file of at most {_LONGEST_PATH} characters, not {len(found)}")
+    return found

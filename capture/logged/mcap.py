@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Callable, Collection, Iterator
+import zlib
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
@@ -107,15 +108,30 @@ def _of_topics(stream: IO[bytes], wanted: Collection[str], known: _Known) -> Ite
         return
     for record in (*summary.schemas.values(), *summary.channels.values()):
         known.add(record)
-    num_bytes = stream.seek(0, io.SEEK_END)
     channels = {number for number, topic in known.topics.items() if topic.name in wanted}
-    for chunk in sorted(summary.chunk_indexes, key=lambda each: each.chunk_start_offset):
-        if channels.isdisjoint(chunk.message_index_offsets) and chunk.message_index_offsets:
-            continue
-        if chunk.chunk_start_offset >= num_bytes:  # a place that cannot be sought would be an error of the disk's
-            raise UnusableLog(f"its index leads to byte {chunk.chunk_start_offset}, it has {num_bytes}")
-        stream.seek(chunk.chunk_start_offset)
-        yield from unpacked(next(_reader(stream, skip_magic=True).records))
+    offsets = {
+        chunk.chunk_start_offset
+        for chunk in summary.chunk_indexes
+        if not (channels.isdisjoint(chunk.message_index_offsets) and chunk.message_index_offsets)
+    }
+    yield from _of_chunks(stream, sorted(offsets))
+
+
+def _of_chunks(stream: IO[bytes], offsets: Sequence[int]) -> Iterator[Any]:
+    """The records of the chunks at these rising places, none of which begins within another one.
+
+    So all of them together are no longer than the file, however many an index names.
+    """
+    num_bytes, behind = stream.seek(0, io.SEEK_END), 0
+    for offset in offsets:
+        if offset >= num_bytes:  # a place that cannot be sought would be an error of the disk's
+            raise UnusableLog(f"its index leads to byte {offset}, it has {num_bytes}")
+        if offset < behind:
+            raise UnusableLog(f"its index leads to byte {offset}, within a chunk that goes on to byte {behind}")
+        stream.seek(offset)
+        chunk = next(_reader(stream, skip_magic=True).records)
+        behind = stream.tell()
+        yield from unpacked(chunk)
 
 
 def _summary(stream: IO[bytes]) -> Any:
@@ -139,14 +155,41 @@ def _records(stream: IO[bytes]) -> Iterator[Any]:
 def unpacked(record: Any) -> Iterator[Any]:
     """What a chunk holds; any other record itself. Raises UnusableLog where it would take too much memory."""
     from mcap.records import Chunk
-    from mcap.stream_reader import breakup_chunk
 
     if not isinstance(record, Chunk):
         yield record
         return
     if record.uncompressed_size > _MOST_BYTES:
         raise UnusableLog(f"a chunk must have at most {_MOST_BYTES} bytes, it has {record.uncompressed_size}")
-    yield from breakup_chunk(_decompressed(record), validate_crc=True)
+    yield from _inside(_decompressed(record))
+
+
+def _inside(chunk: Any) -> Iterator[Any]:
+    """The records of a chunk, one after the other: millions of them, which half a gigabyte may hold, take more memory.
+
+    Raises UnusableLog where they are not those that were written.
+    """
+    from mcap.data_stream import ReadDataStream
+    from mcap.opcode import Opcode
+    from mcap.records import Channel, Message, Schema
+
+    if chunk.compression:
+        raise UnusableLog(
+            f"a chunk must be compressed by lz4, zstd or not, it is by {printable(chunk.compression, 40)!r}"
+        )
+    if chunk.uncompressed_crc and zlib.crc32(chunk.data) != chunk.uncompressed_crc:
+        raise UnusableLog("a chunk does not hold what was written: its checksum is another one")
+    stream = ReadDataStream(io.BytesIO(chunk.data))
+    while stream.count < len(chunk.data):
+        opcode, length = stream.read1(), stream.read8()
+        if opcode == Opcode.CHANNEL:
+            yield Channel.read(stream)
+        elif opcode == Opcode.MESSAGE:
+            yield Message.read(stream, length)
+        elif opcode == Opcode.SCHEMA:
+            yield Schema.read(stream)
+        else:
+            stream.read(length)
 
 
 def _decompressed(chunk: Any) -> Any:

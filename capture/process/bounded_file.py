@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 
 def read_bounded(path: Path, most: int, refusal: type[Exception], source: str = "") -> bytes:
@@ -14,13 +17,21 @@ def read_bounded(path: Path, most: int, refusal: type[Exception], source: str = 
     command. Raises a `refusal` that begins with `source`, or OSError where the bytes cannot be had.
     """
     where = f"{source}: " if source else ""
+    with open_regular(path, refusal, source) as file:
+        size = os.fstat(file.fileno()).st_size
+        if size > most:
+            raise refusal(f"{where}the file has {size} bytes; at most {most} are read")
+        return file.read(size)
+
+
+@contextlib.contextmanager
+def open_regular(path: Path, refusal: type[Exception], source: str = "") -> Iterator[BinaryIO]:
+    """The file `path`, opened to be read. Raises as `read_bounded`."""
+    where = f"{source}: " if source else ""
     _must_be_regular(os.stat(path), refusal, where)
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-        found = os.fstat(file.fileno())  # of what was opened, whatever was there before
-        _must_be_regular(found, refusal, where)
-        if found.st_size > most:
-            raise refusal(f"{where}the file has {found.st_size} bytes; at most {most} are read")
-        return file.read(found.st_size)
+        _must_be_regular(os.fstat(file.fileno()), refusal, where)  # of what was opened, whatever was there before
+        yield file
 
 
 def _must_be_regular(found: os.stat_result, refusal: type[Exception], where: str) -> None:

@@ -76,8 +76,9 @@ def recordings(named: Sequence[Path]) -> list[Recording]:
     """
     found: dict[_Place, dict[str, Photographs | Film]] = {}
     problems: dict[_Place, str] = {}
+    lists: set[Path] = set()
     for path in named:
-        for each in _found(path):
+        for each in _found(path, lists):
             cameras = found.setdefault(each.place, {})
             if each.place in problems or (isinstance(each, _Shot) and each.camera in cameras):
                 raise ValueError(f"{str(Path(*each.place))!r} is given twice; give each recording once")
@@ -89,12 +90,12 @@ def recordings(named: Sequence[Path]) -> list[Recording]:
     return [Recording(name, found[place], problems.get(place, "")) for name, place in zip(names, found, strict=True)]
 
 
-def _found(path: Path, lists: tuple[Path, ...] = ()) -> Iterator[_Shot | _Unreadable]:
-    """What `path` names; `lists` led to it."""
+def _found(path: Path, seen: set[Path], lists: tuple[Path, ...] = ()) -> Iterator[_Shot | _Unreadable]:
+    """What `path` names; `lists` led to it, and those of `seen` were read before."""
     if path.suffix.lower() == sources.LIST and path.is_file():
-        for listed in sources.listed(path, lists):
+        for listed in sources.listed(path, lists, seen):
             try:
-                yield from _found(listed, (*lists, path.resolve()))
+                yield from _found(listed, seen, (*lists, sources.real(path)))
             except (ValueError, FileNotFoundError) as error:
                 yield _Unreadable(listed.absolute().parts, str(error))
         return

@@ -15,6 +15,8 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from splatnode.capture.lerobot.data_set import UnusableDataSet
+from splatnode.capture.lerobot.pyarrow import bounded_table
+from splatnode.capture.lerobot.tables import check_whole
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.printable import printable
 from splatnode.recon.batch.answer import Outcome
@@ -78,7 +80,9 @@ def _earlier(file: Path) -> Iterator[dict[str, Any]]:
     """The rows of a table that `write_seen` wrote, some at a time. Raises UnusableDataSet where it is none, OSError."""
     shown = printable(str(file))
     must = f"{shown!r} must be a table of cameras that splatnode wrote, for others to be added"
-    with _reading(f"{must}; move it away, or mend it"), pq.ParquetFile(file) as table:
+    said = f"{must}; move it away, or mend it"
+    check_whole(file, UnusableDataSet, said)
+    with _reading(said), bounded_table(file) as table:
         names = set(table.schema_arrow.names)
         if others := sorted(names - set(_SIDE.names)):
             raise UnusableDataSet(f"{must}; it has other columns ({printable(', '.join(others), 200)}): move it away")
@@ -98,8 +102,26 @@ def write_with_columns(source: Path, target: Path, by_camera: Mapping[str, Mappi
     an episode is null. Raises UnusableDataSet where `source` cannot be read or has other columns of these names,
     OSError.
     """
-    with _reading(repr(printable(str(source)))):
-        table = pq.read_table(source)
+    shown = repr(printable(str(source)))
+    check_whole(source, UnusableDataSet, shown)
+    with contextlib.ExitStack() as opened:
+        with _reading(shown):
+            table = opened.enter_context(bounded_table(source))
+        writer: pq.ParquetWriter | None = None
+        for index in range(table.num_row_groups):
+            with _reading(shown):
+                some = table.read_row_group(index, use_threads=False)
+            some = _with_columns(some, by_camera, shown)
+            writer = writer or opened.enter_context(pq.ParquetWriter(target, some.schema, compression="snappy"))
+            writer.write_table(some)
+        if writer is None:
+            empty = _with_columns(table.schema_arrow.empty_table(), by_camera, shown)
+            pq.write_table(empty, target, compression="snappy")
+
+
+def _with_columns(table: pa.Table, by_camera: Mapping[str, Mapping[int, Mapping[str, Any]]], shown: str) -> pa.Table:
+    """As `write_with_columns`, of some rows. Raises UnusableDataSet."""
+    with _reading(shown):
         episodes = table.column("episode_index").to_pylist()
     for camera, known in by_camera.items():
         is_known = pa.array([episode in known for episode in episodes], pa.bool_())
@@ -107,13 +129,13 @@ def write_with_columns(source: Path, target: Path, by_camera: Mapping[str, Mappi
             title = f"{_PREFIX}/{camera}/{name}"
             values = pa.array([known[episode][name] if episode in known else None for episode in episodes], kind)
             if title in table.column_names:
-                with _reading(f"{printable(str(source))!r}: the column {printable(title)}"):
+                with _reading(f"{shown}: the column {printable(title)}"):
                     before = table.column(title).cast(kind)
                 merged = pc.call_function("if_else", [is_known, values, before])
                 table = table.set_column(table.column_names.index(title), title, merged)
             else:
                 table = table.append_column(title, values)
-    pq.write_table(table, target, compression="snappy")
+    return table
 
 
 def _write(path: Path, rows: Iterable[Mapping[str, Any]], schema: pa.Schema, at_a_time: int) -> None:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,10 @@ from splatnode.capture import film, recording
 from splatnode.capture.cameras import mcap
 from splatnode.capture.cameras.folder import image_paths, natural_order
 from splatnode.capture.lerobot import data_set
+from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.printable import printable_name
+
+log = logging.getLogger(__name__)
 
 VIDEOS = {".avi", ".m4v", ".mkv", ".mov", ".mp4", ".mpg", ".webm"}
 LIST = ".txt"
@@ -21,6 +25,9 @@ REPORT = "report.json"  # a folder that has one is a result, whose pictures are 
 OWN_SUFFIX = ".splatnode.mcap"  # of what a batch writes beside an MCAP file: no recording
 _PHOTOGRAPHS = "images"  # the name of a folder that says nothing of what the photographs show
 _LONGEST = 150  # characters of a result folder's name
+_DEEPEST = 100  # folders below the one that was named; a path may be 4096 bytes long
+_DEEPEST_LIST = 20  # lists that lead to a list
+_MOST_LIST_BYTES = 100_000_000
 _MARKED = 8  # hexadecimal digits that tell recordings of one name apart
 
 
@@ -42,14 +49,15 @@ def recordings(sources: Sequence[Path], out: Path | None, own_names: frozenset[s
     Raises FileNotFoundError and ValueError for what the command line itself names. Names of `own_names` are not given.
     """
     found: dict[Path, str] = {}
+    seen: set[Path] = set()
     for source in sources:
         if not source.exists() and not film.is_film(source):
             raise FileNotFoundError(
                 f"{str(source)!r} is not there; give a folder, a video, an MCAP file, a data set, or a list (.txt)"
             )
         before = len(found)
-        for path, label in _found(source, out and out.resolve()):
-            found.setdefault(path.resolve(), label)
+        for path, label in _found(source, out and out.resolve(), seen):
+            found.setdefault(real(path), label)
         if len(found) == before:
             raise ValueError(f"no photographs and no videos in {str(source)!r}, or only some that were named already")
     times = Counter(found.values())
@@ -59,16 +67,30 @@ def recordings(sources: Sequence[Path], out: Path | None, own_names: frozenset[s
     ]
 
 
-def _found(source: Path, out: Path | None, lists: tuple[Path, ...] = ()) -> Iterator[tuple[Path, str]]:
-    """Paths of recordings, each with what it is called; `lists` led to this source."""
-    if source.is_dir():
-        for path in _walked(source, out, set()):
+def _found(source: Path, out: Path | None, seen: set[Path], lists: tuple[Path, ...] = ()) -> Iterator[tuple[Path, str]]:
+    """Paths of recordings, each with what it is called; `lists` led to this source. What is in `seen` has been here."""
+    if _is(source.is_dir):
+        for path in _walked(source, out, seen):
             yield from _parts(path, _label(path, source))
-    elif source.suffix.lower() == LIST and source.is_file():
-        for path in listed(source, lists):
-            yield from _found(path, out, (*lists, source.resolve()))
-    else:
+    elif source.suffix.lower() == LIST and _is(source.is_file):
+        for path in listed(source, lists, seen):
+            yield from _found(path, out, seen, (*lists, real(source)))
+    elif real(source) not in seen:
+        seen.add(real(source))
         yield from _parts(source, _label(source))
+
+
+def real(path: Path) -> Path:
+    """Where a path leads, links and all; a circle of links, and a path that is too long, lead to themselves."""
+    return Path(os.path.realpath(path))
+
+
+def _is(asked: Callable[[], bool]) -> bool:
+    """The answer; no where the system does not say, as of a name that is too long."""
+    try:
+        return asked()
+    except OSError:
+        return False
 
 
 def _parts(path: Path, label: str) -> Iterator[tuple[Path, str]]:
@@ -81,7 +103,7 @@ def _parts(path: Path, label: str) -> Iterator[tuple[Path, str]]:
     except (ValueError, OSError, ModuleNotFoundError):
         names = []
     for name in names:
-        yield film.part_of(path.resolve(), name), _name([label, *name.split("/")])
+        yield film.part_of(real(path), name), _name([label, *name.split("/")])
     if not names:
         yield path, label
 
@@ -96,40 +118,73 @@ def parts(path: Path) -> list[str]:
     return data_set.parts(path) if data_set.is_data_set(path) else []
 
 
-def listed(path: Path, lists: Collection[Path]) -> Iterator[Path]:
+def listed(path: Path, lists: Collection[Path], seen: set[Path]) -> Iterator[Path]:
     """The paths that a list names, which are relative to its own folder; empty lines and those of a # say nothing.
 
-    Raises ValueError where it is one of the resolved `lists`, which led to it.
+    A list that is in `seen`, because another one named it, too, names nothing more. Raises ValueError where it is one
+    of the resolved `lists`, which led to it, where these are many, and where it is no list; OSError.
     """
-    if path.resolve() in lists:
-        raise ValueError(f"the list {printable_name(str(path))!r} leads to itself; take it out of what it names")
-    for line in path.read_bytes().splitlines():
+    own, shown = real(path), repr(printable_name(str(path)))
+    if own in lists:
+        raise ValueError(f"the list {shown} leads to itself; take it out of what it names")
+    if len(lists) >= _DEEPEST_LIST:
+        raise ValueError(f"lists may lead to lists {_DEEPEST_LIST} deep, and {shown} lies deeper; name it directly")
+    if own in seen:
+        return
+    seen.add(own)
+    for line in read_bounded(path, _MOST_LIST_BYTES, ValueError, f"the list {shown}").splitlines():
         name = os.fsdecode(line.strip())
+        if "\0" in name:
+            raise ValueError(f"the list {shown} must name a path a line; it has zero bytes, as no path has")
         if name and not name.startswith("#"):
             yield path.parent / name
 
 
 def _walked(folder: Path, out: Path | None, seen: set[Path]) -> Iterator[Path]:
-    real = folder.resolve()
-    if real in seen or real == out or (folder / REPORT).is_file():
-        return
-    seen.add(real)  # links may lead in a circle
-    if recording.is_recording(folder) or data_set.is_data_set(folder) or image_paths(folder):
-        yield folder
-        return
-    for path in sorted(folder.iterdir(), key=natural_order):
-        if path.name.startswith(".") or path.name.endswith(OWN_SUFFIX):
-            continue
-        if path.is_dir():
-            yield from _walked(path, out, seen)
-        elif path.suffix.lower() in {*VIDEOS, film.MCAP} and path.is_file():
+    """The recordings at and below `folder`, in natural order; links may lead in a circle, and each place counts once.
+
+    A folder that cannot be looked into is one, too: its recording says why.
+    """
+    under_way = [iter([folder])]
+    while under_way:
+        path = next(under_way[-1], None)
+        if path is None:
+            under_way.pop()
+        elif not _is(path.is_dir):
             yield path
+        elif (place := real(path)) not in seen and place != out:
+            seen.add(place)
+            try:
+                below = _below(path)
+            except OSError:
+                yield path
+                continue
+            if below is None:
+                yield path
+            elif len(under_way) > _DEEPEST:
+                log.warning("%s: folders more than %d deep are not looked into", printable_name(str(folder)), _DEEPEST)
+            else:
+                under_way.append(iter(below))
+
+
+def _below(folder: Path) -> list[Path] | None:
+    """The folders, videos and logs in a folder, of a result none; None where it is a recording. Raises OSError."""
+    if (folder / REPORT).is_file():
+        return []
+    if recording.is_recording(folder) or data_set.is_data_set(folder) or image_paths(folder):
+        return None
+    visible = (
+        path for path in folder.iterdir() if not path.name.startswith(".") and not path.name.endswith(OWN_SUFFIX)
+    )
+    films = {*VIDEOS, film.MCAP}
+    chosen = [path for path in visible if _is(path.is_dir) or (path.suffix.lower() in films and _is(path.is_file))]
+    return sorted(chosen, key=natural_order)
 
 
 def _label(path: Path, source: Path | None = None) -> str:
     """What a recording is called: its place below the source that was named, or its own name; `images` says nothing."""
     file, part = film.file_and_part(path)
-    own = file.resolve()
+    own = real(file)
     below = [] if source is None else list(path.relative_to(source).parts)
     if not below or below == [_PHOTOGRAPHS]:
         below = [own.parent.name] if own.name == _PHOTOGRAPHS else [own.name]

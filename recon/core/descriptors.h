@@ -5,6 +5,7 @@
 // exactly and alike on every instruction set.
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
 
 #include "simd.h"
@@ -12,6 +13,7 @@
 namespace core {
 
 constexpr int kSize = 128;      // bytes of a descriptor
+constexpr int kLargestHalf = 16380;  // half of 181^2, rounded down
 constexpr int kOffset = 16320;  // above half the largest squared norm: keeps scores positive
 
 // NEON multiplies bytes into 16-bit lanes of two registers or, since Armv8.2, adds four products into a 32-bit lane.
@@ -60,6 +62,17 @@ inline int32_t half_norm(const uint8_t* descriptor) {
     int32_t squared = 0;
     for (int k = 0; k < kSize; ++k) squared += descriptor[k] * descriptor[k];
     return squared / 2;
+}
+
+// Whether sums of products of these descriptors fit: each byte is below 128, and each norm at most 181.
+inline bool fit_sums(const uint8_t* descriptors, int count) {
+    for (int i = 0; i < count; ++i) {
+        const uint8_t* descriptor = descriptors + size_t(i) * kSize;
+        uint8_t bits = 0;
+        for (int k = 0; k < kSize; ++k) bits |= descriptor[k];
+        if (bits > 127 || half_norm(descriptor) > kLargestHalf) return false;
+    }
+    return true;
 }
 
 // A score and the index that has it in one number, so that the larger is the better and, of equals, the earlier.

@@ -109,9 +109,11 @@ using namespace core;
 
 // For each of num1 descriptors the nearest of num2 (`nearest`), its score and that of the second nearest; for each of
 // num2 the nearest of num1 (`back`). score = 16320 - |b|^2 / 2 + a . b, so that |a - b|^2 = |a|^2 + 2 * (16320 - score)
-// but for rounding. At most 65535 descriptors, each of bytes below 128 and norm at most 181.
-CORE_API void core_match(const uint8_t* first, int num1, const uint8_t* second, int num2, int32_t* nearest,
-                         int32_t* score, int32_t* second_score, int32_t* back) {
+// but for rounding. At most 65535 descriptors, each of bytes below 128 and norm at most 181; returns 1, and computes
+// nothing, where they are not.
+CORE_API int32_t core_match(const uint8_t* first, int num1, const uint8_t* second, int num2, int32_t* nearest,
+                            int32_t* score, int32_t* second_score, int32_t* back) {
+    if (std::max(num1, num2) > 0xffff || !fit_sums(first, num1) || !fit_sums(second, num2)) return 1;
     const Panels panels(second, num2);
     std::vector<int32_t> half_norms(num1);
     for (int i = 0; i < num1; ++i) half_norms[i] = half_norm(first + size_t(i) * kSize);
@@ -125,4 +127,5 @@ CORE_API void core_match(const uint8_t* first, int num1, const uint8_t* second, 
         for (const auto& mine : column_best) winner = std::max(winner, mine[column / kLanes][column % kLanes]);
         back[column] = index_of(winner);
     }
+    return 0;
 }

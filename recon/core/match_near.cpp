@@ -33,7 +33,7 @@ inline int32_t dot_product(const uint8_t* a, const uint8_t* b) {
 
 // The second set, by strips and from top to bottom in each.
 struct Strips {
-    float left = 0, width;
+    double left = 0, width;  // as doubles, in which differences of any two floats are finite
     std::vector<int> begin;  // [strip]: place of its first; one more at the end
     std::vector<int> index;  // [place]: number in the second set
     std::vector<float> x, y;
@@ -41,10 +41,10 @@ struct Strips {
     std::vector<int32_t> half_norms;
 
     Strips(const uint8_t* descriptors, const float* points, int count, float reach) : width(reach), index(count) {
-        float right = 0;
+        double right = 0;
         for (int i = 0; i < count; ++i) {
-            left = i ? std::min(left, points[2 * i]) : points[0];
-            right = i ? std::max(right, points[2 * i]) : points[0];
+            left = i ? std::min(left, double(points[2 * i])) : points[0];
+            right = i ? std::max(right, double(points[2 * i])) : points[0];
         }
         width = std::max(width, (right - left) / (kMostStrips - 1));
         const int num_strips = count ? strip_of(right) + 1 : 0;
@@ -65,14 +65,14 @@ struct Strips {
         while (int(begin.size()) <= num_strips) begin.push_back(count);
     }
 
-    int strip_of(float at) const { return int((at - left) / width); }
+    int strip_of(double at) const { return int((at - left) / width); }
 
     // Calls use(place) for each of those nearer than `reach` to (at_x, at_y).
     template <typename Use>
     void near(float at_x, float at_y, float reach, Use use) const {
         const int last = int(begin.size()) - 2;
-        const float strip = std::floor((at_x - left) / width);
-        if (!(strip >= -1 && strip <= float(last + 1))) return;
+        const double strip = std::floor((at_x - left) / width);
+        if (!(strip >= -1 && strip <= last + 1)) return;
         for (int s = std::max(0, int(strip) - 1); s <= std::min(last, int(strip) + 1); ++s) {
             const auto from = y.begin() + begin[s], end = y.begin() + begin[s + 1];
             for (auto here = std::lower_bound(from, end, at_y - reach); here != end && *here <= at_y + reach; ++here) {
@@ -92,9 +92,10 @@ using namespace core;
 // As core_match, where only those of the second set count that are nearer than `reach` in the picture: `first_at`
 // (num1, 2) and `second_at` (num2, 2) are their places, finite. Where none is near, `nearest` or `back` is -1, and
 // where it is one, the second score is 0.
-CORE_API void core_match_near(const uint8_t* first, const float* first_at, int num1, const uint8_t* second,
-                              const float* second_at, int num2, float reach, int32_t* nearest, int32_t* score,
-                              int32_t* second_score, int32_t* back) {
+CORE_API int32_t core_match_near(const uint8_t* first, const float* first_at, int num1, const uint8_t* second,
+                                 const float* second_at, int num2, float reach, int32_t* nearest, int32_t* score,
+                                 int32_t* second_score, int32_t* back) {
+    if (std::max(num1, num2) > 0xffff || !fit_sums(first, num1) || !fit_sums(second, num2)) return 1;
     const Strips strips(second, second_at, num2, reach);
     std::vector<std::vector<int32_t>> column_best(num_threads(), std::vector<int32_t>(num2, 0));
     run_ranges(num1, kRowsPerTask, [&](int begin, int end, int thread) {
@@ -120,4 +121,5 @@ CORE_API void core_match_near(const uint8_t* first, const float* first_at, int n
         for (const auto& mine : column_best) winner = std::max(winner, mine[place]);
         back[strips.index[place]] = winner ? index_of(winner) : -1;
     }
+    return 0;
 }

@@ -37,6 +37,7 @@ public:
           total_(data_cost_ + pixel.smoothness_cost(best_, parallax_)),
           source_costs_(&task.source_costs[pixel.index() * problem_.num_sources]) {
         int order[kMaxSources];
+        for (int s = 0; s < problem_.num_sources; ++s) order[s] = s;  // costs that are no numbers have no order
         for (int s = 0; s < problem_.num_sources; ++s) {
             int place = 0;
             for (int other = 0; other < problem_.num_sources; ++other)

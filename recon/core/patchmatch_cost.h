@@ -189,8 +189,8 @@ struct Landing {
         const float inverse_z = 1.0f / std::max(point.z, kSmallestZ);
         const float x = point.x * inverse_z, y = point.y * inverse_z;
         inside = (point.z > kSmallestZ) & (x >= 0) & (y >= 0) & (x < float(width)) & (y < float(height));
-        u = std::min(std::max(x, 0.0f), float(width) - 0.5f);
-        v = std::min(std::max(y, 0.0f), float(height) - 0.5f);
+        u = std::min(std::max(0.0f, x), float(width) - 0.5f);  // in this order, in which NaN becomes 0
+        v = std::min(std::max(0.0f, y), float(height) - 0.5f);
     }
 };
 
@@ -253,7 +253,7 @@ inline void matching_costs(const Pairs& pairs, float reference_variance, float n
     for (int i = 0; i < pairs.count; ++i) {
         const float variance = std::max(pairs.second[i] - pairs.first[i] * pairs.first[i], 0.0f);
         const float normaliser = (reference_variance + noise_variance) * (variance + noise_variance);
-        costs[i] = std::min(1.0f - pairs.product[i] / std::sqrt(normaliser), 1.0f);
+        costs[i] = std::min(1.0f, 1.0f - pairs.product[i] / std::sqrt(normaliser));  // 1 where nothing has a variance
     }
 }
 
@@ -262,7 +262,7 @@ inline void add_reprojection_errors(const Pairs& pairs, float u, float v, float 
     for (int i = 0; i < pairs.count; ++i) {
         const float inverse_z = 1.0f / std::max(pairs.back_z[i], kSmallestZ);
         const float du = pairs.back_x[i] * inverse_z - u, dv = pairs.back_y[i] * inverse_z - v;
-        const float error = std::min(std::sqrt(du * du + dv * dv), limit);
+        const float error = std::min(limit, std::sqrt(du * du + dv * dv));
         costs[i] += weight * (pairs.back_z[i] > kSmallestZ ? error : limit);
     }
 }

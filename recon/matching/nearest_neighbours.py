@@ -18,6 +18,7 @@ Index32 = npt.NDArray[np.int32]
 DESCRIPTOR_SIZE = 128
 QUANTISED_NORM = 175.0  # length of a descriptor in bytes: with rounding at most 181, so that products fit 16 bits
 _MAX_BYTE = 127  # the core multiplies signed bytes
+_TOO_LARGE = "descriptors must have bytes below 128 and norms of at most 181, as `quantise` makes them; some have more"
 _MAX_DESCRIPTORS = 65535  # that recon/core/match.cpp is written for
 _SCORE_OFFSET = 16320  # `kOffset` of recon/core/match.cpp: keeps scores positive
 
@@ -44,10 +45,12 @@ def match(descriptors1: Bytes, descriptors2: Bytes, config: Config) -> Index:
     first, second = np.ascontiguousarray(descriptors1), np.ascontiguousarray(descriptors2)
     nearest, score, second_score = (np.empty(count1, np.int32) for _ in range(3))
     back = np.empty(count2, np.int32)
-    library().core_match(
+    problem = library().core_match(
         *(pointer(first), count1, pointer(second), count2),
         *(pointer(nearest), pointer(score), pointer(second_score), pointer(back)),
     )
+    if problem:
+        raise ValueError(_TOO_LARGE)
     return _distinct(first, nearest, score, second_score, back, config)
 
 
@@ -74,10 +77,12 @@ def match_near(
     first, second = np.ascontiguousarray(descriptors1), np.ascontiguousarray(descriptors2)
     nearest, score, second_score = (np.empty(count1, np.int32) for _ in range(3))
     back = np.empty(count2, np.int32)
-    library().core_match_near(
+    problem = library().core_match_near(
         *(pointer(first), pointer(places[0]), count1, pointer(second), pointer(places[1]), count2),
         *(ctypes.c_float(reach), pointer(nearest), pointer(score), pointer(second_score), pointer(back)),
     )
+    if problem:
+        raise ValueError(_TOO_LARGE)
     return _distinct(first, nearest, score, second_score, back, config)
 
 

@@ -13,6 +13,8 @@ from typing import TypeVar
 import torch
 from torch import Tensor, nn
 
+from splatnode.capture.process.printable import printable
+
 N = TypeVar("N", bound=nn.Module)
 
 
@@ -37,7 +39,8 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     if not path.is_file():
         raise FileNotFoundError(2, "no such checkpoint (splatnode weights tells where it can be had)", str(path))
     if path.suffix == ".safetensors":
-        return _read_safetensors(path)
+        return _checked(_read_safetensors(path), path)
+    _check_archive(path)
     try:
         # Only plain data and this one class, which holds attributes and does nothing, are let through.
         with torch.serialization.safe_globals([argparse.Namespace]):
@@ -53,7 +56,37 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     weights = content.get("model", content) if isinstance(content, Mapping) else None
     if not isinstance(weights, Mapping) or not all(isinstance(value, Tensor) for value in weights.values()):
         raise ValueError(f"{path} must hold a dict of tensors, or one under 'model'; it holds something else")
-    return dict(weights)
+    return _checked(dict(weights), path)
+
+
+def _checked(weights: dict[str, Tensor], path: Path) -> dict[str, Tensor]:
+    """Raises ValueError unless all are plain arrays of numbers, each no larger than what the file holds of it."""
+    for name, tensor in weights.items():
+        is_plain = type(tensor) in (Tensor, nn.Parameter) and tensor.layout == torch.strided and not tensor.is_quantized
+        if not isinstance(name, str) or not is_plain or tensor.device.type != "cpu":
+            raise ValueError(
+                f"{path} must hold plain tensors, {printable(str(name), 100)} is none; take the official file"
+            )
+        held, shown = tensor.untyped_storage().nbytes(), f"{printable(name, 100)} {tuple(tensor.shape)}"
+        if tensor.numel() * tensor.element_size() > held:
+            raise ValueError(f"{path} holds {held} bytes of {shown}, fewer than it needs; take the official file")
+    return weights
+
+
+def _check_archive(path: Path) -> None:
+    """Raises ValueError where a file of PyTorch's, which is a ZIP archive, would be unpacked to more than its bytes."""
+    if not zipfile.is_zipfile(path):
+        return
+    try:
+        with zipfile.ZipFile(path) as archive:
+            parts = archive.infolist()
+    except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
+        raise ValueError(f"{path} is damaged or not a PyTorch checkpoint; fetch it again ({error})") from error
+    size = path.stat().st_size
+    if any(part.compress_type != zipfile.ZIP_STORED for part in parts) or sum(part.file_size for part in parts) > size:
+        raise ValueError(
+            f"{path} is packed, as no checkpoint of PyTorch is: it was not unpacked; take the official file"
+        )
 
 
 def check_names_and_shapes(
@@ -77,13 +110,14 @@ def check_names_and_shapes(
 
 def _read_safetensors(path: Path) -> dict[str, Tensor]:
     try:
-        from safetensors import SafetensorError
         from safetensors.torch import load_file
     except ImportError as error:
         raise ValueError(f"{path} needs the package safetensors: pip install 'splatnode[learned]'") from error
     try:
         return load_file(path)
-    except SafetensorError as error:
+    except MemoryError:
+        raise
+    except Exception as error:  # of a damaged file: whatever its bytes happen to say
         raise ValueError(f"{path} is damaged or not a safetensors file; fetch it again ({error})") from error
 
 

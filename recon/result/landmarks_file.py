@@ -22,6 +22,7 @@ DESCRIPTORS_A_PHOTOGRAPH = 2000  # kept at most, in the mean: 160 kB of the file
 MOST_DESCRIPTORS = 60_000  # in all: 5 MB
 MOST_BYTES = 64 << 20  # of the arrays in a file that is read
 _DESCRIPTOR_BYTES = 128
+_MOST_BYTE, _MOST_NORM = 127, 181  # of a descriptor, so that products fit 16 bits: `quantise` makes no others
 _ROWS, _COLUMNS = np.triu_indices(3)  # of a symmetric matrix, which is kept by half
 
 
@@ -102,6 +103,9 @@ def _check(found: dict[str, npt.NDArray[Any]], name: str) -> None:
             raise SceneFileError(f"{name}: {key} must be finite, within ±{MAX_COORDINATE:g}")
     if found["descriptors"].dtype != np.uint8 or counts["D"] > MOST_DESCRIPTORS or not counts["C"]:
         raise SceneFileError(f"{name}: there must be cameras, and at most {MOST_DESCRIPTORS} descriptors of bytes")
+    lengths = np.linalg.norm(found["descriptors"].astype(np.float32), axis=1)
+    if (found["descriptors"] > _MOST_BYTE).any() or (lengths > _MOST_NORM).any():
+        raise SceneFileError(f"{name}: a descriptor has bytes of at most {_MOST_BYTE} and a norm up to {_MOST_NORM}")
     if (found["point_of"] >= counts["P"]).any() or (found["photograph_of"] >= counts["C"]).any():
         raise SceneFileError(f"{name}: descriptors must be of its points and photographs")
     for T_world_camera, lens in zip(found["Ts_world_camera"], found["lenses"], strict=True):

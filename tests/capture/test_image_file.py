@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import struct
+import subprocess
+import sys
 import zlib
 
 import cv2
@@ -14,6 +16,7 @@ from hypothesis import strategies as st
 
 from splatnode.capture.image_file import BYTES_A_PIXEL, UnusableImage, decode_image, read_header, read_image_file
 from splatnode.capture.image_header import MAX_SIDE
+from tests.conftest import ROOT
 from tests.support.crafted import Crafted
 from tests.support.crafted.bounded import MARGIN, readings
 from tests.support.crafted.images import png
@@ -31,6 +34,31 @@ def test_every_crafted_image_is_refused_or_within_the_limit_and_so_is_the_memory
     for reading in readings("tests.support.crafted:images", f"{__name__}:read"):
         assert reading.outcome.startswith(("UnusableImage: ", "(")), reading
         assert reading.taken <= BYTES_A_PIXEL * LIMIT + reading.size + MARGIN, reading
+
+
+def test_of_what_opencv_prints_nothing_is_a_strangers_text():
+    """In a process as a verb's is: libjpeg and libpng have sentences of their own, and all else is silent."""
+    code = f"import splatnode.command_line; from {__name__} import _decode_all; _decode_all()"
+    environment = {name: value for name, value in os.environ.items() if name != "OPENCV_LOG_LEVEL"}
+    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, timeout=300)
+    assert run.returncode == 0, run.stderr[-1000:]
+    said = {line for line in run.stderr.splitlines() if not line.startswith((b"libpng ", b"Corrupt JPEG data: "))}
+    known = {b"", b"Premature end of JPEG file", b"Invalid SOS parameters for sequential JPEG"}
+    assert {line for line in said - known if not line.startswith(b"Unsupported marker type")} == set()
+    assert run.stderr.replace(b"\n", b"").decode("ascii").isprintable()
+
+
+def _decode_all() -> None:
+    """For the process whose lines are looked at: files with damage in them, and the escapes of a terminal."""
+    rng = np.random.default_rng(0)
+    image = rng.integers(0, 255, (32, 32, 3)).astype(np.uint8)
+    for suffix in ENCODINGS:
+        whole = cv2.imencode(suffix, image)[1].tobytes()
+        for number in range(30):
+            damaged = bytearray(whole if number % 3 else whole[: len(whole) // 2])
+            for place in rng.integers(2, len(damaged), 4):
+                damaged[place : place + 4] = b"\x1b[2J"
+            cv2.imdecode(np.frombuffer(bytes(damaged), np.uint8), cv2.IMREAD_COLOR)
 
 
 @pytest.mark.parametrize("suffix", ENCODINGS)

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import json
+import struct
+import time
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from splatnode.capture import poses_file
+from splatnode.capture.colmap_images import each_line
 from splatnode.capture.frame import Frame
+from splatnode.capture.given_pose import are_rigid, rigid_problem
 from splatnode.capture.poses_file import PosesFileError, Trajectory, poses_of, read_poses
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.result.export import export_scene
@@ -122,3 +128,79 @@ def test_what_is_no_file_of_poses_is_refused(tmp_path, name, content, told):
 def test_a_folder_must_hold_a_model(tmp_path):
     with pytest.raises(PosesFileError, match=r"must hold images\.txt or images\.bin"):
         read_poses(tmp_path)
+
+
+MANY = 30_000
+
+
+def many(kind: str) -> tuple[str, bytes]:
+    """A file of many poses, and its name."""
+    if kind == "tum":
+        return "a.tum", b"".join(b"%d.5 1 2 3 0 0 0 1\n" % n for n in range(MANY))
+    if kind == "names":
+        return "a.tum", b"".join(b"%d.jpg 1 2 3 0 0 0 1\n" % n for n in range(MANY))
+    if kind == "text":
+        return "images.txt", b"".join(b"%d 1 0 0 0 1 2 3 1 %d.jpg\n\n" % (n, n) for n in range(MANY))
+    if kind == "binary":
+        rows = (struct.pack("<I7dI", n, 1, 0, 0, 0, 1, 2, 3, 1) + b"%d.jpg\0" % n + bytes(8) for n in range(MANY))
+        return "images.bin", struct.pack("<Q", MANY) + b"".join(rows)
+    frames = [{"file_path": f"{n}.jpg", "transform_matrix": np.eye(4).tolist()} for n in range(MANY)]
+    return "transforms.json", json.dumps({"frames": frames}).encode()
+
+
+@pytest.mark.parametrize("kind", ["tum", "names", "text", "binary", "json"])
+def test_many_poses_are_read_soon(tmp_path, kind):
+    """Sooner than each of them can be judged by itself."""
+    name, content = many(kind)
+    (tmp_path / name).write_bytes(content)
+    began = time.process_time()
+    found = read_poses(tmp_path / name)
+    taken_s = time.process_time() - began
+    assert len(found.by_name) + len(found.seconds) == MANY
+    numbers = np.eye(4).ravel().tolist()
+    began = time.process_time()
+    for _ in range(MANY // 10):
+        rigid_problem(numbers)
+    assert taken_s < 10 * (time.process_time() - began)
+
+
+def test_a_time_is_looked_up_without_a_look_at_all_others(tmp_path):
+    seconds = np.arange(1_000_000.0)
+    trajectory = Trajectory(seconds=seconds, Ts=np.broadcast_to(np.eye(4), (len(seconds), 4, 4)))
+    frames = [frame(f"{number}.png", number) for number in range(500)]
+    began = time.process_time()
+    assert len(trajectory.of(frames)) == 500
+    taken_s = time.process_time() - began
+    began = time.process_time()
+    for _ in range(50):
+        assert (seconds == np.floor(seconds)).all()
+    assert taken_s < time.process_time() - began
+
+
+@pytest.mark.parametrize("kind", ["tum", "names", "text", "binary", "json"])
+def test_more_poses_than_are_read_are_refused(tmp_path, monkeypatch, kind):
+    monkeypatch.setattr(poses_file, "MOST_POSES", 100)
+    name, content = many(kind)
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(PosesFileError, match="at most 100 poses are read, and there are more"):
+        read_poses(tmp_path / name)
+
+
+def test_lines_that_are_empty_take_no_memory(tmp_path):
+    text = "\n" * 100_000
+    tracemalloc.start()
+    assert sum(1 for _ in each_line(text)) == 100_000
+    most_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most_bytes < 20_000
+    assert list(each_line("a\r\nb\n\nc")) == ["a", "b", "", "c"] and list(each_line("a\rb")) == ["a", "b"]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_many_matrices_are_judged_as_one_is(seed):
+    rng = np.random.default_rng(seed)
+    matrices = np.tile(np.eye(4), (200, 1, 1)) + rng.normal(size=(200, 4, 4)) * 10.0 ** rng.integers(-9, 2, (200, 1, 1))
+    matrices[rng.random((200, 4, 4)) < 0.002] = np.nan
+    for matrix, is_rigid in zip(matrices, are_rigid(matrices), strict=True):
+        assert not (is_rigid and rigid_problem(matrix.ravel().tolist()))
+    assert are_rigid(np.stack(TRUE)).all()

@@ -24,7 +24,7 @@ void core_set_threads(int);
 void core_photometric_moments(const float*, int, int, float*, float*);
 double core_photometric(const float*, const float*, const float*, const float*, const float*, double, double, int, int,
                         float*);
-void core_match(const uint8_t*, int, const uint8_t*, int, int32_t*, int32_t*, int32_t*, int32_t*);
+int32_t core_match(const uint8_t*, int, const uint8_t*, int, int32_t*, int32_t*, int32_t*, int32_t*);
 }
 
 namespace {

@@ -72,7 +72,7 @@ def make_landmarks() -> Landmarks:
     return Landmarks(
         points=draw.normal(size=(5, 3)),
         covariances=half @ half.transpose(0, 2, 1),
-        descriptors=draw.integers(0, 128, (9, 128)).astype(np.uint8),
+        descriptors=draw.integers(0, 20, (9, 128)).astype(np.uint8),
         point_of=np.array([0, 0, 1, 1, 2, 2, 3, 4, 4]),
         photograph_of=np.array([0, 1, 0, 1, 0, 1, 1, 0, 1]),
         names=("a.jpg", "ü b.jpg"),

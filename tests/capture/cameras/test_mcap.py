@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from mcap.data_stream import RecordBuilder
 from mcap.reader import make_reader
 from mcap.records import Chunk
 from mcap.writer import CompressionType
@@ -18,6 +20,7 @@ from mcap.writer import CompressionType
 from splatnode.capture import film
 from splatnode.capture.cameras.mcap import Config, image_topics, stream
 from splatnode.capture.frame import DroppedFrame, Frame
+from splatnode.capture.logged import mcap
 from splatnode.capture.logged.mcap import UnusableLog, unpacked
 from splatnode.capture.stamp import Clock, Stamp
 from tests.support.mcap_files import START_NS, STEP_NS, as_json, calibration, compressed, raw, write
@@ -124,6 +127,69 @@ def test_an_index_that_leads_nowhere_is_told(tmp_path):
     file.write_bytes(file.read_bytes().replace(entry, wrong))
     with pytest.raises(ValueError, match=f"its index leads to byte {2**63 + 5}, it has {file.stat().st_size}"):
         frames(file)
+
+
+def indexed_anew(file: Path, offsets: list[int]) -> None:
+    """The file with an index that names chunks at these places, of any channel."""
+    data, told = file.read_bytes(), b""
+    with file.open("rb") as opened:
+        summary = make_reader(opened).get_summary()
+    for record in (*summary.schemas.values(), *summary.channels.values()):
+        told += record_bytes(record)
+    first = summary.chunk_indexes[0]
+    for offset in offsets:
+        told += record_bytes(replace(first, chunk_start_offset=offset, message_index_offsets={}))
+    end = data.rindex(b"\x0f" + struct.pack("<Q", 4))  # the end of the data
+    start = end + 13
+    footer = b"\x02" + struct.pack("<QQQI", 20, start, 0, 0)
+    file.write_bytes(data[:start] + told + footer + b"\x89MCAP0\r\n")
+
+
+def record_bytes(record: Any) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return bytes(builder.end())
+
+
+def chunk_places(file: Path) -> list[int]:
+    with file.open("rb") as opened:
+        return [each.chunk_start_offset for each in make_reader(opened).get_summary().chunk_indexes]
+
+
+def test_a_chunk_that_an_index_names_often_is_unpacked_once(tmp_path, monkeypatch):
+    file = write(tmp_path / "a.mcap", [compressed("/image", flat(10 * n)) for n in range(6)], chunk_size=2000)
+    places = chunk_places(file)
+    assert len(places) > 1
+    indexed_anew(file, places * 3000)
+    read, asked = mcap.unpacked, []
+    monkeypatch.setattr(mcap, "unpacked", lambda record: asked.append(record) or read(record))
+    assert len(list(mcap.messages(file, {"/image"}))) == 6
+    assert len(asked) == len(places)
+
+
+def test_a_chunk_within_another_one_is_refused(tmp_path):
+    seen = [compressed("/image", flat(10 * n)) for n in range(6)]
+    file = write(tmp_path / "a.mcap", seen, chunk_size=2000, compression=CompressionType.NONE)
+    places = chunk_places(file)
+    indexed_anew(file, [*places, places[0] + 9])
+    with pytest.raises(UnusableLog, match=f"its index leads to byte {places[0] + 9}, within a chunk that goes on to"):
+        list(mcap.messages(file, {"/image"}))
+
+
+def test_the_records_of_a_chunk_are_not_in_memory_at_once():
+    data = SCHEMA * 10_000
+    tracemalloc.start()
+    assert sum(1 for _ in unpacked(chunk("", data, len(data)))) == 10_000
+    most_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert most_bytes < 2 * len(data)
+
+
+def test_a_chunk_that_was_changed_is_refused():
+    with pytest.raises(UnusableLog, match="its checksum is another one"):
+        list(unpacked(replace(chunk("", SCHEMA, len(SCHEMA)), uncompressed_crc=5)))
+    with pytest.raises(UnusableLog, match="compressed by lz4, zstd or not, it is by 'bz2'"):
+        list(unpacked(chunk("bz2", SCHEMA, len(SCHEMA))))
 
 
 def test_an_image_that_cannot_be_decoded_costs_only_itself(tmp_path):

@@ -16,6 +16,7 @@ from splatnode.capture import film
 from splatnode.capture.cameras import lerobot
 from splatnode.capture.lerobot import data_set
 from splatnode.capture.lerobot.data_set import UnusableDataSet, parts
+from splatnode.capture.process import apart
 from splatnode.capture.video_process import VideoFrame
 from splatnode.command_line import main
 from splatnode.recon.replay_source import Request, source
@@ -159,8 +160,8 @@ def test_without_pyarrow_it_says_what_pyarrow_is_needed_for(copy, monkeypatch, c
 
 
 def test_tables_are_read_once_until_they_change(copy, monkeypatch):
-    read, asked = pq.read_table, []
-    monkeypatch.setattr(pq, "read_table", lambda file, **how: asked.append(file) or read(file, **how))
+    answer, asked = apart.answer, []
+    monkeypatch.setattr(apart, "answer", lambda *given: asked.append(given) or answer(*given))
     for number in (0, 1, 2, 0):
         data_set.film(copy, f"{number}/{TOP}")
     assert len(asked) == 1
@@ -223,3 +224,30 @@ def test_an_info_that_is_none_is_told(copy, content):
 
 def test_the_camera_takes_a_configuration(made):
     assert len(list(lerobot.stream(lerobot.Config(made, f"2/{TOP}")))) == 5
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        "{file_index:99999999}.mp4",
+        "{video_key:>9999999}",
+        "{chunk_index:0999d}",
+        "{video_key.__class__}",
+        "{video_key!r}",
+        "{0}{{",
+        "videos/{video_key}/" + "x" * 2000,
+        "{video_key}" * 90,
+        "a\0{file_index}",
+        "%s{video_key}}",
+    ],
+)
+def test_a_video_path_is_no_format_of_pythons(copy, path):
+    info = json.loads((copy / "meta" / "info.json").read_text())
+    (copy / "meta" / "info.json").write_text(json.dumps({**info, "video_path": path}))
+    with pytest.raises(UnusableDataSet, match="video_path"):
+        data_set.film(copy, f"1/{TOP}")
+
+
+def test_the_fields_of_lerobot_are_filled_in():
+    template = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}-{file_index}.mp4"
+    assert data_set.video_path(template, "a.{b}", 7, 1234) == "videos/a.{b}/chunk-007/file-1234-1234.mp4"

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from splatnode.recon.batch import sources
 from splatnode.recon.batch.sources import recordings
 from tests.support import lerobot_sets
 from tests.support.mcap_files import as_json, compressed, write
@@ -120,3 +122,63 @@ def test_each_camera_of_each_episode_of_a_data_set_is_a_recording(tmp_path):
     assert [recording.name for recording in found] == ["old", *episodes]
     assert found[2].source == str(data_set) + "#episode_000000/side"
     assert names(data_set) == episodes and names(Path(found[2].source)) == [episodes[1]]
+
+
+def test_folders_however_deep_do_not_end_the_others(tmp_path, caplog):
+    """1200 of them: as deep as a path may be, and deeper than functions call each other."""
+    put(tmp_path / "a" / "1.jpg")
+    place = os.open(tmp_path, os.O_RDONLY)
+    for _ in range(2500):
+        os.mkdir("d", dir_fd=place)
+        below = os.open("d", os.O_RDONLY, dir_fd=place)
+        os.close(place)
+        place = below
+    os.close(place)
+    try:
+        assert names(tmp_path) == ["a"]
+        assert "folders more than 100 deep are not looked into" in caplog.text
+    finally:
+        subprocess.run(["rm", "-rf", str(tmp_path / "d")], check=True)
+
+
+def test_lists_that_name_lists_twice_are_read_once(tmp_path):
+    """Thirty such lists would be read a billion times."""
+    put(tmp_path / "a" / "1.jpg")
+    for number in range(19):
+        (tmp_path / f"{number}.txt").write_text(f"{number + 1}.txt\n./{number + 1}.txt\nagain{number + 1}.txt\n")
+        (tmp_path / f"again{number}.txt").symlink_to(f"{number}.txt")
+    (tmp_path / "19.txt").write_text("a\n" * 1000)
+    (tmp_path / "again19.txt").symlink_to("19.txt")
+    assert names(tmp_path / "0.txt") == ["a"]
+
+
+def test_lists_that_lead_to_lists_for_ever_are_told(tmp_path):
+    for number in range(2000):
+        (tmp_path / f"{number}.txt").write_text(f"{number + 1}.txt\n")
+    with pytest.raises(ValueError, match="lists may lead to lists 20 deep, and '.*20.txt' lies deeper; name it"):
+        names(tmp_path / "0.txt")
+
+
+def test_a_source_that_a_list_names_often_is_looked_into_once(tmp_path, monkeypatch):
+    put(tmp_path / "many" / "a" / "1.jpg")
+    (tmp_path / "b.mcap").write_bytes(b"no log")
+    looked, parts = [], sources.parts
+    monkeypatch.setattr(sources, "parts", lambda path: looked.append(path) or parts(path))
+    (tmp_path / "list.txt").write_text("many\nb.mcap\nmany/../many\n" * 100)
+    assert names(tmp_path / "list.txt") == ["a", "b"]
+    assert len(looked) == 2
+
+
+@pytest.mark.parametrize("line", ["circle.txt", "circle", "x" * 300, "x/" * 3000 + "y", "circle/a.mcap"])
+def test_what_a_list_names_wrongly_costs_only_itself(tmp_path, line):
+    put(tmp_path / "a" / "1.jpg")
+    for name in ("circle.txt", "circle"):
+        (tmp_path / name).symlink_to(name)
+    (tmp_path / "list.txt").write_text(f"{line}\na\n")
+    assert len(names(tmp_path / "list.txt")) == 2
+
+
+def test_a_list_is_text(tmp_path):
+    (tmp_path / "list.txt").write_bytes(b"a\0b\n")
+    with pytest.raises(ValueError, match="must name a path a line; it has zero bytes"):
+        names(tmp_path / "list.txt")

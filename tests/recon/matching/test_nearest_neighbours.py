@@ -124,3 +124,41 @@ def test_too_few_descriptors_give_no_match():
 def test_what_is_no_descriptor_is_refused(wrong):
     with pytest.raises(ValueError, match="uint8"):
         nearest_neighbours.match(wrong, descriptors(4, 0), nearest_neighbours.Config())
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        np.full(128, 255),
+        np.full(128, 127),
+        np.full(128, 17),
+        np.array([0] * 127 + [128]),
+        np.array([127] * 3 + [0] * 125),
+    ],
+)
+@pytest.mark.parametrize("first", [False, True])
+def test_descriptors_whose_products_overflow_are_refused(wrong, first):
+    """Longer than 181, or with a byte that the core would take for a negative one."""
+    good, bad = descriptors(40, 0), descriptors(40, 1)
+    bad[23] = wrong
+    config, places = nearest_neighbours.Config(), np.zeros((40, 2))
+    pair = (bad, good) if first else (good, bad)
+    with pytest.raises(ValueError, match="bytes below 128 and norms of at most 181"):
+        nearest_neighbours.match(*pair, config)
+    with pytest.raises(ValueError, match="bytes below 128 and norms of at most 181"):
+        nearest_neighbours.match_near(pair[0], places, pair[1], places, 1.0, config)
+
+
+def test_the_longest_descriptors_are_matched():
+    longest = np.zeros((3, 128), np.uint8)
+    longest[0, :2], longest[1, :121], longest[2, 5] = (127, 127), 16, 127
+    found = nearest_neighbours.match(longest, longest, nearest_neighbours.Config())
+    assert sorted(map(tuple, found.tolist())) == [(0, 0), (1, 1), (2, 2)]
+
+
+@pytest.mark.parametrize("far", [3e38, 1e30, 1e-38])
+def test_places_at_the_ends_of_their_type_are_places(far):
+    four = descriptors(4, 0)
+    places = np.array([[-far, 0.0], [far, -far], [0.0, far], [far / 3, 0.0]])
+    found = nearest_neighbours.match_near(four, places, four, places, 1.0, nearest_neighbours.Config())
+    assert len(found) == 4 or far < 1

@@ -18,7 +18,7 @@ _RGB = np.full((SIDE, SIDE, 3), 100, np.uint8)
 
 def images() -> Iterator[Crafted]:
     """Every one is a few hundred bytes, or as many kilobytes where the trick needs them."""
-    for kind in (_jpegs, _pngs, _webps, _tiffs, _bmps):
+    for kind in (_jpegs, _pngs, _webps, _tiffs, _packed_tiffs, _bmps, _runs):
         yield from kind()
     yield Crafted("signature_only.jpg", b"\xff\xd8\xff", "nothing behind the signature")
     yield Crafted("empty.png", b"", "no bytes at all")
@@ -45,6 +45,9 @@ def _jpegs() -> Iterator[Crafted]:
     yield Crafted(
         "scans.jpg", small[:-2] + scan * 10_000 + small[-2:], "a scan costs 14 bytes and a pass over the image"
     )
+    profile = b"\xff\xe2\xff\xff" + b"ICC_PROFILE\0\1\xff".ljust(65_533, b"x")
+    yield Crafted("profiles.jpg", small[:2] + profile * 255 + small[2:], "17 MB of a colour profile")
+    yield Crafted("texts.jpg", small[:2] + (b"\xff\xfe\xff\xff" + bytes(65_533)) * 255 + small[2:], "17 MB of remarks")
     yield Crafted("lossless_frame.jpg", small.replace(b"\xff\xc0", b"\xff\xc3"), "another coding process than it is")
     exif = b"Exif\0\0" + tiff([(274, 4, [6]), (34665, 4, [8])])
     app = b"\xff\xe1" + struct.pack(">H", len(exif) + 2) + exif
@@ -143,6 +146,80 @@ def _tiffs() -> Iterator[Crafted]:
     yield Crafted("no_directory.tif", b"II*\0" + struct.pack("<I", 2**32 - 1), "a directory behind the end")
     loop = tiff(_entries(SIDE, SIDE))
     yield Crafted("loop.tif", loop.replace(bytes(4), struct.pack("<I", 8), 1), "a next directory that is the first")
+
+
+def _packed_tiffs() -> Iterator[Crafted]:
+    """Of every compression that libtiff may know, with far more in a part than the image has, or none of it."""
+    zeros = zlib.compress(bytes(50_000_000), 9)
+    runs = b"\x81\0" * 400_000  # of PackBits: 128 zeros each
+    for side in (SIDE, 900):
+        for number in (
+            2,
+            3,
+            4,
+            5,
+            6,
+            7,
+            8,
+            32766,
+            32771,
+            32773,
+            32946,
+            34661,
+            34676,
+            34677,
+            34887,
+            34925,
+            50000,
+            50001,
+        ):
+            body = runs if number == 32773 else zeros
+            data = _with_strip(side, body, {259: [number]})
+            yield Crafted(f"packed_{number}_{side}.tif", data, "a strip that unpacks to 50 MB")
+    for name, changed in {
+        "strip_bytes": {279: [2**32 - 1]},
+        "strip_place": {273: [2**32 - 1]},
+        "strips_missing": {278: [1], 259: [8]},
+        "tile_packed": {322: [2048], 323: [2048], 259: [8]},
+        "text": {270: [2**31 - 1] * 3},
+        "profile": {34675: [0] * 100_000},
+        "deep_packed": {258: [16] * 4, 277: [4], 259: [8]},
+        "directories_within": {330: [8] * 1000},
+    }.items():
+        yield Crafted(f"{name}.tif", _with_strip(900, zeros, changed), "a part whose length is a lie")
+    page = _with_strip(SIDE, bytes(3 * SIDE * SIDE), {})
+    (entries,) = struct.unpack_from("<H", page, 8)
+    pages, after = bytearray(page), 10 + 12 * entries
+    for _ in range(20_000):
+        pages[after : after + 4] = struct.pack("<I", len(pages))
+        after = len(pages) + 2
+        pages += struct.pack("<H", 0) + bytes(4)
+    yield Crafted("pages.tif", bytes(pages), "20 000 pages, of which the first is the image")
+
+
+def _with_strip(side: int, strip: bytes, changed: dict[int, list[int]]) -> bytes:
+    """A TIFF of side x side RGB whose one strip has these bytes; with other values of tags."""
+    entries = {tag: values for tag, _, values in _entries(side, side)} | {279: [len(strip)]} | changed
+    rows = [(tag, 4, values) for tag, values in sorted(entries.items())]
+    start = len(tiff(rows))
+    if 273 not in changed:
+        rows = [(tag, kind, [start] if tag == 273 else values) for tag, kind, values in rows]
+    return tiff(rows, body=strip)
+
+
+def _runs() -> Iterator[Crafted]:
+    """BMP files of runs, which say how often a byte is repeated, and where the next one is."""
+    for bits, number in ((8, 1), (4, 2), (24, 1), (8, 3), (8, 4), (32, 2)):
+        for name, body in {
+            "repeated": b"\xff\x01" * 200_000,
+            "moved": b"\0\2\xff\xff" * 200_000,
+            "lines": b"\0\0" * 200_000,
+            "copied": b"\0\xff" + bytes(100),
+            "ended": b"\0\1",
+        }.items():
+            header = struct.pack("<IiiHHIIiiII", 40, 900, 900, 1, bits, number, len(body), 0, 0, 16, 0)
+            start = b"BM" + struct.pack("<IHHI", 2**31 - 1, 0, 0, 14 + len(header) + 64)
+            yield Crafted(f"{name}_{bits}_{number}.bmp", start + header + bytes(64) + body, "runs beyond the image")
 
 
 def _bmps() -> Iterator[Crafted]:
