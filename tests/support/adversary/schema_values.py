@@ -46,7 +46,7 @@ def _value(rng: random.Random, kind: inspect.Type, odd: float) -> Any:
             return [_value(rng, each, odd) for each in kind.item_types]
         case inspect.DictType():
             count = _length(rng, kind.min_length, kind.max_length)
-            return {_value(rng, kind.key_type, 0.0): _value(rng, kind.value_type, odd) for _ in range(count)}
+            return {_key(rng, kind.key_type): _value(rng, kind.value_type, odd) for _ in range(count)}
         case inspect.DataclassType():
             return {field.name: _value(rng, field.type, odd) for field in kind.fields}
         case inspect.EnumType():
@@ -60,6 +60,10 @@ def _value(rng: random.Random, kind: inspect.Type, odd: float) -> Any:
         case inspect.BytesType():
             return rng.randbytes(rng.choice((0, 1, 32)))
     return edges.hostile(rng)
+
+
+def _key(rng: random.Random, kind: inspect.Type) -> Any:
+    return edges.text(rng) if isinstance(kind, inspect.AnyType) else _value(rng, kind, 0.0)
 
 
 def _struct(rng: random.Random, kind: inspect.StructType, odd: float) -> Any:
