@@ -22,6 +22,7 @@ PROCESSES = 2
 CASES = 5_000_000
 BATCH_S = 2.0  # that a batch lasts, about
 _FIRST = 32  # cases of a boundary's first batch, which tells how long one takes
+_TURNS = 20  # in which a boundary has its share, at least
 _HANGS_S = 120.0  # without an answer, beyond what a batch may last: much longer than any case may take
 _ALIKE = 3  # defects of a boundary that are kept of one kind; all are counted
 
@@ -114,7 +115,7 @@ def _attack(
             if attacker.job is None and open_ and time.monotonic() < until:
                 behind = min(open_, key=lambda each: (rows[each.name].next - first) / quotas[each.name])
                 row = rows[behind.name]
-                end = min(row.next + _batch_size(row), first + quotas[behind.name])
+                end = min(row.next + _batch_size(row, quotas[behind.name]), first + quotas[behind.name])
                 attacker.give(behind.name, seed, row.next, end, until)
                 row.next = end
         if all(attacker.job is None for attacker in attackers):
@@ -125,9 +126,10 @@ def _attack(
         tell(rows)
 
 
-def _batch_size(row: Row) -> int:
-    """How many cases last BATCH_S, as far as is known."""
-    return _FIRST if not row.cases else max(8, min(50_000, int(BATCH_S * row.cases / max(row.seconds, 1e-6))))
+def _batch_size(row: Row, quota: int) -> int:
+    """How many cases last BATCH_S, as far as is known, and a small part of them all: no boundary waits for another."""
+    known = int(BATCH_S * row.cases / max(row.seconds, 1e-6))
+    return _FIRST if not row.cases else max(8, min(known, quota // _TURNS))
 
 
 class _Attacker:

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 
 from splatnode.capture import film
@@ -121,7 +122,10 @@ def _draw_quarantine(rng: random.Random) -> stored.Files:
 
 
 def _read_last_run(data: bytes, folder: Path) -> object:
-    found = record_in(data, LastRun)
+    try:
+        found = record_in(data, LastRun)
+    except msgspec.MsgspecError as error:  # as last_run takes it
+        raise Refused("the last run is not known") from error
     return str(found), found
 
 
@@ -158,12 +162,7 @@ def _read_name(data: bytes, folder: Path) -> object:
     if not is_printable(shown, 255):
         raise AssertionError(f"a name that is not printable: {shown!a}")
     told = name_time(name)
-    with contextlib.chdir(folder) if hasattr(contextlib, "chdir") else contextlib.nullcontext():
-        path = Path("film.mp4" + name[name.find("#") :] if name.startswith("film.mp4#") else "film.mp4")
-        return told, film._parse_seconds(path, name.partition("#")[2]) if "#t=" in name else None
-
-
-_PARTS = (("film.mp4", "t=10"),)
+    return told, film._parse_seconds(Path("film.mp4"), name.partition("#")[2]) if "#t=" in name else None
 
 
 def _draw_options(rng: random.Random) -> list[bytes]:
@@ -307,7 +306,7 @@ _WHOLE = Reader((SceneFileError,), ("splatnode.recon.result.whole",))
 _REPORTS = Reader((), (f"{_BATCH}.answer",))
 _LEDGERS = Reader((ledger.OtherBatch,), (f"{_BATCH}.ledger",))
 _QUARANTINES = Reader((), ("splatnode.capture.messaging.quarantine",))
-_LAST_RUNS = Reader((ValueError,), ("splatnode.capture.last_run",))
+_LAST_RUNS = Reader((Refused,), ("splatnode.capture.last_run",))
 _MANIFESTS = Reader((), ("splatnode.recon.result.export.manifest",))
 _LISTS = Reader((ValueError,), (f"{_BATCH}.sources",))
 _NAMES = Reader((ValueError,), ("splatnode.capture.name_time", "splatnode.capture.film"))

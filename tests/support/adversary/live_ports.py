@@ -35,7 +35,7 @@ from splatnode.capture.messaging.spool import Config as SpoolConfig
 from splatnode.capture.messaging.spool import Spool
 from splatnode.capture.messaging.state import StateClient, StateServer, Want
 from splatnode.capture.preview import PreviewHeader
-from splatnode.capture.status import CaptureStatus, Heartbeat
+from splatnode.capture.status import CaptureStatus, _Listener
 from splatnode.recon.daemon.control import Command
 from splatnode.recon.result.message import SceneHeader
 from tests.bench.node.attacked import shout
@@ -122,9 +122,11 @@ class _Port:
         publisher.bind(self._where(service))
         return publisher
 
-    def _subscribed(self, service: Service, schema: Any) -> tuple[Any, Callable[[], Any], zmq.Socket, list[bytes]]:
+    def _subscribed(
+        self, service: Service, opened: Callable[[], Subscriber]
+    ) -> tuple[Any, Callable[[], Any], zmq.Socket, list[bytes]]:
         publisher = self._publisher(service)
-        subscriber = Subscriber(service, self._network, schema)
+        subscriber = opened()
         for _ in range(1000):  # until the subscription has arrived
             subscriber.latest(0.005)
             if publisher.poll(5):
@@ -136,10 +138,10 @@ class _Port:
             subscriber.latest(0.0)
 
     def _open_previews(self) -> tuple[Any, Callable[[], Any], zmq.Socket, list[bytes]]:
-        return self._subscribed(CAPTURE_PREVIEW, PreviewHeader)
+        return self._subscribed(CAPTURE_PREVIEW, lambda: Subscriber(CAPTURE_PREVIEW, self._network, PreviewHeader))
 
     def _open_heartbeats(self) -> tuple[Any, Callable[[], Any], zmq.Socket, list[bytes]]:
-        return self._subscribed(CAPTURE_STATUS, Heartbeat)
+        return self._subscribed(CAPTURE_STATUS, lambda: _Listener(CAPTURE_STATUS, self._network))
 
     def _open_scenes(self) -> tuple[Any, Callable[[], Any], zmq.Socket, list[bytes]]:
         publisher = self._publisher(RECON_SCENE)
