@@ -12,13 +12,12 @@ import msgspec
 import numpy as np
 
 from splatnode.capture.process.config_text import ConfigError
-from splatnode.capture.process.printable import printable_lines
+from splatnode.capture.process.printable import LONGEST_LINE, printable_lines
 from splatnode.command_line import exit_code, explain
 
 MOST_SECONDS = 1.0  # of processor time, for one case
 MOST_MB = 256.0  # of memory, for one case
 _DEEPEST = 12
-_LONGEST_LINE = 5000  # characters: a reason beside a path and what was expected
 _INTERNAL = 70  # the exit code of what nobody foresaw
 _MOST_LINES = 30  # of a configuration's error, which shows where in the file it is
 
@@ -61,7 +60,7 @@ def problem_of_refusal(error: BaseException) -> str:
         return f"it is called an internal error: {text[:200]}"
     if len(lines) > (_MOST_LINES if isinstance(error, ConfigError) else 1):
         return f"it has {len(lines)} lines: {text[:200]!a}"
-    if not text.strip() or max(map(len, lines)) > _LONGEST_LINE:
+    if not text.strip() or max(map(len, lines)) > LONGEST_LINE:
         return f"it has {len(text)} characters: {text[:100]!a}"
     if not all(line.isprintable() for line in lines):
         return f"it is not printable: {text[:200]!a}"

@@ -51,7 +51,7 @@ from tests.support.adversary.schema_values import value
 _RECORDING, _END = Recording("a", "/a"), End(0, "", 1.0, 1.0)
 
 
-class Refused(Exception):
+class Refused(ValueError):
     """What was asked for was not given, as it should be."""
 
 

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import zmq
 
 from splatnode.capture.messaging import keys
@@ -34,6 +35,7 @@ from splatnode.capture.messaging.services import (
 from splatnode.capture.messaging.spool import Config as SpoolConfig
 from splatnode.capture.messaging.spool import Spool
 from splatnode.capture.messaging.state import StateClient, StateServer, Want
+from splatnode.capture.messaging.wire import MAGIC, plain_header
 from splatnode.capture.preview import PreviewHeader
 from splatnode.capture.status import CaptureStatus, _Listener
 from splatnode.recon.daemon.control import Command
@@ -200,8 +202,15 @@ def _free_port() -> int:
 
 
 def _delivery(rng: random.Random) -> messages.Parts:
+    """A keyframe and the delivery before it, which is mostly its own."""
     frame = messages.message(rng, FrameHeader, lambda rng, header: [messages.image_row(rng)])
-    return [*messages.message(rng, Delivery)[1:2], *frame] if rng.random() < 0.8 else frame
+    head = plain_header(frame)
+    if rng.random() < 0.9 and {"session", "sequence"} <= set(head):
+        numbers = {"type": "delivery", "session": head["session"], "sequence": head["sequence"]}
+        before = [MAGIC, msgspec.msgpack.encode([numbers, []])]
+    else:
+        before = messages.message(rng, Delivery)
+    return [*before, *frame]
 
 
 def _of(schema: Any, table: Any = lambda rng, header: ()) -> Callable[[random.Random], messages.Parts]:
