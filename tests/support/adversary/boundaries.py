@@ -86,7 +86,7 @@ def _decoding(schema: Any) -> Callable[[Any, Path], object]:
 
 
 def _photograph(rng: random.Random, header: Any) -> list[messages.Row]:
-    return [messages.image_row(rng)] if isinstance(header, dict) and header.get("type") == "frame" else []
+    return messages.frame_rows(rng, header) if isinstance(header, dict) and header.get("type") == "frame" else []
 
 
 def _preview(rng: random.Random, header: Any) -> list[messages.Row]:

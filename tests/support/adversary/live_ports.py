@@ -203,7 +203,7 @@ def _free_port() -> int:
 
 def _delivery(rng: random.Random) -> messages.Parts:
     """A keyframe and the delivery before it, which is mostly its own."""
-    frame = messages.message(rng, FrameHeader, lambda rng, header: [messages.image_row(rng)])
+    frame = messages.message(rng, FrameHeader, messages.frame_rows)
     head = plain_header(frame)
     if rng.random() < 0.9 and {"session", "sequence"} <= set(head):
         numbers = {"type": "delivery", "session": head["session"], "sequence": head["sequence"]}
