@@ -14,6 +14,8 @@ def read_bounded(path: Path, most: int, refusal: type[Exception], source: str = 
     command. Raises a `refusal` that begins with `source`, or OSError where the bytes cannot be had.
     """
     where = f"{source}: " if source else ""
+    if "\0" in str(path):
+        raise refusal(f"{where}no file has a null byte in its name")
     _must_be_regular(os.stat(path), refusal, where)
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         found = os.fstat(file.fileno())  # of what was opened, whatever was there before
