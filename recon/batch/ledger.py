@@ -110,7 +110,7 @@ class Ledger:
             raise OtherBatch(f"{self.path} has format {header.batch}, expected {_FORMAT}; give another --out")
         if header.command != command:
             raise OtherBatch(
-                f"{self.path} is of a batch with other options: {' '.join(header.command)}. Now they are "
+                f"{self.path} is of a batch with other options: {printable(' '.join(header.command))}. Now they are "
                 f"{' '.join(command)}. Give the same ones, or another --out"
             )
 

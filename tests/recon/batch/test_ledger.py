@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from splatnode.recon.batch.ledger import LEDGER, Ledger
+from splatnode.recon.batch.ledger import LEDGER, Ledger, OtherBatch
 from splatnode.recon.batch.sources import Recording
 
 ROW = {"name": "a", "source": "/a", "verdict": "OK", "message": "", "published": True, "photographs": 3}
@@ -28,3 +28,10 @@ def test_a_row_with_finite_numbers_counts(tmp_path):
     (tmp_path / LEDGER).write_text("".join(json.dumps(line) + "\n" for line in [{"batch": 1, "command": []}, ROW]))
     with Ledger(tmp_path, []) as ledger:
         assert ledger.verdict(Recording("a", "/a")) == "OK"
+
+
+def test_the_options_of_another_batch_are_told_on_one_line(tmp_path):
+    (tmp_path / LEDGER).write_text(json.dumps({"batch": 1, "command": ["a\nevent=forged"]}) + "\n")
+    with pytest.raises(OtherBatch) as refused:
+        Ledger(tmp_path, ["replay"])
+    assert str(refused.value).isprintable()
