@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -113,10 +114,14 @@ def film(folder: Path, part: str) -> Film:
     if row is None:
         raise UnusableDataSet(f"{shown} has no episode {number}; it has {len(set(_numbers(folder)))} episodes")
     chunk, file, from_s, to_s = (row.get(name) for name in wanted)
-    if chunk is None or file is None or from_s is None or to_s is None or to_s <= from_s:
+    if chunk is None or file is None or from_s is None or to_s is None:
         raise UnusableDataSet(f"{shown}: episode {number} has no images of {printable(key)}")
-    video = folder / _video(info, key, int(chunk), int(file))
-    return Film(number, key, video, float(from_s), float(to_s), info.fps if 0 < info.fps <= _MOST_RATE else 0.0)
+    with foreign(UnusableDataSet, f"{shown}: episode {number}"):  # a column may be of any type
+        chunk, file, from_s, to_s = int(chunk), int(file), float(from_s), float(to_s)
+    if not 0.0 <= from_s < to_s < math.inf:
+        raise UnusableDataSet(f"{shown}: episode {number} has no images of {printable(key)}")
+    rate = info.fps if 0 < info.fps <= _MOST_RATE else 0.0
+    return Film(number, key, folder / _video(info, key, chunk, file), from_s, to_s, rate)
 
 
 def episode_and_camera(folder: Path, info: Info, part: str) -> tuple[int, str]:
@@ -161,7 +166,12 @@ def _reading(folder: Path) -> Iterator[tuple[ModuleType, list[Path]]]:
             "download the whole data set, or record an episode first"
         )
     with foreign(UnusableDataSet, f"{shown}: {EPISODES}"):
-        yield pyarrow, files
+        try:
+            yield pyarrow, files
+        except OSError as error:
+            if error.errno is None:  # Arrow's own, of a table that is damaged, and not the disk's
+                raise UnusableDataSet(f"{shown}: {EPISODES} is damaged: {printable(error, 200)}") from error
+            raise
 
 
 def _shown(folder: Path) -> str:
