@@ -22,8 +22,9 @@ from splatnode.capture.process.printable import printable
 MCAP = ".mcap"
 _MODULES = {"mcap": mcap, "lerobot": lerobot, "video": video}
 _MARK = "#"  # between a file and the part of it that is meant
-# Seconds of a video from its first frame, the first of which is in it, as W3C's Media Fragments have it: t=10,20.5
-_SECONDS = re.compile(r"t=(\d+(?:\.\d*)?)?(?:,(\d+(?:\.\d*)?))?", re.ASCII)
+# Seconds of a video from its first frame, the first of which is in it, as W3C's Media Fragments have it: t=10,20.5.
+# No more digits than there are in the largest that a video has: more could be infinite.
+_SECONDS = re.compile(r"t=(\d{1,9}(?:\.\d{0,9})?)?(?:,(\d{1,9}(?:\.\d{0,9})?))?", re.ASCII)
 
 
 def file_and_part(path: Path) -> tuple[Path, str]:

@@ -116,7 +116,7 @@ def film(folder: Path, part: str) -> Film:
     if found is None:
         raise UnusableDataSet(f"{shown} has no episode {number}; it has {len(set(_numbers(folder)))} episodes")
     chunk, file, from_s, to_s = found
-    if not all(map(math.isfinite, found)) or to_s <= from_s:
+    if not all(map(math.isfinite, found)) or not 0.0 <= from_s < to_s:
         raise UnusableDataSet(f"{shown}: episode {number} has no images of {printable(key)}")
     video = folder / _video(info, key, _whole(chunk, "chunk_index"), _whole(file, "file_index"))
     return Film(number, key, video, from_s, to_s, info.fps if 0 < info.fps <= _MOST_RATE else 0.0)

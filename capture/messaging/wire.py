@@ -24,6 +24,7 @@ import zmq
 
 from splatnode.capture.messaging.values import Sequential, SessionId, check
 from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.printable import printable
 from splatnode.capture.process.records import Decoder, decoder_of
 
 # Of the messages: 1 knew no answer to a keyframe that cannot be taken, 2 no time of capture, 3 no masks, 4 no fisheyes.
@@ -142,7 +143,7 @@ def _envelope(head: memoryview, schema: Any) -> _Envelope[Any]:
     try:
         return decoder.decode(head)
     except (ValueError, RecursionError) as error:  # msgspec's own errors are ValueErrors
-        raise WireError(f"header refused: {error}") from error
+        raise WireError(f"header refused: {printable(error)}") from error
 
 
 @functools.lru_cache(maxsize=64)

@@ -28,6 +28,8 @@ def read_bounded(path: Path, most: int, refusal: type[Exception], source: str = 
 def open_regular(path: Path, refusal: type[Exception], source: str = "") -> Iterator[BinaryIO]:
     """The file `path`, opened to be read. Raises as `read_bounded`."""
     where = f"{source}: " if source else ""
+    if "\0" in str(path):
+        raise refusal(f"{where}no file has a null byte in its name")
     _must_be_regular(os.stat(path), refusal, where)
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         _must_be_regular(os.fstat(file.fileno()), refusal, where)  # of what was opened, whatever was there before

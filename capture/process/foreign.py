@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 
+from splatnode.capture.process.printable import printable
+
 
 @contextlib.contextmanager
 def foreign(refusal: type[Exception], source: object = "") -> Iterator[None]:
@@ -21,4 +23,4 @@ def foreign(refusal: type[Exception], source: object = "") -> Iterator[None]:
         raise
     except Exception as error:
         where = f"{source}: " if source else ""
-        raise refusal(f"{where}cannot be read ({type(error).__name__}: {error})") from error
+        raise refusal(f"{where}cannot be read ({type(error).__name__}: {printable(error)})") from error

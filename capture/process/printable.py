@@ -7,6 +7,7 @@ import hashlib
 LONGEST_NAME = 255  # characters, as of a file
 LONGEST_TEXT = 1000  # characters of a message
 _FORMULA = ("=", "+", "-", "@", "\t", "\r", "\n", "\uff1d", "\uff0b", "\uff0d", "\uff20")  # the last: as wide as a word
+LONGEST_LINE = 4000  # characters of one of several lines: a reason that names files and what was expected
 
 
 def printable(text: object, longest: int = LONGEST_TEXT) -> str:
@@ -28,10 +29,11 @@ def is_printable(text: str, longest: int = LONGEST_TEXT) -> bool:
 def printable_lines(text: object) -> str:
     """`text` of several lines, each printable; those after the first are set in by two spaces.
 
-    So a line that a stranger's line break began is told from one of the program's own.
+    So a line that a stranger's line break began is told from one of the program's own. Of one with more than
+    LONGEST_LINE characters the end is left out.
     """
     lines = str(text).rstrip("\n").split("\n")
-    return "\n  ".join(escaped(line) for line in lines)
+    return "\n  ".join(printable(line, LONGEST_LINE) for line in lines)
 
 
 def printable_name(raw: str, longest: int = LONGEST_NAME) -> str:

@@ -14,18 +14,31 @@ import msgspec
 
 Decoder = msgspec.msgpack.Decoder
 _TURN = threading.RLock()
+_TOO_DEEP = "values may not be nested as deeply as these"
 
 
 def record_of(value: Any, kind: Any, dec_hook: Callable[[type, Any], Any] | None = None) -> Any:
-    """`msgspec.convert`: the plain `value` as a `kind`. Raises msgspec.ValidationError."""
+    """`msgspec.convert`: the plain `value` as a `kind`. Raises msgspec.ValidationError, and nothing else."""
     with _TURN:
-        return msgspec.convert(value, kind, dec_hook=dec_hook)
+        try:
+            return msgspec.convert(value, kind, dec_hook=dec_hook)
+        except RecursionError as error:
+            raise msgspec.ValidationError(_TOO_DEEP) from error
 
 
 def record_in(data: bytes | str, kind: Any) -> Any:
-    """`msgspec.json.decode`: the `kind` in JSON. Raises msgspec.DecodeError, msgspec.ValidationError."""
+    """`msgspec.json.decode`: the `kind` in JSON.
+
+    Raises msgspec.DecodeError, msgspec.ValidationError, and nothing else: msgspec itself has further errors for a text
+    that is no UTF-8 and for one that is nested deeply.
+    """
     with _TURN:
-        return msgspec.json.decode(data, type=kind)
+        try:
+            return msgspec.json.decode(data, type=kind)
+        except RecursionError as error:
+            raise msgspec.DecodeError(_TOO_DEEP) from error
+        except UnicodeError as error:
+            raise msgspec.DecodeError(f"JSON is UTF-8: {error}") from error
 
 
 def decoder_of(kind: Any) -> Decoder:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -110,7 +111,7 @@ class Ledger:
             raise OtherBatch(f"{self.path} has format {header.batch}, expected {_FORMAT}; give another --out")
         if header.command != command:
             raise OtherBatch(
-                f"{self.path} is of a batch with other options: {' '.join(header.command)}. Now they are "
+                f"{self.path} is of a batch with other options: {printable(' '.join(header.command))}. Now they are "
                 f"{' '.join(command)}. Give the same ones, or another --out"
             )
 
@@ -134,4 +135,9 @@ def _key(of: Recording | Outcome) -> Key:
 
 
 def _outcome(line: bytes) -> Outcome:
-    return record_of(json.loads(line), Outcome)
+    """Raises ValueError where the line is none of ours: Python's JSON has numbers that are not finite."""
+    found = record_of(json.loads(line), Outcome)
+    numbers = [each for each in msgspec.structs.astuple(found) if isinstance(each, float)]
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError(f"the numbers of a row must be finite, got {numbers}")
+    return found

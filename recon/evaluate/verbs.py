@@ -69,7 +69,7 @@ def _stability_arguments(parser: argparse.ArgumentParser) -> None:
         "--told",
         choices=("nothing", "exif", "given"),
         default="nothing",
-        help="windows of a known camera: splatnode is told the true lens, or EXIF's focal length within 3 %",
+        help="windows of a known camera: splatnode is told the true lens, or EXIF's focal length within 3 %%",
     )
     _add_engine(parser, "trials", "a trial", 120.0)
     parser.add_argument(

@@ -26,7 +26,8 @@ def opened(data: bytes, most_bytes: int, name: str, what: str) -> Iterator[Mappi
             size = sum(member.file_size for member in archive.infolist())
         if size > most_bytes:
             raise SceneFileError(f"{name} holds {size} bytes; at most {most_bytes} are read")
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+        # Sides that no array has overflow when NumPy multiplies them, before it refuses them.
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays, np.errstate(all="ignore"):
             yield arrays
     except (KeyError, ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
         raise SceneFileError(f"{name} is not a file of {what}, or is damaged: {error}") from error

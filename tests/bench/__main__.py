@@ -18,12 +18,8 @@ BENCHMARKS = {
         "merge",
         "faults",
         "walk_faults",
-        "writes",
         "soak",
         "siege",
-        "fuzz",
-        "adversary",
-        "guided",
         "capture",
     ),
     "quality": (

@@ -109,6 +109,13 @@ def test_an_error_is_one_line_and_a_code(monkeypatch, capsys, error, code):
         assert (getattr(error, "strerror", None) or str(error)) in said
 
 
+@pytest.mark.parametrize("verb", [verb.name for verb in command_line.VERBS])
+def test_every_verb_can_say_what_it_takes(verb, capsys):
+    with pytest.raises(SystemExit) as end:
+        command_line.main([verb, "--help"])
+    assert end.value.code == 0 and f"splatnode {verb}" in capsys.readouterr().out
+
+
 def test_a_missing_module_is_told_with_what_brings_it(monkeypatch, capsys):
     for module, brought in {**packages.EXTRAS, **packages.REQUIRED}.items():
         error = ModuleNotFoundError(f"No module named '{module}'", name=f"{module}.part")

@@ -33,6 +33,7 @@ def calls(tmp_path):
         (["demo"], ""),
         (["test", "-x"], "[dev,bench]"),
         (["bench", "scene", "--out", "o"], "[bench]"),
+        (["fuzz", "--seconds", "9"], "[dev,bench]"),
         (["docs"], "[docs]"),
         (["view", "out"], "[viewer]"),
         (["view", "out", "--headless"], ""),
@@ -51,6 +52,10 @@ def test_what_is_installed_follows_from_what_is_asked_for(calls, arguments, extr
 def test_the_site_is_built_or_shown_to_this_machine_alone(calls):
     assert calls("docs")[-1] == "-m mkdocs build --strict"
     assert calls("docs", "--serve")[-1] == "-m mkdocs serve --strict --dev-addr 127.0.0.1:8000"
+
+
+def test_fuzzing_gets_its_options(calls):
+    assert calls("fuzz", "--only", "writes")[-1] == "-m tests.fuzz --only writes"
 
 
 def test_an_environment_that_is_set_up_is_left_alone(calls):

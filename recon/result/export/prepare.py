@@ -32,11 +32,13 @@ def viewer_safe(gaussians: GaussianArrays) -> GaussianArrays:
         distance = np.linalg.norm((gaussians.means - middle).astype(np.float64), axis=1)
     reach = float(np.median(distance[finite])) or 1.0
     kept = take(gaussians, finite & (distance <= _FARTHEST * reach))
-    length = np.linalg.norm(kept.quats, axis=1, keepdims=True)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(kept.quats, axis=1, keepdims=True)
+    is_rotation = (length > 1e-12) & np.isfinite(length)
     identity = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
     return GaussianArrays(
         means=kept.means,
-        quats=np.where(length > 1e-12, kept.quats / np.maximum(length, 1e-12), identity).astype(np.float32),
+        quats=np.where(is_rotation, kept.quats / np.maximum(length, 1e-12), identity).astype(np.float32),
         scales=np.clip(kept.scales, _SCALE_LIMITS[0] * reach, _SCALE_LIMITS[1] * reach).astype(np.float32),
         opacities=np.clip(kept.opacities, *_OPACITY_LIMITS).astype(np.float32),
         sh=kept.sh,

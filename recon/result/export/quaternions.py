@@ -30,7 +30,9 @@ def quats_from_matrices(matrices: npt.ArrayLike) -> Array:
 def matrices_from_quats(quats: npt.ArrayLike) -> Array:
     """(..., 4) quaternions of any length as (..., 3, 3) rotations."""
     q = np.asarray(quats, np.float64)
-    w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    with np.errstate(all="ignore"):  # one whose length is zero or infinite is no rotation: it becomes NaN
+        length = np.linalg.norm(q, axis=-1, keepdims=True)
+        w, x, y, z = np.moveaxis(q / np.where(np.isfinite(length), length, np.nan), -1, 0)
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

@@ -116,6 +116,15 @@ def test_malformed_messages_are_refused(parts):
         decode(parts, Apple | Pear)
 
 
+@pytest.mark.parametrize("name", ["a\nevent=keyframe name=forged", "\x1b[2J", "x" * 100_000])
+def test_a_refusal_is_one_line_that_only_shows_whatever_a_stranger_names(name):
+    head = msgspec.msgpack.encode([{**Numbering().next(), "type": "pear", "name": "birne", name: 0}, []])
+    with pytest.raises(WireError) as refused:
+        decode([MAGIC, head], Pear)
+    text = str(refused.value)
+    assert text.startswith("header refused: ") and text.isprintable() and len(text) < 1100
+
+
 def test_another_version_is_told_what_to_do():
     with pytest.raises(WireError, match="of version 1, and this splatnode speaks version 5: update the older one"):
         decode([b"SPLAT\x01", parts_of()[1]], Pear)

@@ -45,3 +45,9 @@ def test_a_refusal_is_left_as_it_is():
 def test_what_is_not_the_strangers_fault_passes(error):
     with pytest.raises(type(error)), foreign(Refused, "scene.ply"):
         raise error
+
+
+def test_what_a_parser_repeats_of_a_stranger_stays_on_one_line():
+    with pytest.raises(Refused) as refused, foreign(Refused, "a.json"):
+        raise ValueError("a\nevent=keyframe name=forged\x1b[2J" + "x" * 100_000)
+    assert str(refused.value).isprintable() and len(str(refused.value)) < 1100

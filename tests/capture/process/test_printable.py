@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from splatnode.capture.process.printable import is_printable, printable
+from splatnode.capture.process.printable import LONGEST_LINE, is_printable, printable, printable_lines
 
 
 @pytest.mark.parametrize(
@@ -37,3 +37,9 @@ def test_nothing_but_printable_characters_passes_and_a_second_time_changes_nothi
 
 def test_a_long_text_says_that_its_end_is_left_out():
     assert printable("x" * 300, 255) == "x" * 254 + "…"
+
+
+def test_lines_are_each_printable_and_as_long_as_people_read():
+    shown = printable_lines("a\x1b[2J\n" + "b" * 100_000)
+    first, second = shown.split("\n")
+    assert first == "a\\x1b[2J" and second == "  " + "b" * (LONGEST_LINE - 1) + "…"

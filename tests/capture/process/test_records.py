@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import Any
 
 import msgspec
 import pytest
@@ -43,9 +44,29 @@ class Place(msgspec.Struct, frozen=True):
     floors: tuple[int, ...] = ()
 
 
+class Nested(msgspec.Struct, array_like=True, frozen=True):
+    further: Nested | None = None
+
+
 def test_threads_that_meet_a_type_at_once_do_not_end_the_process():
     done = subprocess.run([sys.executable, "-c", MEETING], cwd=ROOT, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout, done.stderr) == (0, "alive\n", "")
+
+
+@pytest.mark.parametrize("data", [b'{"name": ' + b"[" * 100_000, b'{"other": ' * 100_000, b'{"\xff": 1}', b'"\xff"'])
+def test_a_text_that_no_json_is_has_the_errors_of_json(data):
+    with pytest.raises(msgspec.DecodeError):
+        record_in(data, Place)
+    with pytest.raises(msgspec.DecodeError):
+        record_in(data, dict[str, Any])
+
+
+def test_values_that_are_nested_too_deeply_are_none_of_a_kind():
+    deep: Any = 1
+    for _ in range(100_000):
+        deep = [deep]
+    with pytest.raises(msgspec.ValidationError):
+        record_of({"name": deep}, dict[str, Nested])
 
 
 def test_each_way_gives_the_record_and_refuses_what_is_none():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 import zipfile
 from dataclasses import fields, replace
 
@@ -114,3 +115,16 @@ def test_a_result_without_landmarks_says_what_to_do(tmp_path):
     (tmp_path / "scene.ply").write_text("")
     with pytest.raises(FileNotFoundError, match="Reconstruct the photographs again"):
         read_landmarks(tmp_path)
+
+
+def test_sides_that_no_array_has_are_refused_and_nobody_is_warned(landmarks):
+    content = io.BytesIO()
+    head = b"{'descr': '<f4', 'fortran_order': False, 'shape': (9223372036854775808, 6), }"
+    with zipfile.ZipFile(io.BytesIO(encode_landmarks(landmarks))) as old, zipfile.ZipFile(content, "w") as new:
+        for name in old.namelist():
+            points = b"\x93NUMPY\1\0" + len(head).to_bytes(2, "little") + head
+            new.writestr(name, points if name == "points.npy" else old.read(name))
+    with warnings.catch_warnings(record=True) as said, pytest.raises(SceneFileError, match="landmarks.npz"):
+        warnings.simplefilter("always")
+        decode_landmarks(content.getvalue())
+    assert said == []

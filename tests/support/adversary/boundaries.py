@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import random
-import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -46,29 +44,15 @@ from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.message import SceneHeader, from_message
 from splatnode.viewer.sources import load_result
 from tests.support.adversary import cameras, documents, images, messages, scenes, stored
+from tests.support.adversary.boundary import Boundary, Reader, attempt, case_of, cases_of
+from tests.support.adversary.documents_read import DOCUMENTS
+from tests.support.adversary.files_read import FILES
+from tests.support.adversary.live_ports import PORTS
+
+__all__ = ["BOUNDARIES", "Boundary", "Reader", "attempt", "case_of", "cases_of"]
 
 _LIMITS = Limits(header_bytes=1 << 16, arrays=64, total_bytes=1 << 20)
 _MAX_PIXELS = 4_000_000  # of the images that are drawn here: more than any honest one of them has
-
-
-@dataclass(frozen=True)
-class Reader:
-    """The errors by which modules refuse; any other is a defect. Good cases run most of the modules' lines."""
-
-    refusals: tuple[type[Exception], ...]
-    modules: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Boundary:
-    """What is drawn, what reads it, and the memory that reading may take beside the process itself."""
-
-    name: str
-    draw: Callable[[random.Random], Any]
-    read: Callable[[Any, Path], object]  # with an empty folder of its own
-    reader: Reader
-    bound_mb: float
-    share: float = 1.0  # of all cases
 
 
 def _of(schema: Any, table: Any = lambda rng, header: ()) -> Callable[[random.Random], Any]:
@@ -102,7 +86,7 @@ def _decoding(schema: Any) -> Callable[[Any, Path], object]:
 
 
 def _photograph(rng: random.Random, header: Any) -> list[messages.Row]:
-    return [messages.image_row(rng)] if isinstance(header, dict) and header.get("type") == "frame" else []
+    return messages.frame_rows(rng, header) if isinstance(header, dict) and header.get("type") == "frame" else []
 
 
 def _preview(rng: random.Random, header: Any) -> list[messages.Row]:
@@ -261,48 +245,68 @@ def _read_preview(parts: Any, folder: Path) -> object:
 
 
 _MESSAGES = (
-    Boundary("keyframes", _draw_frame, _read_frame, _FRAMES, 10, 6),
-    Boundary("keyframe requests", _of(Request), _decoding(Request), _WIRE, 10, 4),
-    Boundary("keyframe answers", _of(Served), _decoding(Served), _WIRE, 10, 1),
-    Boundary("previews", _of(PreviewHeader, _preview), _read_preview, _PREVIEWS, 200, 1),
-    Boundary("scenes", _of(SceneHeader, _scene), _read_scene, _SCENES, 50, 3),
-    Boundary("maps", _of(MapHeader, _states), _read_map, _WIRE, 20, 1),
-    Boundary("recon's heartbeats", _of(ReconStatus), _decoding(ReconStatus), _WIRE, 10, 2),
-    Boundary("capture's heartbeats", _of(CaptureStatus), _decoding(CaptureStatus), _WIRE, 10, 1),
-    Boundary("any heartbeats", _of(CaptureStatus), _decoding(Heartbeat), _WIRE, 10, 1),
-    Boundary("commands", _of(Command | Answer), _decoding(Command | Answer), _WIRE, 10, 2),
-    Boundary("states", _of(Want), _decoding(Want), _WIRE, 10, 2),
+    Boundary("keyframes", _draw_frame, _read_frame, _FRAMES, 10, 6, mutants=4, tidy=False),
+    Boundary("keyframe requests", _of(Request), _decoding(Request), _WIRE, 10, 4, mutants=4, tidy=False),
+    Boundary("keyframe answers", _of(Served), _decoding(Served), _WIRE, 10, 1, mutants=4, tidy=False),
+    Boundary("previews", _of(PreviewHeader, _preview), _read_preview, _PREVIEWS, 200, 1, mutants=4, tidy=False),
+    Boundary("scenes", _of(SceneHeader, _scene), _read_scene, _SCENES, 50, 3, mutants=4, tidy=False),
+    Boundary("maps", _of(MapHeader, _states), _read_map, _WIRE, 20, 1, mutants=4, tidy=False),
+    Boundary("recon's heartbeats", _of(ReconStatus), _decoding(ReconStatus), _WIRE, 10, 2, mutants=4, tidy=False),
+    Boundary("capture's heartbeats", _of(CaptureStatus), _decoding(CaptureStatus), _WIRE, 10, 1, mutants=4, tidy=False),
+    Boundary("any heartbeats", _of(CaptureStatus), _decoding(Heartbeat), _WIRE, 10, 1, mutants=4, tidy=False),
+    Boundary("commands", _of(Command | Answer), _decoding(Command | Answer), _WIRE, 10, 2, mutants=4, tidy=False),
+    Boundary("states", _of(Want), _decoding(Want), _WIRE, 10, 2, mutants=4, tidy=False),
 )
 _FILES = (
-    Boundary("photographs", images.image, _read_photograph, _IMAGES, 100, 3),
-    Boundary("scene.ply", scenes.ply, _reading("scene.ply", read_gaussians), _formats("ply"), 20, 0.7),
-    Boundary("scene.spz", scenes.spz, _reading("scene.spz", read_gaussians), _formats("spz"), 20, 0.7),
-    Boundary("scene.splat", scenes.splat, _reading("scene.splat", read_gaussians), _formats("splat"), 20, 0.5),
-    Boundary("cameras.json", _document(scenes.cameras), _reading("cameras.json", read_cameras), _CAMERAS, 20),
-    Boundary("results", _draw_result, _read_result, _RESULTS, 50, 0.5),
-    Boundary("true cameras", _draw_truth, _read_truth, _TRUTH, 50, 0.5),
-    Boundary("recordings", stored.recording, _read_recording, _RECORDINGS, 100, 0.5),
+    Boundary("photographs", images.image, _read_photograph, _IMAGES, 100, 3, mutants=2, tidy=False),
+    Boundary(
+        "scene.ply", scenes.ply, _reading("scene.ply", read_gaussians), _formats("ply"), 20, 0.7, mutants=2, tidy=False
+    ),
+    Boundary(
+        "scene.spz", scenes.spz, _reading("scene.spz", read_gaussians), _formats("spz"), 20, 0.7, mutants=2, tidy=False
+    ),
+    Boundary(
+        "scene.splat",
+        scenes.splat,
+        _reading("scene.splat", read_gaussians),
+        _formats("splat"),
+        20,
+        0.5,
+        mutants=2,
+        tidy=False,
+    ),
+    Boundary(
+        "cameras.json",
+        _document(scenes.cameras),
+        _reading("cameras.json", read_cameras),
+        _CAMERAS,
+        20,
+        mutants=2,
+        tidy=False,
+    ),
+    Boundary("results", _draw_result, _read_result, _RESULTS, 50, 0.5, mutants=2),
+    Boundary("true cameras", _draw_truth, _read_truth, _TRUTH, 50, 0.5, mutants=2),
+    Boundary("recordings", stored.recording, _read_recording, _RECORDINGS, 100, 0.5, mutants=2),
 )
 _CONFIGURATIONS = (
-    Boundary("capture.yaml", _settings(_CAPTURE), _reading("capture.yaml", _capture_config), _YAML, 50, 0.4),
-    Boundary("recon.yaml", _settings(_RECON), _reading("recon.yaml", _recon_config), _YAML, 50, 0.4),
+    Boundary(
+        "capture.yaml",
+        _settings(_CAPTURE),
+        _reading("capture.yaml", _capture_config),
+        _YAML,
+        50,
+        0.4,
+        mutants=1,
+        tidy=False,
+    ),
+    Boundary(
+        "recon.yaml", _settings(_RECON), _reading("recon.yaml", _recon_config), _YAML, 50, 0.4, mutants=1, tidy=False
+    ),
 )
 _STATE = (
-    Boundary("messages on disk", _draw_stored, _reading("ledger", read_message), _STORED, 10, 1),
-    Boundary("spool", _draw_spool, _read_spool, _SPOOL, 20, 0.3),
-    Boundary("checkpoint", _draw_store, _read_store, _CHECKPOINT, 20, 0.3),
-    Boundary("keys", stored.keys, _read_keys, _KEYS, 10, 0.5),
+    Boundary("messages on disk", _draw_stored, _reading("ledger", read_message), _STORED, 10, 1, mutants=2),
+    Boundary("spool", _draw_spool, _read_spool, _SPOOL, 20, 0.3, mutants=2),
+    Boundary("checkpoint", _draw_store, _read_store, _CHECKPOINT, 20, 0.3, mutants=2),
+    Boundary("keys", stored.keys, _read_keys, _KEYS, 10, 0.5, mutants=2),
 )
-BOUNDARIES = (*_MESSAGES, *_FILES, *_CONFIGURATIONS, *_STATE)
-
-
-def attempt(boundary: Boundary, case: Any, folder: Path) -> str:
-    """ "read" or "refused". Raises whatever else the boundary raised: a defect."""
-    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    try:
-        boundary.read(case, folder)
-        return "read"
-    except boundary.reader.refusals:
-        return "refused"
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+BOUNDARIES = (*_MESSAGES, *_FILES, *_CONFIGURATIONS, *_STATE, *DOCUMENTS, *FILES, *PORTS)

@@ -55,6 +55,22 @@ TEXTS = (
     "con.png",
     "-rf",
 )
+NUMBER_TEXTS = (
+    *("nan", "-nan", "inf", ".inf", "-.inf", "1e400", "-1e400", "1e-400", "5e-324", "1e308", "1e155", "-0", "0"),
+    *("1e-320", "0x10", "0o7", "1_0", "1,5", "+1", "1e", ".", "true", "~", "[1]", "{}", "''", '"', "#", "١٢", "²", "½"),
+    *(
+        "9" * 25,
+        "9" * 400,
+        "9" * 5000,
+        "0." + "0" * 500 + "1",
+        "190:20:30",
+        "2026-11-23",
+        "\0",
+        "\u2028",
+        "\x85",
+        "\ufeff",
+    ),
+)
 
 
 def integer(rng: random.Random) -> int:
@@ -67,6 +83,17 @@ def number(rng: random.Random) -> float:
 
 def text(rng: random.Random) -> str:
     return rng.choice(TEXTS)
+
+
+def number_text(rng: random.Random) -> str:
+    """What stands where a text has a number."""
+    kind = rng.randrange(4)
+    return (rng.choice(NUMBER_TEXTS), str(integer(rng)), repr(number(rng)), text(rng))[kind]
+
+
+def odd(rng: random.Random, usual: object, share: float = 0.03) -> str:
+    """A usual number as text, or now and then an odd one."""
+    return number_text(rng) if rng.random() < share else str(usual)
 
 
 def unsigned(rng: random.Random, bits: int) -> int:

@@ -73,6 +73,15 @@ def image_row(rng: random.Random) -> Row:
     return "u1", [height, width, channels], rng.randbytes(height * width * channels)
 
 
+def frame_rows(rng: random.Random, header: Any) -> list[Row]:
+    """The image of a frame, and its right image where the header tells of one; now and then others."""
+    if rng.random() < 0.3:
+        return [image_row(rng)]
+    image = "u1", [12, 16, 3], rng.randbytes(576)
+    has_right = isinstance(header, dict) and header.get("baseline") is not None
+    return [image, ("u1", [12, 16], rng.randbytes(192))] if has_right else [image]
+
+
 def bytes_row(data: bytes) -> Row:
     return "u1", [len(data)], data
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 
 from splatnode.recon.result.export.formats.ply import decode as decode_ply
@@ -42,3 +44,13 @@ def test_viewer_safe_keeps_a_sane_scene_as_it_is_and_accepts_none():
     assert len(empty) == 0
     assert len(decode_ply(encode_ply(empty))) == 0
     assert len(decode_spz(encode_spz(empty))) == 0
+
+
+def test_a_quaternion_that_is_too_long_to_measure_is_none_and_nobody_is_warned():
+    gaussians = make_gaussians(10)
+    gaussians.quats[4] = 3e38
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        safe = viewer_safe(gaussians)
+    assert np.array_equal(safe.quats[4], [1, 0, 0, 0])
+    assert np.allclose(np.linalg.norm(safe.quats, axis=1), 1.0, atol=1e-6)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 
 from splatnode.recon.result.export.quaternions import matrices_from_quats, quats_from_matrices
@@ -18,3 +20,10 @@ def test_quaternions_and_matrices_agree_for_every_largest_component():
     assert np.allclose(np.abs((quats * back).sum(1)), 1.0, atol=1e-12)
     quarter_turn_about_z = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
     assert np.allclose(quats_from_matrices(quarter_turn_about_z), [np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+
+
+def test_a_quaternion_of_any_length_warns_of_nothing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert np.isnan(matrices_from_quats([1e200, 0.0, 0.0, 0.0])).all()
+        assert np.isnan(matrices_from_quats([0.0, 0.0, 0.0, 0.0])).all()

@@ -26,7 +26,7 @@ from splatnode.recon.result.export import export_scene
 from splatnode.recon.result.export.stored import read_gaussians
 from splatnode.recon.result.folder import result_folder
 from splatnode.recon.result.verdict import Code
-from tests.bench.node.interrupted import Piece, Tell
+from tests.fuzz.interrupted import Piece, Tell
 from tests.support.exported import make_gaussians, make_snapshot, write
 
 SESSION = "0123456789abcdef" * 2

@@ -22,9 +22,9 @@ from splatnode.recon.daemon.config import Config
 from splatnode.recon.daemon.daemon import Daemon
 from splatnode.recon.daemon.status import State
 from splatnode.recon.result.folder import result_folder
-from tests.bench.node.interrupted import Piece, Tell, in_a_fork
-from tests.bench.node.pieces import no_leftovers, whole
 from tests.bench.node.trial import RECON
+from tests.fuzz.interrupted import Piece, Tell, in_a_fork
+from tests.fuzz.pieces import no_leftovers, whole
 from tests.support.synthetic import photographs
 
 VIEWS = 3

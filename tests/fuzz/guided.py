@@ -1,4 +1,4 @@
-"""Attacks guided by coverage: `python -m tests.bench guided keyframes --seconds 60`, with the package atheris.
+"""Attacks guided by coverage: `python -m tests.fuzz.guided keyframes --seconds 60`, with the package atheris.
 
 The fuzzer's bytes make the choices of what the adversary draws, and it keeps those that reach new lines of the
 boundary. It ends at the first defect, with the case that shows it.

@@ -13,7 +13,7 @@ PIECES = ("spool", "checkpoint", "first result", "new result", "refused result",
 
 def test_a_fault_at_any_write_leaves_the_old_or_the_new_and_needs_no_hand(tmp_path):
     out = tmp_path / "writes.json"
-    command = [sys.executable, "-m", "tests.bench", "writes", "--out", str(out), "--only", *PIECES]
+    command = [sys.executable, "-m", "tests.fuzz.writes", "--out", str(out), "--only", *PIECES]
     ran = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert out.exists(), ran.stderr
     rows = json.loads(out.read_text())["pieces"]
