@@ -149,3 +149,7 @@ def _check_directory(stream: BinaryIO) -> None:
     length = int.from_bytes(end[:4], "little")
     if length > min(_MOST_DIRECTORY, size - 12):
         raise UnusableTable(f"its directory must have at most {min(_MOST_DIRECTORY, size - 12)} bytes, not {length}")
+
+
+if __name__ == "__main__":
+    main()

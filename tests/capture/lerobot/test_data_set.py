@@ -236,7 +236,7 @@ def test_the_camera_takes_a_configuration(made):
         "{video_key!r}",
         "{0}{{",
         "videos/{video_key}/" + "x" * 2000,
-        "{video_key}" * 90,
+        "{video_key}" * 100,
         "a\0{file_index}",
         "%s{video_key}}",
     ],
