@@ -66,7 +66,7 @@ def decoded(file: Path, every: int, max_pixels: int, span: Span = Span()) -> Ite
     """
     numbers = every, max_pixels, span.from_ns, -1 if span.to_ns is None else span.to_ns
     command = apart.command(__name__, os.fsdecode(file.absolute()), *map(str, numbers))
-    child = subprocess.Popen(
+    child = apart.started(
         command,
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,

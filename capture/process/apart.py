@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import resource
 import subprocess
 import sys
+from typing import Any
 
 
 def command(module: str, *arguments: str) -> list[str]:
@@ -19,7 +21,7 @@ def command(module: str, *arguments: str) -> list[str]:
 
 def answer(module: str, data: bytes, most: int, *arguments: str) -> tuple[bytes, int]:
     """What the process of `command` writes, `most` bytes of it, once it has read `data`; and how it ended."""
-    child = subprocess.Popen(
+    child = started(
         command(module, *arguments),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
@@ -37,6 +39,14 @@ def answer(module: str, data: bytes, most: int, *arguments: str) -> tuple[bytes,
             return found, child.wait()
         finally:
             child.kill()
+
+
+def started(command: list[str], **more: Any) -> subprocess.Popen[bytes]:
+    """The process, as subprocess.Popen. Raises OSError; what is_shortage tells where there may be no further one."""
+    try:
+        return subprocess.Popen(command, **more)
+    except BlockingIOError as error:  # fork(2): too many processes, or threads
+        raise OSError(errno.ENOMEM, f"no further process can be started ({error.strerror})") from error
 
 
 def limit_memory(further_bytes: int) -> None:
