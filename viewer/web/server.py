@@ -65,6 +65,7 @@ class Server(ThreadingHTTPServer):
     """Listens from the start, and answers once `start` was called. Raises OSError where it cannot listen."""
 
     daemon_threads = True
+    request_queue_size = 128  # connections that the kernel holds until they are taken in; with 5, a crowd fills it
 
     def __init__(self, board: Board, address: str, port: int, key: str | None) -> None:
         self.board = board

@@ -26,6 +26,7 @@ from splatnode.viewer.web.content import Content
 from splatnode.viewer.web.said import said
 from splatnode.viewer.web.server import Server
 from splatnode.viewer.web.stage import Place, newest, serving
+from tests.capture.messaging.test_sockets import wait_for
 from tests.viewer.test_scene import camera, moment, wall
 
 KEY = "k" * 43
@@ -202,6 +203,36 @@ def test_visitors_who_misbehave_stop_nothing(monkeypatch, caplog):
                     break
         assert told(server)["said"]["good"] is True
     assert not caplog.records  # that is nothing to tell anybody
+
+
+@pytest.mark.parametrize("said", [b"", b"GET /told HTTP/1.1\r\nHost: "], ids=["silent", "slow"])
+def test_a_crowd_of_visitors_takes_no_place_of_who_has_the_key(said):
+    with shown(scene(), KEY) as server, contextlib.ExitStack() as stack:
+        for _ in range(2):
+            for _ in range(100):
+                visitor = stack.enter_context(socket.create_connection(server.server_address[:2], timeout=10))
+                with contextlib.suppress(OSError):
+                    visitor.sendall(said)
+            assert ask(server, "/told", Authorization=f"Bearer {KEY}")[0] == 200
+            assert len(server._visitors) <= server_module._MOST_VISITORS
+
+
+def test_who_waits_for_news_takes_no_place_of_strangers_and_is_one_of_few(monkeypatch):
+    monkeypatch.setattr(server_module, "_MOST_REQUESTS", 1)
+    monkeypatch.setattr(server_module, "_WAIT_S", 1.0)
+    with shown(scene(), KEY) as server:
+        now = json.loads(ask(server, "/told", Authorization=f"Bearer {KEY}")[2])
+        waits = threading.Thread(
+            target=ask,
+            args=(server, f"/told?run={now['run']}&number={now['number']}"),
+            kwargs={"Authorization": f"Bearer {KEY}"},
+        )
+        waits.start()
+        time.sleep(0.3)
+        assert ask(server, "/told", Authorization=f"Bearer {KEY}")[0] == 503
+        assert ask(server, "/told")[0] == 401
+        waits.join()
+        wait_for(lambda: ask(server, "/told", Authorization=f"Bearer {KEY}")[0] == 200)
 
 
 def test_visitors_for_whom_no_thread_could_be_started_take_no_place_for_ever(monkeypatch, caplog):
