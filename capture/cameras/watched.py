@@ -26,7 +26,7 @@ from splatnode.capture.image_file import (
 from splatnode.capture.name_time import name_time
 from splatnode.capture.nothing_new import NothingNew
 from splatnode.capture.process.memory_shortage import is_shortage, outlast
-from splatnode.capture.stamp import Clock, Stamp
+from splatnode.capture.stamp import Clock, Stamp, nearest_stamp
 from splatnode.capture.unavailable import CameraUnavailable
 from splatnode.capture.value_range import ValueRange, find_range
 
@@ -156,7 +156,7 @@ def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> 
         return _given_up(name, f"cannot be read: {error.strerror}", now - first, config)
     except UnusableImage as error:
         return _given_up(name, str(error), now - seen[path.name].first, config)
-    return _decoded(name, data, Stamp(max(0, found.st_mtime_ns), Clock.FILE), config, frame_id)
+    return _decoded(name, data, nearest_stamp(found.st_mtime_ns, Clock.FILE), config, frame_id)
 
 
 def _given_up(name: str, why: str, waited_s: float, config: Config) -> DroppedFrame | None:
