@@ -44,7 +44,8 @@ def answer(module: str, data: bytes, most: int, *arguments: str) -> tuple[bytes,
 def started(command: list[str], **more: Any) -> subprocess.Popen[bytes]:
     """The process, as subprocess.Popen. Raises OSError; what is_shortage tells where there may be no further one."""
     try:
-        return subprocess.Popen(command, **more)
+        child: subprocess.Popen[bytes] = subprocess.Popen(command, **more)
+        return child
     except BlockingIOError as error:  # fork(2): too many processes, or threads
         raise OSError(errno.ENOMEM, f"no further process can be started ({error.strerror})") from error
 

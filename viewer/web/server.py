@@ -22,7 +22,7 @@ from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from urllib.parse import parse_qs
 
 from splatnode.capture.process.crowd import network_of, next_to_go
@@ -133,13 +133,13 @@ class Server(ThreadingHTTPServer):
             if is_free:
                 self._free.release()
 
-    def _take_in(self, request: socket.socket, network: str) -> None:
+    def _take_in(self, request: Any, network: str) -> None:
         with self._lock:
             self._visitors[request] = _Visitor(network, time.monotonic() + _HEAD_S)
             while len(self._visitors) > _MOST_VISITORS:
                 self._hang_up(next_to_go({each: visitor.network for each, visitor in self._visitors.items()}))
 
-    def _forget(self, request: socket.socket) -> None:
+    def _forget(self, request: Any) -> None:
         with self._lock:
             self._visitors.pop(request, None)
 
