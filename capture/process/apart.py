@@ -7,7 +7,6 @@ import errno
 import resource
 import subprocess
 import sys
-from typing import Any
 
 
 def command(module: str, *arguments: str) -> list[str]:
@@ -21,13 +20,7 @@ def command(module: str, *arguments: str) -> list[str]:
 
 def answer(module: str, data: bytes, most: int, *arguments: str) -> tuple[bytes, int]:
     """What the process of `command` writes, `most` bytes of it, once it has read `data`; and how it ended."""
-    child = started(
-        command(module, *arguments),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,  # what a decoder says of a stranger's file is a stranger's text
-        start_new_session=True,  # Ctrl-C is for us
-    )
+    child = started(command(module, *arguments), subprocess.PIPE)
     with child:
         assert child.stdin is not None and child.stdout is not None
         try:
@@ -41,11 +34,16 @@ def answer(module: str, data: bytes, most: int, *arguments: str) -> tuple[bytes,
             child.kill()
 
 
-def started(command: list[str], **more: Any) -> subprocess.Popen[bytes]:
-    """The process, as subprocess.Popen. Raises OSError; what is_shortage tells where there may be no further one."""
+def started(command: list[str], stdin: int) -> subprocess.Popen[bytes]:
+    """The process, whose output can be read. Raises OSError; what is_shortage tells where no further one may be."""
     try:
-        child: subprocess.Popen[bytes] = subprocess.Popen(command, **more)
-        return child
+        return subprocess.Popen(
+            command,
+            stdin=stdin,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,  # what a decoder says of a stranger's file is a stranger's text
+            start_new_session=True,  # Ctrl-C is for us
+        )
     except BlockingIOError as error:  # fork(2): too many processes, or threads
         raise OSError(errno.ENOMEM, f"no further process can be started ({error.strerror})") from error
 
