@@ -57,6 +57,7 @@ def main() -> None:
             node.start("recon")
             node.start("capture")
         kills = killed(nodes["killed"], walk, random.Random(args.seed), 60 * args.minutes)
+        print(json.dumps(kills), flush=True)
         rested = {name: rests(node, args.patience_s) for name, node in nodes.items()}
         codes = {name: {verb: node.end(verb) for verb in ("capture", "recon")} for name, node in nodes.items()}
         expect_exports_whole(nodes["killed"])
