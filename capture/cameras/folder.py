@@ -214,7 +214,8 @@ def with_transparency(item: Frame | DroppedFrame, mask: Mask | None) -> Frame | 
 def _hidden_images(folder: Path) -> Iterator[DroppedFrame]:
     """The files that are images by their content and not by their name, each left out."""
     known = SUFFIXES | FOREIGN_SUFFIXES
-    visible = [path for path in folder.iterdir() if not path.name.startswith(".") and path.suffix.lower() not in known]
+    listed = outlast(lambda: [*folder.iterdir()], frame_name(folder))
+    visible = [path for path in listed if not path.name.startswith(".") and path.suffix.lower() not in known]
     for path in sorted(visible, key=natural_order)[:_MAX_OTHER_FILES]:
         with contextlib.suppress(OSError):  # what cannot be read is no image to anybody
             kind = outlast(lambda path=path: _image_kind(path), frame_name(path)) if path.is_file() else None
