@@ -6,6 +6,7 @@ import logging
 import math
 import os
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 
 import cv2
@@ -16,6 +17,7 @@ from splatnode.capture.last_run import begin_run, end_run
 from splatnode.capture.messaging.broadcast import Publisher
 from splatnode.capture.messaging.commands import Answer, CommandServer, Seen
 from splatnode.capture.messaging.keyframes import KeyframeServer
+from splatnode.capture.messaging.network import files_for_strangers
 from splatnode.capture.messaging.services import CAPTURE_CONTROL, CAPTURE_PREVIEW, CAPTURE_STATUS
 from splatnode.capture.messaging.spool import Spool, SpoolFull
 from splatnode.capture.messaging.wire import Numbering, WireError
@@ -24,9 +26,11 @@ from splatnode.capture.process.after_ready import after_ready
 from splatnode.capture.process.limits import make_sure_of_room, raise_file_limit
 from splatnode.capture.process.logs import event
 from splatnode.capture.process.memory import keep_freed, resident_mb
+from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage, raise_shortage
 from splatnode.capture.process.printable import printable
 from splatnode.capture.process.problems import Problems, is_said
 from splatnode.capture.process.service_manager import ServiceManager
+from splatnode.capture.process.unfailing import Unfailing
 from splatnode.capture.reader import Reader, State
 from splatnode.capture.selection import Decision, Selector
 from splatnode.capture.status import HEARTBEAT_S, NAMED, CaptureStatus
@@ -35,7 +39,8 @@ log = logging.getLogger(__name__)
 
 POLL_S = 0.05  # longest wait for a frame, and so for the answer to a request that comes meanwhile
 SOUND_S = 1.0  # a recording that has not failed by then can be read
-_FILES, _THREADS = 96, 10  # of which the process has need: three endpoints, the camera's thread, those of libraries
+_SOCKETS = 4  # that it binds
+_FILES, _THREADS = 96, 16  # of which the process has need: three endpoints, the camera's thread, those of libraries
 PREVIEW_JITTER = 0.1  # share of the time between previews by which a frame may come too early
 
 
@@ -48,7 +53,7 @@ def capture(config: CaptureConfig) -> None:
     keep_freed()
     cv2.setNumThreads(1)  # small images: threads would cost more than they give, and the processor is recon's
     raise_file_limit()
-    make_sure_of_room(_FILES, _THREADS)
+    make_sure_of_room(_FILES + files_for_strangers(config.network, _SOCKETS), _THREADS)
     with ExitStack() as resources:
         manager = ServiceManager()
         server = resources.enter_context(KeyframeServer(config.network, Spool(config.spool)))
@@ -61,9 +66,9 @@ def capture(config: CaptureConfig) -> None:
         if why := server.spool.shortage():
             event(log, logging.WARNING, "disk_space", problem=why)
         sound_s = math.inf if is_live(camera) else time.monotonic() + SOUND_S  # a live camera proves it by a frame
-        while not (reader.state is State.FINISHED and server.queued == 0):
+        while session.is_waiting or not (reader.state is State.FINISHED and server.queued == 0):
             with after_ready(manager):
-                item = reader.next(POLL_S)
+                item = None if session.waits(POLL_S) else reader.next(POLL_S)
                 if item is not None or time.monotonic() > sound_s:
                     manager.ready()
                     session.say_started()
@@ -98,6 +103,25 @@ class _Session:
         self._next_preview_ns = 0
         self._began = self._next_beat = time.monotonic()
         self._rate = _Rate()
+        self._heart, self._preview = Unfailing("the heartbeat"), Unfailing("the preview")
+        self._postponed: tuple[str, Callable[[], object]] | None = None  # a frame, and what is to be done with it
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a frame waits for memory or a file that this process may open: no further one is read meanwhile."""
+        return self._postponed is not None
+
+    def waits(self, pause_s: float) -> bool:
+        """Whether a frame still waits, after another try and a pause."""
+        if self._postponed is None:
+            return False
+        (name, step), self._postponed = self._postponed, None
+        self._attempt(name, step)
+        if self._postponed is None:
+            event(log, logging.INFO, "goes_on", frame=name)
+            return False
+        time.sleep(pause_s)
+        return True
 
     def say_started(self) -> None:
         """Logs, once, that the camera is open and gives frames."""
@@ -107,17 +131,23 @@ class _Session:
 
     def handle(self, item: Frame | DroppedFrame | None, state: State) -> None:
         """Takes or drops what came, if something did. Whatever a frame's content makes fail costs that frame alone."""
-        if item is None:
-            return
+        if isinstance(item, Frame):
+            self._attempt(item.name, lambda: self.take(item, state))
+        elif item is not None:
+            self._attempt(item.name, lambda: self.drop(item))
+
+    def _attempt(self, name: str, step: Callable[[], object]) -> None:
+        """Does a step with the frame `name`; where the process is short of something, it is done again later."""
         try:
-            if isinstance(item, Frame):
-                self.take(item, state)
-            else:
-                self.drop(item)
+            step()
         except Exception as error:
-            why = f"{item.name}: {type(error).__name__}: {error}"
-            if is_said(self._problems.add("frames that could not be handled", why)):
-                log.exception("%s could not be handled", item.name)
+            why = f"{name}: {type(error).__name__}: {error}"
+            if is_shortage(error):
+                self._postponed = name, step
+                if is_said(self._problems.add(f"times that a frame had to wait ({SHORT_OF_MEMORY})", why)):
+                    event(log, logging.WARNING, "waits", frame=name, why=why)
+            elif is_said(self._problems.add("frames that could not be handled", why)):
+                log.exception("%s could not be handled", name)
 
     def serve(self) -> None:
         """Answers recon's requests, and whoever has seen the problems."""
@@ -126,35 +156,38 @@ class _Session:
 
     def take(self, frame: Frame, state: State) -> None:
         """Sends a frame: as a keyframe where it adds something to those before, and as a preview in any case."""
+        decision = self._selector.decide(frame, waiting=self._server.queued)
         self.frames += 1
         self._rate.count()
-        decision = self._selector.decide(frame, waiting=self._server.queued)
         self.unusable += decision.candidate and not decision.take
         if decision.take:
-            self._offer(frame, decision)
+            self._attempt(frame.name, lambda: self._offer(frame, decision))
         if decision.candidate:
             self.last_decision = f"{frame.name}: {'taken' if decision.take else 'not taken'}: {decision.reason}"
-        self._send_preview(frame, decision, state)
+        self._preview.do(lambda: self._send_preview(frame, decision, state))
 
     def drop(self, dropped: DroppedFrame) -> None:
         """Tells recon of a photograph that cannot be used, where half of the spool at least is free for keyframes.
 
         A live camera's next frame makes up for one that it could not give: these are counted.
         """
-        self.dropped += 1
         live = is_live(self.config.camera)
-        if not live or is_said(self.dropped):
-            event(log, logging.WARNING, "dropped", name=dropped.name, reason=dropped.reason, number=self.dropped)
         if not live and self._server.queued < self.config.spool.max_frames // 2:
             self._deliver(dropped)
+        self.dropped += 1
+        if not live or is_said(self.dropped):
+            event(log, logging.WARNING, "dropped", name=dropped.name, reason=dropped.reason, number=self.dropped)
 
     def beat(self, reader: Reader) -> None:
-        """Sends a heartbeat, when one is due."""
+        """Sends a heartbeat, when one is due; none where what it tells cannot be had."""
         if time.monotonic() < self._next_beat:
             return
         self._next_beat = time.monotonic() + HEARTBEAT_S
+        self._heart.do(lambda: self._heartbeats.send(self._status(reader)))
+
+    def _status(self, reader: Reader) -> CaptureStatus:
         quarantine = self._server.spool.quarantine
-        status = CaptureStatus(
+        return CaptureStatus(
             **self._heartbeat_numbers.next(),
             state=reader.state.value,
             why=printable(reader.why or self._spool_full or self._shortage()),
@@ -179,7 +212,6 @@ class _Session:
             rss_mb=resident_mb(),
             problem=self._problem(),
         )
-        self._heartbeats.send(status)
 
     def _problem(self) -> str:
         server, quarantine = self._server, self._server.spool.quarantine
@@ -209,7 +241,10 @@ class _Session:
         event(log, logging.INFO, "keyframe", name=frame.name, reason=decision.reason, waiting=self._server.queued)
 
     def _deliver(self, item: Frame | DroppedFrame) -> bool:
-        """Puts a frame into the spool; False where there is no room, which is logged once until there is room again."""
+        """Puts a frame into the spool; False where there is no room, which is logged once until there is room again.
+
+        Raises what is_shortage tells: then the frame waits, and not the disk is to blame.
+        """
         try:
             self._server.offer(item)
         except WireError as error:
@@ -218,6 +253,7 @@ class _Session:
                 event(log, logging.ERROR, "too_large", why=error)
             return False
         except (SpoolFull, OSError) as error:
+            raise_shortage(error)
             self.not_taken += 1
             if not self._spool_full:
                 event(log, logging.ERROR, "spool_full", why=error)

@@ -26,6 +26,7 @@ from splatnode.capture.image_header import ImageHeader, UnusableImage, read_head
 from splatnode.capture.orientation import ON_ITS_SIDE, ORIENTATION, upright
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.memory_shortage import outlast
 from splatnode.capture.stamp import Stamp
 from splatnode.capture.value_range import Extent, ValueRange, find_range, measure_extent, to_eight_bits
 
@@ -133,8 +134,13 @@ def find_common_range(paths: Sequence[Path], max_pixels: int = MAX_PIXELS) -> Va
     extents = []
     for path in deep[:: math.ceil(len(deep) / _MAX_MEASURED) or 1]:
         with contextlib.suppress(OSError, UnusableImage):
-            extents.append(measure_values(read_image_file(path, max_pixels), max_pixels))
+            extents.append(outlast(lambda path=path: _measured(path, max_pixels), path.name))
     return find_range(extent for extent in extents if extent is not None)
+
+
+def _measured(path: Path, max_pixels: int) -> Extent | None:
+    """Raises UnusableImage, OSError."""
+    return measure_values(read_image_file(path, max_pixels), max_pixels)
 
 
 def _with_exif(image: npt.NDArray[np.uint8], tiff: bytes) -> DecodedImage:

@@ -21,6 +21,7 @@ from splatnode.capture.image_file import SUFFIXES, UnusableImage, decode_photogr
 from splatnode.capture.image_header import read_header
 from splatnode.capture.orientation import ORIENTATION, upright
 from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.memory_shortage import outlast
 from splatnode.capture.process.printable import printable_name
 
 Image = npt.NDArray[np.uint8]
@@ -122,7 +123,7 @@ def read_mask(path: Path, frame: Frame) -> Mask:
     A mask that has the size of the photograph as it is stored, not turned yet, is turned as the photograph's EXIF says.
     """
     try:
-        image = decode_photograph(read_image_file(path)).image
+        image = outlast(lambda: decode_photograph(read_image_file(path)).image, printable_name(path.name))
     except (UnusableImage, OSError) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise UnusableMask(f"the mask {printable_name(path.name)} cannot be read: {why}") from error

@@ -30,6 +30,7 @@ from splatnode.capture.motion import Motion
 from splatnode.capture.process.bounded_file import read_bounded
 from splatnode.capture.process.durable import sync_folder
 from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.memory_shortage import outlast
 from splatnode.capture.process.printable import LONGEST_NAME, is_printable, marked_name, printable
 from splatnode.capture.process.records import record_in
 from splatnode.capture.right_image import Baseline, RightImage, grey
@@ -182,11 +183,7 @@ class Recording:
         if isinstance(line, _DroppedLine):
             return DroppedFrame(line.name, line.reason)
         try:
-            content, image = self._image(line.file, line.sha256, max_pixels)
-            right = None
-            if line.right is not UNSET:
-                beside = self._image(line.right.file, line.right.sha256, max_pixels)[1]
-                right = RightImage(grey(beside), line.right.baseline)
+            content, image, right = outlast(lambda: self._images(line, max_pixels), line.name)
         except UnusableImage as error:
             return DroppedFrame(line.name, str(error))
         except OSError as error:
@@ -194,6 +191,14 @@ class Recording:
         known = image, line.intrinsics, content, line.captured_at
         moved = or_none(line.given_pose), or_none(line.motion), or_none(line.gravity)
         return framed(frame_id, line.name, line.stamp_ns, *known, None, *moved, right, or_none(line.exposure))
+
+    def _images(self, line: _Line, max_pixels: int) -> tuple[bytes, npt.NDArray[np.uint8], RightImage | None]:
+        """The file's bytes, its image, and what the right camera saw. Raises UnusableImage, OSError."""
+        content, image = self._image(line.file, line.sha256, max_pixels)
+        if line.right is UNSET:
+            return content, image, None
+        beside = self._image(line.right.file, line.right.sha256, max_pixels)[1]
+        return content, image, RightImage(grey(beside), line.right.baseline)
 
     def _image(self, file: str, sha256: str, max_pixels: int) -> tuple[bytes, npt.NDArray[np.uint8]]:
         """The file, and its image (H, W, 3) RGB. Raises UnusableImage where it is not the recorded one, and OSError."""

@@ -103,9 +103,20 @@ class Selector:
         self._next_ns = 0  # nothing is examined before
 
     def decide(self, frame: Frame, waiting: int = 0) -> Decision:
-        """Whether this frame becomes a keyframe; `waiting` frames are not acknowledged by recon yet."""
+        """Whether this frame becomes a keyframe; `waiting` frames are not acknowledged by recon yet.
+
+        Where it fails, for want of memory, the frame may be given again.
+        """
         if frame.stamp_ns < self._next_ns and not self.config.every_frame:
             return Decision(False, "between two examinations", False)
+        before_ns = self._next_ns
+        try:
+            return self._examine(frame, waiting)
+        except BaseException:
+            self._next_ns = before_ns
+            raise
+
+    def _examine(self, frame: Frame, waiting: int) -> Decision:
         self._next_ns = frame.stamp_ns + round(1e9 / self.config.per_second)
         small = reduced(frame.image, TRACKED_SIDE)
         grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
@@ -157,13 +168,13 @@ class Selector:
         return fault
 
     def _remember(self, view: _View, grey: Image) -> None:
+        found = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, qualityLevel=CORNER_QUALITY, minDistance=CORNER_DISTANCE)
         self._views = [*self._views[1 - REMEMBERED_VIEWS :], view]
         if view.file is not None:
             self._files[view.file] = None
             if len(self._files) > REMEMBERED_FILES:
                 del self._files[next(iter(self._files))]
         self._start = grey
-        found = cv2.goodFeaturesToTrack(grey, MAX_CORNERS, qualityLevel=CORNER_QUALITY, minDistance=CORNER_DISTANCE)
         self._corners = self._now = np.zeros((0, 1, 2), np.float32) if found is None else found
 
 

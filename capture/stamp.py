@@ -52,9 +52,14 @@ class Stamp:
         return f"{self.ns // _NS}.{self.ns % _NS:09d}"
 
 
+def nearest_stamp(ns: int, clock: Clock) -> Stamp:
+    """The stamp of `ns`, which may be anything: a clock may be set to any year, and a file's time, too."""
+    return Stamp(min(max(0, ns), LARGEST_NS), clock)
+
+
 def wall_clock(mono_ns: int) -> Stamp:
     """What the wall clock showed at a time of this machine's monotonic clock, if nobody has set it since."""
-    return Stamp(max(0, mono_ns + min(_reading() for _ in range(_READINGS))[1]), Clock.UTC)
+    return nearest_stamp(mono_ns + min(_reading() for _ in range(_READINGS))[1], Clock.UTC)
 
 
 def _reading() -> tuple[int, int]:

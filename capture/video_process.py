@@ -66,13 +66,7 @@ def decoded(file: Path, every: int, max_pixels: int, span: Span = Span()) -> Ite
     """
     numbers = every, max_pixels, span.from_ns, -1 if span.to_ns is None else span.to_ns
     command = python.command("splatnode.capture.video_process", os.fsdecode(file.absolute()), *map(str, numbers))
-    child = subprocess.Popen(
-        command,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,  # what FFmpeg says of a stranger's file is a stranger's text
-        start_new_session=True,  # Ctrl-C is for us
-    )
+    child = apart.started(command, subprocess.DEVNULL)
     with child, contextlib.ExitStack() as cleanup:
         cleanup.callback(child.kill)
         assert child.stdout is not None

@@ -10,6 +10,7 @@ import msgspec
 
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.lenses.undistort import undistorted
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.recon.config import Config
 from splatnode.recon.frames.keyframe import LIBRARY_ERRORS, Features, Keyframe, modelled_image
 from splatnode.recon.matching import features
@@ -45,12 +46,14 @@ def prepare(frame: Frame, config: Config, found: Features | None = None) -> Keyf
     except ValueError as error:  # it names the frame
         raise UnusableFrame(str(error)) from error
     except LIBRARY_ERRORS as error:
+        raise_shortage(error)
         raise UnusableFrame(f"{frame.name}: its distortion cannot be taken out: {error}") from error
     frame = replace(straight, encoded=None)  # recordings alone want the file as it came
     try:
         found = found or features.used(features.extract(frame.image, config.matching.features), frame.mask)
         return Keyframe(frame, modelled_image(frame.image, config.size), found)
     except LIBRARY_ERRORS as error:
+        raise_shortage(error)
         raise UnusableFrame(f"{frame.name}: no features can be found in it: {error}") from error
 
 

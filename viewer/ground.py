@@ -20,6 +20,7 @@ _LOWEST = 2.0  # percent of the Gaussians around the middle may lie below the gr
 _AROUND = 3.0  # times the median distance from the middle: what is farther has no say
 _REACH = 2.0  # times the same distance, from the middle of the grid to its edge
 _CELLS = 12  # at most, from edge to edge
+_LEAST = 1e-12  # length of a step, in the unit of the world
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +75,7 @@ def ground_lines(there: Ground | None) -> tuple[Lines, ...]:
 
 
 def round_number(least: float) -> float:
-    """The smallest of 1, 2, 5, 10, 20 ..., or of 0.5, 0.2, 0.1 ..., that is at least `least`."""
+    """The smallest of 1, 2, 5, 10, 20 ..., or of 0.5, 0.2, 0.1 ..., that is at least `least`, within 1e-12 and 1e12."""
+    least = min(max(least, _LEAST), 1.0 / _LEAST)
     power = 10.0 ** math.floor(math.log10(least))
     return next(factor * power for factor in (1.0, 2.0, 5.0, 10.0) if factor * power >= least * (1 - 1e-9))

@@ -21,6 +21,7 @@ from splatnode.capture.given_pose import SIGMA_M as POSE_SIGMA_M
 from splatnode.capture.image_file import (
     MAX_PIXELS,
     SUFFIXES,
+    DecodedImage,
     MaxPixels,
     UnusableImage,
     decode_photograph,
@@ -31,6 +32,7 @@ from splatnode.capture.image_header import image_kind
 from splatnode.capture.masks import Mask, masked
 from splatnode.capture.name_time import name_time
 from splatnode.capture.pace import FramesPerSecond, Pace, paced
+from splatnode.capture.process.memory_shortage import outlast
 from splatnode.capture.process.printable import printable, printable_name
 from splatnode.capture.right_image import LONGEST_M, SIGMA_M, Baseline, RightImage, grey, partners
 from splatnode.capture.value_range import ValueRange
@@ -163,9 +165,7 @@ def _frames(
             continue
         name = frame_name(path)
         try:
-            data = read_image_file(path, config.max_pixels)
-            decoded = decode_photograph(data, config.max_pixels, used)
-            right = _right_of(path, rights, config)
+            data, decoded, right = outlast(lambda path=path: _read(path, rights, used, config), name)
         except UnusableImage as error:
             yield DroppedFrame(name, str(error))
         except OSError as error:
@@ -188,6 +188,14 @@ def _frames(
         yield from _hidden_images(config.folder)
 
 
+def _read(
+    path: Path, rights: Mapping[str, Path], used: ValueRange | None, config: Config
+) -> tuple[bytes, DecodedImage, RightImage | None]:
+    """The file's bytes, the photograph, and what the right camera saw. Raises UnusableImage, OSError."""
+    data = read_image_file(path, config.max_pixels)
+    return data, decode_photograph(data, config.max_pixels, used), _right_of(path, rights, config)
+
+
 def in_words_of_range(used: ValueRange) -> str:
     """What is told of images of 16 bits whose values are stretched."""
     return f"16-bit photographs use only {used}: this range is stretched to 8 bits, alike for all of them"
@@ -206,10 +214,12 @@ def with_transparency(item: Frame | DroppedFrame, mask: Mask | None) -> Frame | 
 def _hidden_images(folder: Path) -> Iterator[DroppedFrame]:
     """The files that are images by their content and not by their name, each left out."""
     known = SUFFIXES | FOREIGN_SUFFIXES
-    visible = [path for path in folder.iterdir() if not path.name.startswith(".") and path.suffix.lower() not in known]
+    listed = outlast(lambda: [*folder.iterdir()], frame_name(folder))
+    visible = [path for path in listed if not path.name.startswith(".") and path.suffix.lower() not in known]
     for path in sorted(visible, key=natural_order)[:_MAX_OTHER_FILES]:
-        with contextlib.suppress(OSError):
-            if path.is_file() and (kind := _image_kind(path)) is not None:
+        with contextlib.suppress(OSError):  # what cannot be read is no image to anybody
+            kind = outlast(lambda path=path: _image_kind(path), frame_name(path)) if path.is_file() else None
+            if kind is not None:
                 shown = f"{path.suffix} is no suffix of photographs" if path.suffix else "its name has no suffix"
                 yield DroppedFrame(frame_name(path), f"{shown}, and its content is {kind}: give it that suffix")
 

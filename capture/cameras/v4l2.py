@@ -17,6 +17,7 @@ from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.given_lens import check_fits
 from splatnode.capture.image_file import UnusableImage, decode_image
 from splatnode.capture.pace import FramesPerSecond
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.stamp import wall_clock
 from splatnode.capture.unavailable import CameraUnavailable
 from splatnode.capture.video4linux import locks
@@ -66,6 +67,7 @@ def find(system: System | None = None) -> list[dict[str, str]]:
                     text = f"{device.card} ({device.bus}): {', '.join(device.pixel_formats())}"
                     found.append({"device": _stable_name(Path(device.path)), "description": text})
         except OSError as error:
+            raise_shortage(error)
             found.append({"device": f"/dev/{number.name}", "description": f"cannot be opened: {error.strerror}"})
     return found
 

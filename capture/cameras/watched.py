@@ -15,6 +15,7 @@ from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics, framed
 from splatnode.capture.given_lens import same_aspect
 from splatnode.capture.image_file import (
     MAX_PIXELS,
+    DecodedImage,
     MaxPixels,
     UnusableImage,
     check_whole,
@@ -24,9 +25,10 @@ from splatnode.capture.image_file import (
 )
 from splatnode.capture.name_time import name_time
 from splatnode.capture.nothing_new import NothingNew
-from splatnode.capture.stamp import Clock, Stamp
+from splatnode.capture.process.memory_shortage import is_shortage, outlast
+from splatnode.capture.stamp import Clock, Stamp, nearest_stamp
 from splatnode.capture.unavailable import CameraUnavailable
-from splatnode.capture.value_range import find_range
+from splatnode.capture.value_range import ValueRange, find_range
 
 REMEMBERED = 100_000  # photographs that were taken and are no longer there: all may be back
 _TEMPORARY_SUFFIXES = {".tmp", ".part", ".partial", ".crdownload", ".filepart"}
@@ -146,12 +148,15 @@ def _look(path: Path, seen: dict[str, _Seen], config: Config, frame_id: int) -> 
         seen.pop(path.name, None)
         return None
     except OSError as error:  # often for a moment: its mode is still to be changed, a share answers late
+        if is_shortage(error):  # no fault of the file, which has all of its time again
+            seen.pop(path.name, None)
+            return None
         _listed(config.folder)  # raises where it is the folder that has gone
         first = seen.setdefault(path.name, _Seen(-1, -1, now, now)).first
         return _given_up(name, f"cannot be read: {error.strerror}", now - first, config)
     except UnusableImage as error:
         return _given_up(name, str(error), now - seen[path.name].first, config)
-    return _decoded(name, data, Stamp(max(0, found.st_mtime_ns), Clock.FILE), config, frame_id)
+    return _decoded(name, data, nearest_stamp(found.st_mtime_ns, Clock.FILE), config, frame_id)
 
 
 def _given_up(name: str, why: str, waited_s: float, config: Config) -> DroppedFrame | None:
@@ -161,9 +166,7 @@ def _given_up(name: str, why: str, waited_s: float, config: Config) -> DroppedFr
 
 def _decoded(name: str, data: bytes, written_at: Stamp, config: Config, frame_id: int) -> Frame | DroppedFrame:
     try:
-        extent = measure_values(data, config.max_pixels)
-        used = None if extent is None else find_range([extent])
-        decoded = decode_photograph(data, config.max_pixels, used)
+        decoded, used = outlast(lambda: _in_eight_bits(data, config.max_pixels), name)
     except UnusableImage as error:
         return DroppedFrame(name, str(error))
     image, intrinsics = decoded.image, decoded.intrinsics
@@ -176,9 +179,16 @@ def _decoded(name: str, data: bytes, written_at: Stamp, config: Config, frame_id
     return with_transparency(item, decoded.mask)
 
 
+def _in_eight_bits(data: bytes, max_pixels: int) -> tuple[DecodedImage, ValueRange | None]:
+    """The photograph, and the range of 16 bits that it was stretched from. Raises UnusableImage."""
+    extent = measure_values(data, max_pixels)
+    used = None if extent is None else find_range([extent])
+    return decode_photograph(data, max_pixels, used), used
+
+
 def _listed(folder: Path) -> list[Path]:
     try:
-        paths = image_paths(folder)
+        paths = outlast(lambda: image_paths(folder), frame_name(folder))
     except OSError as error:
         raise CameraUnavailable(f"cannot watch {str(folder)!r}: {error.strerror or error}") from error
     return [path for path in paths if not _TEMPORARY_SUFFIXES & {part.lower() for part in path.suffixes}]

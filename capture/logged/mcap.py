@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.printable import printable
 
 _MOST_BYTES = 1 << 29  # of a record, and of what it is decompressed to
@@ -142,7 +143,8 @@ def _summary(stream: IO[bytes]) -> Any:
     reader = SeekingReader(stream, record_size_limit=_MOST_BYTES)
     try:
         return reader.get_summary()
-    except Exception:  # its end is not there; what the parser meets instead may be anything
+    except Exception as error:  # its end is not there; what the parser meets instead may be anything
+        raise_shortage(error)
         return None
 
 

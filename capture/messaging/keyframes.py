@@ -46,6 +46,7 @@ from splatnode.capture.messaging.services import CAPTURE_KEYFRAMES
 from splatnode.capture.messaging.spool import Key, Spool
 from splatnode.capture.messaging.turns import Connection, Turns
 from splatnode.capture.messaging.wire import Numbering, Part, WireError, decode, encode, size_bytes
+from splatnode.capture.process.memory_shortage import is_shortage, may_be_shortage
 from splatnode.capture.process.printable import LONGEST_TEXT, printable
 
 log = logging.getLogger(__name__)
@@ -139,7 +140,7 @@ class KeyframeServer(Endpoint):
         try:
             parts = parts or self.spool.get(key)
             name = name_in(parts)
-        except (OSError, ValueError):
+        except (OSError, ValueError):  # for whatever reason: without its name it is set aside all the same
             name = "?"
         log.warning("set aside %s: %s", name, reason)
         self.spool.set_aside(key, name, reason)
@@ -160,7 +161,9 @@ class KeyframeServer(Endpoint):
         """False where this client cannot take more now."""
         try:
             parts = self.spool.get(key)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, MemoryError) as error:
+            if is_shortage(error):  # no fault of the keyframe, which waits
+                return False
             self._set_aside(key, f"lost on the disk: {error}")
             return True
         size = size_bytes(parts)
@@ -265,6 +268,8 @@ class KeyframeClient(Endpoint):
             try:
                 frame = received(key, parts, self.network.limits)
             except WireError as error:
+                if may_be_shortage(error):  # the connection is made anew, and the frame comes again
+                    raise
                 self.refuse(key, str(error))
             else:
                 self._held[key] = None

@@ -17,6 +17,7 @@ import zmq
 
 from splatnode.capture.process.durable import remove_leftovers, write_whole
 from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.memory_shortage import outlast
 from splatnode.capture.process.private import NotPrivate, StrayFile, check_only_ours, read_own
 
 log = logging.getLogger(__name__)
@@ -24,6 +25,7 @@ log = logging.getLogger(__name__)
 SECRET, PUBLIC, SERVER, ALLOWED = "secret.key", "public.key", "server.key", "allowed"
 _KEY_BYTES = 40
 _LARGEST = 1000  # bytes of a key's file
+_READ_S = 1.0  # that a handshake waits where a key's file cannot be opened
 _MOST_SAID = 100  # refused keys and connections
 _Z85 = re.compile(rb"[0-9a-zA-Z.\-:+=^!/*?&<>()\[\]{}@%$#]{40}")
 
@@ -140,7 +142,7 @@ class AllowList:
 
     def callback(self, domain: str, key: bytes) -> bool:
         try:
-            allowed = key == self.own or key in self._listed()
+            allowed = key == self.own or key in outlast(self._listed, "whom to let in", _READ_S)
         except OSError as error:
             self._say(logging.ERROR, f"cannot read whom to let in, so nobody is: {error}")
             return False
@@ -153,7 +155,7 @@ class AllowList:
         for each in (self.folder.parent, self.folder):
             check_only_ours(each)
         found = set()
-        for path in self.folder.glob("*.key"):
+        for path in sorted(self.folder / name for name in os.listdir(self.folder) if name.endswith(".key")):
             try:
                 found.add(_read_key(path))
             except (KeyFileError, NotPrivate) as error:

@@ -4,7 +4,8 @@ ZeroMQ behaves as follows (measured), hence this file. A second bind on an ipc p
 prevents it. A send without a receiver blocks for ever: no send waits. A pending message keeps a process from ending:
 LINGER is 0. The answer to a heartbeat cannot overtake a part that is on its way: what takes longer than their time-out
 would never arrive, so that there are none, and the kernel notices a dead link. A plain tcp socket gives the application
-raw bytes from anybody: there is no tcp without CURVE. The number of parts of a message is not bounded: a peer that is
+raw bytes from anybody: there is no tcp without CURVE. It accepts connections without end: a gate bounds those that
+have no key. The number of parts of a message is not bounded: a peer that is
 let in could fill the memory, which the services' MemoryMax limits.
 """
 
@@ -24,6 +25,7 @@ import zmq
 from zmq.utils.monitor import recv_monitor_message
 
 from splatnode.capture.messaging import wire
+from splatnode.capture.messaging.gate import OVERSHOOT, PLACES, Gate
 from splatnode.capture.messaging.keys import ALLOWED, AllowList, Keys, read_keys
 from splatnode.capture.messaging.services import Service
 from splatnode.capture.process.limits import make_sure_of_room, raise_file_limit
@@ -42,7 +44,7 @@ _RECONNECT_MS, _MAX_RECONNECT_MS = 100, 1000  # pause before connecting again, d
 _HANDSHAKE_MS = 5000  # a connection whose handshake takes longer is closed
 _DEAD_LINK_S = 10  # without a sign of the other machine, after which a tcp connection is given up, on both ends
 _PROBES = 4  # of an idle connection in that time, after a first while of the same length
-_FILES, _THREADS = 32, 3  # of which an endpoint has need: two threads of libzmq, one that knows whom to let in
+_FILES, _THREADS = 32, 4  # of which an endpoint has need: libzmq's two threads, one that lets in, one that keeps out
 _LONGEST_IPC_PATH = 107  # sun_path, see unix(7)
 
 
@@ -57,6 +59,11 @@ class Network(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def limits(self) -> wire.Limits:
         return wire.Limits(total_bytes=self.max_message_mb << 20)
+
+
+def files_for_strangers(network: Network, sockets: int) -> int:
+    """Descriptors that those without a key can take of a process that binds so many sockets."""
+    return 0 if network.tcp is None else sockets * PLACES + OVERSHOOT
 
 
 class NetworkError(PermissionError):
@@ -139,6 +146,8 @@ class Endpoint:
                 if error.errno == errno.EADDRINUSE:
                     raise AlreadyRunning(service, None) from error
                 raise OSError(error.errno, f"cannot offer {service.name} at {address}: {error.strerror}") from error
+            if self._keys is not None:
+                self._resources.callback(Gate(socket).close)
             return socket
 
     def _connect(self, service: Service, kind: int, *, queue: int) -> zmq.Socket:

@@ -17,6 +17,7 @@ import msgspec
 from splatnode.capture.messaging.values import Name, Text, check
 from splatnode.capture.process.durable import remove_leftovers, write_whole
 from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.printable import LONGEST_NAME, LONGEST_TEXT, printable
 from splatnode.capture.process.private import StrayFile, own_files, private_folder, read_own
 from splatnode.capture.process.records import record_in
@@ -120,7 +121,8 @@ def _record(path: Path) -> SetAside:
             record = record_in(read_own(beside, _LARGEST_RECORD), SetAside)
             check(record)
             return record
-    except (OSError, ValueError):
+    except (OSError, ValueError) as error:
+        raise_shortage(error)
         return SetAside("?", "its reason was lost", printable(path.name, LONGEST_NAME))
 
 
@@ -128,6 +130,7 @@ def _number_in(path: Path) -> int:
     """-1 where there is none."""
     try:
         text = read_own(path, 20).strip()
-    except (OSError, StrayFile):
+    except (OSError, StrayFile) as error:
+        raise_shortage(error)
         return -1
     return int(text) if re.fullmatch(b"[0-9]{1,18}", text) else -1

@@ -22,6 +22,7 @@ from splatnode.capture.messaging.wire import Part
 from splatnode.capture.process.disk_space import shortage
 from splatnode.capture.process.durable import remove_leftovers
 from splatnode.capture.process.lock import exclusive
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.private import StrayFile, own_files, private_folder
 from splatnode.capture.process.state_directory import state_directory
 
@@ -96,13 +97,17 @@ class Spool:
         return shortage(self.directory, further_bytes, "further keyframes (spool.max_mb)")
 
     def put(self, key: Key, parts: Sequence[Part]) -> None:
-        """Returns when the message is on the disk. Raises SpoolFull."""
+        """Returns when the message is on the disk.
+
+        Raises SpoolFull; what is_shortage tells, where another time may do.
+        """
         size = size_in_file(parts)
         self._make_sure_of_room(size)
         path = self.directory / f"{self._number:012d}-{key.session}-{key.sequence}.frame"
         try:
             write_message(path, parts)
         except OSError as error:  # full, read-only, failing: it may be so for a while, and the camera goes on
+            raise_shortage(error)
             raise SpoolFull(f"keyframes cannot be kept in {self.directory}: {error.strerror}") from error
         self._files[key], self._bytes[key] = path, size
         self._number += 1
@@ -154,6 +159,7 @@ class Spool:
         except StrayFile as error:
             log.warning("left alone: %s (spool.max_mb)", error)
         except (OSError, MessageFileError) as error:
+            raise_shortage(error)
             log.error("put aside a damaged keyframe: %s", error)
             self.quarantine.take(path, "?", f"damaged on the disk: {error}")
         else:

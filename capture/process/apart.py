@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import resource
 import subprocess
 
@@ -11,13 +12,7 @@ from splatnode.capture.process import python
 
 def answer(module: str, data: bytes, most: int, *arguments: str) -> tuple[bytes, int]:
     """What the process of a module writes, `most` bytes of it, once it has read `data`; and how it ended."""
-    child = subprocess.Popen(
-        python.command(module, *arguments),
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,  # what a decoder says of a stranger's file is a stranger's text
-        start_new_session=True,  # Ctrl-C is for us
-    )
+    child = started(python.command(module, *arguments), subprocess.PIPE)
     with child:
         assert child.stdin is not None and child.stdout is not None
         try:
@@ -29,6 +24,20 @@ def answer(module: str, data: bytes, most: int, *arguments: str) -> tuple[bytes,
             return found, child.wait()
         finally:
             child.kill()
+
+
+def started(command: list[str], stdin: int) -> subprocess.Popen[bytes]:
+    """The process, whose output can be read. Raises OSError; what is_shortage tells where no further one may be."""
+    try:
+        return subprocess.Popen(
+            command,
+            stdin=stdin,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,  # what a decoder says of a stranger's file is a stranger's text
+            start_new_session=True,  # Ctrl-C is for us
+        )
+    except BlockingIOError as error:  # fork(2): too many processes, or threads
+        raise OSError(errno.ENOMEM, f"no further process can be started ({error.strerror})") from error
 
 
 def limit_memory(further_bytes: int) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import IO, Any
 
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.private import create_own
 
 _BUFFER = 1 << 20  # bytes: the many small arrays of a message are one call each else
@@ -58,10 +59,15 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Makes renames and removals survive a power cut. A file system that cannot do it has done what it can."""
-    with contextlib.suppress(OSError):
+    """Makes renames and removals survive a power cut. A file system that cannot do it has done what it can.
+
+    Raises what is_shortage tells: where the folder cannot be opened now, nothing is promised.
+    """
+    try:
         descriptor = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+    except OSError as error:
+        raise_shortage(error)

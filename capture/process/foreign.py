@@ -15,7 +15,7 @@ def foreign(refusal: type[Exception], source: object = "") -> Iterator[None]:
     For the code that reads a stranger's bytes, and for nothing else: a parser meets what its author did not think of,
     and what it then raises (OverflowError, RecursionError, an IndexError of a library) is no error of the process.
     A refusal that is one already is left as it is, and so is an OSError: that the disk does not give the bytes is not
-    the fault of what they say.
+    the fault of what they say. Whether memory lacked, `may_be_shortage` tells of the refusal.
     """
     try:
         yield

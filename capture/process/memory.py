@@ -7,7 +7,11 @@ Without keeping it, the kernel takes the pages of each frame back and zeroes the
 from __future__ import annotations
 
 import ctypes
+import functools
+import logging
 import os
+
+log = logging.getLogger(__name__)
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h
 _LARGEST = 64 << 20  # bytes; larger arrays come from the kernel and go back to it. A frame of 20 megapixels is smaller
@@ -22,6 +26,18 @@ def keep_freed() -> None:
 
 
 def resident_mb() -> float:
-    """Resident memory of this process now, in 2^20 bytes."""
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+    """Resident memory of this process now, in 2^20 bytes; 0 where that cannot be read, which is said once.
+
+    Heartbeats tell of it: where no file can be opened, they have the more to come.
+    """
+    try:
+        with open("/proc/self/statm") as file:
+            return int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+    except (OSError, MemoryError, ValueError, IndexError) as error:
+        _say_unknown(f"{type(error).__name__}: {error}")
+        return 0.0
+
+
+@functools.cache
+def _say_unknown(why: str) -> None:
+    log.warning("how much memory this process has cannot be read (%s): 0 MB is told", why)

@@ -12,6 +12,7 @@ from pathlib import Path
 from splatnode.capture import film
 from splatnode.capture.cameras.folder import foreign_file, frame_name, image_paths
 from splatnode.capture.lerobot import data_set
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.packages import remedy
 from splatnode.capture.process.printable import printable, printable_name
 from splatnode.capture.recording import is_recording
@@ -97,6 +98,7 @@ def _found(path: Path, seen: set[Path], lists: tuple[Path, ...] = ()) -> Iterato
             try:
                 yield from _found(listed, seen, (*lists, sources.real(path)))
             except (ValueError, FileNotFoundError) as error:
+                raise_shortage(error)
                 yield _Unreadable(listed.absolute().parts, str(error))
         return
     cameras = _in_folder(path) if path.is_dir() else {}
@@ -181,6 +183,7 @@ def _of_source(path: Path, named: Path) -> _Shot | _Unreadable:
     except ModuleNotFoundError as error:
         return _Unreadable(path.parts, f"{error.name} is not installed. {remedy(error.name or '')}")
     except (ValueError, OSError) as error:
+        raise_shortage(error)
         return _Unreadable(path.parts, str(error))
     if part and file.suffix.lower() == film.MCAP:
         return _Shot(file.parts, printable_name(part), Film(path))

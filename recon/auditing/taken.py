@@ -10,6 +10,7 @@ from splatnode.capture import film
 from splatnode.capture.cameras import folder
 from splatnode.capture.frame import DroppedFrame, Frame, Intrinsics
 from splatnode.capture.given_lens import seen_through
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.packages import remedy
 from splatnode.capture.process.printable import printable, printable_name
 from splatnode.recon.auditing.stations import Film, Photographs, Recording
@@ -51,6 +52,7 @@ def _readable(frames: Iterator[Frame | DroppedFrame], path: Path) -> list[Frame 
     except ModuleNotFoundError as error:
         reason = f"{error.name} is not installed. {remedy(error.name or '')}"
     except (ValueError, OSError) as error:
+        raise_shortage(error)
         reason = str(error)
     else:
         reason = "it holds no photographs"

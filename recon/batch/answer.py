@@ -7,7 +7,7 @@ from pathlib import Path
 
 import msgspec
 
-from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY
+from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, outlast
 from splatnode.capture.process.printable import printable
 from splatnode.capture.process.records import record_in
 from splatnode.recon.batch.sources import REPORT, Recording
@@ -73,7 +73,7 @@ def outcome(recording: Recording, folder: Path, end: End) -> Outcome:
     if end.exit_code not in _WITH_ANSWER:
         return without_answer(recording, end, end.reason or f"ended with exit code {end.exit_code} and said nothing")
     try:
-        report = record_in(read_json_file(folder / REPORT), _Report)
+        report = outlast(lambda: record_in(read_json_file(folder / REPORT), _Report), f"{recording.name}'s report")
     except (OSError, ValueError) as error:  # a decoder's errors are ValueErrors
         return without_answer(recording, end, f"ended with exit code {end.exit_code}, but {REPORT}: {error}")
     claim = report.bounds

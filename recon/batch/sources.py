@@ -15,6 +15,7 @@ from splatnode.capture.cameras import mcap
 from splatnode.capture.cameras.folder import image_paths, natural_order
 from splatnode.capture.lerobot import data_set
 from splatnode.capture.process.bounded_file import read_bounded
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.printable import printable_name
 
 log = logging.getLogger(__name__)
@@ -100,7 +101,8 @@ def _parts(path: Path, label: str) -> Iterator[tuple[Path, str]]:
     """
     try:
         names = parts(path)
-    except (ValueError, OSError, ModuleNotFoundError):
+    except (ValueError, OSError, ModuleNotFoundError) as error:
+        raise_shortage(error)
         names = []
     for name in names:
         yield film.part_of(real(path), name), _name([label, *name.split("/")])

@@ -20,6 +20,7 @@ import msgspec
 
 from splatnode.capture.messaging.broadcast import Publisher
 from splatnode.capture.messaging.commands import Answer, CommandServer, Seen
+from splatnode.capture.messaging.network import files_for_strangers
 from splatnode.capture.messaging.services import RECON_CONTROL, RECON_DEPTH, RECON_MAP, RECON_SCENE, RECON_STATUS
 from splatnode.capture.messaging.state import StateServer
 from splatnode.capture.messaging.wire import Numbering
@@ -33,6 +34,7 @@ from splatnode.capture.process.problems import Problems, is_said
 from splatnode.capture.process.service_manager import ServiceManager
 from splatnode.capture.process.state_directory import state_directory
 from splatnode.capture.process.stop_signals import on_first
+from splatnode.capture.process.unfailing import Unfailing
 from splatnode.recon.config import overlaid
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
@@ -57,7 +59,8 @@ from splatnode.recon.result.snapshot import CameraEstimate
 log = logging.getLogger(__name__)
 
 SERVE_S = 0.05  # between looks at what the threads have produced
-_FILES, _THREADS = 128, 20  # of which the daemon has need: six endpoints, its own threads, those that compute
+_SOCKETS = 8  # that it binds: of states two
+_FILES, _THREADS = 128, 28  # of which the daemon has need: six endpoints, its own threads, those that compute
 END_S = 20.0  # for the threads to end; an export takes seconds
 STUCK_S = (
     300.0  # without progress the worker counts as stuck; its longest step, verifying all views, takes tens of seconds
@@ -89,8 +92,8 @@ class Daemon:
         self._resources = contextlib.ExitStack()
         with self._closing_on_error():
             raise_file_limit()
-            make_sure_of_room(_FILES, _THREADS)
             network = config.network
+            make_sure_of_room(_FILES + files_for_strangers(network, _SOCKETS), _THREADS)
             self._scenes = self._resources.enter_context(StateServer(RECON_SCENE, network))
             self._depths = self._resources.enter_context(StateServer(RECON_DEPTH, network))
             maps = self._resources.enter_context(StateServer(RECON_MAP, network)) if config.map.live else None
@@ -117,6 +120,7 @@ class Daemon:
         self._started_s = time.monotonic()
         self._shown: Published | None = None
         self._errors: list[BaseException] = []
+        self._heart, self._told = Unfailing("the heartbeat"), State.LOADING.value  # the service manager's
 
     def __enter__(self) -> Daemon:
         return self
@@ -146,10 +150,9 @@ class Daemon:
                 self._tell_map(self._worker.mapped)
                 if time.monotonic() >= next_status_s:
                     next_status_s = time.monotonic() + self._config.status_every_s
-                    status = self._status()
-                    self._heartbeat.send(status)
+                    self._heart.do(self._beat)
                     if time.monotonic() - self._worker.moved_s < STUCK_S:  # else the service manager restarts it
-                        manager.alive(f"{status.state.value}, {status.keyframes} keyframes, {status.verdict}")
+                        manager.alive(self._told)
         finally:
             self._stopping.set()
             manager.stopping()
@@ -157,6 +160,11 @@ class Daemon:
         if self._errors:
             raise self._errors[0]
         event(log, logging.INFO, "stopped")
+
+    def _beat(self) -> None:
+        status = self._status()
+        self._told = f"{status.state.value}, {status.keyframes} keyframes, {status.verdict}"
+        self._heartbeat.send(status)
 
     def _thread(self, run: Callable[[], None]) -> threading.Thread:
         def guarded() -> None:

@@ -6,6 +6,7 @@ import logging
 
 from splatnode.capture.process.disk_space import shortage
 from splatnode.capture.process.logs import event
+from splatnode.capture.process.memory_shortage import is_shortage
 from splatnode.recon.daemon.checkpoint.store import Store
 from splatnode.recon.daemon.config import Config
 from splatnode.recon.result.size import result_bytes
@@ -34,6 +35,8 @@ class DiskSpace:
                 self._config.out, result_bytes(most_gaussians, self._config.max_views), "the result"
             )
         except OSError as error:
+            if is_shortage(error):  # this time it is not known
+                return self._told and f"{self._told}: make room on the disk"
             problem = f"the disk does not tell how much is free ({error.strerror or error})"
         if bool(problem) != bool(self._told):
             event(log, logging.WARNING if problem else logging.INFO, "disk_space", problem=problem or "none")

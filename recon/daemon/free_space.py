@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from splatnode.capture.process.logs import event
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.recon.daemon.status import State
 from splatnode.recon.daemon.watcher import Finished
 from splatnode.recon.occupancy.build import occupancy_map
@@ -83,6 +84,7 @@ def _with_depths(snapshot: Snapshot, folder: Path) -> Snapshot:
     try:
         depths, written = read_depths(folder), read_cameras(folder / "cameras.json")
     except (OSError, ValueError) as error:
+        raise_shortage(error)
         log.warning("the depths in %s cannot be read: %s", folder, error)
         return snapshot
     poses = {camera.name: camera.T_world_camera for camera in written}

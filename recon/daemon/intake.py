@@ -74,17 +74,17 @@ class Intake:
         while not self._stopping.is_set():
             try:
                 stored = self._store.put(received)
-            except OSError as error:
-                self._say_full(f"{received.frame.name} cannot be stored ({error.strerror}): make room on the disk")
-                self._stopping.wait(RETRY_S)
-                client.say_ready()
-                continue
             except Exception as error:
                 if is_shortage(error):
                     self._wait_for_memory(client, received.frame.name)
                     continue
-                client.refuse(received.key, f"it cannot be stored: {type(error).__name__}: {error}")
-                return
+                if not isinstance(error, OSError):
+                    client.refuse(received.key, f"it cannot be stored: {type(error).__name__}: {error}")
+                    return
+                self._say_full(f"{received.frame.name} cannot be stored ({error.strerror}): make room on the disk")
+                self._stopping.wait(RETRY_S)
+                client.say_ready()
+                continue
             self.full = ""
             client.acknowledge(received)
             if stored is not None:  # what the camera could not give is told with the next scene, and disturbs none

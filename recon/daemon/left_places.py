@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from splatnode.capture.process.logs import event
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.recon.config import Config
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon import finishing, membership, places
@@ -91,6 +92,7 @@ class LeftPlaces:
                 with found.work.fallback_budget(self._fallback_s):
                     done = step(store, found, pause)
         except OSError as error:
+            raise_shortage(error)
             self._output.complain(
                 f"{folder.name} cannot be finished ({error.strerror or error}): make room on the disk"
             )
@@ -110,6 +112,7 @@ class LeftPlaces:
             try:
                 self._take_out(scene, name)
             except OSError as error:
+                raise_shortage(error)
                 self._output.complain(
                     f"{name} cannot be taken out of {scene} ({error.strerror}): make room on the disk"
                 )
@@ -127,6 +130,7 @@ class LeftPlaces:
                 with contextlib.closing(Store(folder)) as store:
                     store.forget(name, "retracted")
             except CheckpointError as error:
+                raise_shortage(error)
                 self._output.complain(f"{name} cannot be taken out of {scene}: {error}")
         self._here.was_retracted(scene, name)
 

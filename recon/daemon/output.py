@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from splatnode.capture.process.logs import event
+from splatnode.capture.process.memory_shortage import SHORT_OF_MEMORY, is_shortage
 from splatnode.recon.daemon import places
 from splatnode.recon.daemon.checkpoint import checkpoint
 from splatnode.recon.daemon.checkpoint.store import Store
@@ -52,14 +53,14 @@ class Output:
         try:
             checkpoint.save(place, work, final)
         except OSError as error:
-            self.complain(f"the scene cannot be saved ({error.strerror}): make room on the disk")
+            self.complain(f"the scene cannot be saved ({_why(error)})")
 
     def save_fallbacks(self, place: Store, work: IncrementalReconstruction) -> None:
         """Writes which fallbacks gained nothing, so that no process tries them again."""
         try:
             checkpoint.save_fallbacks(place, work)
         except OSError as error:
-            self.complain(f"what was tried cannot be saved ({error.strerror}): make room on the disk")
+            self.complain(f"what was tried cannot be saved ({_why(error)})")
 
     def export(
         self,
@@ -88,7 +89,7 @@ class Output:
             if judged:
                 self.places.link(place.scene_id, before)
         except OSError as error:
-            self.complain(error.strerror or str(error))
+            self.complain(SHORT_OF_MEMORY if is_shortage(error) else error.strerror or str(error))
             return False
         known = bounds_in_words.of_cameras(measured.cameras, measured.scale)
         event(log, logging.INFO, "exported", folder=folder, gaussians=len(snapshot.gaussians), bounds=known)
@@ -110,7 +111,11 @@ class Output:
         try:
             write()
         except OSError as error:
-            self.complain(error.strerror or str(error))
+            self.complain(SHORT_OF_MEMORY if is_shortage(error) else error.strerror or str(error))
+
+
+def _why(error: OSError) -> str:
+    return SHORT_OF_MEMORY if is_shortage(error) else f"{error.strerror}: make room on the disk"
 
 
 def _described(place: Store, state: State, folder: str | None, snapshot: Snapshot, kept: Sequence[str]) -> Place:

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.process.foreign import foreign
 from splatnode.capture.process.memory import resident_mb
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.records import record_in
 from splatnode.recon.daemon.atlas.links import Cameras, Kind, Link, carried, link
 from splatnode.recon.daemon.atlas.pose_graph import Pose, optimised
@@ -143,6 +144,7 @@ class Places:
         except FileNotFoundError:
             pass
         except (OSError, SceneFileError) as error:
+            raise_shortage(error)
             log.warning("the index of places begins anew: %s", error)
 
     def newest(self, most: int) -> Sequence[Place]:
@@ -224,6 +226,7 @@ class Places:
         try:
             cameras = read_cameras(self._path.parent / place.folder / "cameras.json")
         except (OSError, SceneFileError) as error:
+            raise_shortage(error)
             log.warning("the cameras of %s cannot be read: %s", scene_id, error)
             return {}
         return {camera.name: camera.T_world_camera for camera in cameras}

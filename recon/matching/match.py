@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.progress import Step, Tell, told_to_nobody
 from splatnode.recon.deadline import is_over
 from splatnode.recon.frames.keyframe import LIBRARY_ERRORS, Keyframe
@@ -204,6 +205,7 @@ def _with_tilted_features(keyframe: Keyframe, tilts: Sequence[float], config: Co
     try:
         return _add_tilted_features(keyframe, tilts, config)
     except LIBRARY_ERRORS as error:
+        raise_shortage(error)
         log.warning("%s is matched without simulated tilts: %s", keyframe.name, error)
         return keyframe
 

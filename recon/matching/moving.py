@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 from splatnode.capture.frame import DroppedFrame
 from splatnode.capture.masks import masked
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.recon.frames.keyframe import (
     LIBRARY_ERRORS,
     REFERENCE_SIDE,
@@ -142,6 +143,7 @@ def _find_groups(graph: ViewGraph, pair: Pair, matches: Index) -> list[_Group]:
     try:
         return list(_groups(graph, pair, matches))
     except LIBRARY_ERRORS as error:
+        raise_shortage(error)
         first, second = (graph.keyframes[index].name for index in pair)
         log.warning("%s and %s are not searched for what moves: %s", first, second, error)
         return []

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.recon.frames.keyframe import (
     LIBRARY_ERRORS,
     PLAIN,
@@ -110,6 +111,7 @@ def _verified(keyframe1: Keyframe, keyframe2: Keyframe, matches: Index, config: 
     try:
         return _estimate_geometry(keyframe1, keyframe2, matches, config)
     except LIBRARY_ERRORS as error:
+        raise_shortage(error)
         log.warning("%s and %s count as sharing nothing: %s", keyframe1.name, keyframe2.name, error)
         return MatchedPair(matches, None, 0.0)
 

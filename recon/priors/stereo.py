@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.recon.deadline import OutOfTime
 from splatnode.recon.frames.keyframe import LIBRARY_ERRORS
 from splatnode.recon.priors import consistency
@@ -255,6 +256,7 @@ def _start_or_unknown(view: StereoView, level: Level, sparse: SparsePoints | Non
     try:
         return _start(view, level, sparse)
     except LIBRARY_ERRORS as error:
+        raise_shortage(error)
         log.warning("%s: stereo begins without its sparse points: %s", view.name, error)
         return _start(view, level, None)
 

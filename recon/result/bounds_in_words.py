@@ -10,6 +10,7 @@ from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.snapshot import CameraEstimate
 
 _DIGITS = 2  # significant ones
+_LEAST, _MOST = 1e-9, 1e9  # numbers beyond these are told as bounds: nobody's cameras are so exact, or so wrong
 _ROUNDING = 1e-9  # relative: a number that is over its digits by less is not rounded up
 _LENGTHS = ((1.0, "m"), (0.01, "cm"), (0.001, "mm"))  # metres of a unit and its sign, the largest first
 
@@ -40,9 +41,12 @@ def _length(metres: float) -> str:
 
 
 def rounded_up(value: float) -> str:
-    """With two significant digits, the smallest number that is not below `value`; no exponent."""
+    """With two significant digits, the smallest number that is not below `value`; no exponent. Never raises."""
     if not (math.isfinite(value) and value > 0):
         return "0" if value == 0 else "an unknown number of"
+    if value > _MOST:
+        return f"more than {_MOST:.0f}"
+    value = max(value, _LEAST)
     decimals = _DIGITS - 1 - math.floor(math.log10(value))
     rounded = math.ceil(value * 10.0**decimals * (1.0 - _ROUNDING)) / 10.0**decimals
     text = f"{rounded:.{max(decimals, 0)}f}"

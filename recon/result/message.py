@@ -37,6 +37,7 @@ MAX_DROPPED = 200  # that are named with their reasons
 MAX_PIXELS = 1 << 26  # of a camera's picture at modelled size, which a viewer may have to paint
 LARGEST_VALUE = 1e9  # of a Gaussian; one with a larger number is left out
 SH_BASES = (1, 4, 9, 16)  # of degrees 0 to 3
+LEAST_BOUND = 1e-9  # that is not 0, in degrees, per cent, or the unit of the world
 MAX_CAMERAS = 1000  # of a message: bounds what a hostile one can make a viewer allocate
 GAUSSIAN_FIELDS = ("means", "quats", "scales", "opacities", "sh", "source_frame")
 
@@ -48,13 +49,19 @@ Matrix3 = Annotated[tuple[Finite, ...], msgspec.Meta(min_length=9, max_length=9)
 
 
 class BoundsRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A Bounds."""
+    """A Bounds. Each is 0, or a number that can be reckoned with: nobody knows a camera as exactly as LEAST_BOUND."""
 
     rotation_deg: Amount
     centre: Amount
     centre_percent: Amount
     focal_percent: Amount
     axes: tuple[Vector3, Vector3, Vector3]
+
+    def __post_init__(self) -> None:
+        """Raises ValueError, of which msgspec makes its own error."""
+        for number in (self.rotation_deg, self.centre, self.centre_percent, self.focal_percent):
+            if 0.0 < number < LEAST_BOUND:
+                raise ValueError(f"a bound must be 0 or at least {LEAST_BOUND:g}, got {number:g}")
 
 
 class CameraRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -196,7 +203,13 @@ def scale_from(record: ScaleRecord) -> Scale:
 
 
 def bounds_record(bounds: Bounds | None) -> BoundsRecord | None:
-    return None if bounds is None else BoundsRecord(**asdict(bounds))
+    """A bound that is too small to be told is told as the least one, which holds, too."""
+    if bounds is None:
+        return None
+    numbers = {
+        name: max(value, LEAST_BOUND) if name != "axes" and value else value for name, value in asdict(bounds).items()
+    }
+    return BoundsRecord(**numbers)
 
 
 def bounds_from(record: BoundsRecord | None) -> Bounds | None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.recon.result.export.error import SceneFileError
 
 
@@ -30,4 +31,5 @@ def opened(data: bytes, most_bytes: int, name: str, what: str) -> Iterator[Mappi
         with np.load(io.BytesIO(data), allow_pickle=False) as arrays, np.errstate(all="ignore"):
             yield arrays
     except (KeyError, ValueError, OSError, zipfile.BadZipFile, EOFError) as error:
+        raise_shortage(error)
         raise SceneFileError(f"{name} is not a file of {what}, or is damaged: {error}") from error

@@ -23,8 +23,10 @@ from splatnode.capture.image_file import (
     read_image_file,
 )
 from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.memory_shortage import outlast, raise_shortage
 from splatnode.capture.process.printable import is_printable
 from splatnode.capture.process.records import record_in
+from splatnode.capture.value_range import ValueRange
 from splatnode.recon.result.export.error import SceneFileError
 from splatnode.recon.result.export.limits import read_json_file
 from splatnode.recon.result.export.sources import SOURCES
@@ -92,6 +94,7 @@ def _gaussians(scene: Path) -> GaussianArrays:
         try:
             return read_gaussians(scene, sources)
         except SceneFileError as error:
+            raise_shortage(error)
             log.warning("it is not known which photographs the Gaussians come from: %s", error)
     return read_gaussians(scene)
 
@@ -157,10 +160,14 @@ def found_photographs(cameras: tuple[CameraEstimate, ...], folders: Sequence[Pat
         try:
             path = photograph_path(camera, folders)
             if path is not None:
-                found[camera.name] = _small(decode_photograph(read_image_file(path), used=used).image)
+                found[camera.name] = outlast(lambda path=path: _photograph(path, used), camera.name)
         except (UnusableImage, OSError) as error:
             log.warning("%s is shown without its photograph: %s", camera.name, error)
     return found
+
+
+def _photograph(path: Path, used: ValueRange | None) -> npt.NDArray[np.uint8]:
+    return _small(decode_photograph(read_image_file(path), used=used).image)
 
 
 def photograph_path(camera: CameraEstimate, folders: Sequence[Path]) -> Path | None:

@@ -18,6 +18,7 @@ BENCHMARKS = {
         "merge",
         "faults",
         "walk_faults",
+        "kills",
         "soak",
         "siege",
         "capture",

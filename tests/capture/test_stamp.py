@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 
 import pytest
 
-from splatnode.capture.stamp import LARGEST_NS, Clock, Stamp, wall_clock
+from splatnode.capture.stamp import LARGEST_NS, Clock, Stamp, nearest_stamp, wall_clock
 
 
 @pytest.mark.parametrize(
@@ -37,3 +38,9 @@ def test_a_reading_of_the_clocks_that_was_disturbed_does_not_count(monkeypatch):
     monkeypatch.setattr(time, "monotonic_ns", lambda: next(monotonic))
     monkeypatch.setattr(time, "time_ns", lambda: next(wall))
     assert wall_clock(1000).ns == 10**18 + 1000
+
+
+@pytest.mark.parametrize(("shown", "told"), [(-(10**20), 0), (LARGEST_NS + 10**18, LARGEST_NS)])
+def test_a_clock_that_is_set_to_any_year_ends_no_camera(monkeypatch, shown, told):
+    monkeypatch.setattr("splatnode.capture.stamp.time", SimpleNamespace(monotonic_ns=lambda: 0, time_ns=lambda: shown))
+    assert wall_clock(1000) == nearest_stamp(shown, Clock.UTC) == Stamp(told, Clock.UTC)

@@ -1,10 +1,13 @@
 """Answers what the page asks for. It takes no orders: requests have no body, and no question changes anything.
 
-One thread a request; a visitor who is slow, silent or gone costs no more than that thread for a while.
+One thread a request; a visitor who is slow, silent or gone costs no more than that thread for a while. Those who have
+not shown yet that they may look have places of their own, and where these are full, the oldest of the machine that has
+the most must go: they take no place from who has the key.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import ipaddress
 import json
@@ -14,19 +17,23 @@ import socketserver
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from functools import partial
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import resources
+from typing import Any, NamedTuple
 from urllib.parse import parse_qs
 
+from splatnode.capture.process.crowd import network_of, next_to_go
 from splatnode.viewer.web.access import Access
 from splatnode.viewer.web.board import Board, Shown
 
 log = logging.getLogger(__name__)
 
-_MOST_REQUESTS = 64  # at a time
-_HEAD_S = 8.0  # in which a request must have been made
+_MOST_REQUESTS = 64  # at a time, of those who may look
+_MOST_VISITORS = 32  # at a time, who have not shown yet that they may look
+_HEAD_S = 5.0  # in which a visitor must have shown that
 _STUCK_S = 20.0  # without a byte sent or taken
 _WAIT_S = 10.0  # for something new
 _CHUNK = 1 << 16  # bytes
@@ -47,14 +54,27 @@ _HEADERS = {
 }
 
 
+class _Visitor(NamedTuple):
+    """A connection that has not shown yet that it may look."""
+
+    network: str
+    until_s: float  # monotonic
+
+
 class Server(ThreadingHTTPServer):
     """Listens from the start, and answers once `start` was called. Raises OSError where it cannot listen."""
 
     daemon_threads = True
+    request_queue_size = 128  # connections that the kernel holds until they are taken in; with 5, a crowd fills it
 
     def __init__(self, board: Board, address: str, port: int, key: str | None) -> None:
         self.board = board
         self._free = threading.BoundedSemaphore(_MOST_REQUESTS)
+        self._running = threading.BoundedSemaphore(
+            _MOST_REQUESTS + 2 * _MOST_VISITORS
+        )  # visitors who go still have one
+        self._visitors: dict[socket.socket, _Visitor] = {}  # the oldest first
+        self._lock = threading.Lock()  # of the visitors
         if ipaddress.ip_address(address).version == 6:
             self.address_family = socket.AF_INET6
         self.pages = _pages()
@@ -74,20 +94,62 @@ class Server(ThreadingHTTPServer):
         threading.Thread(target=partial(self.serve_forever, 0.1), name="web", daemon=True).start()
 
     def process_request(self, request, client_address) -> None:
-        if not self._free.acquire(blocking=False):
+        if not self._running.acquire(blocking=False):
             self.shutdown_request(request)
             return
         try:
+            self._take_in(request, network_of(client_address[0]))
             super().process_request(request, client_address)
         except BaseException:  # no thread could be started, which would have given it back
-            self._free.release()
+            self._forget(request)
+            self._running.release()
             raise
 
     def process_request_thread(self, request, client_address) -> None:
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self._free.release()
+            self._running.release()
+
+    def service_actions(self) -> None:
+        """Hangs up on visitors who have had their time."""
+        now = time.monotonic()
+        with self._lock:
+            for request in [each for each, visitor in self._visitors.items() if visitor.until_s <= now]:
+                self._hang_up(request)
+
+    def shutdown_request(self, request) -> None:
+        self._forget(request)  # before it is closed: its descriptor is another's then
+        super().shutdown_request(request)
+
+    @contextlib.contextmanager
+    def place_of(self, request: socket.socket) -> Iterator[bool]:
+        """A place among those who may look; False where there is none."""
+        self._forget(request)
+        is_free = self._free.acquire(blocking=False)
+        try:
+            yield is_free
+        finally:
+            if is_free:
+                self._free.release()
+
+    def _take_in(self, request: Any, network: str) -> None:
+        with self._lock:
+            self._visitors[request] = _Visitor(network, time.monotonic() + _HEAD_S)
+            while len(self._visitors) > _MOST_VISITORS:
+                self._hang_up(next_to_go({each: visitor.network for each, visitor in self._visitors.items()}))
+
+    def _forget(self, request: Any) -> None:
+        with self._lock:
+            self._visitors.pop(request, None)
+
+    def _hang_up(self, request: socket.socket) -> None:
+        """Its thread ends then."""
+        del self._visitors[request]
+        try:
+            request.shutdown(socket.SHUT_RDWR)
+        except OSError:
+            log.debug("a visitor was gone already")
 
     def handle_error(self, request, client_address) -> None:
         """A visitor who goes in the middle of an answer is no error."""
@@ -102,18 +164,7 @@ class _Request(BaseHTTPRequestHandler):
     error_message_format, error_content_type = "%(code)d %(message)s\n", "text/plain; charset=utf-8"
     timeout = _STUCK_S
 
-    def setup(self) -> None:
-        super().setup()
-        self._deadline = threading.Timer(_HEAD_S, self._hang_up)
-        self._deadline.daemon = True
-        self._deadline.start()
-
-    def finish(self) -> None:
-        self._deadline.cancel()
-        super().finish()
-
     def do_GET(self) -> None:
-        self._deadline.cancel()
         access, (path, _, query) = self.server.access, self.path.partition("?")
         try:
             asked = {name: values[0] for name, values in parse_qs(query, max_num_fields=4).items()}
@@ -130,7 +181,10 @@ class _Request(BaseHTTPRequestHandler):
                 HTTPStatus.UNAUTHORIZED,
                 "the key is missing or wrong: open the address that splatnode view --web prints",
             )
-        self._answer(path, asked)
+        with self.server.place_of(self.connection) as is_free:
+            if not is_free:
+                return self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, "too many look at this scene just now: try again")
+            self._answer(path, asked)
 
     def _answer(self, path: str, asked: dict[str, str]) -> None:
         board = self.server.board
@@ -170,12 +224,6 @@ class _Request(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: object) -> None:
         """Requests are not logged: the page asks all the time, and an address may hold a key."""
-
-    def _hang_up(self) -> None:
-        try:
-            self.connection.shutdown(socket.SHUT_RDWR)
-        except OSError:
-            log.debug("a visitor without a request was gone already")
 
 
 def _told(board: Board, shown: Shown) -> bytes:

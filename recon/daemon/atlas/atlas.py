@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatnode.capture.process.logs import event
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.recon.config import Config
 from splatnode.recon.core import give_back_memory
 from splatnode.recon.daemon.atlas.bridge import Bridge, Side, bridge
@@ -98,6 +99,7 @@ class Atlas:
                 with contextlib.closing(Store(folder)) as store:
                     return checkpoint.graph_of(store, self._config)
             except (CheckpointError, OSError, ValueError) as error:
+                raise_shortage(error)
                 log.warning("%s is not recognised again: %s", scene, error)
                 self.forget(scene)
         return ViewGraph(self._config.matching)

@@ -11,6 +11,7 @@ import msgspec
 from splatnode.capture.messaging.message_file import read_message, write_message
 from splatnode.capture.messaging.values import SessionId
 from splatnode.capture.messaging.wire import Limits, decode, encode
+from splatnode.capture.process.memory_shortage import raise_shortage
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +53,7 @@ def read_ledger(directory: Path) -> Ledger:
     except FileNotFoundError:
         return Ledger()
     except (OSError, ValueError) as error:
+        raise_shortage(error)
         raise CheckpointError(
             f"the checkpoint in {directory} is damaged ({error}). Move the folder away to begin anew; "
             "its keyframes are in frames/"

@@ -10,6 +10,7 @@ import msgspec
 
 from splatnode.capture.messaging.message_file import read_message, write_message
 from splatnode.capture.messaging.wire import Message, decode, encode
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.recon.daemon.checkpoint.ledger import LIMITS
 
 log = logging.getLogger(__name__)
@@ -30,6 +31,7 @@ def load(directory: Path, name: str, schema: Any) -> Message[Any] | None:
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as error:
+        raise_shortage(error)
         log.warning("%s of the checkpoint is made anew: %s", name, error)
         return None
 

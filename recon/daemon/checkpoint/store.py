@@ -34,6 +34,7 @@ from splatnode.capture.messaging.keyframe_messages import ReceivedFrame
 from splatnode.capture.messaging.wire import Message
 from splatnode.capture.process.durable import remove_leftovers
 from splatnode.capture.process.lock import Held, exclusive
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.printable import LONGEST_NAME, printable
 from splatnode.capture.process.private import own_files, private_folder
 from splatnode.recon.daemon.checkpoint import left, made_anew
@@ -133,6 +134,7 @@ class Store:
                     self._remove(number)
                     continue
             except (OSError, ValueError) as error:
+                raise_shortage(error)
                 log.error("a keyframe is lost on the disk, put aside: %s", error)
                 path.rename(path.with_suffix(".damaged"))
                 continue

@@ -153,6 +153,10 @@ def _parsed(data: bytes, name: str) -> _File:
     return parsed
 
 
+def _numbers_of(bounds: _Bounds) -> tuple[float, ...]:
+    return bounds.rotation_deg, bounds.centre, bounds.centre_percent, bounds.focal_percent
+
+
 def _camera(record: _Camera, name: str) -> CameraEstimate:
     T_world_camera, K = np.array(record.T_world_camera), np.array(record.K)
     problem = camera_problem(T_world_camera, K, record.width, record.height)
@@ -160,6 +164,8 @@ def _camera(record: _Camera, name: str) -> CameraEstimate:
         problem = "a name must be that of a file, in printable letters"
     if (record.stamp_ns is None) != (record.clock is None):
         problem = "stamp_ns and clock must be there both, or none"
+    if record.bounds is not None and min(_numbers_of(record.bounds)) < 0:
+        problem = f"bounds must not be below 0, got {min(_numbers_of(record.bounds)):g}"
     if problem:
         raise SceneFileError(f"{name}, camera {printable(record.name, 100)!r}: {problem}")
     bounds = record.bounds and Bounds(**msgspec.structs.asdict(record.bounds))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import msgspec
 
 from splatnode.capture.process.foreign import foreign
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.printable import is_printable
 from splatnode.capture.process.records import record_in
 from splatnode.recon.result.export.error import SceneFileError
@@ -38,11 +38,17 @@ def entries(files: Mapping[str, bytes]) -> dict[str, dict[str, object]]:
 
 
 def digests(path: Path) -> dict[str, str]:
-    """SHA-256 by file of what the manifest `path` lists; empty where there is none that can be read."""
-    with contextlib.suppress(OSError, SceneFileError), foreign(SceneFileError):
-        manifest = record_in(read_json_file(path), _Manifest)
-        return {name: entry.sha256 for name, entry in manifest.files.items() if is_printable(name)}
-    return {}
+    """SHA-256 by file of what the manifest `path` lists; empty where there is none that can be read.
+
+    Raises what is_shortage tells.
+    """
+    try:
+        with foreign(SceneFileError):
+            manifest = record_in(read_json_file(path), _Manifest)
+    except (OSError, SceneFileError) as error:
+        raise_shortage(error)
+        return {}
+    return {name: entry.sha256 for name, entry in manifest.files.items() if is_printable(name)}
 
 
 def made_of(folder: Path) -> dict[str, str]:
@@ -51,8 +57,10 @@ def made_of(folder: Path) -> dict[str, str]:
     for manifest in (OF_A_MAP, f"{MAPS}/{OF_A_MAP}", EXPORTS):
         within = manifest.removesuffix(OF_A_MAP).removesuffix(EXPORTS)
         listed = {f"{within}{name}": digest for name, digest in digests(folder / manifest).items()}
-        with contextlib.suppress(OSError):
+        try:
             listed |= {manifest: sha256((folder / manifest).read_bytes())} if listed else {}
+        except OSError as error:
+            raise_shortage(error)
         found |= listed
     return found
 

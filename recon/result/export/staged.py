@@ -24,6 +24,7 @@ import msgspec
 
 from splatnode.capture.process.durable import sync_folder
 from splatnode.capture.process.folders import made
+from splatnode.capture.process.memory_shortage import raise_shortage
 from splatnode.capture.process.records import record_in
 
 _MARK = "[0-9a-f]{12}"
@@ -279,8 +280,12 @@ def _locked(descriptor: int) -> bool:
 
 
 def _entries(folder: Path, pattern: re.Pattern[str]) -> list[Path]:
-    """The folder's entries with such names; none where there is no such folder or it cannot be listed."""
+    """The folder's entries with such names; none where there is no such folder or it cannot be listed.
+
+    Raises what is_shortage tells.
+    """
     try:
         return [folder / name for name in os.listdir(folder) if pattern.fullmatch(name)]
-    except OSError:
+    except OSError as error:
+        raise_shortage(error)
         return []

@@ -244,3 +244,15 @@ def test_the_lens_is_of_the_photographs_of_its_aspect_ratio(tmp_path):
     (tmp_path / "b.png").write_bytes(cv2.imencode(".png", np.zeros((64, 48, 3), np.uint8))[1].tobytes())
     frames = watch(tmp_path, intrinsics=lens)
     assert next(frames).intrinsics == lens.resized(64, 48) and next(frames).intrinsics is None
+
+
+def test_a_photograph_of_any_year_is_one(tmp_path):
+    for index, year in enumerate((1950, 2024, 2200)):
+        path = tmp_path / f"{index}.jpg"
+        path.write_bytes(photograph(index))
+        try:
+            os.utime(path, ns=2 * ((year - 1970) * 365 * 86400 * 10**9,))
+        except OSError:
+            pytest.skip("this file system has no such years")
+    stream = watch(tmp_path)
+    assert [next(stream).captured_at.clock for _ in range(3)] == [Clock.FILE] * 3

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from splatnode.recon.result.bounds import Bounds, ball
 from splatnode.recon.result.bounds_in_words import of_camera, of_cameras
@@ -46,3 +48,13 @@ def test_of_several_cameras_the_widest_is_told():
 
 def test_cameras_without_bounds_leave_nothing_to_tell():
     assert of_cameras((), RELATIVE) == of_cameras((replace(make_camera(0), bounds=None),), RELATIVE) == ""
+
+
+@pytest.mark.parametrize("metric", [True, False])
+@given(number=st.floats(width=64) | st.sampled_from([5e-324, 1e-320, 2.3e-308, 1.7e308, float("nan"), float("inf")]))
+def test_every_number_has_words(number, metric):
+    said = of_camera(Bounds(number, number, number, number, ball(1.0)), Scale(metric, "a ruler"))
+    assert said.isprintable() and "e" not in said.split("degrees")[0].removeprefix("direction to ").replace(
+        "more than", ""
+    ).replace("an unknown number of", "")
+    assert len(said) < 250

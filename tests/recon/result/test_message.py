@@ -13,7 +13,7 @@ from splatnode.capture.messaging.jpeg import to_jpeg
 from splatnode.capture.messaging.wire import Message, Numbering, WireError, decode, encode
 from splatnode.capture.stamp import Clock, Stamp
 from splatnode.recon.result.bounds import Bounds
-from splatnode.recon.result.message import SceneHeader, from_message, to_message
+from splatnode.recon.result.message import CameraRecord, SceneHeader, camera_record, from_message, to_message
 from splatnode.recon.result.scale import RELATIVE, Scale
 from splatnode.recon.result.snapshot import CameraEstimate, GaussianArrays, Snapshot
 from splatnode.recon.result.verdict import Code, Verdict
@@ -245,3 +245,15 @@ def test_what_is_said_of_a_scene_is_cut_to_what_a_message_holds():
     live = from_message(sent(replace(snapshot(), verdict=verdict, dropped=(DroppedFrame("", long),) * 2500))).snapshot
     assert len(live.verdict.message) == 1000 and "\n" not in live.verdict.message
     assert len(live.dropped) == 200 and len(live.verdict.frames) == 1000
+
+
+def test_a_bound_that_cannot_be_reckoned_with_is_refused_and_never_sent():
+    scene, tiny = snapshot(1), Bounds(1e-320, 0.0, 1e-15, 1.0, ((0.0, 0.0, 0.0),) * 3)
+    exact = replace(scene.cameras[0], bounds=tiny)
+    live = from_message(sent(replace(scene, cameras=(exact,))))
+    bounds = live.snapshot.cameras[0].bounds
+    assert bounds is not None and (bounds.rotation_deg, bounds.centre, bounds.centre_percent) == (1e-9, 0.0, 1e-9)
+    record = msgspec.to_builtins(camera_record(exact))
+    record["bounds"]["focal_percent"] = 1e-320
+    with pytest.raises(msgspec.ValidationError, match="a bound must be 0 or at least 1e-09"):
+        msgspec.convert(record, CameraRecord)

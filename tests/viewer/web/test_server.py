@@ -16,7 +16,9 @@ import numpy as np
 import pytest
 
 from splatnode.capture.frame import DroppedFrame
+from splatnode.recon.result.bounds import Bounds, ball
 from splatnode.recon.result.export.formats.splat import decode
+from splatnode.recon.result.scale import Scale
 from splatnode.recon.result.verdict import Code, Verdict
 from splatnode.viewer.moment import Moment
 from splatnode.viewer.sources import Finished
@@ -26,6 +28,7 @@ from splatnode.viewer.web.content import Content
 from splatnode.viewer.web.said import said
 from splatnode.viewer.web.server import Server
 from splatnode.viewer.web.stage import Place, newest, serving
+from tests.capture.messaging.test_sockets import wait_for
 from tests.viewer.test_scene import camera, moment, wall
 
 KEY = "k" * 43
@@ -125,6 +128,14 @@ def test_what_strangers_named_is_printable_and_stays_json():
     assert "300 photographs were left out before:" in lines
 
 
+@pytest.mark.parametrize("number", [1e-320, 5e-324, 1e-12, 1e300, 1.7e308])
+def test_no_number_of_a_scene_ends_the_viewer(number):
+    bounds = Bounds(number, number, number, number, ball(number))
+    one = moment(wall(3), replace(camera(0.0), bounds=bounds), scale=Scale(True, "a ruler"))
+    with shown(one) as server:
+        assert "(95 % bounds)" in json.dumps(told(server))
+
+
 def test_nothing_that_a_visitor_sends_is_an_order():
     with shown(scene()) as server:
         before = told(server)["number"]
@@ -202,6 +213,38 @@ def test_visitors_who_misbehave_stop_nothing(monkeypatch, caplog):
                     break
         assert told(server)["said"]["good"] is True
     assert not caplog.records  # that is nothing to tell anybody
+
+
+@pytest.mark.parametrize("said", [b"", b"GET /told HTTP/1.1\r\nHost: "], ids=["silent", "slow"])
+def test_a_crowd_of_visitors_takes_no_place_of_who_has_the_key(said):
+    began = time.monotonic()
+    with shown(scene(), KEY) as server, contextlib.ExitStack() as stack:
+        for _ in range(2):
+            for _ in range(100):
+                visitor = stack.enter_context(socket.create_connection(server.server_address[:2], timeout=10))
+                with contextlib.suppress(OSError):
+                    visitor.sendall(said)
+            assert ask(server, "/told", Authorization=f"Bearer {KEY}")[0] == 200
+            assert len(server._visitors) <= server_module._MOST_VISITORS
+    assert time.monotonic() - began < 15  # nobody waits until strangers have had their time
+
+
+def test_who_waits_for_news_takes_no_place_of_strangers_and_is_one_of_few(monkeypatch):
+    monkeypatch.setattr(server_module, "_MOST_REQUESTS", 1)
+    monkeypatch.setattr(server_module, "_WAIT_S", 1.0)
+    with shown(scene(), KEY) as server:
+        now = json.loads(ask(server, "/told", Authorization=f"Bearer {KEY}")[2])
+        waits = threading.Thread(
+            target=ask,
+            args=(server, f"/told?run={now['run']}&number={now['number']}"),
+            kwargs={"Authorization": f"Bearer {KEY}"},
+        )
+        waits.start()
+        time.sleep(0.3)
+        assert ask(server, "/told", Authorization=f"Bearer {KEY}")[0] == 503
+        assert ask(server, "/told")[0] == 401
+        waits.join()
+        wait_for(lambda: ask(server, "/told", Authorization=f"Bearer {KEY}")[0] == 200)
 
 
 def test_visitors_for_whom_no_thread_could_be_started_take_no_place_for_ever(monkeypatch, caplog):

@@ -1,0 +1,162 @@
+"""Whoever holds a failed read or write for the fault of a file asks first whether this process lacks something.
+
+Each handler of OSError, or of everything, in the three rooms raises, or asks `memory_shortage`, or is listed here
+with what makes a shortage harmless to it.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.conftest import ROOT
+
+ROOMS = ("capture", "recon", "viewer")
+ASKS = {"is_shortage", "may_be_shortage", "raise_shortage", "outlast"}
+WIDE = {"OSError", "Exception", "BaseException", "FFmpegError", "ZMQError"}
+HARMLESS = {
+    "it is tried again by itself, and nothing is lost until then": {
+        "capture/cameras/watched.py:_version",
+        "capture/daemon.py:_shortage",
+        "capture/messaging/keyframes.py:_say",
+        "capture/messaging/spool.py:_remove_acknowledged",
+        "capture/messaging/state.py:_reply",
+        "capture/process/service_manager.py:_notify",
+        "capture/process/unfailing.py:do",
+        "recon/daemon/checkpoint/checkpoint.py:_prepared",
+        "recon/daemon/checkpoint/ledger.py:identified",
+        "recon/daemon/checkpoint/store.py:_remove",
+        "recon/daemon/daemon.py:_publish",
+        "recon/daemon/intake.py:_forget",
+        "recon/daemon/intake.py:run",
+        "recon/daemon/previews.py:run",
+        "recon/daemon/watcher.py:_watch",
+        "recon/result/export/staged.py:completed",
+        "viewer/sources.py:_listen",
+    },
+    "a shortage is told to whoever asked, as what it is": {
+        "capture/daemon.py:capture",
+        "capture/process/memory.py:resident_mb",
+        "capture/process/limits.py:make_sure_of_room",
+        "capture/reader.py:_run",
+        "recon/batch/write_back.py:write_back",
+        "recon/daemon/daemon.py:_answer",
+        "recon/daemon/daemon.py:guarded",
+        "recon/daemon/output.py:save",
+        "recon/daemon/output.py:save_fallbacks",
+        "recon/jobs/called.py:answered",
+        "recon/mapping/scenes.py:run",
+        "viewer/map_source.py:_work",
+        "viewer/window.py:call",
+    },
+    "what is left out is no frame, no keyframe and no result: a name, a reason, a picture, a figure": {
+        "capture/last_run.py:last_run",
+        "capture/messaging/keyframes.py:_set_aside",
+        "capture/messaging/quarantine.py:seen",
+        "capture/messaging/quarantine.py:take",
+        "recon/batch/pictures.py:address",
+        "recon/core/__init__.py:_processor_flags",
+        "recon/doctor.py:_core",
+        "recon/doctor.py:_gpu",
+        "recon/doctor.py:_network",
+        "recon/doctor.py:_learned_parts",
+        "recon/doctor.py:_lpips",
+        "recon/evaluate/moments.py:run_to_its_end",
+        "recon/evaluate/timing.py:_name",
+        "recon/jobs/alone.py:with_siblings",
+        "recon/jobs/alone.py:_busy_s",
+        "recon/jobs/cores.py:free_core",
+        "recon/jobs/launch.py:main",
+        "recon/jobs/memory.py:tree_mb",
+        "recon/jobs/memory.py:_children",
+        "recon/jobs/template.py:_copy",
+        "recon/jobs/template.py:_become",
+        "recon/result/report.py:peak_rss_mb",
+    },
+    "it takes neither a descriptor nor memory: a name is removed, a socket shut, a lock or a kind asked for": {
+        "capture/cameras/folder.py:_may_be_file",
+        "capture/messaging/gate.py:_is_let_in",
+        "capture/messaging/gate.py:_peer",
+        "capture/messaging/gate.py:_shut",
+        "capture/messaging/quarantine.py:_keep_bound",
+        "capture/process/durable.py:remove_leftovers",
+        "capture/process/durable.py:write_whole",
+        "capture/process/folders.py:_remove_if_empty",
+        "capture/process/terminal.py:_is_closed_pipe",
+        "capture/video4linux/device.py:close",
+        "recon/result/export/result.py:remove_result",
+        "recon/result/export/staged.py:_remove",
+        "recon/result/export/staged.py:_write_files",
+        "recon/result/export/staged.py:_write_through",
+        "viewer/web/server.py:_hang_up",
+    },
+    "it runs in a process of its own, with a file that is open already": {
+        "capture/av.py:_decode",
+        "capture/av.py:_packets",
+        "capture/av.py:_packets_from",
+    },
+}
+
+
+def test_a_shortage_is_never_held_for_the_fault_of_a_file():
+    found = {each for room in ROOMS for path in sorted((ROOT / room).rglob("*.py")) for each in _careless(path)}
+    known = set[str]().union(*HARMLESS.values())
+    assert not found - known, f"ask raise_shortage there, or say here why a shortage is harmless: {found - known}"
+    assert not known - found, f"no longer so: {known - found}"
+
+
+def test_the_rule_sees_what_it_is_for(tmp_path):
+    careless = "def read():\n    try:\n        pass\n    except (ValueError, OSError):\n        return None\n"
+    (tmp_path / "one.py").write_text(careless)
+    (tmp_path / "two.py").write_text(careless.replace("except (ValueError, OSError)", "except KeyError"))
+    (tmp_path / "three.py").write_text(careless.replace("return None", "raise_shortage(error)"))
+    (tmp_path / "four.py").write_text("def write():\n    with suppress(OSError):\n        pass\n")
+    found = {name: [*_careless(tmp_path / f"{name}.py")] for name in ("one", "two", "three", "four")}
+    assert {name for name, each in found.items() if each} == {"one", "four"}
+
+
+def _careless(path: Path) -> Iterator[str]:
+    """FILE:FUNCTION of each handler that neither raises nor asks."""
+    shown = path.relative_to(ROOT) if path.is_relative_to(ROOT) else path
+    tree = ast.parse(path.read_text())
+    for function in (each for each in ast.walk(tree) if isinstance(each, ast.FunctionDef)):
+        if any(_is_careless(each) for each in _within(function)):
+            yield f"{shown}:{function.name}"
+
+
+def _within(function: ast.FunctionDef) -> Iterator[ast.stmt]:
+    """Statements of the function, without those of functions within it."""
+    rest: list[ast.AST] = [*function.body]
+    while rest:
+        node = rest.pop()
+        if isinstance(node, ast.FunctionDef):
+            continue
+        if isinstance(node, ast.stmt):
+            yield node
+        rest += ast.iter_child_nodes(node)
+
+
+def _is_careless(statement: ast.stmt) -> bool:
+    if isinstance(statement, ast.With):
+        contexts = [each.context_expr for each in statement.items]
+        return any({"suppress"} <= _names(each) and _names(each) & WIDE for each in contexts) and not _asks(
+            statement.body
+        )
+    if not isinstance(statement, ast.Try) or _asks(statement.body):
+        return False
+    wide = [each for each in statement.handlers if each.type is None or _names(each.type) & WIDE]
+    return any(not _asks(each.body) and not _raises(each.body) for each in wide)
+
+
+def _names(node: ast.AST) -> set[str]:
+    found = {each.id for each in ast.walk(node) if isinstance(each, ast.Name)}
+    return found | {each.attr for each in ast.walk(node) if isinstance(each, ast.Attribute)}
+
+
+def _asks(body: list[ast.stmt]) -> bool:
+    return any(_names(each) & ASKS for each in body)
+
+
+def _raises(body: list[ast.stmt]) -> bool:
+    return any(isinstance(node, ast.Raise) for each in body for node in ast.walk(each))
