@@ -87,13 +87,13 @@ def _in_window(args: argparse.Namespace) -> int:
         source = _source(finished, network)
         from splatnode.viewer.window import show
 
-        def opened() -> None:
+        def on_open() -> None:
             ready()
             if finished is None:
                 _give_way()
 
         session, size = Session(source, State()), args.size or probe.size
-        show(session, software=probe.software, screenshots=_folder(args, finished), opened=opened, size=size)
+        show(session, software=probe.software, screenshots=_folder(args, finished), opened=on_open, size=size)
     return EXIT_GOOD
 
 
