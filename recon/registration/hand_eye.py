@@ -20,7 +20,7 @@ _LEAST_CAMERAS = 4  # 24 numbers for a similarity and an offset, which are 13
 _LEAST_TURN_DEG = 5.0  # by which orientations must differ: of cameras that look one way a shift is one of the world
 _MOST_SIGMAS = 3.0  # root of the mean square of what is left, of which images are a part
 _IMAGES = 2.0  # times as wide as given: what images do not know of their cameras counts, too
-_OF_SHIFT_M = 10.0  # standard deviation of the offset's shift before anything is known, metres
+_OF_SHIFT_M = 1.0  # standard deviation of the offset's shift before anything is known, metres
 
 
 def offset_of(keyframes: Sequence[Keyframe], registration: Registration) -> Offset | None:
@@ -59,4 +59,8 @@ def offset_of(keyframes: Sequence[Keyframe], registration: Registration) -> Offs
 
     found = least_squares(errors, np.zeros(13), x_scale=0.01)
     left = float(np.sqrt(2.0 * found.cost / (6 * len(scene) - 13)))
-    return Offset(offset(found.x)) if left < _MOST_SIGMAS else None
+    if left >= _MOST_SIGMAS:
+        return None
+    covariance = np.linalg.pinv(found.jac.T @ found.jac)
+    turn, shift = (float(np.sqrt(np.linalg.eigvalsh(covariance[b, b]).max())) for b in (slice(7, 10), slice(10, 13)))
+    return Offset(offset(found.x), turn, size * shift)

@@ -62,6 +62,8 @@ class Offset:
     """What is wrong with all given poses alike: T_given = T_true @ T_true_given, as of a wrong hand-eye calibration."""
 
     T_camera_given: Array  # (4, 4) metres
+    turn_sigma: float  # standard deviation about the axis in which it is least known, radians
+    shift_sigma: float  # and in the direction, metres
 
     @property
     def metres(self) -> float:

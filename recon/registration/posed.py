@@ -84,6 +84,9 @@ def _world(
     joint = covariance.joint[np.ix_(rows, rows)]
     blocks = [slice(3 * i, 3 * i + 3) for i in range(len(views))]
     in_world = [(to_first @ turns[b], unit * to_first @ moves[b]) for b in blocks]
+    # What is not known of the offset is not known of any camera.
+    turn_sigma, shift_sigma = (0.0, 0.0) if offset is None else (offset.turn_sigma, offset.shift_sigma)
+    of_turn, of_shift = turn_sigma**2 * np.eye(3), (shift_sigma * unit / given.metres) ** 2 * np.eye(3)
     sigmas = given.poses.sigmas[np.argsort(order)][held, 1] * given.metres
     centres = given.metres * bundle.centres(estimate)[held]
     return GivenWorld(
@@ -93,8 +96,8 @@ def _world(
         scale_sigma=float(np.median(sigmas) / (spread(centres) * np.sqrt(len(held)))),
         deviations=tuple(replace(each, index=order[each.index]) for each in built.deviations),
         offset=offset,
-        turn_covariances=np.stack([turn @ joint @ turn.T for turn, _ in in_world]),
-        centre_covariances=np.stack([move @ joint @ move.T for _, move in in_world]),
+        turn_covariances=np.stack([turn @ joint @ turn.T + of_turn for turn, _ in in_world]),
+        centre_covariances=np.stack([move @ joint @ move.T + of_shift for _, move in in_world]),
         held=frozenset(held),
     )
 

@@ -5,7 +5,6 @@ Images that alone cannot tell where they were taken are no reason to refuse here
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -80,8 +79,9 @@ def _naming(verdict: Verdict, graph: ViewGraph, given: GivenWorld, placed: set[i
     sentences, advice = [verdict.message], [verdict.advice]
     if given.offset is not None:
         sentences.append(
-            f"All given poses are off alike, by {rounded_up(given.offset.degrees)} degrees and "
-            f"{rounded_up(given.offset.metres)} m in the camera's frame, which was taken out."
+            f"All given poses are off alike, by {given.offset.degrees:.2g} degrees and {given.offset.metres:.2g} m in the "
+            f"camera's frame (known to {_known(given.offset.turn_sigma * 180.0 / np.pi)} degrees and "
+            f"{_known(given.offset.shift_sigma)} m), which was taken out."
         )
         advice.append("Calibrate how the camera sits on what carries it (hand-eye).")
     if given.deviations:
@@ -94,12 +94,11 @@ def _naming(verdict: Verdict, graph: ViewGraph, given: GivenWorld, placed: set[i
     return replace(verdict, message=" ".join(sentences), advice=" ".join(filter(None, advice)), frames=frames)
 
 
+def _known(sigma: float) -> str:
+    return rounded_up(_TWO_SIDED_95 * sigma)
+
+
 def _residual(graph: ViewGraph, deviation: Deviation, placed: set[int]) -> str:
     done = "placed by the photographs alone" if deviation.index in placed else "left out"
     name = printable(graph.names[deviation.index])
     return f"that of {name} is {deviation.metres:.2g} m and {deviation.degrees:.2g} degrees off ({done})"
-
-
-def named_poses(graph: ViewGraph, given: GivenWorld) -> Mapping[str, Deviation]:
-    """The given poses that the images contradict, by the names of their keyframes."""
-    return {graph.names[each.index]: each for each in given.deviations}
