@@ -78,10 +78,10 @@ def _naming(verdict: Verdict, graph: ViewGraph, given: GivenWorld, placed: set[i
     """With the poses that the images contradict, and what all given poses have wrong in common."""
     sentences, advice = [verdict.message], [verdict.advice]
     if given.offset is not None:
+        off = f"{given.offset.degrees:.2g} degrees and {given.offset.metres:.2g} m"
+        known = f"{_known(float(np.degrees(given.offset.turn_sigma)))} degrees and {_known(given.offset.shift_sigma)} m"
         sentences.append(
-            f"All given poses are off alike, by {given.offset.degrees:.2g} degrees and {given.offset.metres:.2g} m in the "
-            f"camera's frame (known to {_known(given.offset.turn_sigma * 180.0 / np.pi)} degrees and "
-            f"{_known(given.offset.shift_sigma)} m), which was taken out."
+            f"All given poses are off alike, by {off} in the camera's frame (known to {known}), which was taken out."
         )
         advice.append("Calibrate how the camera sits on what carries it (hand-eye).")
     if given.deviations:
