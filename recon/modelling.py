@@ -172,7 +172,7 @@ def snapshot(
         final=final,
         served_by=scene.served_by if scene else {},
         evidence=conclusion.evidence_record,
-        given=_in_given_world(conclusion) if scene else None,
+        given=_in_given_world(conclusion) if scene and final else None,
         landmarks=conclusion.landmarks if scene and final else None,
         depths=_confirmed(scene) if scene and final else {},
         masked=conclusion.masked,

@@ -49,7 +49,7 @@ class GivenPoses:
     @property
     def known(self) -> npt.NDArray[np.bool_]:
         """(C,) whether a pose holds its camera."""
-        return np.isfinite(self.sigmas).all(1)
+        return np.asarray(np.isfinite(self.sigmas).all(1))
 
     def without(self, cameras: Sequence[int]) -> GivenPoses:
         """Those of these cameras hold nothing any more."""

@@ -108,14 +108,12 @@ def _joined(known: TwoView | None, matches: Index, one: Keyframe, other: Keyfram
     for side in (0, 1):
         _, first = np.unique(matches[:, side], return_index=True)
         matches = matches[np.sort(first)]
-    points = [
-        keyframe.features.points[matches[:, side]] - principal_point(keyframe.frame)
-        for side, keyframe in enumerate((one, other))
-    ]
+    points1 = one.features.points[matches[:, 0]] - principal_point(one.frame)
+    points2 = other.features.points[matches[:, 1]] - principal_point(other.frame)
     ratio = _focal(other) / longer_side(other.frame)
     num_candidates = len(matches) if known is None else known.num_candidates
     log10_nfa = 0.0 if known is None else known.log10_nfa
-    return TwoView(matches, *points, num_candidates, log10_nfa, 0, 0, ratio, ratio)
+    return TwoView(matches, points1, points2, num_candidates, log10_nfa, 0, 0, ratio, ratio)
 
 
 def _focal(keyframe: Keyframe) -> float:
