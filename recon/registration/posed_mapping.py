@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from splatnode.recon.registration import (
     bundle,
+    epipolar,
     finishing,
     incremental,
     inliers,
@@ -38,7 +39,9 @@ _MOST_TOLERANCE = 24.0  # times the largest error of an observation
 _LEAST_HELD = 2  # poses that must stay
 _DOUBTED_RATIO = 0.6  # share of a view's matches that fit, below which its pose is doubted
 _MORE, _MORE_POINTS = 1.5, 15  # factor and number by which more observations must fit another pose
-_LEAST_OBSERVATIONS = 15  # of a camera that images alone place
+_LEAST_OBSERVATIONS = 15  # of points that two others see, of a camera that images alone place
+# A pair with so many matches tells whether a pose is false: most agree on another one, and few on what is given
+_TELLING_MATCHES, _CONSISTENT, _AGREEING = 40, 0.8, 0.3
 _ROUNDS = 3  # of tests after a map was finished
 
 
@@ -153,7 +156,7 @@ def _let_go(problem: MappingProblem, partial: PartialMap, given: Given, config: 
         if not doubted:
             break
         tried.add(doubted[0])
-        freed = _replaced(problem, partial, doubted[0], config)
+        freed = _replaced(problem, partial, doubted[0], config) or _refuted(problem, partial, doubted[0], config)
         if freed is not None:
             partial = freed
             tried.clear()
@@ -184,6 +187,47 @@ def _replaced(problem: MappingProblem, partial: PartialMap, view: int, config: m
     freed = _settled(problem, freed, 2.0 * incremental.SETTLED_TOLERANCE, config)
     before, after = (_observations(each)[view] for each in (partial, freed))
     return freed if after > _MORE * before + _MORE_POINTS else None
+
+
+def _refuted(problem: MappingProblem, partial: PartialMap, view: int, config: mapper.Config) -> PartialMap | None:
+    """The map with `view` where one pair places it, where its pairs with views that are sure all refute its pose.
+
+    For views of which too little is seen by two others: nothing but the pair tells how far away they are.
+    """
+    rest = replace(partial, registered=tuple(each for each in partial.registered if each != view))
+    rest = _settled(problem, _without(rest, [view]), incremental.SETTLED_TOLERANCE, config)
+    sure = set(np.flatnonzero(_observations(rest) >= config.incremental.min_points).tolist())
+    chosen = {(i, j): pair for (i, j), pair in problem.pairs.items() if view in (i, j) and {i, j} - {view} <= sure}
+    limit, best = config.incremental.triangulation.max_error_px, 0
+    freed = None
+    for (i, j), pair in chosen.items():
+        if len(pair.matches) < _TELLING_MATCHES:
+            continue
+        scale = float(problem.scale[i])
+        fit = epipolar.sampson_errors(partial.estimate, (i, j), pair) < limit * scale
+        if fit.mean() > _AGREEING:
+            return None
+        focals = np.exp(partial.estimate.log_focals[partial.estimate.lens_of_camera[[i, j]]])
+        rotation, direction, num_fit = epipolar.relative_pose(pair, *focals.tolist(), limit * scale)
+        if num_fit < _CONSISTENT * len(pair.matches):
+            return None
+        if num_fit > best:
+            best, freed = num_fit, _beside(rest, view, (i, j), rotation, direction)
+    return None if freed is None else replace(freed, registered=partial.registered)
+
+
+def _beside(partial: PartialMap, view: int, pair: tuple[int, int], rotation: Array, direction: Array) -> PartialMap:
+    """The map with `view` by the pose of the second camera of `pair` in the first one, as far apart as they were."""
+    estimate, (first, second) = partial.estimate, pair
+    centres = bundle.centres(estimate)
+    move = direction / np.linalg.norm(direction) * np.linalg.norm(centres[second] - centres[first])
+    if view == second:
+        turned = rotation @ estimate.rotations[first]
+        shifted = rotation @ estimate.translations[first] + move
+    else:
+        turned = rotation.T @ estimate.rotations[second]
+        shifted = rotation.T @ (estimate.translations[second] - move)
+    return replace(partial, estimate=bundle.with_pose(estimate, view, turned, shifted))
 
 
 def _observations(partial: PartialMap) -> npt.NDArray[np.int64]:
@@ -238,9 +282,25 @@ def _finished(
 def _without_unseen(finished: finishing.Finished) -> finishing.Finished:
     """The map without cameras that nothing holds: neither a given pose nor enough observations."""
     partial, held = finished.map, set(_held(finished.map))
-    counts = _observations(partial)
+    estimate = partial.estimate
+    seen_by = np.bincount(estimate.point_of, minlength=len(estimate.points))
+    by_three = estimate.camera_of[seen_by[estimate.point_of] >= 3]
+    counts = np.bincount(by_three, minlength=len(estimate.rotations))
     kept = tuple(v for v in partial.registered if v in held or counts[v] >= _LEAST_OBSERVATIONS)
-    return replace(finished, map=replace(partial, registered=kept))
+    if kept == partial.registered:
+        return finished
+    own = np.isin(estimate.camera_of, kept)
+    own &= np.bincount(estimate.point_of[own], minlength=len(estimate.points))[estimate.point_of] >= 2
+    points, point_of = np.unique(estimate.point_of[own], return_inverse=True)
+    rest = replace(
+        estimate,
+        points=estimate.points[points],
+        camera_of=estimate.camera_of[own],
+        point_of=point_of,
+        pixels=estimate.pixels[own],
+    )
+    rest = bundle.adjust(rest, partial.prior, finished.loss) if len(points) else rest
+    return replace(finished, map=replace(partial, registered=kept, estimate=rest))
 
 
 def _deviations(finished: finishing.Finished, given: Given) -> tuple[Deviation, ...]:
