@@ -68,7 +68,8 @@ def build_map(
     config = _less_sure(config)
     partial = _settled(problem, _start(problem, focals, given), _first_tolerance(problem, focals, given), config)
     pause()
-    partial = _tested(problem, _let_go(problem, partial, given, config), given, config)
+    partial = _without_undecided(problem, _let_go(problem, partial, config), config)
+    partial = _tested(problem, partial, given, config)
     pause()
     if partial is None:
         return None
@@ -148,7 +149,7 @@ def _without(partial: PartialMap, views: Sequence[int]) -> PartialMap:
     return replace(partial, estimate=replace(partial.estimate, given=given.without(views)))
 
 
-def _let_go(problem: MappingProblem, partial: PartialMap, given: Given, config: mapper.Config) -> PartialMap:
+def _let_go(problem: MappingProblem, partial: PartialMap, config: mapper.Config) -> PartialMap:
     """The map without the poses of views whose matches hardly fit, and fit another pose much better."""
     tried: set[int] = set()
     while len(_held(partial)) > _LEAST_HELD:
@@ -190,35 +191,75 @@ def _replaced(problem: MappingProblem, partial: PartialMap, view: int, config: m
 
 
 def _refuted(problem: MappingProblem, partial: PartialMap, view: int, config: mapper.Config) -> PartialMap | None:
-    """The map with `view` where one pair places it, where its pairs with views that are sure all refute its pose.
+    """The map with `view` where one pair places it, where its pairs with views that others confirm refute its pose.
 
     For views of which too little is seen by two others: nothing but the pair tells how far away they are.
     """
+    says = _pairs_say(problem, partial, config)
+    confirmed = {each for pair, said in says.items() if said > 0 for each in pair}
+    refuting = [pair for pair, said in says.items() if said < 0 and view in pair and set(pair) & confirmed]
+    if view in confirmed or not refuting:
+        return None
+    best = max(refuting, key=lambda pair: (len(problem.pairs[pair].matches), pair))
     rest = replace(partial, registered=tuple(each for each in partial.registered if each != view))
     rest = _settled(problem, _without(rest, [view]), incremental.SETTLED_TOLERANCE, config)
-    sure = set(np.flatnonzero(_observations(rest) >= config.incremental.min_points).tolist())
-    chosen = {(i, j): pair for (i, j), pair in problem.pairs.items() if view in (i, j) and {i, j} - {view} <= sure}
-    limit, best = config.incremental.triangulation.max_error_px, 0
-    freed = None
-    for (i, j), pair in chosen.items():
-        if len(pair.matches) < _TELLING_MATCHES:
+    return replace(_beside(problem, rest, view, best, config), registered=partial.registered)
+
+
+def _without_undecided(problem: MappingProblem, partial: PartialMap, config: mapper.Config) -> PartialMap:
+    """The map without both views of a pair that refutes one of their poses, where nothing tells which.
+
+    As it is where most of the poses would be gone with them.
+    """
+    says = _pairs_say(problem, partial, config)
+    confirmed = {each for pair, said in says.items() if said > 0 for each in pair}
+    undecided = [pair for pair, said in says.items() if said < 0 and not set(pair) & confirmed]
+    views = {each for pair in undecided for each in pair}
+    held = set(_held(partial))
+    if not views or len(held - views) < _LEAST_HELD or 2 * len(held - views) <= len(held):
+        return partial
+    moved = _without(replace(partial, registered=tuple(v for v in partial.registered if v not in views)), sorted(views))
+    for pair in undecided:
+        for view in pair:
+            found = _beside(problem, partial, view, pair, config).estimate
+            pose = found.rotations[view], found.translations[view]
+            moved = replace(moved, estimate=bundle.with_pose(moved.estimate, view, *pose))
+    return _settled(problem, moved, incremental.SETTLED_TOLERANCE, config)
+
+
+def _pairs_say(problem: MappingProblem, partial: PartialMap, config: mapper.Config) -> dict[tuple[int, int], int]:
+    """Of pairs of views that given poses hold: 1 where the matches agree with these, -1 where with others, else 0."""
+    held, found = set(_held(partial)), {}
+    limit = config.incremental.triangulation.max_error_px
+    for (i, j), pair in problem.pairs.items():
+        if not {i, j} <= held or len(pair.matches) < _TELLING_MATCHES:
             continue
         scale = float(problem.scale[i])
-        fit = epipolar.sampson_errors(partial.estimate, (i, j), pair) < limit * scale
-        if fit.mean() > _AGREEING:
-            return None
-        focals = np.exp(partial.estimate.log_focals[partial.estimate.lens_of_camera[[i, j]]])
-        rotation, direction, num_fit = epipolar.relative_pose(pair, *focals.tolist(), limit * scale)
-        if num_fit < _CONSISTENT * len(pair.matches):
-            return None
-        if num_fit > best:
-            best, freed = num_fit, _beside(rest, view, (i, j), rotation, direction)
-    return None if freed is None else replace(freed, registered=partial.registered)
+        share = float((epipolar.sampson_errors(partial.estimate, (i, j), pair) < limit * scale).mean())
+        if share > _AGREEING:
+            found[i, j] = int(share > _DOUBTED_RATIO)
+            continue
+        num_fit = _relative(problem, partial, (i, j), config)[2]
+        found[i, j] = -int(num_fit >= _CONSISTENT * len(pair.matches))
+    return found
 
 
-def _beside(partial: PartialMap, view: int, pair: tuple[int, int], rotation: Array, direction: Array) -> PartialMap:
-    """The map with `view` by the pose of the second camera of `pair` in the first one, as far apart as they were."""
+def _relative(
+    problem: MappingProblem, partial: PartialMap, pair: tuple[int, int], config: mapper.Config
+) -> tuple[Array, Array, int]:
+    """The pose of the second view of `pair` in the first one, and how many matches agree, by these alone."""
+    i, j = pair
+    focals = np.exp(partial.estimate.log_focals[partial.estimate.lens_of_camera[[i, j]]])
+    limit = config.incremental.triangulation.max_error_px * float(problem.scale[i])
+    return epipolar.relative_pose(problem.pairs[pair], float(focals[0]), float(focals[1]), limit)
+
+
+def _beside(
+    problem: MappingProblem, partial: PartialMap, view: int, pair: tuple[int, int], config: mapper.Config
+) -> PartialMap:
+    """The map with `view` where the matches of `pair` alone place it, as far from the other view as it was."""
     estimate, (first, second) = partial.estimate, pair
+    rotation, direction, _ = _relative(problem, partial, pair, config)
     centres = bundle.centres(estimate)
     move = direction / np.linalg.norm(direction) * np.linalg.norm(centres[second] - centres[first])
     if view == second:
