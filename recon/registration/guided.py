@@ -66,38 +66,46 @@ def _along_lines(one: Keyframe, other: Keyframe, given: Given, pair: Pair) -> In
     pixel = longer_side(other.frame) / REFERENCE_SIDE / _focal(other)  # at REFERENCE_SIDE, at depth 1
     turned = float(np.hypot(*poses.sigmas[[i, j], 0]))
     band = np.clip(_SIGMAS * np.sqrt(2.0) * turned / pixel, _LEAST_PX, _WIDEST_PX) * pixel
-    along = _mutual(descriptors, lines, rays[1], band)
-    beside = [_mutual(descriptors, lines + [0.0, 0.0, aside * band], rays[1], band) for aside in _ASIDE]
+    along, *beside = _mutual(descriptors, lines, rays[1], band, (0.0, *_ASIDE))
     by_chance = max(map(len, beside))
     if len(along) < _BY_CHANCE * by_chance + _LEAST:
         return np.zeros((0, 2), np.int64)
     return np.stack([points[0][along[:, 0]], points[1][along[:, 1]]], 1)
 
 
-def _mutual(descriptors: Sequence[Float32], lines: Array, rays: Array, band: float) -> Index:
-    """(M, 2) features, each the other's nearest within `band` of the line, clearly nearer than the second nearest."""
+def _mutual(
+    descriptors: Sequence[Float32], lines: Array, rays: Array, band: float, moves: Sequence[float]
+) -> list[Index]:
+    """(M, 2) features, each the other's nearest within `band` of the line, clearly nearer than the second nearest.
+
+    For the lines as they are moved aside by each of `moves` bands.
+    """
     count, other = len(lines), len(rays)
-    nearest, distinct = np.full(count, -1), np.zeros(count, bool)
-    back_squared, back = np.full(other, np.inf, np.float32), np.full(other, -1)
     squared_norms = [(each**2).sum(1) for each in descriptors]
+    nearest, distinct = np.full((len(moves), count), -1), np.zeros((len(moves), count), bool)
+    back_squared, back = np.full((len(moves), other), np.inf, np.float32), np.full((len(moves), other), -1)
     for start in range(0, count, _ROWS):
         rows = slice(start, start + _ROWS)
-        squared = squared_norms[0][rows, None] + squared_norms[1] - 2.0 * descriptors[0][rows] @ descriptors[1].T
-        far = np.abs(lines[rows, :2] @ rays.T + lines[rows, 2:]) > band
-        squared[far] = np.inf
-        two = np.argpartition(squared, 1, axis=1)[:, :2]
-        values = np.take_along_axis(squared, two, 1)
-        first = values.argmin(1)
-        best, second = values.min(1), values.max(1)
-        nearest[rows] = np.where(np.isfinite(best), two[np.arange(len(two)), first], -1)
-        distinct[rows] = best < _RATIO**2 * second
-        least = squared.argmin(0)
-        values_back = squared[least, np.arange(other)]
-        nearer = values_back < back_squared
-        back_squared[nearer], back[nearer] = values_back[nearer], start + least[nearer]
-    (kept,) = np.nonzero(distinct & (nearest >= 0))
-    kept = kept[back[nearest[kept]] == kept]
-    return np.stack([kept, nearest[kept]], 1)
+        every = squared_norms[0][rows, None] + squared_norms[1] - 2.0 * descriptors[0][rows] @ descriptors[1].T
+        away = (lines[rows, :2] @ rays.T + lines[rows, 2:]).astype(np.float32)
+        numbers = np.arange(len(every))
+        for k, move in enumerate(moves):
+            squared = np.where(np.abs(away + np.float32(move * band)) > band, np.float32(np.inf), every)
+            least = squared.argmin(0)
+            values_back = squared[least, np.arange(other)]
+            nearer = values_back < back_squared[k]
+            back_squared[k, nearer], back[k, nearer] = values_back[nearer], start + least[nearer]
+            first = squared.argmin(1)
+            best = squared[numbers, first]
+            squared[numbers, first] = np.inf
+            nearest[k, rows] = np.where(np.isfinite(best), first, -1)
+            distinct[k, rows] = best < _RATIO**2 * squared.min(1)
+    found = []
+    for k in range(len(moves)):
+        (kept,) = np.nonzero(distinct[k] & (nearest[k] >= 0))
+        kept = kept[back[k, nearest[k, kept]] == kept]
+        found.append(np.stack([kept, nearest[k, kept]], 1))
+    return found
 
 
 def _joined(known: TwoView | None, matches: Index, one: Keyframe, other: Keyframe) -> TwoView:
