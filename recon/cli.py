@@ -38,14 +38,14 @@ from splatnode.recon.evaluate.timing import untimed
 from splatnode.recon.evaluate.truth import load_scene
 from splatnode.recon.jobs.calls import engine as opened
 from splatnode.recon.mapping.command import replay_map
-from splatnode.recon.metric.arguments import metric_changes
+from splatnode.recon.metric.arguments import metric_changes, trusts_poses
 from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.metric.stereo_pairs import pairs_of, rights_in
 from splatnode.recon.offline import check_baseline, reconstructed, run, shown_to_nobody, with_looks
 from splatnode.recon.rasterize import device
 from splatnode.recon.rasterize.device import Device
 from splatnode.recon.rasterize.dispatch import rasterizer
-from splatnode.recon.replay_source import Request, Source, asked_for, source
+from splatnode.recon.replay_source import Request, Source, asked_for, source, with_poses
 from splatnode.recon.result import bounds_in_words
 from splatnode.recon.result.export.manifest import LIVE_PICTURE
 from splatnode.recon.result.folder import result_folder
@@ -88,6 +88,9 @@ def _replay(args: argparse.Namespace, request: Request, config: Config, tell: Te
         say(taken, error=True)
     check_baseline(config, given)
     known = _known_of_metres(args, given)
+    if known.poses is not None and trusts_poses(args):
+        given = with_poses(given, known.poses, config.metric.poses_sigma_m, config.metric.poses_sigma_deg)
+        known = replace(known, poses=None)  # they are the photographs' own now
     needed_bytes = largest_result_bytes(given.sizes, config.size, config.most_gaussians) + given.further_bytes
     with result_folder(args.out, needed_bytes), _viewer(args) as show:
         config = with_looks(config, LOOK_EVERY) if args.view else config
@@ -242,6 +245,8 @@ def _config(args: argparse.Namespace) -> Config:
     if args.prior is not None and args.prior != config.prior.kind:
         config = overlaid(config, {"prior": {"kind": args.prior}})
     config = overlaid(config, {"metric": metric_changes(args)})
+    if trusts_poses(args):
+        config = overlaid(config, {"registration": {"trust_poses": True}})
     flags = {
         "size": args.size,
         "device": args.device,

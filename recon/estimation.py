@@ -15,23 +15,29 @@ from splatnode.recon.matching.view_graph import ViewGraph
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior, without_hidden
 from splatnode.recon.registration import continuation
+from splatnode.recon.registration.hand_eye import offset_of
+from splatnode.recon.registration.inliers import pooled_ratio
+from splatnode.recon.registration.known_poses import GivenWorld, Offset
+from splatnode.recon.registration.posed import register_posed
 from splatnode.recon.registration.register import Registration, register
 from splatnode.recon.registration.straightened import straightened
 from splatnode.recon.result.bounds import Bounds
 from splatnode.recon.result.landmarks import Landmarks
-from splatnode.recon.result.verdict import Verdict
+from splatnode.recon.result.verdict import SURE, Verdict
 from splatnode.recon.verification.claims import claims, shaped
 from splatnode.recon.verification.decision import decide, refuse_before_registration
 from splatnode.recon.verification.evidence import Evidence
 from splatnode.recon.verification.fitted import FITTED
-from splatnode.recon.verification.input_kinds import explain_refusal
+from splatnode.recon.verification.input_kinds import explain_refusal, refuse_stereo_or_panorama
 from splatnode.recon.verification.likelihood import record, weigh
+from splatnode.recon.verification.posed import decide_posed, posed_bounds
 from splatnode.recon.verification.verify import verify, verify_further
 
 # Points of a further camera that two others see, from which a provisional estimate places it; frames of another place
 # that were taken for this one had up to 20.
 MIN_CONFIRMED_POINTS = 50
 PROVISIONALLY_WIDER = 2.0  # factor of a provisional estimate's bounds, whose sources are quick or taken over
+LEAST_FITTING = 0.5  # share of all matches that fit given poses, below which these may be wrong together
 _NOTHING = 1e-6  # share of a keyframe that rounding leaves
 PROVISIONAL = "Provisional: checked again with all evidence when the camera rests."
 
@@ -47,6 +53,7 @@ class Conclusion:
     landmarks: Landmarks | None = None  # of a scene that is to be saved
     masked: Mapping[str, float] = field(default_factory=dict)  # share that a mask hides, by keyframe that has one
     moving: Mapping[str, float] = field(default_factory=dict)  # share that was found to move, by keyframe
+    given: GivenWorld | None = None  # the world of given poses that hold the cameras; None: none do
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +69,13 @@ class Estimate:
     @property
     def publishable(self) -> bool:
         """Whether there are cameras, verified, that may be published."""
-        return self.verdict.publishable and self.registration is not None and self.evidence is not None
+        held = self.evidence is not None or self.given is not None
+        return self.verdict.publishable and self.registration is not None and held
+
+    @property
+    def given(self) -> GivenWorld | None:
+        """The world of given poses that hold the cameras; None where none do."""
+        return None if self.registration is None else self.registration.given
 
     @property
     def bounds(self) -> Mapping[str, Bounds]:
@@ -70,6 +83,8 @@ class Estimate:
 
         A provisional estimate claims less, so that what is known in the end is not less than was claimed before.
         """
+        if self.registration is not None and self.registration.given is not None:
+            return posed_bounds(self.graph, self.registration, self.registration.given)
         if self.registration is None or self.evidence is None:
             return {}
         names, cameras = self.graph.names, self.registration.cameras
@@ -92,7 +107,8 @@ class Estimate:
         stamps = {keyframe.name: keyframe.frame.captured_at for keyframe in self.graph.keyframes}
         known = {name: stamp for name, stamp in stamps.items() if stamp is not None}
         masked, moving = self._hidden
-        return Conclusion(self.verdict, self.bounds, self.evidence_record, known, masked=masked, moving=moving)
+        told = self.verdict, self.bounds, self.evidence_record, known
+        return Conclusion(*told, masked=masked, moving=moving, given=self.given)
 
     @property
     def _hidden(self) -> tuple[dict[str, float], dict[str, float]]:
@@ -134,8 +150,22 @@ def estimate_cameras(
 ) -> Estimate:
     """Registers the keyframes of a complete view graph, verifies the cameras, and decides whether they are published.
 
-    There is no registration where it would be of no use. `pause` is called about once a second and may raise.
+    There is no registration where it would be of no use. With trusted poses, those that the images do not contradict
+    hold the cameras. `pause` is called about once a second and may raise.
     """
+    posed = _held_by_poses(graph, config, pause)
+    if posed is not None and not _contradicted(posed):
+        return posed
+    alone = _by_images_alone(graph, rejected, config, pause)
+    if posed is None or alone.verdict.code in SURE:
+        return _without_offset(alone, config, pause) or alone
+    return posed
+
+
+def _by_images_alone(
+    graph: ViewGraph, rejected: Sequence[Rejected], config: Config, pause: Callable[[], None]
+) -> Estimate:
+    """As `estimate_cameras`, whatever poses are given."""
     refusal = refuse_before_registration(graph, rejected, config.decision)
     if refusal is not None:
         return Estimate(graph, None, None, explain_refusal(refusal, graph))
@@ -145,6 +175,40 @@ def estimate_cameras(
     give_back_memory()
     verdict = explain_refusal(decide(graph, registration, evidence, config.decision), graph)
     return Estimate(graph, registration, evidence, verdict)
+
+
+def _held_by_poses(
+    graph: ViewGraph, config: Config, pause: Callable[[], None], offset: Offset | None = None
+) -> Estimate | None:
+    """The estimate whose cameras given poses hold; None where they are not trusted, or cannot hold any.
+
+    `offset` is taken out of all poses.
+    """
+    if not config.registration.trust_poses or refuse_stereo_or_panorama(graph.keyframes) is not None:
+        return None
+    registration = register_posed(graph.keyframes, graph.pairs, config.registration, pause, offset)
+    give_back_memory()
+    if registration is None or registration.given is None:
+        return None
+    return Estimate(graph, registration, None, decide_posed(graph, registration, registration.given, config.decision))
+
+
+def _contradicted(posed: Estimate) -> bool:
+    """Whether so few matches fit that the poses may be wrong together: then no single one stands out."""
+    if posed.registration is None or not posed.graph.pairs:
+        return False
+    ratios = posed.registration.inlier_ratios
+    known = {pair: ratio for pair, ratio in ratios.items() if pair in posed.graph.pairs}
+    return bool(known) and pooled_ratio(known, posed.graph.pairs) < LEAST_FITTING
+
+
+def _without_offset(alone: Estimate, config: Config, pause: Callable[[], None]) -> Estimate | None:
+    """The estimate held by given poses without what is wrong with all of them alike; None where nothing is."""
+    if not config.registration.trust_poses or alone.registration is None or not alone.verdict.publishable:
+        return None
+    offset = offset_of(alone.graph.keyframes, alone.registration)
+    posed = None if offset is None else _held_by_poses(alone.graph, config, pause, offset)
+    return None if posed is None or _contradicted(posed) else posed
 
 
 def estimate_depth(

@@ -25,7 +25,7 @@ from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.rasterize.device import chosen
 from splatnode.recon.registration.straightened import straightened
 from splatnode.recon.result.consistent_depth import with_consistent_depth
-from splatnode.recon.result.snapshot import GaussianArrays, Snapshot
+from splatnode.recon.result.snapshot import GaussianArrays, InGivenWorld, Snapshot
 from splatnode.recon.result.verdict import Verdict
 from splatnode.recon.scene import denied, growth, light
 from splatnode.recon.scene.first_look import first_look
@@ -172,6 +172,7 @@ def snapshot(
         final=final,
         served_by=scene.served_by if scene else {},
         evidence=conclusion.evidence_record,
+        given=_in_given_world(conclusion) if scene and final else None,
         landmarks=conclusion.landmarks if scene and final else None,
         depths=_confirmed(scene) if scene and final else {},
         masked=conclusion.masked,
@@ -180,6 +181,13 @@ def snapshot(
         falloffs=_falloffs(scene) if scene else {},
     )
     return replace(made, verdict=with_consistent_depth(verdict, made.consistent_depth, config.consistent_depth))
+
+
+def _in_given_world(conclusion: Conclusion) -> InGivenWorld | None:
+    given = conclusion.given
+    if given is None:
+        return None
+    return InGivenWorld(given.scale, given.rotation, given.translation, given.scale_sigma, len(given.held))
 
 
 def _falloffs(scene: Scene) -> dict[str, float]:

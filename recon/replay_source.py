@@ -7,18 +7,20 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 
 from splatnode.capture import film
 from splatnode.capture.cameras import folder
 from splatnode.capture.choosing import THINNED, Choice, choose
 from splatnode.capture.frame import DroppedFrame, Frame
 from splatnode.capture.given_lens import Lenses, describe_image
+from splatnode.capture.given_pose import given_pose
 from splatnode.capture.image_file import encode_png
 from splatnode.capture.lerobot import data_set
 from splatnode.capture.masks import Find, all_masked, in_files
@@ -27,6 +29,8 @@ from splatnode.capture.process.progress import Tell, counted, told_to_nobody
 from splatnode.capture.quality import Limits
 from splatnode.capture.selection import Config
 from splatnode.recon.config import Config as Reconstruction
+
+Array = npt.NDArray[np.float64]
 
 ALL = 30  # photographs of a folder that are all used; of more, keyframes are chosen
 MOST = 60  # keyframes of a video, or of a folder of more photographs
@@ -168,6 +172,20 @@ def with_lenses(given: Source, lenses: Lenses) -> Source:
     """Returns the frames, each with its lens. Raises ValueError where a lens is of none of them."""
     lenses.check(describe_image(each) for each in given.frames if isinstance(each, Frame))
     return replace(given, frames=tuple(map(lenses.apply, given.frames)))
+
+
+def with_poses(given: Source, poses: Mapping[str, Array], sigma_m: float, sigma_deg: float) -> Source:
+    """The frames, each with its pose of `poses` (4, 4), metres, by their names, and its sigmas. Raises ValueError."""
+
+    def posed(frame: Frame | DroppedFrame) -> Frame | DroppedFrame:
+        if not isinstance(frame, Frame) or frame.name not in poses:
+            return frame
+        try:
+            return replace(frame, given_pose=given_pose(poses[frame.name], sigma_m, sigma_deg))
+        except ValueError as error:
+            raise ValueError(f"{printable_name(frame.name)}: {error}") from error
+
+    return replace(given, frames=tuple(map(posed, given.frames)))
 
 
 def with_masks(given: Source, find: Find, tell: Tell = told_to_nobody) -> Source:

@@ -26,8 +26,11 @@ struct Bundle {
     const double* pixels;                                        // (O, 2)
     // (G, 6) means of the lens parameters and their information (6 G, 6 G); a diagonal element of 0 fixes a parameter.
     const double *prior_means, *prior_information;
-    int32_t num_cameras, num_lenses, num_points, fixed_camera;
+    int32_t num_cameras, num_lenses, num_points, fixed_camera;  // fixed_camera -1: given poses hold all of them
     double robust_squared;
+    // Given poses, world to camera: rotations (C, 3, 3), centres (C, 3), and the information (C, 2) of a turn about each
+    // axis and of a position in each direction; 0: nothing is given.
+    const double *given_rotations, *given_centres, *given_information;
 };
 
 struct Projection {
@@ -89,6 +92,42 @@ inline bool is_free(const Bundle& bundle, int parameter) {
     return bundle.prior_information[size_t(parameter) * (kLens * bundle.num_lenses) + parameter] > 0;
 }
 
+// How far a camera is from its given pose, in its own axes: the turn (3) and the shift (3), and what they depend on.
+struct PoseDeviation {
+    double turn[3], shift[3], seen[3];  // seen: the given centre from the camera's origin of translation, R c
+
+    PoseDeviation(const Bundle& bundle, int camera) {
+        const double *rotation = bundle.rotations + 9 * camera, *given = bundle.given_rotations + 9 * camera;
+        double by[3][3];
+        for (int i = 0; i < 3; ++i) {
+            for (int j = 0; j < 3; ++j) {
+                by[i][j] = 0;
+                for (int k = 0; k < 3; ++k) by[i][j] += rotation[3 * i + k] * given[3 * j + k];
+            }
+            seen[i] = 0;
+            for (int k = 0; k < 3; ++k) seen[i] += rotation[3 * i + k] * bundle.given_centres[3 * camera + k];
+            shift[i] = seen[i] + bundle.translations[3 * camera + i];
+        }
+        const double half[3] = {(by[2][1] - by[1][2]) / 2, (by[0][2] - by[2][0]) / 2, (by[1][0] - by[0][1]) / 2};
+        const double sine = std::sqrt(half[0] * half[0] + half[1] * half[1] + half[2] * half[2]);
+        const double angle = std::atan2(sine, (by[0][0] + by[1][1] + by[2][2] - 1) / 2);
+        const double factor = sine < 1e-12 ? 1.0 : angle / sine;
+        for (int i = 0; i < 3; ++i) turn[i] = factor * half[i];
+    }
+};
+
+static double pose_cost(const Bundle& bundle) {
+    double cost = 0;
+    for (int camera = 0; camera < bundle.num_cameras; ++camera) {
+        const double* information = bundle.given_information + 2 * camera;
+        if (!(information[0] > 0 || information[1] > 0)) continue;
+        const PoseDeviation d(bundle, camera);
+        for (int i = 0; i < 3; ++i)
+            cost += information[0] * d.turn[i] * d.turn[i] + information[1] * d.shift[i] * d.shift[i];
+    }
+    return cost;
+}
+
 static double total_cost(const Bundle& bundle) {
     std::vector<double> costs(kChunks, 0.0);
     run_parallel(kChunks, [&](int chunk, int) {
@@ -104,7 +143,7 @@ static double total_cost(const Bundle& bundle) {
     });
     double cost = 0;
     for (const double value : costs) cost += value;
-    return cost + LensPriors(bundle).cost();
+    return cost + LensPriors(bundle).cost() + pose_cost(bundle);
 }
 
 // Derivatives of a residual (2) by its camera's pose and lens (12) and by its point (3), and its weight.

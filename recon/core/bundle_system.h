@@ -152,6 +152,32 @@ void eliminate(const Bundle& bundle, int point, double damping, System& system, 
     reduce(inverse, right, num_columns, system.size, sums);
 }
 
+// What a given pose says of its camera. Turns are small, so that a turn's deviation changes as the turn itself does.
+void add_given_pose(const Bundle& bundle, int camera, double damping, System& system) {
+    const double of_turn = bundle.given_information[2 * camera], of_shift = bundle.given_information[2 * camera + 1];
+    if (!(of_turn > 0 || of_shift > 0)) return;
+    const PoseDeviation d(bundle, camera);
+    const double *q = d.seen, *shift = d.shift;
+    // A turn by w moves R c by w x R c: this by its columns.
+    const double by_turn[3][3] = {{0, q[2], -q[1]}, {-q[2], 0, q[0]}, {q[1], -q[0], 0}};
+    for (int i = 0; i < 3; ++i) {
+        double* of_rotation = &system.matrix[size_t(kPose * camera + i) * system.size + kPose * camera];
+        double* of_translation = &system.matrix[size_t(kPose * camera + 3 + i) * system.size + kPose * camera];
+        double pull = of_turn * d.turn[i];
+        for (int j = 0; j < 3; ++j) {
+            double product = 0;
+            for (int k = 0; k < 3; ++k) product += by_turn[k][i] * by_turn[k][j];
+            if (j <= i) of_rotation[j] += of_shift * product;
+            if (j == i) of_rotation[j] += of_turn + (of_shift * product + of_turn) * damping;
+            of_translation[j] += of_shift * by_turn[i][j];
+            pull += of_shift * by_turn[j][i] * shift[j];
+        }
+        of_translation[3 + i] += of_shift * (1 + damping);
+        system.gradient[kPose * camera + i] += pull;
+        system.gradient[kPose * camera + 3 + i] += of_shift * shift[i];
+    }
+}
+
 void assemble(const Bundle& bundle, double damping, System& system) {
     const int size = system.size;
     run_parallel(kChunks, [&](int chunk, int) {
@@ -187,6 +213,7 @@ void assemble(const Bundle& bundle, double damping, System& system) {
         row[i] += information[i] * damping;
         system.gradient[first + i] += priors.pull[i];
     }
+    for (int camera = 0; camera < bundle.num_cameras; ++camera) add_given_pose(bundle, camera, damping, system);
 }
 
 }  // namespace

@@ -44,7 +44,15 @@ def add_poses(parser: argparse.ArgumentParser) -> None:
         "--poses-sigma",
         type=_two_sigmas,
         metavar="METRES,DEGREES",
-        help="how unsure each pose is: the standard deviation of its position and of its orientation (default: 0.01,2)",
+        help="how unsure each pose is: the standard deviation of its position and of its orientation, absolute in the "
+        "poses' world. With a lens that is told (--intrinsics) the poses then hold the cameras, also where photographs "
+        "share no matches; poses that the photographs contradict are named and let go",
+    )
+    parser.add_argument(
+        "--poses-only-check",
+        action="store_true",
+        help="only compare the poses with the cameras that the photographs alone tell, and take metres and axes from "
+        "them, as without --poses-sigma",
     )
 
 
@@ -76,6 +84,11 @@ def _two_sigmas(text: str) -> tuple[float, float]:
     return metres, degrees
 
 
+def trusts_poses(args: argparse.Namespace) -> bool:
+    """Whether the given poses hold the cameras: who says how unsure they are trusts them so far."""
+    return args.poses_sigma is not None and not args.poses_only_check
+
+
 def metric_changes(args: argparse.Namespace) -> dict[str, Any]:
     """What of the configuration's `metric` these arguments set. Raises ValueError."""
     changes: dict[str, Any] = {}
@@ -89,6 +102,8 @@ def metric_changes(args: argparse.Namespace) -> dict[str, Any]:
         changes |= _measured("stereo", args.stereo_baseline)
     if args.poses_sigma is not None and args.poses is None:
         raise ValueError("--poses-sigma is of --poses FILE, which is not given: how unsure are which poses?")
+    if args.poses_only_check and args.poses is None:
+        raise ValueError("--poses-only-check is of --poses FILE, which is not given: which poses are to be checked?")
     if args.poses_sigma is not None:
         changes["poses_sigma_m"], changes["poses_sigma_deg"] = args.poses_sigma
     return changes

@@ -24,7 +24,7 @@ from splatnode.recon.networks.depth_anything import load_metric
 from splatnode.recon.result.bounds_in_words import rounded_up
 from splatnode.recon.result.placement import Placement
 from splatnode.recon.result.scale import Scale, sentences
-from splatnode.recon.result.snapshot import Snapshot
+from splatnode.recon.result.snapshot import InGivenWorld, Snapshot
 
 # Of the scene's size: a grid as coarse as its coordinates may be. A render then has 40 dB against the same elsewhere.
 MOST_STEP = 1e-3
@@ -68,7 +68,11 @@ def _said(snapshot: Snapshot, config: Config, evidence: Evidence) -> tuple[list[
     if config.marker_m is not None:
         said += by_markers(views_of(snapshot), evidence.sightings, config.marker_m, config.marker_sigma_m)
     aligned = None
-    if evidence.poses is not None or evidence.tracked:
+    if snapshot.given is not None:
+        found = _by_held(snapshot, snapshot.given)
+        aligned = None if isinstance(found, str) else found
+        said.append(found if isinstance(found, str) else found.unit)
+    elif evidence.poses is not None or evidence.tracked:
         given = evidence.poses or {}  # which are meant where the photographs came with others
         tracked = {name: pose for name, pose in evidence.tracked.items() if name not in given}
         poses = {**{name: pose.matrix for name, pose in tracked.items()}, **given}
@@ -85,6 +89,17 @@ def _said(snapshot: Snapshot, config: Config, evidence: Evidence) -> tuple[list[
     if config.network:
         said.append(_by_the_network(snapshot, config.network_sigma))
     return said, aligned
+
+
+def _by_held(snapshot: Snapshot, given: InGivenWorld) -> Aligned | str:
+    """What the poses that hold the cameras tell: the world that these are in already, but for its unit and place."""
+    to_world = Similarity(given.scale, given.rotation, given.translation)
+    centre = np.stack([camera.T_world_camera[:3, 3] for camera in snapshot.cameras]).mean(0)
+    unit = Measurement(
+        given.scale, given.scale_sigma, f"poses of {given.num_poses} photographs, which hold the cameras"
+    )
+    aligned = Aligned(unit, to_world, centre, ())
+    return _too_far(snapshot, aligned) or aligned
 
 
 def _too_far(snapshot: Snapshot, aligned: Aligned) -> str:
@@ -133,5 +148,6 @@ def _placed(snapshot: Snapshot, by: Similarity) -> Snapshot:
         cameras=tuple(map(placement.camera, snapshot.cameras)),
         gaussians=placement.gaussians(snapshot.gaussians),
         landmarks=landmarks,
+        given=None,
         depths={name: (depth * factor).astype(np.float16) for name, depth in snapshot.depths.items()},
     )

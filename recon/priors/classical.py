@@ -16,7 +16,7 @@ from splatnode.recon.priors import stereo
 from splatnode.recon.priors.consistency import DepthMap
 from splatnode.recon.priors.pointmap import Pointmap
 from splatnode.recon.priors.prior import Prior
-from splatnode.recon.priors.registered_camera import modelled_K, sparse_points
+from splatnode.recon.priors.registered_camera import modelled_K, searched_depths, sparse_points
 from splatnode.recon.registration.register import Registration
 
 
@@ -81,7 +81,7 @@ class ClassicalPrior(Prior):
         for camera in registration.cameras:
             keyframe = graph.keyframes[camera.index]
             points = sparse_points(registration, camera, keyframe.scale)
-            near, far = stereo.depth_range(points.depths)
+            near, far = searched_depths(registration, camera, points)
             near_far = (near, self._config.far_margin * far)
             K, T_world_camera = modelled_K(graph, camera), camera.T_world_camera
             views.append(stereo.StereoView(keyframe.image, K, T_world_camera, near_far, keyframe.name))

@@ -8,6 +8,7 @@ covariance.
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -33,6 +34,35 @@ _MIN_EIGENVALUE = 1e-14  # of the information at unit curvature: what is flatter
 
 
 @dataclass(frozen=True, eq=False)
+class GivenPoses:
+    """Poses of C cameras that are known within sigmas: Gaussian priors, each independent of the others."""
+
+    rotations: Array  # (C, 3, 3) world to camera
+    centres: Array  # (C, 3) world
+    sigmas: Array  # (C, 2) of a turn about each axis, radians, and of a position in each direction; inf: not known
+
+    @property
+    def information(self) -> Array:
+        """(C, 2)"""
+        return 1.0 / self.sigmas**2
+
+    @property
+    def known(self) -> npt.NDArray[np.bool_]:
+        """(C,) whether a pose holds its camera."""
+        return np.asarray(np.isfinite(self.sigmas).all(1))
+
+    def without(self, cameras: Sequence[int]) -> GivenPoses:
+        """Those of these cameras hold nothing any more."""
+        sigmas = self.sigmas.copy()
+        sigmas[list(cameras)] = np.inf
+        return replace(self, sigmas=sigmas)
+
+    def relabelled(self, old: Index) -> GivenPoses:
+        """Camera i has the pose of camera `old[i]`."""
+        return GivenPoses(self.rotations[old], self.centres[old], self.sigmas[old])
+
+
+@dataclass(frozen=True, eq=False)
 class Problem:
     """C cameras, G lenses (each shared by a group of cameras), P points and O observations of them."""
 
@@ -47,6 +77,7 @@ class Problem:
     point_of: Index  # (O,)
     pixels: Array  # (O, 2) relative to the nominal principal point
     log_aspects: Array | None = None  # (G,) log of the focal length down over that across; None: pixels are square
+    given: GivenPoses | None = None  # what holds the cameras; None: nothing, so that one of them is fixed
 
     @property
     def aspects(self) -> Array:
@@ -254,12 +285,17 @@ def covariance(problem: Problem, prior: LensPrior, config: Config, fixed_camera:
     information = np.empty((_POSE * count + _LENS * num_lenses,) * 2)
     library().core_bundle_information(ctypes.byref(native), pointer(information))
     free = np.ones(len(information), bool)
-    free[_POSE * fixed_camera : _POSE * (fixed_camera + 1)] = False
-    free[_POSE * count :] = prior.free.ravel()
     observed = np.bincount(problem.camera_of, minlength=count) > 0
+    scaled = np.zeros(len(information))
+    if problem.given is None:
+        free[_POSE * fixed_camera : _POSE * (fixed_camera + 1)] = False
+        scaled = _scale_direction(problem, fixed_camera)
+    else:
+        observed |= problem.given.known
+    free[_POSE * count :] = prior.free.ravel()
     free[: _POSE * count] &= np.repeat(observed, _POSE)
     (kept,) = np.nonzero(free)
-    inverse = _gauge_free_inverse(information[np.ix_(kept, kept)], _scale_direction(problem, fixed_camera)[kept])
+    inverse = _gauge_free_inverse(information[np.ix_(kept, kept)], scaled[kept])
     full = np.zeros_like(information)
     full[np.ix_(kept, kept)] = inverse * config.noise_px**2
     return Covariance(
@@ -325,6 +361,7 @@ class _Native(ctypes.Structure):
         *((name, ctypes.c_void_p) for name in ("prior_means", "prior_information")),
         *((name, ctypes.c_int32) for name in ("num_cameras", "num_lenses", "num_points", "fixed_camera")),
         ("robust_squared", ctypes.c_double),
+        *((name, ctypes.c_void_p) for name in ("given_rotations", "given_centres", "given_information")),
     )
 
 
@@ -343,11 +380,24 @@ def _native(
         *(np.ascontiguousarray(values, dtype=np.int32) for values in indices),
         *(np.ascontiguousarray(values, dtype=np.float64) for values in observed),
     ]
+    held = _held_by(problem, config)
     native = _Native(
         *(pointer(array) for array in arrays),
-        len(problem.rotations), len(problem.log_focals), len(problem.points), fixed_camera, config.robust_px**2,
+        len(problem.rotations), len(problem.log_focals), len(problem.points),
+        fixed_camera if problem.given is None else -1, config.robust_px**2,
+        *(pointer(array) for array in held),
     )  # fmt: skip
-    return native, arrays
+    return native, [*arrays, *held]
+
+
+def _held_by(problem: Problem, config: Config) -> list[Array]:
+    """Rotations, centres and information of the given poses, as the core reads them; 0 where nothing is given."""
+    if problem.given is None:
+        count = len(problem.rotations)
+        return [np.zeros((count, 3, 3)), np.zeros((count, 3)), np.zeros((count, 2))]
+    given = problem.given
+    values = given.rotations, given.centres, config.noise_px**2 * given.information
+    return [np.ascontiguousarray(each, dtype=np.float64) for each in values]
 
 
 def _safe_depth(depth: Array) -> Array:

@@ -154,9 +154,11 @@ def _adjust_and_filter(problem: MappingProblem, partial: PartialMap, config: Con
 
 
 def _all_observed(estimate: bundle.Problem, registered: Sequence[int]) -> bool:
-    """Whether every registered camera has enough observations for its pose."""
-    counts = np.bincount(estimate.camera_of, minlength=len(estimate.rotations))
-    return bool((counts[list(registered)] >= _MIN_OBSERVATIONS).all())
+    """Whether every registered camera has enough observations for its pose, or a given pose that holds it."""
+    enough = np.bincount(estimate.camera_of, minlength=len(estimate.rotations)) >= _MIN_OBSERVATIONS
+    if estimate.given is not None:
+        enough |= estimate.given.known
+    return bool(enough[list(registered)].all())
 
 
 def _errors(problem: MappingProblem, estimate: bundle.Problem) -> Array:

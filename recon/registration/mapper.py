@@ -66,6 +66,7 @@ class Map:
             rotations=self.estimate.rotations[old],
             translations=self.estimate.translations[old],
             lens_of_camera=self.estimate.lens_of_camera[old],
+            given=None if self.estimate.given is None else self.estimate.given.relabelled(old),
             camera_of=new[self.estimate.camera_of],
         )
         ratios = {
@@ -251,7 +252,7 @@ def as_map(problem: MappingProblem, finished: finishing.Finished, max_error_px: 
         prior=partial.prior,
         loss=finished.loss,
         inlier_ratios=inliers.inlier_ratios(problem, partial, max_error_px),
-        median_angle_deg=float(np.median(angles)),
+        median_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
         rms_px=finished.rms_px,
         num_common=num_common,
     )

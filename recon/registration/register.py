@@ -11,11 +11,12 @@ import numpy.typing as npt
 from splatnode.recon.frames.keyframe import Keyframe, content_key, longer_side, principal_point
 from splatnode.recon.geometry import without_distortion
 from splatnode.recon.matching.two_view import TwoView
-from splatnode.recon.registration import bundle, lenses, mapper, own_lenses, uncertainty
+from splatnode.recon.registration import bundle, known_poses, lenses, mapper, own_lenses, uncertainty
 from splatnode.recon.registration.config import Config
+from splatnode.recon.registration.known_poses import GivenWorld
 from splatnode.recon.registration.lenses import Grouping
 from splatnode.recon.registration.mapping_problem import View
-from splatnode.recon.registration.patch_image import patch_image
+from splatnode.recon.registration.patch_image import PatchImage, patch_image
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.int64]
@@ -67,6 +68,7 @@ class Registration:
     focal_sigma: float  # of the logarithm of the least certain focal length; infinite where nothing is known
     median_angle_deg: float  # of the points' triangulation angles
     rms_px: float  # of the observations' errors, pixels at REFERENCE_SIDE
+    given: GivenWorld | None = None  # the world of given poses that held cameras; None: none did
 
 
 def register(
@@ -82,23 +84,28 @@ def register(
     """
     if not pairs:
         return None
-    order = sorted(range(len(keyframes)), key=lambda index: content_key(keyframes[index]))
+    order = in_order_of_content(keyframes)
     ordered = [keyframes[index] for index in order]
     rank = np.argsort(order)
-    built = _build(ordered, _relabelled(pairs, rank), config, pause)
+    built = _build(ordered, relabelled(pairs, rank), config, pause)
     if built is None:
         return None
     found, grouping = built
     return in_first_camera(found.relabelled(order), keyframes, [grouping.scales[i] for i in rank], config)
 
 
-def _relabelled(pairs: Mapping[tuple[int, int], TwoView], new: Index) -> dict[tuple[int, int], TwoView]:
+def in_order_of_content(keyframes: Sequence[Keyframe]) -> list[int]:
+    """Positions of the keyframes in the order in which they are registered, which is not that of their arrival."""
+    return sorted(range(len(keyframes)), key=lambda index: content_key(keyframes[index]))
+
+
+def relabelled(pairs: Mapping[tuple[int, int], TwoView], new: Index) -> dict[tuple[int, int], TwoView]:
     """The pairs, sorted, with keyframes relabelled: keyframe i becomes keyframe `new[i]`."""
-    relabelled = {}
+    found = {}
     for (i, j), pair in pairs.items():
         first, second = int(new[i]), int(new[j])
-        relabelled[min(first, second), max(first, second)] = pair if first < second else pair.swapped()
-    return dict(sorted(relabelled.items()))
+        found[min(first, second), max(first, second)] = pair if first < second else pair.swapped()
+    return dict(sorted(found.items()))
 
 
 def _build(
@@ -126,14 +133,19 @@ def _map(
     pause: Callable[[], None],
 ) -> mapper.Map | None:
     """The map of keyframes with the lenses of `grouping`, in the pixels of these."""
-    settings = config.mapper.finishing.subpixel.patch_image
-    images = [
-        patch_image(keyframe.frame.image, principal_point(keyframe.frame), settings).of_resized(grouping.scales[i])
-        for i, keyframe in enumerate(keyframes)
-    ]
+    images = patch_images(keyframes, grouping, config)
     known = lenses.candidates(keyframes, grouping, pairs, config.lenses)
     views, scaled = views_of(keyframes, grouping), in_lens_pixels(pairs, grouping)
     return mapper.build_map(views, known, scaled, config.mapper, images, pause)
+
+
+def patch_images(keyframes: Sequence[Keyframe], grouping: Grouping, config: Config) -> list[PatchImage]:
+    """The keyframes' images in the pixels of their lenses, by which observations become exact."""
+    settings = config.mapper.finishing.subpixel.patch_image
+    return [
+        patch_image(keyframe.frame.image, principal_point(keyframe.frame), settings).of_resized(grouping.scales[i])
+        for i, keyframe in enumerate(keyframes)
+    ]
 
 
 def views_of(keyframes: Sequence[Keyframe], grouping: Grouping) -> list[View]:
@@ -165,8 +177,7 @@ def in_first_camera(
     sides = np.array([scale * longer_side(k.frame) for scale, k in zip(scales, keyframes, strict=True)])
     doubted, prior = own_lenses.uncertain(estimate, found.prior, sides, config.mapper.own_lenses)
     covariance = bundle.covariance(doubted, prior, found.loss, found.views[0])
-    _, depths = bundle.project(estimate)
-    unit = 1.0 / max(float(np.median(depths)), _MIN_DEPTH)
+    unit = 1.0 / max(known_poses.distance(estimate, order), _MIN_DEPTH)
     rotation0, translation0 = estimate.rotations[order[0]], estimate.translations[order[0]]
     rotation_sigmas, centre_sigmas = uncertainty.camera_sigmas(estimate, covariance, order)
     covariances = unit**2 * rotation0 @ uncertainty.centre_covariances(estimate, covariance, order) @ rotation0.T

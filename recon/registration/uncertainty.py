@@ -78,7 +78,7 @@ def _errors(problem: bundle.Problem, covariance: bundle.Covariance, registered: 
     count = len(members)
     if not all(np.isfinite(values).all() for values in (joint, rotations, translations)):
         return None
-    turns, moves = _by_pose(rotations, translations)
+    turns, moves = by_pose(rotations, translations)
     centres = np.stack([-R.T @ t for R, t in zip(rotations, translations, strict=True)])
     centred = centres - centres.mean(0)
     spread = max(float(np.sqrt((centred**2).sum(1).mean())), _MIN_SPREAD)
@@ -90,7 +90,7 @@ def _errors(problem: bundle.Problem, covariance: bundle.Covariance, registered: 
     return _Errors(joint, turns, moves, spread)
 
 
-def _by_pose(rotations: Array, translations: Array) -> tuple[Array, Array]:
+def by_pose(rotations: Array, translations: Array) -> tuple[Array, Array]:
     """Derivatives (3 C, 6 C) of the orientations and centres in the world by the poses' parameters."""
     count = len(rotations)
     turns, moves = np.zeros((3 * count, 6 * count)), np.zeros((3 * count, 6 * count))

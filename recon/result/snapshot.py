@@ -17,6 +17,7 @@ from splatnode.recon.result.up import Up
 from splatnode.recon.result.verdict import Verdict
 
 Array = npt.NDArray[np.float32]
+Array64 = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +70,17 @@ class GaussianArrays:
 
 
 @dataclass(frozen=True, eq=False)
+class InGivenWorld:
+    """How a scene lies in the world of the given poses that held its cameras: scale * rotation @ p + translation."""
+
+    scale: float  # metres per unit
+    rotation: Array64  # (3, 3)
+    translation: Array64  # (3,) metres
+    scale_sigma: float  # standard deviation of the logarithm of the scale
+    num_poses: int  # that hold it
+
+
+@dataclass(frozen=True, eq=False)
 class Snapshot:
     """The scene after a step of the reconstruction. The world is the first camera's frame, or that of given poses."""
 
@@ -85,6 +97,7 @@ class Snapshot:
     served_by: Mapping[str, str] = field(default_factory=dict)  # network or measure, by regularisation that was used
     evidence: Mapping[str, object] | None = None  # recon.verification.likelihood.record; None: nothing to verify
     scale: Scale = RELATIVE  # the unit of all lengths
+    given: InGivenWorld | None = None  # how it lies in the world of given poses; None: that is not known, or it does
     up: Up | None = None  # in the world; None: no IMU tells it
     landmarks: Landmarks | None = None  # by which further photographs are placed; None: they were not gathered
     # By camera (h, w), one value for 2 x 2 pixels: z where a second photograph confirms it, else 0. Empty: not gathered

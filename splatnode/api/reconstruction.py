@@ -18,7 +18,7 @@ from splatnode.recon.config import Config, overlaid
 from splatnode.recon.config import preset as named
 from splatnode.recon.metric.evidence import Evidence
 from splatnode.recon.offline import check_baseline, reconstructed
-from splatnode.recon.replay_source import with_masks
+from splatnode.recon.replay_source import with_masks, with_poses
 
 Changes = Mapping[str, Any] | str | PathLike[str]
 
@@ -29,6 +29,7 @@ def reconstruct(
     intrinsics: LensChoice | None = None,
     poses: Poses | None = None,
     poses_sigma: tuple[float, float] | None = None,
+    poses_only_check: bool = False,
     masks: Masks | None = None,
     scale: Scale | None = None,
     budget_s: float | None = None,
@@ -55,7 +56,9 @@ def reconstruct(
       tells, else it is estimated.
     - `poses`: T_world_camera (4, 4) in metres that others estimated: by the photographs' names, in the order of a list
       (None: not known), or a file as `--poses` reads it. They give metres and the world's axes; one that does not fit
-      is left out and named. `poses_sigma`: standard deviations of a position, metres, and an orientation, degrees.
+      is left out and named. `poses_sigma`: standard deviations of a position, metres, and an orientation, degrees: with
+      `intrinsics` the poses then hold the cameras, also where photographs share nothing. `poses_only_check`: they do
+      not even then, but are compared with the cameras that the photographs alone tell.
     - `masks`: what of the photographs is used: white (any value above 0) is used, black is ignored. A folder of masks
       with the photographs' names, one file for all, or a list, for each photograph an array (H, W), a path, or None
       for one that is used whole. None: all is used.
@@ -79,10 +82,16 @@ def reconstruct(
     source = photographs(images, views, every_frame, telling)
     source = source if masks is None else with_masks(source, finder(masks, images), telling)
     source = with_lens(source, intrinsics, images)
+    trusted = poses is not None and poses_sigma is not None and not poses_only_check
     flags = {"budget_s": budget_s, "seed": seed, "metric": sigmas_of(poses_sigma)}
+    flags["registration"] = {"trust_poses": True} if trusted else None
     chosen = configured(preset, config, flags, scale, of_pictures=source.photographs is None)
     check_baseline(chosen, source)
-    given = Evidence((), poses_given(poses, images, source.frames), pairs_given(scale, images, source.frames))
+    known = poses_given(poses, images, source.frames)
+    if trusted and known is not None:
+        source = with_poses(source, known, chosen.metric.poses_sigma_m, chosen.metric.poses_sigma_deg)
+        known = None  # they are the photographs' own now
+    given = Evidence((), known, pairs_given(scale, images, source.frames))
     made = reconstructed(source, chosen, preset, only_seen, threads, given, tell=telling)
     return result_of(made.snapshot, made, lenses(source.frames))
 

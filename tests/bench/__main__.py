@@ -52,6 +52,7 @@ BENCHMARKS = {
         "consistent_depth",
         "lens_assumptions",
         "registrations",
+        "known_poses",
     ),
     "speed": ("rasterize", "stereo", "growth", "throughput", "campaign"),
     "viewer": ("viewer", "dragging", "drive", "drive_web", "beside"),

@@ -36,7 +36,8 @@ def save(store: Store, work: IncrementalReconstruction, final: bool) -> None:
     store.save("graph", *saved.graph_message(work.graph))
     save_fallbacks(store, work)
     estimate = work.remembered()
-    if estimate is not None and estimate.publishable:
+    # Cameras that given poses hold have no evidence, and are estimated anew after a restart.
+    if estimate is not None and estimate.publishable and estimate.evidence is not None:
         store.save("judgement", *saved_estimate.estimate_message(estimate, work.proven))
     if work.scene is not None:
         store.save("pointmaps", *saved_estimate.pointmaps_message(work.known.pointmaps))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
+
 import pytest
 
 from splatnode.command_line import build_parser
 from splatnode.recon.batch.verb import replay_options
 from splatnode.recon.config import Config, overlaid
-from splatnode.recon.metric.arguments import metric_changes
+from splatnode.recon.metric.arguments import add_poses, metric_changes, trusts_poses
 
 
 def configured(*options: str):
@@ -47,3 +49,14 @@ def test_what_is_no_value_is_refused(option, value, capsys):
     with pytest.raises(SystemExit):
         configured(option, value)
     assert f"argument {option}: " in capsys.readouterr().err
+
+
+def test_who_says_how_unsure_poses_are_trusts_them_unless_they_are_only_to_be_checked():
+    parser = argparse.ArgumentParser()
+    add_poses(parser)
+    for given, trusted in (
+        (["--poses", "p"], False),
+        (["--poses", "p", "--poses-sigma", "0.001,0.1"], True),
+        (["--poses", "p", "--poses-sigma", "0.001,0.1", "--poses-only-check"], False),
+    ):
+        assert trusts_poses(parser.parse_args(given)) is trusted

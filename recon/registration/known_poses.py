@@ -1,0 +1,140 @@
+"""Poses that came with images, as registration takes them: within their sigmas, in a frame near the cameras."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.geometry import spread
+from splatnode.recon.registration import bundle
+
+Array = npt.NDArray[np.float64]
+
+TOLD = ("given", "calibration")  # sources of a lens that is known
+_LEAST_POSES = 2  # that tell a scale
+_LEAST_SPREAD = 1e-9  # metres, in place of 0
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """Poses of some of C keyframes. A unit of the frame that the poses are in has `metres`, around `origin`."""
+
+    poses: bundle.GivenPoses
+    origin: Array  # (3,) metres, in the given world
+    metres: float
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """A given pose that the images contradict."""
+
+    index: int  # of the keyframe
+    metres: float  # from where the images place the camera
+    degrees: float
+    sigmas: float  # how unlikely that is, as the deviation of a normal distribution
+
+
+@dataclass(frozen=True, eq=False)
+class GivenWorld:
+    """How a registration lies in the world of given poses, and how well its cameras are known there.
+
+    A point p of the registration is at `scale * rotation @ p + translation` there, in metres.
+    """
+
+    scale: float
+    rotation: Array  # (3, 3)
+    translation: Array  # (3,)
+    scale_sigma: float  # standard deviation of the logarithm of the scale
+    deviations: tuple[Deviation, ...]  # the worst first
+    offset: Offset | None  # in which all given poses agree, and which was taken out; None: there is none
+    # (C, 3, 3) of the cameras' orientations, radians, and centres, in the frame and unit of the registration
+    turn_covariances: Array
+    centre_covariances: Array
+    held: frozenset[int]  # keyframes whose given pose holds their camera
+
+
+@dataclass(frozen=True, eq=False)
+class Offset:
+    """What is wrong with all given poses alike: T_given = T_true @ T_true_given, as of a wrong hand-eye calibration."""
+
+    T_camera_given: Array  # (4, 4) metres
+    turn_sigma: float  # standard deviation about the axis in which it is least known, radians
+    shift_sigma: float  # and in the direction, metres
+
+    @property
+    def metres(self) -> float:
+        return float(np.linalg.norm(self.T_camera_given[:3, 3]))
+
+    @property
+    def degrees(self) -> float:
+        return float(np.degrees(np.arccos(np.clip((np.trace(self.T_camera_given[:3, :3]) - 1.0) / 2.0, -1.0, 1.0))))
+
+
+def given_by(keyframes: Sequence[Keyframe], offset: Offset | None = None) -> Given | None:
+    """The poses of those keyframes whose lens is told; None where fewer than two hold a scale.
+
+    They must be farther apart than they are unsure. `offset` is taken out of them.
+    """
+    known = [i for i, keyframe in enumerate(keyframes) if has_pose(keyframe)]
+    if len(known) < _LEAST_POSES:
+        return None
+    rotations, centres = np.tile(np.eye(3), (len(keyframes), 1, 1)), np.zeros((len(keyframes), 3))
+    sigmas = np.full((len(keyframes), 2), np.inf)
+    for i in known:
+        pose = keyframes[i].frame.given_pose
+        if pose is None:
+            raise AssertionError("these keyframes have poses")
+        T = pose.matrix if offset is None else pose.matrix @ np.linalg.inv(offset.T_camera_given)
+        u, _, vt = np.linalg.svd(T[:3, :3])  # what comes is a rotation but for rounding
+        rotations[i], centres[i] = (u @ vt).T, T[:3, 3]
+        sigmas[i] = np.radians(pose.sigma_deg), pose.sigma_m
+    apart = spread(centres[known])
+    if apart <= np.median(sigmas[known, 1]):
+        return None
+    origin, metres = centres[known].mean(0), max(apart, _LEAST_SPREAD)
+    sigmas[:, 1] /= metres
+    centres[known] = (centres[known] - origin) / metres
+    return Given(bundle.GivenPoses(rotations, centres, sigmas), origin, metres)
+
+
+def has_pose(keyframe: Keyframe) -> bool:
+    """Whether a pose may hold its camera: it came with one, and with its lens."""
+    lens = keyframe.frame.intrinsics
+    return keyframe.frame.given_pose is not None and lens is not None and lens.source in TOLD
+
+
+def distance(problem: bundle.Problem, registered: Sequence[int]) -> float:
+    """The median depth of the points; of too few, that at which the cameras' axes are nearest to one another."""
+    if len(problem.points) >= _ENOUGH_POINTS:
+        return float(np.median(bundle.project(problem)[1]))
+    found = axis_depths(problem.rotations[list(registered)], bundle.centres(problem)[list(registered)])
+    centres = bundle.centres(problem)[list(registered)]
+    return float(np.median(found)) if len(found) else _FAR_OFF * max(spread(centres), _LEAST_SPREAD)
+
+
+_ENOUGH_POINTS = 5  # to know how far away a scene is
+_FAR_OFF = 5.0  # times the cameras' spread: the distance of a scene of which nothing is known
+_LEAST_ANGLE = np.sin(np.radians(2.0)) ** 2  # squared sine between two axes that meet somewhere
+
+
+def axis_depths(rotations: Array, centres: Array) -> Array:
+    """(M,) depths at which pairs of optical axes are nearest to each other, where that is before both cameras.
+
+    `rotations` (C, 3, 3) are world to camera.
+    """
+    found = []
+    for i in range(len(centres)):
+        for j in range(len(centres)):
+            axis, other, way = rotations[i][2], rotations[j][2], centres[j] - centres[i]
+            cosine = float(axis @ other)
+            if i == j or 1.0 - cosine**2 < _LEAST_ANGLE:
+                continue
+            here = float(way @ axis - cosine * (way @ other)) / (1.0 - cosine**2)
+            there = float(cosine * (way @ axis) - way @ other) / (1.0 - cosine**2)
+            if here > 0 and there > 0:
+                found.append(here)
+    return np.array(found)

@@ -1,0 +1,107 @@
+"""Registration with given poses: cameras in the world of these, whether images share matches or not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from splatnode.recon.frames.keyframe import Keyframe
+from splatnode.recon.geometry import spread
+from splatnode.recon.matching.two_view import TwoView
+from splatnode.recon.registration import bundle, guided, known_poses, lenses, mapping_problem, posed_mapping
+from splatnode.recon.registration.config import Config
+from splatnode.recon.registration.known_poses import Given, GivenWorld, Offset
+from splatnode.recon.registration.posed_mapping import PosedMap
+from splatnode.recon.registration.register import (
+    Registration,
+    in_first_camera,
+    in_lens_pixels,
+    in_order_of_content,
+    patch_images,
+    relabelled,
+    views_of,
+)
+from splatnode.recon.registration.uncertainty import by_pose
+
+Pairs = Mapping[tuple[int, int], TwoView]
+
+
+def register_posed(
+    keyframes: Sequence[Keyframe],
+    pairs: Pairs,
+    config: Config,
+    pause: Callable[[], None] = lambda: None,
+    offset: Offset | None = None,
+) -> Registration | None:
+    """The cameras of the keyframes whose pose is given and true, and of those that images place beside them.
+
+    None where given poses cannot hold a map: fewer than two have a pose and a lens that are told, or the images
+    contradict as many of them as they confirm. `offset` is taken out of all poses. `pairs` and `pause`: see `register`.
+    """
+    order = in_order_of_content(keyframes)
+    ordered, rank = [keyframes[index] for index in order], np.argsort(order)
+    given = known_poses.given_by(ordered, offset)
+    if given is None:
+        return None
+    grouping = lenses.group(ordered, across_sizes=True)
+    matched = guided.with_more(ordered, relabelled(pairs, rank), given)
+    pause()
+    views = views_of(ordered, grouping)
+    known = lenses.candidates(ordered, grouping, matched, config.lenses)
+    settings = config.mapper
+    problem = mapping_problem.prepare(
+        views,
+        known,
+        in_lens_pixels(matched, grouping),
+        settings.max_growing_tracks,
+        settings.max_final_tracks,
+    )
+    focals, images = [lens.focals[0] for lens in known], patch_images(ordered, grouping, config)
+    built = posed_mapping.build_map(problem, focals, given, images, settings, pause)
+    if built is None:
+        return None
+    moved = replace(built, map=built.map.relabelled(order))
+    found = in_first_camera(moved.map, keyframes, [grouping.scales[i] for i in rank], config)
+    return replace(found, given=_world(moved, found, given, order, offset))
+
+
+def _world(
+    built: PosedMap, found: Registration, given: Given, order: Sequence[int], offset: Offset | None
+) -> GivenWorld:
+    """How the registration `found` of `built`, whose views are keyframes, lies in the given world.
+
+    View i of `built.deviations` is keyframe `order[i]`.
+    """
+    estimate, views = built.map.estimate, [camera.index for camera in found.cameras]
+    first, unit = views[0], _unit(built, found)
+    to_first, from_first = estimate.rotations[first], estimate.translations[first]
+    held = [] if estimate.given is None else [view for view in views if estimate.given.known[view]]
+    covariance = bundle.covariance(estimate, built.map.prior, built.map.loss, -1)
+    turns, moves = by_pose(estimate.rotations[views], estimate.translations[views])
+    rows = (6 * np.array(views)[:, None] + np.arange(6)).ravel()
+    joint = covariance.joint[np.ix_(rows, rows)]
+    blocks = [slice(3 * i, 3 * i + 3) for i in range(len(views))]
+    in_world = [(to_first @ turns[b], unit * to_first @ moves[b]) for b in blocks]
+    # What is not known of the offset is not known of any camera.
+    turn_sigma, shift_sigma = (0.0, 0.0) if offset is None else (offset.turn_sigma, offset.shift_sigma)
+    of_turn, of_shift = turn_sigma**2 * np.eye(3), (shift_sigma * unit / given.metres) ** 2 * np.eye(3)
+    sigmas = given.poses.sigmas[np.argsort(order)][held, 1] * given.metres
+    centres = given.metres * bundle.centres(estimate)[held]
+    return GivenWorld(
+        scale=given.metres / unit,
+        rotation=to_first.T,
+        translation=given.origin - given.metres * to_first.T @ from_first,
+        scale_sigma=float(np.median(sigmas) / (spread(centres) * np.sqrt(len(held)))),
+        deviations=tuple(replace(each, index=order[each.index]) for each in built.deviations),
+        offset=offset,
+        turn_covariances=np.stack([turn @ joint @ turn.T + of_turn for turn, _ in in_world]),
+        centre_covariances=np.stack([move @ joint @ move.T + of_shift for _, move in in_world]),
+        held=frozenset(held),
+    )
+
+
+def _unit(built: PosedMap, found: Registration) -> float:
+    """A length in `found` over the same in `built`: `in_first_camera` scaled it."""
+    return 1.0 / known_poses.distance(built.map.estimate, [camera.index for camera in found.cameras])
